@@ -193,9 +193,7 @@ class OpenStore(Shared):
         """See a recording that has ended; if MongoDB is available again, index the rest."""
         self.catch_up(report.entry.id)
         if report.failure is None:
-            if self.index.connected is not None:
-                # The next connection need not look at it.
-                self.catalog.put_indexed([report.entry.id], self.index.id)
+            self.note_indexed(report.entry.id)
             return
         self.index.disconnect()
         try:

@@ -65,7 +65,7 @@ def opened_store(
         doing = "so the files answer"
         if records and recover:  # else beside the recorder
             target = store.shared.index.index_to_record("Recording")
-            doing = "so the index is made later" if target.is_wanted else "so there is no index"
+            doing = target.without
         if recover:
             notes(_recovered(store, verifies=verifies))
         _print_rebuilt(store, doing)

@@ -7,7 +7,7 @@ import signal
 import threading
 import time
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from contextlib import suppress
 from functools import partial
 from multiprocessing.connection import Connection
@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 import hybridlog
 from hybridlog.entries import put_entry
 from hybridlog.follow.child import ENDED, RECOVERED, Followed, Task
-from hybridlog.follow.follower import Follower, begin_again
+from hybridlog.follow.follower import Follower, begin_again, make_rows_ahead
 from hybridlog.follow.triggers import Trigger
 from hybridlog.maintenance.tables import missing
 from hybridlog.query.answers.follow import Arrivals
@@ -116,7 +116,8 @@ class _Beside:
                         check(one.predicate, types)
                     except WhereError as error:
                         never = f"trigger {one.text!r} can never fire on {channel.topic}"
-                        self.tell("say", f"{never}: {str(error).partition(chr(10))[0]}")
+                        why = str(error).splitlines()[0]  # the others point into its text
+                        self.tell("say", f"{never}: {why}")
 
     def run(self) -> None:
         """Do all that a recording needs until its end, and the rest then."""
@@ -128,7 +129,7 @@ class _Beside:
                 thread.join(_EVERY_S)
                 self._tell_state()
         self._rows_due = 0.0
-        self._make_rows()
+        self._make_rows(lambda: True)
         self._tell_state()
 
     def _tell_state(self) -> None:
@@ -176,18 +177,18 @@ class _Beside:
                 if now != read:
                     read = now
                     self.tell("read", read)
-            self._make_rows()
+            self._make_rows(lambda: not self._ended.is_set())
             self._tell_state()
             if not is_last:
                 self._ended.wait(max(_EVERY_S - (time.monotonic() - started), 0))
 
-    def _make_rows(self) -> None:
+    def _make_rows(self, is_wanted: Callable[[], bool]) -> None:
         """Write rows of new sealed segments; now and then also of others, for rules may be new."""
-        follower, now = self._follower, time.monotonic()
-        sealed = self._store.directory.listing(self._task.recording).sealed
-        if follower is not None and (sealed != self._sealed or now >= self._rows_due):
+        directory, recording, now = self._store.directory, self._task.recording, time.monotonic()
+        sealed = directory.listing(recording).sealed
+        if sealed != self._sealed or now >= self._rows_due:
             with suppress(StoreError, DiskFullError):  # the next look, or who lets them go
-                follower.make_rows()
+                make_rows_ahead(directory, recording, is_wanted)
                 self._sealed, self._rows_due = sealed, now + _ROWS_S
 
     # The rest.
@@ -205,8 +206,7 @@ class _Beside:
         target = index.index_to_record("Recording")
         why = index.unavailable
         if why is not None and not isinstance(why, WithoutMongoError):
-            doing = "the index is made later" if target.is_wanted else "there is no index"
-            self.tell("say", f"MongoDB is unavailable, so {doing}: {why}")
+            self.tell("say", f"MongoDB is unavailable, {target.without}: {why}")
         entry = put_entry(directory, catalog, task.recording, is_open=True)
         done: Collection[str] = ()
         topics: Collection[str] | None = None
@@ -225,9 +225,8 @@ class _Beside:
                 follower.follow()
         follower.is_stopped = False
         follower.finish(put_entry(directory, catalog, task.recording))
-        if follower.failure is None and index.connected is not None:
-            # The next connection need not look at it.
-            catalog.put_indexed([task.recording], index.id)
+        if follower.failure is None:
+            store.shared.note_indexed(task.recording)
 
     def _recover(self) -> None:
         """Make documents that the index lacks of earlier recordings."""

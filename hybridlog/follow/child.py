@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from hybridlog.entries import put_entry
-from hybridlog_storage.settings import EMBEDDED, NONE
 
 if TYPE_CHECKING:
     import subprocess
@@ -32,7 +31,7 @@ _PATIENCE_S: Final = 1.0  # then the user hears of what is left at the end
 _TRIES: Final = 5
 """So often in a row it may end before it has told how far it is."""
 _PAUSE_S: Final = 1.0
-_TOLD_TO_MANAGERS: Final = {"NOTIFY_SOCKET", "WATCHDOG_PID", "WATCHDOG_USEC"}
+_OF_SERVICE: Final = {"NOTIFY_SOCKET", "WATCHDOG_PID", "WATCHDOG_USEC"}
 RECOVERED: Final = "recovered"
 """Tells it that earlier recordings are sealed: it brings their documents up to date."""
 ENDED: Final = "ended"
@@ -87,10 +86,11 @@ class FollowerProcess:
         task: Task,
         triggers: Sequence[Trigger],
         *,
+        has_documents: bool,
         hit: Callable[[str, int], object],
         say: Callable[[str], None],
     ) -> None:
-        self.state = Followed((task.mongo or directory.settings.mongo or EMBEDDED) != NONE)
+        self.state = Followed(has_documents)
         self.judged: Collection[int] | None = () if triggers else None
         self.wait_s: float | None = None
         self.left: Callable[[int], object] = lambda _: None
@@ -229,7 +229,7 @@ def _started(control: Connection[Any, Any]) -> subprocess.Popen[bytes]:
     return subprocess.Popen(  # noqa: S603 - our own module
         [sys.executable, "-c", _START.format(places, control.fileno())],
         cwd="/",
-        env={key: value for key, value in os.environ.items() if key not in _TOLD_TO_MANAGERS},
+        env={key: value for key, value in os.environ.items() if key not in _OF_SERVICE},
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,

@@ -85,6 +85,11 @@ class IndexTarget:
         """True if the recording gets documents, now or later."""
         return self.database is not None or self.failure is not None
 
+    @property
+    def without(self) -> str:
+        """The end of a sentence about a MongoDB that is unavailable."""
+        return "so the index is made later" if self.is_wanted else "so there is no index"
+
 
 class _Sender:
     """Sends documents to the index on a thread of its own, while more are made.
@@ -269,14 +274,8 @@ class Follower:
         )
 
     def make_rows(self) -> None:
-        """Write rows of what is sealed, where rules of the store let payloads go.
-
-        Raises:
-            StoreError: Files cannot be read or written.
-            DiskFullError: There is no room.
-        """
-        if not Rules.of(read_settings(self._directory.path).retention).is_empty:
-            make_rows(self._directory, self._entry.id, lambda: not self.is_stopped)
+        """See `make_rows_ahead`."""
+        make_rows_ahead(self._directory, self._entry.id, lambda: not self.is_stopped)
 
     def forget(self) -> None:
         """Remove the documents of a recording that is removed.
@@ -516,6 +515,19 @@ class Follower:
         if self._renewed is not None:
             self._renewed.close()
             self._renewed = None
+
+
+def make_rows_ahead(
+    directory: StoreDirectory, recording: str, is_wanted: Callable[[], bool]
+) -> None:
+    """Write rows of what is sealed, where rules of the store let payloads go.
+
+    Raises:
+        StoreError: Files cannot be read or written.
+        DiskFullError: There is no room.
+    """
+    if not Rules.of(read_settings(directory.path).retention).is_empty:
+        make_rows(directory, recording, is_wanted)
 
 
 class FollowerThread:

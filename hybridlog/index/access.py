@@ -220,11 +220,20 @@ class IndexAccess:
         return IndexAddress(re.sub(r"//([^:/@]*):[^/]*@", r"//\1@", self._uri or ""), name)
 
     @property
+    def _named(self) -> str:
+        return self.wanted or self._directory.settings.mongo or EMBEDDED
+
+    @property
+    def is_wanted(self) -> bool:
+        """False in a store that is used without MongoDB."""
+        return self._named != NONE
+
+    @property
     def place(self) -> str:
         """Description of the index's location; does not contact MongoDB."""
         if self.connected is not None:
             return f"database {self.connected.name} at {self.connected.address}"
-        uri = self.wanted or self._directory.settings.mongo or EMBEDDED
+        uri = self._named
         if uri == EMBEDDED:
             return "the MongoDB that comes with hybridlog"
         if uri == NONE:

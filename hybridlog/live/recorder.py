@@ -37,7 +37,7 @@ from hybridlog.live.ring import GROUPS, Ring
 from hybridlog.live.silence import RULE, Silence, SilenceWatch
 from hybridlog.live.state import RecorderState, StateFile
 from hybridlog.live.statistics import Tally, TopicCounts
-from hybridlog.maintenance.edit import change, remove_if
+from hybridlog.maintenance.edit import remove_if
 from hybridlog.maintenance.keep import RetentionThread
 from hybridlog.maintenance.retention import Rules
 from hybridlog.query.times import format_duration, format_time
@@ -232,6 +232,7 @@ class Recorder:
             self._shared.catalog,
             task,
             triggers,
+            has_documents=index.is_wanted,
             hit=lambda text, time: self.fire(text, self._passed(time)),
             say=self.say,
         )
@@ -339,7 +340,7 @@ class Recorder:
         """Mark and pin what triggers have found last."""
         try:
             if self._incidents.write():
-                change(self._shared, report.entry, lambda now: now)
+                self._shared.catch_up(report.entry.id)
         except HybridlogError as error:
             self.say(f"the last messages of triggers are not marked and pinned: {error}")
         now = self._directory.manifests.read(self._target.id)
