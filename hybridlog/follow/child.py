@@ -1,4 +1,4 @@
-"""The process beside a live recorder that makes all that is derived, as the recorder sees it."""
+"""Starts, hears and ends the process beside a live recorder that makes all that is derived."""
 
 from __future__ import annotations
 

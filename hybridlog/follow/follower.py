@@ -591,7 +591,7 @@ class FollowerThread:
 def in_thread(
     directory: StoreDirectory, catalog: Catalog, target: IndexTarget, interval_s: float | None
 ) -> Callable[[RecordingEntry], FollowerThread]:
-    """What begins to follow a new recording, on a thread of this process."""
+    """A function that begins to follow a new recording, on a thread of this process."""
     return lambda entry: FollowerThread(Follower(directory, catalog, entry, target), interval_s)
 
 

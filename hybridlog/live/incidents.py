@@ -25,7 +25,7 @@ _PROLONGED_S: Final = 1.0  # between two changes that only prolong incidents
 
 
 class Moment(NamedTuple):
-    """What is marked: from one steady time to another, ns, or at one, or with an end to come."""
+    """A mark to be set: its text, tags and steady times, ns; its end may come later, or never."""
 
     text: str
     tags: Mapping[str, str]

@@ -80,7 +80,12 @@ _SLOW_WRITE_S = 2.0  # to pack and write a chunk, on a disk that is busy
 
 @dataclass(frozen=True, slots=True)
 class RecorderOptions(LiveOptions):
-    """Options of a recorder, and of its recording; the first rule that fits a topic applies."""
+    """Options of a recorder, and of its recording; the first rule that fits a topic applies.
+
+    It stops after `max_bytes` of payloads, or when less than `reserve_bytes` are free. After
+    `ring_s` messages go that no pin touches. What lies `before_s` (None: as long as the ring) and
+    `after_s` around a trigger or signal is marked and pinned.
+    """
 
     name: str = "live"
     matcher: TopicMatcher | None = None

@@ -112,7 +112,7 @@ class LiveRecording:
     Args:
         directory: The store.
         catalog: The store's catalog.
-        follow: Begins to follow it.
+        follow: Starts the follower of the recording.
         name: Name of the recording.
         options: Options.
         on_close: Called with the report at the end of the recording.

@@ -60,7 +60,7 @@ class Capture:
     Args:
         directory: The store.
         catalog: Its catalog.
-        follow: Begins to follow it.
+        follow: Starts the follower of the recording.
         known: Returns all recordings of the store as they are now.
         name: Name of the recording.
         tags: Tags of the recording.
