@@ -112,7 +112,7 @@ class IndexAccess:
         self._uri: str | None = None
         self._mongod: EmbeddedMongod | None = None
         self._database: Database | None = None
-        self._owns = False  # no copy of the store does
+        self._owns = False  # the index is of the store at this place, not of a copy elsewhere
         self._rests_until = 0.0
         self._connecting = threading.RLock()
         self._is_complete = False  # the index has all recordings

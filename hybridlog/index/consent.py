@@ -69,7 +69,7 @@ def trust(store_id: str, uri: str) -> None:
 
 
 def _mark(store_id: str, uri: str) -> Path:
-    """The file that says so; nothing is in it."""
+    """The empty file which says that this user has named a server for a store."""
     name = sha256(f"{store_id} {without_password(uri)}".encode("utf-8", "surrogatepass"))
     return state_directory() / _FOLDER / name.hexdigest()
 

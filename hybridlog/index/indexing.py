@@ -44,7 +44,7 @@ class Documents(NamedTuple):
 class ChunkIndexer:
     """Makes the index documents of the chunks of a recording, given by its id or key.
 
-    Without `has_documents`, it makes only their catalog entries.
+    Without `has_documents`, it makes only the results of decoding, for the catalog.
     """
 
     def __init__(self, recording: str, *, has_documents: bool = True) -> None:

@@ -112,7 +112,7 @@ def _repair_one(directory: StoreDirectory, report: RepairReport, recording: str)
         if inventory.listing.sealed.get(number) != log.name:
             continue
         with suppress(StoreError), SegmentReader(path / log.name, number) as reader:
-            # What is left of it is told.
+            # Damage that stays is found by `verify`, which comes next.
             if reader.digest() != log.digest and rebuild_summary(path / log.name, log.digest):
                 done.append(Repaired(inventory.name, log.name, "its summary was rebuilt"))
     return done

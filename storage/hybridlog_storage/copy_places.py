@@ -136,7 +136,7 @@ class Place(ABC):
 
     @abstractmethod
     def working(self, recording: str) -> AbstractContextManager[None]:
-        """Copy into a recording; where there are locks, nobody else does meanwhile: `HeldError`."""
+        """Copy into a recording; where there are locks, `HeldError` if another process does."""
 
     @abstractmethod
     def sees(self, name: str) -> bool:
@@ -170,7 +170,7 @@ class Source(Place):
 
     @abstractmethod
     def pieces(self, name: str, at: int, size: int) -> Iterator[bytes]:
-        """Bytes of a file below the store; `RefusedError` if it is missing, or has not `size`."""
+        """Bytes of a file below the store; `RefusedError` if none of `size` bytes is there."""
 
     @contextmanager
     def opened(self, name: str, size: int) -> Iterator[int]:

@@ -247,7 +247,7 @@ class LooseBatch:
 
     @classmethod
     def of(cls, batch: Batch) -> LooseBatch:
-        """Copies of the payloads of a batch: one of them may outlast its buffer."""
+        """The messages of a batch with copies of their payloads, which may outlast its buffer."""
         source = batch.buffer if isinstance(batch.buffer, bytes) else memoryview(batch.buffer)
         places = zip(batch.offset.tolist(), batch.length.tolist(), strict=True)
         payloads = [bytes(source[start : start + size]) for start, size in places]

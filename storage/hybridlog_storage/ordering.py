@@ -43,12 +43,3 @@ def run_starts(values: NDArray[Any]) -> NDArray[np.intp]:
     starts = np.zeros(len(changes) + min(len(values), 1), np.intp)
     np.add(changes, 1, out=starts[1:])
     return starts
-
-
-def run_lengths(starts: NDArray[np.intp], total: int) -> NDArray[np.intp]:
-    """Length of each run, intp[k]; `total` is the end of the last one."""
-    lengths = np.empty(len(starts), np.intp)
-    lengths[-1] = total
-    lengths[:-1] = starts[1:]
-    lengths -= starts
-    return lengths

@@ -35,7 +35,7 @@ BLOCK = 4096
 """Bytes of a block; a multiple of every device's block size."""
 _STAGE = 1 << 20  # a recorder has up to 32 files open
 DIRECT: int = getattr(os, "O_DIRECT", 0)
-"""Flag of direct reads and writes, 0 if not supported."""
+"""Flag of direct writes, 0 if not supported."""
 _OWN = 1 << 18  # bytes from which content is not staged; pool buffers start at a block
 _REFUSED = {errno.EINVAL, errno.EOPNOTSUPP}
 

@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 _SLICE_FROM = 2048  # mean payload bytes from which one slice copy per message is cheapest
 
 
-def windows(buffer: Buffer, width: int) -> NDArray[np.void]:
+def _windows(buffer: Buffer, width: int) -> NDArray[np.void]:
     """A view of every run of `width` bytes of a buffer, by start offset."""
     return np.ndarray(
         (max(len(buffer) - width + 1, 0),), dtype=f"V{width}", buffer=buffer, strides=(1,)
     )
 
 
-def copy_payloads(batch: Batch, target: bytearray | memoryview, starts: NDArray[np.int64]) -> None:
+def _copy_payloads(batch: Batch, target: bytearray, starts: NDArray[np.int64]) -> None:
     """Copy each payload of a batch to its position in a large enough buffer."""
     if batch.payload_bytes >= _SLICE_FROM * len(batch):
         # numpy copies between arrays without the interpreter lock.
@@ -38,8 +38,8 @@ def copy_payloads(batch: Batch, target: bytearray | memoryview, starts: NDArray[
     lengths = distinct(batch.length)
     for length in lengths[lengths > 0].tolist():
         rows = slice(None) if len(lengths) == 1 else batch.length == length
-        places = windows(target, length)
-        places[starts[rows]] = windows(batch.buffer, length)[batch.offset[rows]]
+        places = _windows(target, length)
+        places[starts[rows]] = _windows(batch.buffer, length)[batch.offset[rows]]
 
 
 def joined(batches: Sequence[Batch]) -> Batch:
@@ -69,7 +69,7 @@ def interleave(batches: Sequence[Batch], order: NDArray[np.intp]) -> Batch:
     place[order] = offset
     at = 0
     for batch in batches:
-        copy_payloads(batch, target, place[at : at + len(batch)])
+        _copy_payloads(batch, target, place[at : at + len(batch)])
         at += len(batch)
     left = Left.joined(batches)
     return Batch(

@@ -1,4 +1,4 @@
-"""Private directories with short paths for unix sockets of this user's processes."""
+"""A private directory with a short path for unix sockets of this user's processes."""
 
 from __future__ import annotations
 
@@ -23,34 +23,31 @@ def socket_base() -> Path:
 
 
 def lasting_socket(file: int) -> Path:
-    """Path of a socket that goes with an open file, the same in every process."""
-    about = os.fstat(file)
-    return _private(socket_base() / f"{about.st_dev:x}-{about.st_ino:x}.sock")
+    """Path of a socket that goes with an open file, the same in every process.
 
-
-def _private(socket: Path) -> Path:
-    """Create the directories of a socket, which only this user can open."""
-    base = socket_base()
+    Its directory, which only this user can open, is made.
+    """
+    base, about = socket_base(), os.fstat(file)
+    socket = base / f"{about.st_dev:x}-{about.st_ino:x}.sock"
     if len(os.fsencode(socket)) > MAX_SOCKET_PATH:
         raise StoreError(
             f"{base.parent} is too long a path for a socket: set HYBRIDLOG_RUNTIME_DIR to a short "
             f"one."
         )
-    for path in dict.fromkeys((base, socket.parent)):
-        try:
-            path.mkdir(mode=0o700)
-        except FileExistsError:
-            pass
-        except OSError as error:
-            raise StoreError(
-                f"{path} cannot be made for a socket: {error.strerror}. Set "
-                f"HYBRIDLOG_RUNTIME_DIR to a directory that can be written."
-            ) from error
-        if not is_private(path):
-            raise StoreError(
-                f"{path} must be a directory that only this user can open, and is "
-                f"not. Remove it, or set HYBRIDLOG_RUNTIME_DIR to another directory."
-            )
+    try:
+        base.mkdir(mode=0o700)
+    except FileExistsError:
+        pass
+    except OSError as error:
+        raise StoreError(
+            f"{base} cannot be made for a socket: {error.strerror}. Set "
+            f"HYBRIDLOG_RUNTIME_DIR to a directory that can be written."
+        ) from error
+    if not is_private(base):
+        raise StoreError(
+            f"{base} must be a directory that only this user can open, and is "
+            f"not. Remove it, or set HYBRIDLOG_RUNTIME_DIR to another directory."
+        )
     return socket
 
 

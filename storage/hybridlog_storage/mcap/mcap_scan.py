@@ -230,7 +230,7 @@ class Scan:
 
     @lazy
     def _listed(self) -> set[tuple[int, int, int, int, str]]:
-        """The summary's word on each chunk, wherever it starts."""
+        """Times, sizes and codec of each chunk of the summary; it may be elsewhere in the file."""
         return {
             (
                 one.message_start_time,

@@ -106,10 +106,10 @@ class Database:
     def connect(cls, uri: str, name: str = "hybridlog", *, timeout_s: float = 5.0) -> Self:
         """Connect and check that the server answers and is new enough.
 
-        A database named in the URI wins over `name`, a `serverSelectionTimeoutMS` in it over
-        `timeout_s`. That is for every later operation, too; with the URI of a replica set it is 20
-        seconds more, as it may elect a primary. A URI or name that is not allowed raises
-        `UsageError`.
+        `timeout_s` is the wait for the server, now and in every later operation; 20 seconds more
+        for a replica set, which may elect a primary. A database named in the URI wins over `name`,
+        a `serverSelectionTimeoutMS` in it over `timeout_s`. A URI or name that is not allowed
+        raises `UsageError`.
         """
         from pymongo import MongoClient
         from pymongo.errors import InvalidURI, PyMongoError

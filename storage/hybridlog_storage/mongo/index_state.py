@@ -98,8 +98,8 @@ class IndexState:
     def clear(self, entry: RecordingEntry, but: Collection[str] = ()) -> None:
         """Remove the index documents of a recording, but those of some segments, numbers as text.
 
-        They are looked for within its times, its losses and an hour around them, and of one that
-        is whole in its topics: a crash may have cut messages whose documents are here.
+        A crash may have cut messages whose documents are here. So these are looked for up to an
+        hour around its messages and losses, and in all topics unless the recording is complete.
         """
         chosen: dict[str, object] = {"_meta.rec": entry.key}
         rows = entry.end.get("losses", ())

@@ -124,7 +124,7 @@ class Bucket:
         return self._again(prefix, listed)
 
     def read(self, name: str, begin: int, end: int, size: int) -> bytes:
-        """Bytes `[begin, end)` of an object; `ObjectChangedError` if it has not `size` in all."""
+        """Bytes `[begin, end)` of an object; `ObjectChangedError` if its size is not `size`."""
         about, data = self._get(name, {"range": (begin, end)}, end - begin)
         if (about.size, len(data)) != (size, end - begin):
             raise ObjectChangedError(f"{self._place(name)} has another size than it had.")

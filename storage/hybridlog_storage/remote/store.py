@@ -508,7 +508,7 @@ class RemoteDirectory(StoreDirectory):
     ) -> Iterator[None]:
         """Nothing is locked: a change is made of the newest manifest, and made again.
 
-        This process may not record: `StoreError`.
+        Nothing can be recorded here: `records` raises `StoreError`.
         """
         self.check_changes()
         if records:

@@ -37,7 +37,7 @@ class OpenChunk:
         """Append messages with the channel ids of the segment, and their arrival numbers."""
         self.size += batch.payload_bytes + _HEAD * len(batch)
         self._payloads += batch.payloads.tolist()
-        batch.payloads = batch.payloads[:0].copy()  # others of the same array may go
+        batch.payloads = batch.payloads[:0].copy()  # a view keeps the whole array
         self._batches.append(batch)
         self._seq.append(seq)
 

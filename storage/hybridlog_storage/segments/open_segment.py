@@ -71,8 +71,7 @@ class OpenSegment:
     @property
     def damaged(self) -> list[Damage]:
         """Parts that cannot be read, in file order."""
-        stopped = self._walk.stopped
-        return [*self._walk.damaged, *([] if stopped is None else [stopped])]
+        return self._walk.damaged
 
     @property
     def end(self) -> int:

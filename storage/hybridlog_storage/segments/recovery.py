@@ -112,7 +112,7 @@ class _Rest:
         if walk.recording is not None:
             check_format(walk.recording, segment.path)
             segment.group = group_of(walk.recording, segment.number)
-        self._damage = [*walk.damaged, *([] if walk.stopped is None else [walk.stopped])]
+        self._damage = walk.damaged
         for number, one in walk.schemas.items():
             segment.schemas[number] = Schema(one.name, one.encoding, bytes(one.data))
         segment.channels |= walk.channels
@@ -136,11 +136,6 @@ class _Rest:
         """Descriptions of the damage, in the order of the file."""
         found = sorted(self._damage, key=lambda one: one.offset)
         return [f"byte {one.offset}: {one.reason}" for one in found]
-
-    @property
-    def is_complete(self) -> bool:
-        """True if the recorder had written all data, and only the summary may be missing."""
-        return self._walk.is_complete and self._walk.recording is not None
 
     @property
     def is_empty(self) -> bool:
@@ -207,9 +202,9 @@ class _Rest:
 
     def seal_again(self, digest: str) -> bool:
         """Write the summary of a sealed file, if the file then has its digest."""
-        segment, end = self._segment, self._walk.end
-        if not self.is_complete:
-            return False
+        walk, segment, end = self._walk, self._segment, self._walk.end
+        if not walk.is_complete or walk.recording is None:
+            return False  # more is missing than the summary
         found = hasher()
         for at in range(0, end, _PIECE):
             found.update(self._reader.read(at, min(_PIECE, end - at)))

@@ -41,8 +41,7 @@ def damage_of(
         except SegmentError as error:
             walk = Walk(reader)
             walk.go_on()
-            places = [*walk.damaged, *([] if walk.stopped is None else [walk.stopped])]
-            damaged = [SegmentDamage(one.offset, one.reason) for one in places]
+            damaged = [SegmentDamage(one.offset, one.reason) for one in walk.damaged]
             return [SegmentDamage(max(reader.size - 1, 0), str(error)), *damaged], False
         if reader.digest(progress) == digest:
             return [], True

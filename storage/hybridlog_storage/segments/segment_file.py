@@ -89,7 +89,6 @@ class Sealed(NamedTuple):
         `place` is its number, and that of the first segment of its group; `content` is its bytes,
         and their digest.
         """
-        number, group = place
         (number, group), (size, digest) = place, content
         spans = table.chunks[["first", "last"]]
         file = File(

@@ -99,7 +99,7 @@ class Division:
 class SegmentGroup:
     """The open segments of a group, by key, in the order of their numbers.
 
-    `create` starts the next one, given the number of the first one of the group; None for that.
+    `create` starts the next one, given the number of the group's first one, or None to start that.
     """
 
     def __init__(self, create: Callable[[int | None], SegmentFile]) -> None:

@@ -140,8 +140,8 @@ class SegmentSummary:
 
     @property
     def chunks(self) -> list[ChunkPlace]:
-        """Position of each chunk that has messages, in file order."""
-        return [place for place in places_of(self.table) if place.channels]
+        """Position of each chunk, in file order."""
+        return places_of(self.table)
 
 
 class SegmentReader:

@@ -151,8 +151,9 @@ class RecordingWriter:
         self.written: Counter[int] = Counter()
         """Number of messages in the files, by channel id."""
         self.stored_bytes = 0
-        self.has_extras = False  # those of `close_truncated` are in a segment
         """Bytes of content in the files, before compression."""
+        self.has_extras = False
+        """True once those of `close_truncated` are in a segment."""
         self._closed_bytes = 0  # of content in closed chunks, those in the files included
         self._last_times: dict[int, int] = {}  # in the files, by channel id
         self._directory = directory

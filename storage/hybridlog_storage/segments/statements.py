@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from typing import Any, TypedDict
+from typing import Any, TypedDict, cast
 
 from msgspec import convert
 
@@ -30,21 +30,14 @@ LossRow = TypedDict(
 
 def loss_rows(value: Mapping[str, object]) -> list[dict[str, Any]]:
     """Rows of the loss ledger, from the value of its metadata record, see `LossRow`."""
-    rows: list[dict[str, Any]] = _checked(value.get("rows"), list[LossRow])
-    _check_spans(rows)
-    return rows
-
-
-def _checked(value: object, kind: Any) -> Any:
+    found = value.get("rows")
     try:
-        json.dumps(value, ensure_ascii=False).encode()  # fails for halves of surrogate pairs
-        return convert(value, kind)
+        json.dumps(found, ensure_ascii=False).encode()  # fails for halves of surrogate pairs
+        rows = cast("list[dict[str, Any]]", convert(found, list[LossRow]))
     except (ValueError, RecursionError) as error:
         raise SegmentError(f"a metadata record is damaged: {error!r}") from error
-
-
-def _check_spans(rows: list[dict[str, Any]]) -> None:
     for row in rows:
         begin, end = row["from"], row["to"]
         if (begin is None) != (end is None) or (begin is not None and begin > end):
             raise SegmentError("a metadata record is damaged: a loss ends before it begins")
+    return rows

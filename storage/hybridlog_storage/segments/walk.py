@@ -74,14 +74,12 @@ class _TornError(SegmentError):
 
 
 class Walk:
-    """The records of a segment so far.
+    """The records of a segment so far, in file order.
 
     Attributes:
         recording: What it says of its recording; None without.
         channels: Id of the schema, and channel, by id of the channel.
         schemas: Schemas by id, also of channels that are not defined.
-        damaged: What cannot be read, in file order, as all the others are.
-        stopped: What is at the end of the file, if no writer leaves that; else None.
         is_complete: Whether the end of the data was reached: the writer had begun the summary.
         end: Where the last whole record ends, or damage before a later one.
     """
@@ -96,14 +94,19 @@ class Walk:
         self.losses: list[dict[str, Any]] = []
         self.attachments: list[AttachmentIndex] = []
         self.metadata: list[MetadataIndex] = []
-        self.damaged: list[Damage] = []
-        self.stopped: Damage | None = None
+        self._damaged: list[Damage] = []
+        self._stopped: Damage | None = None  # at the end of the file, if no writer leaves that
         self.is_complete = False
         self.end = len(START)
 
+    @property
+    def damaged(self) -> list[Damage]:
+        """What cannot be read, in file order."""
+        return [*self._damaged, *([] if self._stopped is None else [self._stopped])]
+
     def go_on(self) -> None:
         """Read what follows the last whole record."""
-        self.stopped, self.is_complete = None, False
+        self._stopped, self.is_complete = None, False
         self._bytes.size = self._reader.size
         self._bytes.forget()
         while not self.is_complete and self.end < self._reader.size:
@@ -115,13 +118,10 @@ class Walk:
                 behind = self._bytes.search(at + 1, size, _PROVABLE, self._proves_itself)
                 if behind is None:
                     if not isinstance(error, _TornError):
-                        self.stopped = Damage(at, size - at, str(error))
+                        self._stopped = Damage(at, size - at, str(error))
                     return
-                self._damage(at, behind, str(error))
+                self._damaged.append(Damage(at, behind - at, str(error)))
                 self.end = behind
-
-    def _damage(self, at: int, behind: int, reason: str) -> None:
-        self.damaged.append(Damage(at, behind - at, reason))
 
     def _peek(self, at: int, size: int) -> memoryview:
         """Bytes of the file, fewer at its end."""
@@ -158,7 +158,8 @@ class Walk:
                 found = self._reader.attachment_at(at, end - at)
                 self.attachments.append(found.index(at, end - at))
             elif opcode == DAMAGED_OPCODE:
-                self._damage(at, end, "it was damaged when the recording was recovered")
+                why = "it was damaged when the recording was recovered"
+                self._damaged.append(Damage(at, end - at, why))
             elif end - at > _MAX_PADDING or any(self._reader.read(at, end - at)[HEAD:]):
                 raise SegmentError("padding has other bytes than zeros")
             return end
