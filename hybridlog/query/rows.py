@@ -188,6 +188,8 @@ class Rows:
                 asked.append(part)
             elif part.is_unbounded:
                 total += part.messages
+            elif not part.is_by_log_time:
+                in_chunks.append(part)
             else:
                 try:
                     total += self._count_by_time(part)
@@ -482,8 +484,6 @@ class Rows:
 
     def _count_by_time(self, part: Part) -> int:
         """Number of messages in the windows of a part."""
-        if not part.is_by_log_time:
-            return self.count_in_chunks([part])
         edges = part.log_windows.ravel()
         held = self._held(part)
         low, high = (edges.searchsorted(placed(held[n]), "right") for n in ("first", "last"))
