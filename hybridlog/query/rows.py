@@ -440,10 +440,7 @@ class Rows:
         """The chunks of a recording that may hold wanted messages."""
         bounds, clock = part.bounds, part.clock
         if part.windows is not None and part.is_by_log_time:
-            windows = part.log_windows
-            bounds, clock = (0, 0), "log"
-            if len(windows):
-                bounds = int(windows[0, 0]), int(windows[-1, 1])
+            bounds, clock = part.log_span, "log"
         is_empty = bounds is not None and bounds[0] >= bounds[1]
         chunks = (
             [] if is_empty else self.session.chunks(part.recording, list(indexes), bounds, clock)
@@ -504,10 +501,8 @@ class Rows:
 
     def _held(self, part: Part) -> NDArray[np.void]:
         """Messages of a part in chunks, as of `Session.parts`."""
-        windows = part.log_windows
-        span = (int(windows[0, 0]), int(windows[-1, 1])) if len(windows) else (0, 0)
         ids = [channel.channel_id for channel in part.channels]
-        return self.session.parts(part.recording, ids, span)
+        return self.session.parts(part.recording, ids, part.log_span)
 
 
 def _within(part: Part, segments: Collection[int]) -> Part:
