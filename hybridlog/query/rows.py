@@ -398,11 +398,11 @@ class Rows:
             _, indexes = of_recording.setdefault(part.recording.id, (part, {}))
             decide = filter_of(part) if filtered else None
             found = None if decide is None else self._placed(part, offsets)
+            covered = frozenset[int]() if found is None else found.segments
             for channel in part.channels:
                 indexes[channel.channel_id] = len(channels)
-                if decide is not None and (found is None or found.segments is not None):
-                    covered = () if found is None else found.segments
-                    filters[len(channels)] = decide, covered or ()
+                if decide is not None and covered is not None:  # None: the table has all
+                    filters[len(channels)] = decide, covered
                 channels.append(channel)
         return ScanPlan(
             channels,
