@@ -253,11 +253,7 @@ class Rows:
         for (times, seq, records), left in self._values(
             part, found, fields, summaries, partial=partial
         ):
-            made: dict[str, pa.Array[Any]] = {}
-            for path in summaries if left is not None else ():
-                array, _, what = path.rpartition(".")
-                known = None if left is None else left.statistic(array, what)
-                made |= {} if known is None else {path: known}
+            made = {} if left is None else left.statistics(summaries)
             leaves = with_summaries(flat(records), fields, made)
             yield Values(times, seq, structs(leaves, len(times)))
 
