@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 
     from hybridlog.message import Message
     from hybridlog.query.chunk_columns import Chunk
-    from hybridlog.query.chunk_scan import MessageRun
-    from hybridlog.query.counters import Counters
     from hybridlog.query.question import Question, RecordedChannel, Span
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
