@@ -111,9 +111,7 @@ def _last_of(
         chunk = session.chunk(recording, entry.segment, entry.place, counters.add_chunk)
         fits = chunk.batch.log_time <= span[1]
         if not number.keys() >= {*entry.place.channels}:
-            own = [channel for channel in entry.place.channels if channel in number]
-            is_own = [chunk.batch.channel == channel for channel in own]
-            fits &= np.logical_or.reduce(is_own)
+            fits &= np.isin(chunk.batch.channel, [*number])
         (rows,) = fits.nonzero()
         if len(rows):
             # Rows are in order of arrival: of equal times, the last one is wanted.
