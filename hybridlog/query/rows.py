@@ -241,7 +241,7 @@ class Rows:
     ) -> Iterator[Values]:
         """The same by dotted path, as tables have them; also summaries of arrays.
 
-        With `partial`, also of messages that lack arrays without their payload; these are null.
+        With `partial`, also of messages that have lost arrays with their payloads: null there.
         """
         from hybridlog.frames.columns import flat, with_summaries
         from hybridlog.schema.arrow_columns import structs
@@ -382,7 +382,7 @@ class Rows:
     def plan(
         self, parts: Sequence[Part], *, filtered: bool = True, reverse: bool = False
     ) -> ScanPlan:
-        """The plan for reading the matching messages of some parts, or all, from chunks.
+        """The plan for reading messages of some parts from chunks; if `filtered`, matching ones.
 
         Where a table decides, it says where they are; else filters decide on what is read.
         """
