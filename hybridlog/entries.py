@@ -528,7 +528,7 @@ def lost_in_crash(manifest: Manifest, after: Sealed) -> list[truth.Loss]:
 
 
 def described(inventory: Inventory) -> Manifest:
-    """The manifest that a recording's segments tell, without its files."""
+    """A manifest of what a recording's segments say about it, which lists no files yet."""
     for _, summary in sorted(inventory.summaries.items()):
         said = summary.recording
         known = {name: said.get(name) for name in ("id", "name", "tags", "source", "created")}
@@ -676,7 +676,7 @@ def unlisted(inventory: Inventory) -> Callable[[Manifest], Manifest] | None:
 
 
 def made_again(inventory: Inventory, old: Manifest | None) -> Manifest:
-    """The manifest of a recording that has lost it."""
+    """The manifest of a recording that has lost it, from its files and an `old` one, if any."""
     made = old or described(inventory)
     numbers = [
         number
@@ -703,7 +703,7 @@ def _listing_of(inventory: Inventory, numbers: Iterable[int]) -> Callable[[Manif
 
 
 def _rows_of(inventory: Inventory, number: int) -> tuple[File | None, Sequence[File]]:
-    """The files of rows of a log tell its line of the manifest, and theirs."""
+    """The manifest's lines of a log that is gone and of its files of rows, from these files."""
     name = inventory.listing.sealed[number]
     if not is_rows(name):
         return None, ()

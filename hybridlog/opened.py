@@ -102,7 +102,8 @@ class OpenStore(Shared):
     def catch_up(self, *recordings: str, mends: bool = False) -> None:
         """See which recordings came or went, and how some others are now.
 
-        All else that was read stays, so this costs little in a store of thousands.
+        All else that was read stays, so this costs little in a store of thousands. With `mends`,
+        those that a crash has cut short are recovered.
         """
         with self.following:
             if self._latest is None:
@@ -151,7 +152,10 @@ class OpenStore(Shared):
     # Repairs.
 
     def mend(self, seconds: float = math.inf) -> None:
-        """Repair what questions met: recordings after a crash, missing and damaged tables."""
+        """Repair what questions met: recordings after a crash, missing and damaged tables.
+
+        Tables that are not made in so many seconds stay in `repairs.noted_tables`.
+        """
         self.check_process()
         if self.directory.is_writable:
             with self._mending:

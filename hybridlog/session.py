@@ -65,7 +65,7 @@ _Topics = tuple[tuple[str, ...], tuple[str, ...] | None]
 
 
 class Asked(Protocol):
-    """The object of questions: an open store as it is at each, or always at one moment."""
+    """Takes questions: an open store as it is at each of them, or always as at one moment."""
 
     directory: StoreDirectory
 
@@ -77,8 +77,8 @@ class Session:
     """An open store at one moment. Thread safe.
 
     A question takes one at its beginning, and hands it to all that it calls. What running
-    recordings have flushed by then is read when it first asks about them. Where a file is gone, or
-    another one, the newer state of its recording takes the place of the one of the moment.
+    recordings have flushed by then is read when it first asks about them. Where a file is gone or
+    was replaced, later questions see the newer state of its recording.
 
     `resolved` has topics of patterns, as long as the topics are the same.
     """
@@ -582,7 +582,8 @@ class Session:
     def _check_same(self, entry: RecordingEntry, number: int, *, reads: bool = True) -> None:
         """Raise a `ChangedError` if a segment that cannot be read is another file by now.
 
-        Later questions to this moment are about the newer files.
+        Later questions to this moment are about the newer files. Without `reads`, only the
+        catalog was asked, so a segment that is gone counts as another file, too.
         """
         place = self._recordings.by_id.get(entry.id)
         look = None if place is None else self._recordings.summaries[place].look
@@ -594,7 +595,7 @@ class Session:
             raise gone(entry.name)
         is_there = str(number) in now.digests or number in now.flushed
         if reads and not is_there and not self._has_let_go(entry.id, number):
-            return  # it is lost, which who reads it is told
+            return  # it is lost: the caller's own error says so
         if _file_in(now, number) != _file_in(entry, number):
             self._entries[entry.id] = now
             raise _changed(entry)

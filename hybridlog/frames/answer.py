@@ -227,13 +227,7 @@ class Decoder:
         """The requested summaries of arrays of expired messages."""
         known = {path.path: path.type for path in channel.codec.paths()}
         requested = (path.replace("[]", "") for path in self._chosen or ())
-        found = {}
-        for path in (path for path in requested if is_summary(path, known)):
-            array, _, what = path.rpartition(".")
-            made = records.statistic(array, what)
-            if made is not None:
-                found[path] = made
-        return found
+        return records.statistics(path for path in requested if is_summary(path, known))
 
     def own_columns(
         self,

@@ -450,8 +450,8 @@ def holding(
 def changing(time: NDArray[np.int64], pause: int) -> NDArray[np.int64]:
     """Steps (messages that differ from the one before) grouped into int64[k, 3]: begin, end, steps.
 
-    `time` has log times of the steps, ns, ascending; `pause` is the longest one within a change,
-    ns.
+    `time` has log times of the steps, ns, ascending. In a change, each step is at most `pause` ns
+    after the one before.
     """
     if not len(time):
         return np.empty((0, 3), np.int64)

@@ -40,7 +40,7 @@ class Matches(NamedTuple):
 class MessageFilter:
     """Decides one predicate on decoded messages. Thread safe.
 
-    Without types of the fields by path, no definition fixes them.
+    `types` are those of the fields by path; None where no definition fixes them.
     """
 
     def __init__(self, predicate: Predicate, types: Mapping[str, str] | None) -> None:

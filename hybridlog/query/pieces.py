@@ -26,7 +26,7 @@ class Piece(NamedTuple):
 def pieces(query: Query, how: str) -> Iterator[Piece]:
     """The parts of a question, in the order of recordings and times.
 
-    They are by `recording`, `mark`, or a predicate with `TOPIC: ` in front or about the one topic.
+    `how` is `recording`, `mark`, or a predicate, with `TOPIC: ` in front unless there is one topic.
     """
     if how == "recording":
         names = _files_of(query)

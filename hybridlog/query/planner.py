@@ -139,7 +139,7 @@ class Planner:
         }
 
     def decided(self, parts: Sequence[Part]) -> list[Part]:
-        """Parts with predicates that columns and messages decide: MongoDB is asked about all."""
+        """The parts with predicates for columns and messages: MongoDB is asked once for all."""
         wanted = [part for part in parts if part.needs_index]
         if not wanted:
             return [*parts]

@@ -188,6 +188,12 @@ class Part:
         cut = np.clip(self.windows, low, high)
         return cut[cut[:, 1] > cut[:, 0]]
 
+    @property
+    def log_span(self) -> Span:
+        """From the first of `log_windows` to the end of the last one, ns; empty without any."""
+        windows = self.log_windows
+        return (int(windows[0, 0]), int(windows[-1, 1])) if len(windows) else (0, 0)
+
     @lazy
     def share(self) -> float:
         """Fraction of the topic's time in the part, 0 to 1."""

@@ -188,6 +188,8 @@ class Rows:
                 asked.append(part)
             elif part.is_unbounded:
                 total += part.messages
+            elif not part.is_by_log_time:
+                in_chunks.append(part)
             else:
                 try:
                     total += self._count_by_time(part)
@@ -239,7 +241,7 @@ class Rows:
     ) -> Iterator[Values]:
         """The same by dotted path, as tables have them; also summaries of arrays.
 
-        With `partial`, also of messages that lack arrays without their payload; these are null.
+        With `partial`, also of messages that have lost arrays with their payloads: null there.
         """
         from hybridlog.frames.columns import flat, with_summaries
         from hybridlog.schema.arrow_columns import structs
@@ -251,11 +253,7 @@ class Rows:
         for (times, seq, records), left in self._values(
             part, found, fields, summaries, partial=partial
         ):
-            made: dict[str, pa.Array[Any]] = {}
-            for path in summaries if left is not None else ():
-                array, _, what = path.rpartition(".")
-                known = None if left is None else left.statistic(array, what)
-                made |= {} if known is None else {path: known}
+            made = {} if left is None else left.statistics(summaries)
             leaves = with_summaries(flat(records), fields, made)
             yield Values(times, seq, structs(leaves, len(times)))
 
@@ -384,7 +382,7 @@ class Rows:
     def plan(
         self, parts: Sequence[Part], *, filtered: bool = True, reverse: bool = False
     ) -> ScanPlan:
-        """The plan for reading the matching messages of some parts, or all, from chunks.
+        """The plan for reading messages of some parts from chunks; if `filtered`, matching ones.
 
         Where a table decides, it says where they are; else filters decide on what is read.
         """
@@ -396,11 +394,11 @@ class Rows:
             _, indexes = of_recording.setdefault(part.recording.id, (part, {}))
             decide = filter_of(part) if filtered else None
             found = None if decide is None else self._placed(part, offsets)
+            covered = frozenset[int]() if found is None else found.segments
             for channel in part.channels:
                 indexes[channel.channel_id] = len(channels)
-                if decide is not None and (found is None or found.segments is not None):
-                    covered = () if found is None else found.segments
-                    filters[len(channels)] = decide, covered or ()
+                if decide is not None and covered is not None:  # None: the table has all
+                    filters[len(channels)] = decide, covered
                 channels.append(channel)
         return ScanPlan(
             channels,
@@ -438,10 +436,7 @@ class Rows:
         """The chunks of a recording that may hold wanted messages."""
         bounds, clock = part.bounds, part.clock
         if part.windows is not None and part.is_by_log_time:
-            windows = part.log_windows
-            bounds, clock = (0, 0), "log"
-            if len(windows):
-                bounds = int(windows[0, 0]), int(windows[-1, 1])
+            bounds, clock = part.log_span, "log"
         is_empty = bounds is not None and bounds[0] >= bounds[1]
         chunks = (
             [] if is_empty else self.session.chunks(part.recording, list(indexes), bounds, clock)
@@ -482,8 +477,6 @@ class Rows:
 
     def _count_by_time(self, part: Part) -> int:
         """Number of messages in the windows of a part."""
-        if not part.is_by_log_time:
-            return self.count_in_chunks([part])
         edges = part.log_windows.ravel()
         held = self._held(part)
         low, high = (edges.searchsorted(placed(held[n]), "right") for n in ("first", "last"))
@@ -504,10 +497,8 @@ class Rows:
 
     def _held(self, part: Part) -> NDArray[np.void]:
         """Messages of a part in chunks, as of `Session.parts`."""
-        windows = part.log_windows
-        span = (int(windows[0, 0]), int(windows[-1, 1])) if len(windows) else (0, 0)
         ids = [channel.channel_id for channel in part.channels]
-        return self.session.parts(part.recording, ids, span)
+        return self.session.parts(part.recording, ids, part.log_span)
 
 
 def _within(part: Part, segments: Collection[int]) -> Part:

@@ -13,7 +13,7 @@ from hybridlog.schema.states import CAUSES, State
 from hybridlog_storage.errors import PayloadError
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
+    from collections.abc import Collection, Iterable, Sequence
 
     import pyarrow as pa
     from numpy.typing import NDArray
@@ -119,6 +119,12 @@ class LeftFields(Objects):
         found = [part_of_summary(part, names, what) for part in self._records({path})]
         kind = next((one.type for one in found if one is not None), None)
         return None if kind is None else self._narrowed(found, kind)
+
+    def statistics(self, paths: Iterable[str]) -> dict[str, pa.Array[Any]]:
+        """The same by path (`ranges.min`), of those that have one."""
+        split = ((path, *path.rpartition(".")) for path in paths)
+        found = {path: self.statistic(array, what) for path, array, _, what in split}
+        return {path: values for path, values in found.items() if values is not None}
 
     def lacking(self, but: Collection[str] = ()) -> NDArray[np.bool_]:
         """bool[n], True where a wanted array, none of `but`, has only its summary left."""

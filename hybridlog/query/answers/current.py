@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 
     from hybridlog.message import Message
     from hybridlog.query.chunk_columns import Chunk
-    from hybridlog.query.chunk_scan import MessageRun
-    from hybridlog.query.counters import Counters
     from hybridlog.query.question import Question, RecordedChannel, Span
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
@@ -113,9 +111,7 @@ def _last_of(
         chunk = session.chunk(recording, entry.segment, entry.place, counters.add_chunk)
         fits = chunk.batch.log_time <= span[1]
         if not number.keys() >= {*entry.place.channels}:
-            own = [channel for channel in entry.place.channels if channel in number]
-            is_own = [chunk.batch.channel == channel for channel in own]
-            fits &= np.logical_or.reduce(is_own)
+            fits &= np.isin(chunk.batch.channel, [*number])
         (rows,) = fits.nonzero()
         if len(rows):
             # Rows are in order of arrival: of equal times, the last one is wanted.

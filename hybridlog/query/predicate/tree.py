@@ -7,16 +7,15 @@ meaning: their places in the text are ignored, and NaN equals NaN.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, TypeAlias, TypeVar
+from typing import Literal, NamedTuple, TypeAlias
 
 from hybridlog_storage.lazy import lazy
 
 Value: TypeAlias = bool | int | float | str | None
 """The operand of a comparison; times and durations are integer nanoseconds."""
 Order = Literal["==", "!=", "<", "<=", ">", ">="]
-Element = TypeVar("Element")
 
 
 class _Node:
@@ -58,10 +57,6 @@ class Slice(NamedTuple):
 
     def __str__(self) -> str:
         return f"[{self.begin}:{'' if self.end is None else self.end}]"
-
-    def of(self, values: Sequence[Element]) -> list[Element]:
-        """The elements of an array."""
-        return list(values[self.begin : self.end])
 
 
 Parts: TypeAlias = tuple[str | int | Slice, ...]
