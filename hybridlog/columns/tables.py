@@ -258,14 +258,14 @@ class Tables:
         try:
             with self._lock:
                 self._look(recording, topics)
-                known = {topic: self._known_rows(recording, topic) for topic in topics}
+                return {
+                    topic
+                    for topic in topics
+                    if not self._has_rows(recording, topic)
+                    or not all(one.is_of(recording) for one in self._known_rows(recording, topic))
+                }
         except StoreError:
             return set(topics)
-        return {
-            topic
-            for topic, rows in known.items()
-            if not all(one.is_of(recording) for one in rows) or not self._has_rows(recording, topic)
-        }
 
     def _look(self, recording: RecordingEntry, topics: Collection[str]) -> None:
         """Look at the folders of some topics, once for all, if rows of them are missing."""
