@@ -271,7 +271,7 @@ def _shared_name(time: int) -> str:
 
 
 class Listing:
-    """Status of a folder's entries by name, read again only after a change; none without it."""
+    """Status of a folder's entries by name, read again after a change; none without the folder."""
 
     def __init__(self, path: Path) -> None:
         self.names: dict[str, os.stat_result] = {}

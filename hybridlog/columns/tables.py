@@ -212,7 +212,7 @@ class Tables:
             self._found[recording.id, topic] = None
 
     def whole(self, file: ColumnFile, *, arrays: bool) -> TopicTable:
-        """All rows of a file, as if of one topic; `arrays` if those that count have them whole."""
+        """All rows of a file, as if of one topic; with `arrays`, all count as rows with arrays."""
         counts = file.counts._replace(arrays=file.counts.rows if arrays else 0)
         return TopicTable("", file.all_parts(), counts, self.opened)
 
@@ -321,7 +321,7 @@ class Tables:
     ) -> tuple[TopicTable, frozenset[int]] | None:
         """The table of some sealed segments of a running recording; None without a valid one.
 
-        Returns also the segments of which it has all rows; `messages` is by sealed segment.
+        Returns also the segments of which it has all rows; `messages` counts by sealed segment.
         """
         if not self.can_have(recording, topic):
             return None

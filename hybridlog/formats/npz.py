@@ -11,7 +11,7 @@
 | structures | `name.field` |
 
 If a column has nulls, `name.valid` marks the rows with a value; the others are NaN, NaT,
-zero or empty. All rows are in memory, as they are for who reads the file.
+zero or empty. All rows are held in memory, as a reader of the file holds them, too.
 """
 
 from __future__ import annotations
