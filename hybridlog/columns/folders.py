@@ -175,14 +175,13 @@ class TableFolders:
             if addition.pieces:
                 self._write(path, addition.pieces)
             return
-        pieces, before = [*addition.pieces], 0
+        pieces = [*addition.pieces]
         new = {section.topic for section, _ in pieces}
-        for section in reader.about.sections:
+        for before, section in reader.sections():
             is_fresh = section.segments.items() <= self._digests.items()
             stays = is_fresh and section.topic not in new and not goes(section.topic)
             if section.id != self._recording or stays:
                 pieces.append((section, table.slice(before, section.rows)))
-            before += section.rows
         if pieces:
             self._write(path, pieces, reader)
         else:
