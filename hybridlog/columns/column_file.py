@@ -264,8 +264,8 @@ class ColumnFile:
     ) -> dict[str, tuple[int, ...]]:
         """Numbers of the columns of some fields, None for all, by the table's column around them.
 
-        `own` are columns of the table itself. With `arrays`, all rows have these in full, and their
-        summaries.
+        `own` are columns of the table itself. `arrays` says that all rows have arrays in full, and
+        their summaries.
         """
         key = None if paths is None else frozenset(paths), frozenset(own), arrays
         found = self._chosen.get(key)

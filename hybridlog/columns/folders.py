@@ -175,14 +175,13 @@ class TableFolders:
             if addition.pieces:
                 self._write(path, addition.pieces)
             return
-        pieces, before = [*addition.pieces], 0
+        pieces = [*addition.pieces]
         new = {section.topic for section, _ in pieces}
-        for section in reader.about.sections:
+        for before, section in reader.sections():
             is_fresh = section.segments.items() <= self._digests.items()
             stays = is_fresh and section.topic not in new and not goes(section.topic)
             if section.id != self._recording or stays:
                 pieces.append((section, table.slice(before, section.rows)))
-            before += section.rows
         if pieces:
             self._write(path, pieces, reader)
         else:
@@ -271,7 +270,7 @@ def _shared_name(time: int) -> str:
 
 
 class Listing:
-    """Status of a folder's entries by name, read again only after a change; none without it."""
+    """Status of a folder's entries by name, read again after a change; none without the folder."""
 
     def __init__(self, path: Path) -> None:
         self.names: dict[str, os.stat_result] = {}

@@ -138,7 +138,7 @@ def column_names(
 
 
 class TopicCounts(NamedTuple):
-    """Rows of a topic in a file; `unreadable` ones lack fields, `arrays` ones are whole."""
+    """Rows of a topic in a file, those without fields, and those that have arrays in full."""
 
     rows: int
     unreadable: int = 0
@@ -180,7 +180,7 @@ class Section:
 
 @dataclass(frozen=True, slots=True)
 class About:
-    """The description of a file of tables, in the file; `span` is the bytes of the row groups.
+    """The description of a file of tables, in the file; `span` is where row groups begin and end.
 
     `of_rows` is what a file of rows says of them besides; empty in a table.
     """

@@ -1,6 +1,6 @@
 """Writes Parquet files whose pages have Parquet's checksums, and whose footer has one of its own.
 
-That one is a CRC-32 of 4 bytes in front of the footer. Other readers ignore both.
+The footer's is the 4 bytes in front of it, a CRC-32. Other readers ignore both.
 """
 
 from __future__ import annotations

@@ -93,8 +93,8 @@ def piece_of(
 ) -> Piece:
     """Rows of messages of one topic and state.
 
-    Readable ones have that state. `has_publish_time` is by channel id; `columns` turns fields into
-    columns; `fields` are paths of those wanted, None for all.
+    Readable ones have that state. `channel` of the batch has ids; `has_publish_time` is by these.
+    `columns` turns fields into columns; `fields` are paths of those wanted, None for all.
     """
     import pyarrow as pa
     import pyarrow.compute as pc

@@ -212,7 +212,7 @@ class Tables:
             self._found[recording.id, topic] = None
 
     def whole(self, file: ColumnFile, *, arrays: bool) -> TopicTable:
-        """All rows of a file, as if of one topic; `arrays` if those that count have them whole."""
+        """All rows of a file, as if of one topic; with `arrays`, all count as rows with arrays."""
         counts = file.counts._replace(arrays=file.counts.rows if arrays else 0)
         return TopicTable("", file.all_parts(), counts, self.opened)
 
@@ -258,14 +258,14 @@ class Tables:
         try:
             with self._lock:
                 self._look(recording, topics)
-                known = {topic: self._known_rows(recording, topic) for topic in topics}
+                return {
+                    topic
+                    for topic in topics
+                    if not self._has_rows(recording, topic)
+                    or not all(one.is_of(recording) for one in self._known_rows(recording, topic))
+                }
         except StoreError:
             return set(topics)
-        return {
-            topic
-            for topic, rows in known.items()
-            if not all(one.is_of(recording) for one in rows) or not self._has_rows(recording, topic)
-        }
 
     def _look(self, recording: RecordingEntry, topics: Collection[str]) -> None:
         """Look at the folders of some topics, once for all, if rows of them are missing."""
@@ -321,7 +321,7 @@ class Tables:
     ) -> tuple[TopicTable, frozenset[int]] | None:
         """The table of some sealed segments of a running recording; None without a valid one.
 
-        Returns also the segments of which it has all rows; `messages` is by sealed segment.
+        Returns also the segments of which it has all rows; `messages` counts by sealed segment.
         """
         if not self.can_have(recording, topic):
             return None

@@ -78,7 +78,7 @@ class TableRows:
 
 
 class TopicTable:
-    """All messages of a topic in a recording; with `has_arrays` in full, but for bytes."""
+    """All messages of a topic in a recording; `has_arrays` if they are in full, but for bytes."""
 
     def __init__(
         self, topic: str, parts: Sequence[TablePart], counts: TopicCounts, opened: OpenFiles

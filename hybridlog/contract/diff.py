@@ -191,8 +191,8 @@ def _of_fields(
 ) -> Iterator[Difference]:
     """A difference for each field whose statistics are not the same.
 
-    A number of values that is that of the messages is told by those. What is shown alike is
-    the same: sums of one set of values depend on their order.
+    A count of values that equals the number of messages is left out, as that is told already.
+    What is shown alike counts as the same: a sum depends on the order of its values.
     """
     for field in sorted({*a, *b}):
         if field not in a or field not in b:

@@ -11,7 +11,7 @@
 | structures | `name.field` |
 
 If a column has nulls, `name.valid` marks the rows with a value; the others are NaN, NaT,
-zero or empty. All rows are in memory, as they are for who reads the file.
+zero or empty. All rows are held in memory, as a reader of the file holds them, too.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from hybridlog.formats.answer import Answer
 from hybridlog.formats.tables import groups
 from hybridlog.formats.writing import Sink, Target
 from hybridlog.schema.arrow_types import (
+    bounds_of,
     is_bytes,
     is_list,
     is_numeric,
@@ -96,7 +97,7 @@ def _arrays(name: str, column: pa.ChunkedArray) -> Arrays:
         yield name, items.reshape(len(column), kind.list_size)
     elif is_list(kind):
         yield from _arrays(f"{name}.values", pc.list_flatten(column))
-        yield f"{name}.offsets", _offsets(pc.list_value_length(column))
+        yield f"{name}.offsets", bounds_of(column)
     elif pa.types.is_struct(kind):
         for field, member in zip(kind, column.flatten(), strict=True):
             yield from _arrays(f"{name}.{_array_name(field.name)}", member)
@@ -120,17 +121,10 @@ def _texts(name: str, column: pa.ChunkedArray) -> Arrays:
                 words[at : at + len(part)] = part
             yield name, words
             return
-    chunks = column.cast(pa.large_binary()).fill_null(b"").chunks
-    data = b"".join(cell for chunk in chunks for cell in chunk.to_pylist())
+    binary = column.cast(pa.large_binary())
+    data = b"".join(cell for chunk in binary.fill_null(b"").chunks for cell in chunk.to_pylist())
     yield f"{name}.values", np.frombuffer(data, np.uint8)
-    yield f"{name}.offsets", _offsets(pc.binary_length(column))
-
-
-def _offsets(lengths: pa.ChunkedArray) -> NDArray[np.int64]:
-    """Where rows begin, and the last one ends."""
-    ends = np.zeros(len(lengths) + 1, np.int64)
-    np.cumsum(lengths.fill_null(0).to_numpy(), out=ends[1:])
-    return ends
+    yield f"{name}.offsets", bounds_of(binary)
 
 
 def _numbers(column: pa.ChunkedArray) -> NDArray[Any]:

@@ -32,7 +32,7 @@ _MAX_WINDOW = 1 << 27
 
 @dataclass(slots=True)
 class Spooled:
-    """A temporary unpacked file, and why it is cut. `remove` it once a reader has opened it."""
+    """A temporary unpacked file, and why it is cut, if it is; `remove` it once it is open."""
 
     path: Path
     problem: str | None

@@ -195,7 +195,7 @@ def _check_outside(path: Path) -> None:
 
 
 def new_directory(target: str | os.PathLike[str], content: str) -> tuple[Path, Unfinished]:
-    """A directory to write, with links resolved, and the unfinished one that will replace it."""
+    """A missing or empty directory, links resolved, and the unfinished one that will replace it."""
     path = Path(os.path.realpath(target))
     _check_outside(path)
     if path.exists() and not path.is_dir():

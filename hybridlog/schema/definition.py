@@ -90,7 +90,7 @@ class Instant:
 
 @dataclass(frozen=True, slots=True)
 class ArrayOf:
-    """An array, whose `width` is not on the wire, or a sequence; its bound is not enforced."""
+    """An array of `width` elements, a number not on the wire; or a sequence, `bound` unchecked."""
 
     element: FieldType
     width: int | None = None

@@ -273,10 +273,9 @@ class _Parser:
         if len(rest) != 1:
             return None
         number = _integer(rest[0])
-        known = self._types.constants
-        for candidate in _candidates(scope, rest[0]) if number is None else ():
-            if candidate in known:
-                return sign * known[candidate]
+        if number is None:
+            found = map(self._types.constants.get, _candidates(scope, rest[0]))
+            number = next((value for value in found if value is not None), None)
         return None if number is None else sign * number
 
     def _constant(self, scope: list[str]) -> None:

@@ -48,27 +48,22 @@ def bodies_of(codec: Codec, batch: Batch) -> Iterator[BodyGroup]:
 
     Each message is in exactly one group.
     """
-    if codec.indexed:
-        yield from decoded_bodies(columns_of(codec, batch))
-    elif len(batch):
-        yield BodyGroup(np.arange(len(batch)), np.empty((len(batch), 0), np.uint8), None)
-
-
-def decoded_bodies(decoded: Decoded) -> Iterator[BodyGroup]:
-    """Make index bodies of decoded messages."""
-    surplus = decoded.surplus
+    if not codec.indexed:
+        if len(batch):
+            yield _without_fields(np.arange(len(batch)), None)
+        return
+    decoded = columns_of(codec, batch)
     if isinstance(decoded.records, Records):
         yield from _of_columns(decoded, decoded.records)
     else:
         for made, own in decoded.records.bodies(ARRAY_LIMIT, MAX_BYTES):
             rows = decoded.rows[own]
-            left = np.intersect1d(rows, surplus) if len(surplus) else no_rows()
             if isinstance(made, str):
-                yield _error(rows, made)
+                yield _without_fields(rows, made)
             else:
-                yield BodyGroup(rows, made, None, surplus=left)
+                yield BodyGroup(rows, made, None, None, _surplus_among(rows, decoded))
     for bad in decoded.unreadable:
-        yield _error(bad.rows, bad.reason)
+        yield _without_fields(bad.rows, bad.reason)
 
 
 def _of_columns(decoded: Decoded, records: Records) -> Iterator[BodyGroup]:
@@ -76,14 +71,17 @@ def _of_columns(decoded: Decoded, records: Records) -> Iterator[BodyGroup]:
     for group in bodies(records, array_limit=ARRAY_LIMIT, max_bytes=MAX_BYTES):
         rows = decoded.rows[group.rows]
         if isinstance(group, TooLarge):
-            yield _error(rows, f"its fields take more than {MAX_BYTES >> 20} MiB")
+            yield _without_fields(rows, f"its fields take more than {MAX_BYTES >> 20} MiB")
             continue
         own = None if stamps is None else stamps[group.rows]
-        surplus = np.intersect1d(rows, decoded.surplus) if len(decoded.surplus) else no_rows()
-        yield BodyGroup(rows, group.body, None, own, surplus)
+        yield BodyGroup(rows, group.body, None, own, _surplus_among(rows, decoded))
 
 
-def _error(rows: NDArray[np.intp], error: str) -> BodyGroup:
+def _surplus_among(rows: NDArray[np.intp], decoded: Decoded) -> NDArray[np.intp]:
+    return np.intersect1d(rows, decoded.surplus) if len(decoded.surplus) else no_rows()
+
+
+def _without_fields(rows: NDArray[np.intp], error: str | None) -> BodyGroup:
     return BodyGroup(rows, np.empty((len(rows), 0), np.uint8), error)
 
 

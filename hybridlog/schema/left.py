@@ -109,7 +109,7 @@ class LeftFields(Objects):
             pa.nulls(len(part), kind) if one is None else converted(one, kind, drops=True)
             for one, part in zip(parts, self._parts, strict=True)
         ]
-        return pa.concat_arrays([pa.nulls(0, kind), *arrays]).take(pa.array(self._order))
+        return pa.concat_arrays([pa.nulls(0, kind), *arrays]).take(self._order)
 
     def statistic(self, path: str, what: str) -> pa.Array[Any] | None:
         """`n`, `min`, `max` or `mean` of an array in each message; None if there is none."""
@@ -183,7 +183,7 @@ class LeftCodec:
         for row, reason in enumerate(errors):
             if reason is not None:
                 bad.setdefault(reason, []).append(row)
-        good = np.setdiff1d(np.arange(len(order)), [row for own in bad.values() for row in own])
+        good = np.flatnonzero([reason is None for reason in errors])
         empty = self.original.columns(b"", no_rows(), no_rows(), fields)
         records = LeftFields(parts, order[good], fields, empty)
         unreadable = [Unreadable(np.array(own, np.intp), why) for why, own in bad.items()]

@@ -64,7 +64,7 @@ def document_cells(array: pa.Array[Any], *, typed: bool, whole: bool) -> list[An
         return [{"n": Int64(n)} if there else None for n, there in counted]
     made: Callable[[Any], Any] = bytes
     if is_time(array.type):
-        made, array = Duration if kind.startswith("d") else Nanoseconds, array.view("int64")
+        made, array = Duration if kind.startswith("duration") else Nanoseconds, array.view("int64")
     elif typed and kind in _LONG:
         made = Int64
     elif not is_bytes(array.type):

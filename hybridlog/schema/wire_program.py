@@ -100,7 +100,7 @@ class Run:
         """Layout from field `first` on, as far as the known phase allows.
 
         The start has `phase` modulo `modulus`: 1, 2, 4 or 8. Fields of larger alignment cannot be
-        placed; from such a one, the layout is empty.
+        placed; if the first one is such a field, the layout is empty.
         """
         key = (first, phase, modulus)
         found = self._layouts.get(key)

@@ -150,7 +150,7 @@ def _valid(
 
 
 def _transforms_of(table: pa.Table, *, is_static: bool) -> pa.Table:
-    """The transforms of messages as rows: times, names, seven numbers, and whether they hold."""
+    """The transforms of messages as rows: times, frames, seven numbers, and `is_static`."""
     times = table["log_time"].combine_chunks().cast(pa.int64())
     columns = {name: table[name].combine_chunks() for name in table.column_names}
     if "transforms" in columns:

@@ -72,11 +72,11 @@ _USUAL: Final = re.compile(
     rb"(?s)\x26\0\0\0"
     rb"(?:\x04\0\0\0op=\x02|\x09\0\0\0conn=(....)|\x0d\0\0\0time=(........)){3}...."
 )
-"""The header of a message without further fields, and the length of its data."""
+"""The header of a message without further fields, in any order, and the length of its data."""
 _USUAL_BYTES: Final = 46
 _SORTED: Final = struct.Struct("<13s4x17s8xI").unpack_from
 _SORTED_NAMES: Final = b"\x26\0\0\0\x09\0\0\0conn=", b"\x04\0\0\0op=\x02\x0d\0\0\0time="
-"""The same with its fields in the order in which rosbag writes them: names, and length."""
+"""The same in the order of rosbag: what is around the values, and the length of the data."""
 
 _u32 = struct.Struct("<I").unpack_from
 
@@ -152,21 +152,15 @@ def walk(data: bytes, most: int) -> _Walk:
     pos, size, u32, usual, in_order = 0, len(data), _u32, _USUAL.match, _SORTED
     first, second = _SORTED_NAMES
     while pos + 8 <= size and len(rows) < most:
-        if pos + _USUAL_BYTES <= size:
+        start = pos + _USUAL_BYTES
+        if start <= size:
+            conn = time = 0
             before, between, count = in_order(data, pos)
             if before == first and between == second:
-                start = pos + _USUAL_BYTES
-                if start + count > size:
-                    break
-                rows.append((start, count, pos + 13, pos + 34))
-                pos = start + count
-                continue
-        head = usual(data, pos)
-        if head is not None and head.end() == pos + _USUAL_BYTES:
-            conn, time = head.start(1), head.start(2)
+                conn, time = pos + 13, pos + 34
+            elif (head := usual(data, pos)) is not None and head.end() == start:
+                conn, time = head.start(1), head.start(2)
             if conn > 0 and time > 0:
-                start = pos + _USUAL_BYTES
-                count = u32(data, start - 4)[0]
                 if start + count > size:
                     break
                 rows.append((start, count, conn, time))

@@ -40,7 +40,8 @@ def write_bag(answer: Answer, target: Target) -> None:
 class BagWriter(LogWriter):
     """Writes one ROS 1 bag, version 2.0, with its index.
 
-    Only channels of ROS 1 messages (`message_encoding` is `ros1`) fit into a bag.
+    Only channels of ROS 1 messages (`message_encoding` is `ros1`) fit into a bag. Its header is
+    written last, so a bag for a stream is written to a temporary file first.
     """
 
     def __init__(self, target: Target) -> None:

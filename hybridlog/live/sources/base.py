@@ -11,7 +11,7 @@ from __future__ import annotations
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Protocol, Self
+from typing import TYPE_CHECKING, Final, Protocol, Self
 
 from hybridlog.record.losses import Cause, Loss
 
@@ -132,6 +132,9 @@ class LiveSource(ABC):
         self.stop()
 
 
+_JOIN_S: Final = 5.0
+
+
 class ThreadedSource(LiveSource):
     """A source with a thread of its own, which ends soon after `_stopping` is set."""
 
@@ -153,6 +156,14 @@ class ThreadedSource(LiveSource):
         name = f"hybridlog-{self.kind}"
         self._thread = threading.Thread(target=guarded, name=name, daemon=True)
         self._thread.start()
+
+    def _reached(self) -> None:
+        self.was_reached = True
+
+    def stop(self) -> None:
+        """Stop, after the messages that are under way, and wait some seconds at most."""
+        self._stopping.set()
+        self._join(_JOIN_S)
 
     def _join(self, seconds: float | None = None) -> None:
         """Wait for the end of the thread."""

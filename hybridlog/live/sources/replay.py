@@ -30,7 +30,6 @@ _MIN_PAUSE_S: Final = 0.001  # messages that are due within it go out together
 _MAX_PAUSE_S: Final = 3600.0
 _LATE_S: Final = 0.5
 _LONG_S: Final = 60.0
-_JOIN_S: Final = 5.0
 _WINDOW: Final = 32 << 20  # payload bytes of the lookahead
 _WINDOW_ROWS: Final = 1 << 17
 
@@ -85,11 +84,6 @@ class ReplaySource(ThreadedSource):
         """Open the log, and begin to play it."""
         self._source, self._sink = open_source(self._path), sink
         self._begin(sink, self._run)
-
-    def stop(self) -> None:
-        """Stop, even in a pause. All messages that are due have been sent."""
-        self._stopping.set()
-        self._join(_JOIN_S)
 
     def _run(self) -> None:
         """Play the log to its end, or until it is stopped."""

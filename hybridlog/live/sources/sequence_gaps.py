@@ -123,7 +123,7 @@ class SequenceGapDetector:
     def _wait(self, gap: SequenceGap) -> None:
         if not self.waiting:
             self._messages_after = 0
-        elif self.waiting[-1][1:3] == gap[1:3]:
+        elif self.waiting[-1][1:] == gap[1:]:
             # Many gaps in what was received at once are one.
             gap = joined_gap([self.waiting.pop(), gap])
         self.waiting.append(gap)

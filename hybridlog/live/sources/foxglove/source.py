@@ -18,13 +18,9 @@ in another century.
 
 from __future__ import annotations
 
-from typing import Final
-
 from hybridlog.live.sources.base import Sink, ThreadedSource
 from hybridlog.live.sources.foxglove.protocol import parse_address, without_user
 from hybridlog_storage.errors import MissingDependencyError
-
-_JOIN_S: Final = 5.0
 
 
 class FoxgloveSource(ThreadedSource):
@@ -60,15 +56,3 @@ class FoxgloveSource(ThreadedSource):
                 "recording from Foxglove needs picows: pip install 'hybridlog[foxglove]'"
             ) from error
         self._begin(sink, Client(sink, address, self._stopping, self._reached).run)
-
-    def _reached(self) -> None:
-        self.was_reached = True
-
-    def stop(self) -> None:
-        """Close the connection after the messages that are under way.
-
-        A hanging look-up of a host name may keep the thread alive longer; it then ends
-        without calling the sink.
-        """
-        self._stopping.set()
-        self._join(_JOIN_S)

@@ -18,7 +18,6 @@ from xml.parsers.expat import ExpatError
 from hybridlog.live.sources.base import PeerError, one_line
 from hybridlog.live.sources.network import (
     PATIENCE_S,
-    Endpoint,
     Network,
     UnreachedError,
     endpoint_of,
@@ -154,8 +153,6 @@ class RpcServer:
         self._socket = listening
         self._methods = methods
         self._clients: set[asyncio.Task[None]] = set()
-        host, port = listening.getsockname()[:2]
-        self.endpoint = Endpoint(host, port)
 
     async def serve(self) -> None:
         """Answers calls until cancelled; then closes all sockets."""

@@ -92,9 +92,6 @@ class Ros1Source(ThreadedSource):
                 f"{error}; give a ROS master like {_DEFAULT_URI} with --ros1 or ROS_MASTER_URI"
             ) from error
 
-    def _reached(self) -> None:
-        self.was_reached = True
-
     async def _follow(self, sink: Sink, uri: str) -> None:
         """Runs all tasks until the source is stopped or one of them fails."""
         loop = asyncio.get_running_loop()

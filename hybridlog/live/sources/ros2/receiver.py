@@ -99,7 +99,7 @@ class Receiver:
         self.said_bye = False
 
     def run(self) -> None:
-        """Reads to the end; WireError if that is in the middle of a frame."""
+        """Reads to the end; WireError for what breaks the protocol, OSError of the socket."""
         # A large payload is read directly into the bytes object for the sink, without a
         # copy.
         raw = io.FileIO(self._peer.fileno(), closefd=False)

@@ -63,21 +63,21 @@ class Ros2Source(ThreadedSource):
     def check(self) -> None:
         """Start the child; messages are read after `start`."""
         if self._child is None:
-            self._child, self._settings = self._launched()
+            self._child = self._launched()
 
     def start(self, sink: Sink) -> None:
         """Begin to listen."""
         self.check()
-        child, settings = self._child, self._settings
-        self._begin(sink, lambda: self._supervise(child, sink, settings))
+        child = self._child
+        self._begin(sink, lambda: self._supervise(child, sink))
 
-    def _launched(self) -> tuple[Process, dict[str, object]]:
-        """A new child and its settings."""
+    def _launched(self) -> Process:
+        """The first child; sets what later ones need."""
         domain = self.address.partition(" ")[2]
         if not (domain.isascii() and domain.isdigit() and int(domain) <= MAX_DOMAIN):
             raise UsageError(f"ROS 2 has domains from 0 to {MAX_DOMAIN}, not {domain[:40]!r}")
         overrides = {} if self._overrides is None else read_overrides(self._overrides)
-        settings: dict[str, object] = {"overrides": overrides}
+        settings = self._settings = {"overrides": overrides}
         try:
             child, self._python = launch(self._python, settings, self._domain_id, self._stopping)
         except ChildError as error:
@@ -85,7 +85,7 @@ class Ros2Source(ThreadedSource):
                 f"ROS 2 does not start: {one_line(str(error))}; does `ros2 topic list` work?"
             ) from error
         self.address = f"domain {domain}, {one_line(str(child.hello.get('middleware')))}"
-        return child, settings
+        return child
 
     def stop(self) -> None:
         """Stop listening, after the child has passed on its messages."""
@@ -103,7 +103,7 @@ class Ros2Source(ThreadedSource):
                 child.kill()
         self._join()
 
-    def _supervise(self, child: Process | None, sink: Sink, settings: dict[str, object]) -> None:
+    def _supervise(self, child: Process | None, sink: Sink) -> None:
         """Reads from one child after the other."""
         pause = _PAUSE_S
         while child is not None:
@@ -114,7 +114,7 @@ class Ros2Source(ThreadedSource):
             if time.monotonic() - began > _STABLE_S:
                 pause = _PAUSE_S
             sink.say(f"ROS 2: the child ended ({reason}); restarting it")
-            child = self._start_again(sink, settings, pause)
+            child = self._start_again(sink, pause)
             pause = min(2 * pause, _MAX_PAUSE_S)
         for topic, since in self._outages.items():
             report_outage(sink, topic, since)
@@ -146,12 +146,12 @@ class Ros2Source(ThreadedSource):
                 sink.topic_gone(topic)
         return one_line("; ".join(filter(None, (reason, exit_report))))
 
-    def _start_again(self, sink: Sink, settings: dict[str, object], pause: float) -> Process | None:
+    def _start_again(self, sink: Sink, pause: float) -> Process | None:
         """A new child after a pause; None if the source is stopped meanwhile."""
         while not self._stopping.wait(pause):
             pause = min(2 * pause, _MAX_PAUSE_S)
             try:
-                child, _ = launch(self._python, settings, self._domain_id, self._stopping)
+                child, _ = launch(self._python, self._settings, self._domain_id, self._stopping)
             except (ChildError, MissingDependencyError) as error:
                 if self._stopping.is_set():
                     break
