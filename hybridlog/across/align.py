@@ -20,6 +20,7 @@ from hybridlog.across.topic_reader import (
     TopicReader,
     concatenated,
 )
+from hybridlog.frames.answer import text_column
 from hybridlog.frames.names import free_name
 from hybridlog.query.answers.lost import completeness_of
 from hybridlog.query.answers.remarks import remarks
@@ -215,8 +216,7 @@ class Aligned:
         self.rows += len(times) if is_told else 0
         columns: dict[str, Any] = {TIME: own[TIME]}
         if recording is not None:
-            text = recording.encode("utf-8", "replace").decode()
-            columns[RECORDING] = pa.repeat(pa.scalar(text, pa.string()), len(times))
+            columns[RECORDING] = text_column(recording, len(times))
         if isinstance(self._base, TopicReader):
             self._base.add(columns, own, empty, 0)
         for partner in partners:
