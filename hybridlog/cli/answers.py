@@ -278,7 +278,7 @@ def write_answer(
     for name in ("lines", "tables", "batches", "points", "messages"):
         setattr(answer, name, _checked(told(getattr(answer, name)), completeness))
     path = target if isinstance(target, Path) else None
-    size = 0 if path is None else payload_bytes(query)
+    size = payload_bytes(query) if path is not None and output.has_bars() else 0
     with writing(path), Bar(form, size, quiet=path is None) as bar:
         OUTPUTS[form].write(answer, target, **settings or {})
     notes = answer.notes
