@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 MAX_TIMES: Final = 20_000_000
-"""As of `lane_of`, of a timeline."""
+"""Most messages of a topic whose times `lane_of` reads, unless its caller says otherwise."""
 _SAMPLED: Final = 100_000  # steps that tell the usual one
 _LATEST: Final = np.iinfo(np.int64).max
 
@@ -196,7 +196,7 @@ class Matches:
     def after(self, place: Match, count: int) -> list[Match]:
         """The first matches behind a place, in order, at most `count`.
 
-        It is a match, or a time with the arrival number -1, and not among them.
+        The place is a match, which is not among them, or a time with the arrival number -1.
         """
         begin = self.count_before(Match(place.time, place.seq + 1))
         return self._rows(begin, begin + count)

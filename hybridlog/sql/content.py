@@ -102,7 +102,7 @@ class StoreContent:
             return self._views[topic]
 
     def differing(self, topic: str) -> list[RecordingSummary]:
-        """Recordings of which each one with a topic has the definition of one of these."""
+        """One of the recordings that have a topic, for each set of topics and types."""
         return self.snapshot.differing(self._having(topic))
 
 
