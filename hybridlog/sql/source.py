@@ -57,7 +57,8 @@ class TopicDataset(ds.Dataset, PyArrowDatasetSource):  # type: ignore[misc] # wi
         """A scanner, whose reader DuckDB takes."""
         names = self.schema.names if columns is None else list(columns)
         schema = pa.schema([self.schema.field(name) for name in names])
-        batches = _told(self.view.rows(names, filter, reading := self._reading()), reading)
+        reading = self._reading()
+        batches = _told(self.view.rows(names, filter, reading), reading)
         return _Scanner(pa.RecordBatchReader.from_batches(schema, batches))
 
 
