@@ -342,10 +342,10 @@ class _Partner:
 
         `empty` counts rows without a message or a value, by name and reason.
         """
-        known = self._times if len(self._times) else times
         found = match(times, self._times, self._how, self._tolerance)
         table = _taken(self._table, found.before)
         if self._how == "interpolate":
+            known = self._times if len(self._times) else times
             low, high = known[np.maximum(found.before, 0)], known[np.maximum(found.after, 0)]
             length = (high - low).astype(np.float64)
             weight = (times - low) / np.where(length > 0, length, 1)
