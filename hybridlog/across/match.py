@@ -98,7 +98,7 @@ def match(
 
 
 def quaternion_paths(known: Mapping[str, str] | None) -> list[str]:
-    """Paths of the quaternions among fields of known types; None if no definition fixes them."""
+    """Paths of the quaternions among fields with these types (None where nothing fixes them)."""
     return [path for path, kind in (known or {}).items() if kind in QUATERNIONS]
 
 

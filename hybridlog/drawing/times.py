@@ -170,7 +170,7 @@ class Matches:
         return self._times.nbytes + self._seqs.nbytes + self._held.nbytes
 
     def ticks(self, span: Span, pixels: int) -> Ticks:
-        """Matches by pixel of a picture of a span of log time, ns, not empty."""
+        """Matches by pixel; the picture is of log time `[begin, end)`, ns, not empty."""
         width = _pixel_width(span, pixels)
         found = self._times[slice(*np.searchsorted(placed(self._times), span))]
         place, begins, counts = np.unique(
