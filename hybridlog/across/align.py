@@ -20,6 +20,7 @@ from hybridlog.across.topic_reader import (
     TopicReader,
     concatenated,
 )
+from hybridlog.frames.answer import text_column
 from hybridlog.frames.names import free_name
 from hybridlog.query.answers.lost import completeness_of
 from hybridlog.query.answers.remarks import remarks
@@ -215,8 +216,7 @@ class Aligned:
         self.rows += len(times) if is_told else 0
         columns: dict[str, Any] = {TIME: own[TIME]}
         if recording is not None:
-            text = recording.encode("utf-8", "replace").decode()
-            columns[RECORDING] = pa.repeat(pa.scalar(text, pa.string()), len(times))
+            columns[RECORDING] = text_column(recording, len(times))
         if isinstance(self._base, TopicReader):
             self._base.add(columns, own, empty, 0)
         for partner in partners:
@@ -342,10 +342,10 @@ class _Partner:
 
         `empty` counts rows without a message or a value, by name and reason.
         """
-        known = self._times if len(self._times) else times
         found = match(times, self._times, self._how, self._tolerance)
         table = _taken(self._table, found.before)
         if self._how == "interpolate":
+            known = self._times if len(self._times) else times
             low, high = known[np.maximum(found.before, 0)], known[np.maximum(found.after, 0)]
             length = (high - low).astype(np.float64)
             weight = (times - low) / np.where(length > 0, length, 1)

@@ -58,7 +58,7 @@ class Bins:
             self._blocks = ((times, pa.table({})) for times, _ in self._reader.times(recording))
 
     def decided(self, times: NDArray[np.int64]) -> int:
-        """All times are."""
+        """Number of times that are decided: all of them."""
         return len(times)
 
     def row_bytes(self) -> int:

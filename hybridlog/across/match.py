@@ -98,7 +98,7 @@ def match(
 
 
 def quaternion_paths(known: Mapping[str, str] | None) -> list[str]:
-    """Paths of the quaternions among fields of known types; None if no definition fixes them."""
+    """Paths of the quaternions among fields with these types (None where nothing fixes them)."""
     return [path for path, kind in (known or {}).items() if kind in QUATERNIONS]
 
 
@@ -107,8 +107,8 @@ def interpolated(
 ) -> pa.Table:
     """Rows between the rows of two tables with the same columns; those that match nothing are null.
 
-    The weight is 0 for the row before, 1 for the row after. Quaternions with a column for each part
-    count.
+    The weight is 0 for the row before, 1 for the row after. Quaternions, given by path, are turned
+    from one to the other if each part is a column.
     """
     columns: dict[str, Any] = dict(zip(before.column_names, before.columns, strict=True))
     done: set[str] = set()

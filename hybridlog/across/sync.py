@@ -30,8 +30,6 @@ from hybridlog_storage.errors import StoreError, TimeError, UsageError
 from hybridlog_storage.times import span_of
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from numpy.typing import NDArray
 
     from hybridlog.message import Message

@@ -116,7 +116,7 @@ class TopicReader:
     def tables(self, recording: str, span: tuple[int, int] | None = None) -> Iterator[Block]:
         """The messages beside a recording, by log time.
 
-        The span, ns, is that of a question without a range.
+        The span, log time `[begin, end)` in ns, is for a question without a range.
         """
         if self.elsewhere(recording) is not None:
             return

@@ -72,7 +72,7 @@ class Destination:
 
     @property
     def target(self) -> Target:
-        """What a writer takes."""
+        """The path or stream that a writer takes."""
         return self.path or sys.stdout.buffer
 
     def check(self) -> None:
@@ -278,7 +278,7 @@ def write_answer(
     for name in ("lines", "tables", "batches", "points", "messages"):
         setattr(answer, name, _checked(told(getattr(answer, name)), completeness))
     path = target if isinstance(target, Path) else None
-    size = 0 if path is None else payload_bytes(query)
+    size = payload_bytes(query) if path is not None and output.has_bars() else 0
     with writing(path), Bar(form, size, quiet=path is None) as bar:
         OUTPUTS[form].write(answer, target, **settings or {})
     notes = answer.notes
@@ -427,7 +427,7 @@ def _lines_of(table: pa.Table) -> Iterator[list[Line]]:
     names = ["log_time_ns" if name == "log_time" else name for name in table.column_names]
     if names.count("log_time_ns") > 1:
         raise UsageError(
-            "JSON has log_time as 'log_time_ns', as another column: name one with `as`."
+            "In JSON, log_time is 'log_time_ns', and so is another column: name one with `as`."
         )
     for batch in table.combine_chunks().to_batches(max_chunksize=_LINES_AT_ONCE):
         yield list(json_rows(pa.StructArray.from_arrays(batch.columns, names)))
@@ -535,7 +535,7 @@ def check_room(path: Path, *, force: bool, is_directory: bool = False) -> None:
 
 
 def writing(path: Path | None) -> AbstractContextManager[None]:
-    """A block that writes a file, or into a stream; a signal that stops it leaves no part."""
+    """A block that writes a file (None: a stream); stopped, it says if the file is not written."""
     if path is None:
         return nullcontext()
     return if_stopped(lambda: "" if is_published(path) else f"{path} is not written.")

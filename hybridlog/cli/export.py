@@ -32,8 +32,6 @@ from hybridlog_storage.errors import (
 )
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from hybridlog.query.query import Query
 
 _LOGS = formats_of("log")

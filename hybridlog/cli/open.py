@@ -20,8 +20,6 @@ from hybridlog.wording import listed
 from hybridlog_storage.errors import HybridlogError, MissingDependencyError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from hybridlog.query.query import Query
     from hybridlog.store import Store
     from hybridlog.view.playback.server import PlaybackServer

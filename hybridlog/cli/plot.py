@@ -68,7 +68,7 @@ def plot_command(given: _Given) -> None:
     if path is not None:
         check_room(path, force=given.force)
     with answering(given) as asked:
-        from hybridlog.drawing.figure import lines
+        from hybridlog.drawing.figure import figure, lines
 
         names = [] if given.fields is None else parse_fields(given.fields)
         width = _WIDTH if shape is None else shape[0]
@@ -76,8 +76,6 @@ def plot_command(given: _Given) -> None:
         if not form:
             _print(found)
         else:
-            from hybridlog.drawing.figure import figure
-
             height = _HEIGHT * max(1, len({line.topic for line in found}))
             size = shape or (width, height)
             write_bytes(path or sys.stdout.buffer, figure(found, size=size, form=form))

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 class Bar:
     """A bar with rate and remaining time; a context manager that removes it.
 
-    It appears at the first progress, on a terminal. Elsewhere there is nothing.
+    It appears at the first progress, on a terminal. Elsewhere there is nothing. The total is in
+    bytes, about: None if it is unknown, 0 if each part tells its own.
     """
 
     def __init__(self, label: str, total: int | None = 0, *, quiet: bool = False) -> None:

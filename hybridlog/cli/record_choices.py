@@ -229,7 +229,6 @@ def opened_to_record(
     return choices.opened(
         create=True,
         cache_mb=choices.cache_size,
-        quiet=choices.quiet,
         records=True,
         recover=recover,
     )

@@ -198,7 +198,7 @@ def _recover(store: Store, recorders: Sequence[Recorder]) -> None:
     try:
         with opened_store(store.directory.path, NONE, quiet=True) as opened:
             recorders[-1].recovered()
-            opened.catalog.has_changed = False  # the end of this command lists all recordings
+            opened.catalog.has_changed = False  # the list of recordings is written at the end
     except (HybridlogError, OSError) as error:
         output.note(f"hybridlog: earlier recordings are not recovered yet: {error}")
 

@@ -322,7 +322,7 @@ class LogRecorder:
         self._tell({**about, "error": str(error), "exit_code": error.exit_code}, "error")
 
     def _tell(self, row: dict[str, Any], what: str) -> None:
-        """Show what came of a log: at the end, if there is one."""
+        """Show what came of a log: at the end; at once while directories are watched."""
         self._current = None
         self._counts[what] += 1
         if self._logs:

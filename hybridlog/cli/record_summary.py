@@ -82,7 +82,7 @@ COLUMNS: Final = [
     Column("time", lambda row: f"{row['seconds']:.2f} s", "right"),
     Column("messages/s", _rate, "right", order=2),
 ]
-"""Of the rows of `row_of`."""
+"""Of a table of the rows of `row_of`."""
 
 
 def fields_of(row: Mapping[str, Any]) -> list[tuple[str, object]]:

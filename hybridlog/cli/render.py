@@ -69,7 +69,7 @@ def bytes_of(name: str, key: str, order: int = 0) -> Column:
 
 @dataclass(slots=True)
 class _Shape:
-    """The columns of a table that are shown, and their widths."""
+    """The columns of a table that are shown, and their widths; `width` is that of the screen."""
 
     columns: Sequence[Column]
     widths: list[int]
@@ -99,11 +99,9 @@ class _Shape:
             yield "  ".join(aligned).rstrip()
 
     def room(self) -> int:
-        """Columns of the terminal that the table leaves; files and pipes have room for all."""
+        """Columns of the screen that the table leaves; files and pipes have room for all."""
         taken = sum(self.widths) + 2 * (len(self.widths) - 1)
-        if self.width is not None:
-            return self.width - taken
-        return screen_width() - taken if sys.stdout.isatty() else 0
+        return 0 if self.width is None else self.width - taken
 
     def narrow(self, rows: Sequence[Sequence[str]]) -> bool:
         """Fold and cut cells until the table fits; False if a word would be broken."""
@@ -125,10 +123,8 @@ class _Shape:
         return True
 
 
-def _shape(
-    columns: Sequence[Column], block: Sequence[Any], width: int | None = None
-) -> _Shape | None:
-    """The widest table that fits a width, or the terminal; None if none does."""
+def _shape(columns: Sequence[Column], block: Sequence[Any], width: int | None) -> _Shape | None:
+    """The widest table that fits a screen of that width (None: no screen); None if none does."""
     order = sorted((one for one in columns if one.order), key=lambda one: one.order)
     for without in range(len(order) + 1):
         left = [one for one in columns if one not in order[:without]]
@@ -168,7 +164,7 @@ def print_table(
     alike = [one for one in columns if is_all and one.varies and len({*map(one.cell, block)}) < 2]
     titles = max(titles - sum(one in alike for one in columns[:titles]), 1)
     columns = [one for one in columns if one not in alike]
-    shape = _shape(columns, block)
+    shape = _shape(columns, block, screen_width() if sys.stdout.isatty() else None)
     if shape is None:
         for number, row in enumerate(chain(block, source)):
             named = [(one.name, one.cell(row)) for one in columns]

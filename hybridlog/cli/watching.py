@@ -31,7 +31,11 @@ def watch(
     pause_s: float = 2.0,
     report: Callable[[HybridlogError], None] = lambda error: output.note(str(error)),
 ) -> None:
-    """Call `look`, which acts and yields problems, again and again; a signal ends this normally."""
+    """Call `look`, which acts and yields problems, again and again; a signal ends this normally.
+
+    A problem is reported once, as long as it lasts. While a place or a database is away, the pause
+    is longer.
+    """
     if isinstance(sys.stdout, io.TextIOWrapper):  # a file and a pipe show each line at once
         sys.stdout.reconfigure(line_buffering=True)
     told: set[str] = set()

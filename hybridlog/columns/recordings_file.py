@@ -22,6 +22,13 @@ if TYPE_CHECKING:
     from hybridlog_storage.summary import RecordingSummary
 
 TIME: Final = pa.timestamp("us", "UTC")
+TIMES: Final = (
+    ("first_time", TIME),
+    ("last_time", TIME),
+    ("first_t", pa.int64()),
+    ("last_t", pa.int64()),
+)
+"""Columns of a first and a last log time."""
 TAGS: Final = pa.map_(pa.string(), pa.string())
 RECORDINGS: Final = pa.schema(
     [
@@ -30,10 +37,7 @@ RECORDINGS: Final = pa.schema(
         ("tags", TAGS),
         ("status", pa.string()),
         ("created", TIME),
-        ("first_time", TIME),
-        ("last_time", TIME),
-        ("first_t", pa.int64()),
-        ("last_t", pa.int64()),
+        *TIMES,
         ("messages", pa.int64()),
         ("topics", pa.int64()),
         ("segments", pa.int64()),
@@ -66,7 +70,7 @@ def recordings_table(summaries: Iterable[RecordingSummary]) -> pa.Table:
 
 
 def times(first: int | None, last: int | None) -> dict[str, Any]:
-    """Cells of a first and a last log time, ns."""
+    """Cells of `TIMES` for a first and a last log time, ns."""
     return {
         "first_time": None if first is None else first // 1000,
         "last_time": None if last is None else last // 1000,

@@ -95,7 +95,8 @@ def lines(
 ) -> list[Line]:
     """The next lines behind one, or the last ones in front of it, in order, of a `filtered` query.
 
-    That line has a log time, ns, and an arrival number; -1 for all lines of that time, too.
+    That line is named by its log time, ns, and its arrival number; -1 stands in front of all lines
+    of that time.
     """
     beside = query.between(time, time + 1).where(f"_meta.seq {'<' if before else '>'} {seq}")
     rest = query.between(None, time) if before else query.between(time + 1)

@@ -144,7 +144,7 @@ def _axes(rows: NDArray[Any]) -> list[NDArray[Any]]:
 
 
 def _posed(axes: list[NDArray[Any]], pose: Any) -> list[NDArray[Any]]:
-    """The points in the frame of the message, which their pose is in; None for the frame itself."""
+    """The points in the frame of the message; without a pose in it, they are in it already."""
     if pose is None:
         return axes
     own = placed(pose)

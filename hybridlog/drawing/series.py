@@ -25,8 +25,6 @@ from hybridlog.wording import listed
 from hybridlog_storage.errors import SegmentError, TopicError, UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from numpy.typing import NDArray
 
     from hybridlog.message import Message

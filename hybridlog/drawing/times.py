@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 MAX_TIMES: Final = 20_000_000
-"""As of `lane_of`, of a timeline."""
+"""Most messages of a topic whose times `lane_of` reads, unless its caller says otherwise."""
 _SAMPLED: Final = 100_000  # steps that tell the usual one
 _LATEST: Final = np.iinfo(np.int64).max
 
@@ -170,7 +170,7 @@ class Matches:
         return self._times.nbytes + self._seqs.nbytes + self._held.nbytes
 
     def ticks(self, span: Span, pixels: int) -> Ticks:
-        """Matches by pixel of a picture of a span of log time, ns, not empty."""
+        """Matches by pixel; the picture is of log time `[begin, end)`, ns, not empty."""
         width = _pixel_width(span, pixels)
         found = self._times[slice(*np.searchsorted(placed(self._times), span))]
         place, begins, counts = np.unique(
@@ -196,7 +196,7 @@ class Matches:
     def after(self, place: Match, count: int) -> list[Match]:
         """The first matches behind a place, in order, at most `count`.
 
-        It is a match, or a time with the arrival number -1, and not among them.
+        The place is a match, which is not among them, or a time with the arrival number -1.
         """
         begin = self.count_before(Match(place.time, place.seq + 1))
         return self._rows(begin, begin + count)

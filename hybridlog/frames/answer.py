@@ -31,8 +31,6 @@ from hybridlog_storage.messages import Batch
 from hybridlog_storage.ordering import order_of
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
     from numpy.typing import NDArray
 
     from hybridlog.query.chunk_scan import MessageRun

@@ -134,7 +134,7 @@ def _times(table: pa.Table) -> list[int | None]:
 
 
 def _values(table: pa.Table, name: str, fits: Callable[[pa.DataType], bool]) -> list[Any]:
-    """The values of a column, times as integers; none if it lacks or has another type."""
+    """The values of a column, times as integers; none without it, or if its type is another."""
     place = table.schema.get_field_index(name)
     if place < 0 or not fits(table.schema.field(place).type):
         return []

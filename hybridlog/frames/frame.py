@@ -24,7 +24,6 @@ from hybridlog.schema.arrow_types import is_list, is_numeric, is_text, lengths_o
 from hybridlog_storage.errors import MissingDependencyError
 
 if TYPE_CHECKING:
-    import pyarrow as pa
     from numpy.typing import NDArray
 
 

@@ -11,7 +11,14 @@ import numpy as np
 import pyarrow as pa
 
 from hybridlog.columns.layout import POINTS
-from hybridlog.columns.recordings_file import RECORDINGS, TAGS, TIME, recordings_table, times
+from hybridlog.columns.recordings_file import (
+    RECORDINGS,
+    TAGS,
+    TIME,
+    TIMES,
+    recordings_table,
+    times,
+)
 from hybridlog.query.answers.marks import marks_in
 from hybridlog.query.counters import Counters
 from hybridlog.query.ranges import RangeResolver
@@ -95,7 +102,7 @@ class StoreContent:
             return self._views[topic]
 
     def differing(self, topic: str) -> list[RecordingSummary]:
-        """Recordings of which each one with a topic has the definition of one of these."""
+        """One of the recordings that have a topic, for each set of topics and types."""
         return self.snapshot.differing(self._having(topic))
 
 
@@ -183,10 +190,7 @@ _TOPICS: Final = pa.schema(
         ("encoding", pa.string()),
         ("messages", pa.int64()),
         ("bytes", pa.int64()),
-        ("first_time", TIME),
-        ("last_time", TIME),
-        ("first_t", pa.int64()),
-        ("last_t", pa.int64()),
+        *TIMES,
         ("mean_skew", pa.float64()),
         ("unset_stamps", pa.int64()),
         ("problem", pa.string()),
@@ -198,10 +202,7 @@ _LOSSES: Final = pa.schema(
         ("topic", pa.string()),
         ("cause", pa.string()),
         ("messages", pa.int64()),
-        ("first_time", TIME),
-        ("last_time", TIME),
-        ("first_t", pa.int64()),
-        ("last_t", pa.int64()),
+        *TIMES,
         ("file", pa.string()),
         ("reason", pa.string()),
     ]

@@ -129,7 +129,7 @@ class SqlEngine:
 class SqlConnection:
     """Runs queries one after the other. Not thread safe.
 
-    `memory` is the limit of DuckDB's, bytes. One that `only_reads` refuses all but queries.
+    `memory` is DuckDB's limit, bytes. With `only_reads`, statements other than queries are refused.
 
     Attributes:
         stopped: Set it in any thread to end the query that runs, and all later ones.

@@ -56,7 +56,7 @@ Paths = Collection[str] | None
 
 @dataclass(slots=True)
 class ScanCounts:
-    """Counts of what was read for a query: groups of rows by file and number, bytes decoded."""
+    """What was read for a query: files, row groups by file and number, chunks, bytes decoded."""
 
     files: set[str] = field(default_factory=set)
     groups: set[tuple[str, int]] = field(default_factory=set)

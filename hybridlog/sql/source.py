@@ -17,7 +17,7 @@ from hybridlog.sql.plan import Reading
 
 
 class TopicDataset(ds.Dataset, PyArrowDatasetSource):  # type: ignore[misc] # without types
-    """A topic as DuckDB reads it: it relies on the source for the filters that it hands over.
+    """A topic as DuckDB reads it. DuckDB relies on the source for the filters that it hands over.
 
     DuckDB takes the number of rows, and asks which filters are applied, by a class that is no
     part of its documented interface; so the version of its package is bounded.
@@ -57,7 +57,8 @@ class TopicDataset(ds.Dataset, PyArrowDatasetSource):  # type: ignore[misc] # wi
         """A scanner, whose reader DuckDB takes."""
         names = self.schema.names if columns is None else list(columns)
         schema = pa.schema([self.schema.field(name) for name in names])
-        batches = _told(self.view.rows(names, filter, reading := self._reading()), reading)
+        reading = self._reading()
+        batches = _told(self.view.rows(names, filter, reading), reading)
         return _Scanner(pa.RecordBatchReader.from_batches(schema, batches))
 
 

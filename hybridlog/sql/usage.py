@@ -47,9 +47,10 @@ EVERYTHING: Final = Usage()
 
 
 def usage_of(tree: str, views: Collection[str]) -> Usage:
-    """The paths that a query, as `json_serialize_sql` gives it, names.
+    """The paths that a query names.
 
-    `views` are folded names of views whose columns are known.
+    `tree` is the query as `json_serialize_sql` gives it, `views` are folded names of views whose
+    columns are known.
     """
     found = json.loads(tree)
     if found.get("error", True):

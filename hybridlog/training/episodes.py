@@ -22,6 +22,7 @@ from hybridlog.query.query import Query
 from hybridlog.query.question import Question
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import format_duration, format_time
+from hybridlog.schema.arrow_types import is_list, is_numeric
 from hybridlog_storage.errors import DefinitionError, PayloadError, TopicError, UsageError
 
 if TYPE_CHECKING:
@@ -212,7 +213,7 @@ def _numbers(column: pa.ChunkedArray, topic: str, path: str) -> NDArray[np.float
     """The numbers of a column: float32[n, width]."""
     kind = column.type
     width = 1
-    if pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind):
+    if is_list(kind):
         lengths = pc.unique(pc.list_value_length(column)).to_pylist()
         if len(lengths) > 1:
             raise UsageError(
@@ -221,7 +222,7 @@ def _numbers(column: pa.ChunkedArray, topic: str, path: str) -> NDArray[np.float
             )
         width = int(lengths[0]) if lengths else 0
         column, kind = pc.list_flatten(column), kind.value_type
-    if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)):
+    if not is_numeric(kind):
         raise UsageError(f"{topic}: {path} is {kind}, no number.")
     flat: NDArray[np.float32] = column.cast(pa.float32(), safe=False).to_numpy()
     return flat.reshape(-1, width)

@@ -142,7 +142,7 @@ Answer: TypeAlias = "Callable[[Context, RequestParams], Any]"
 def route(path: str, answer: Answer, turns: threading.Semaphore | None = None) -> Route:
     """A route that answers in a thread when it is its turn, and stops when the client has gone.
 
-    The path is that below the token; other turns take the place of the context's.
+    The path is that below the token. The turns are the context's, unless others are given.
     """
 
     def answered(request: Request, given_up: threading.Event) -> Response:

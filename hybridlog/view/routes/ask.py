@@ -160,13 +160,13 @@ def _moments(
         return [], []
     known = [entry.name for entry in read.recordings.values()]
     named = names or [known[0] if len(known) == 1 else None] * len(times)
-    entries = {}
+    spans = {}
     for name in {*named} - {None}:
         with suppress(HybridlogError):  # there is no such recording, or it is damaged
-            entries[name] = context.store.entry(str(name))
+            spans[name] = context.store.entry(str(name)).span
     found: list[str | None] = []
     for time, name in zip(times, named, strict=True):
-        first, last = (name in entries and entries[name].span) or (0, -1)
+        first, last = spans.get(name) or (0, -1)
         is_inside = time is not None and first <= time < last + _MICROSECOND
         found.append(str(min(time or 0, last) - first) if is_inside else None)
     return found, [name if at else None for name, at in zip(named, found, strict=True)]

@@ -17,7 +17,6 @@ from hybridlog_storage.errors import DefinitionError, MissingDependencyError, Pa
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-    from starlette.responses import Response
 
     from hybridlog.view.context import Context, RequestParams
 

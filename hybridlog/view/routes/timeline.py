@@ -16,11 +16,10 @@ from hybridlog.view.context import Context, extent, packed_response, route, star
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
     from starlette.responses import Response
 
-    from hybridlog.view.context import Context, RequestParams
+    from hybridlog.view.context import RequestParams
 
 
 MAX_LANES: Final = 64
