@@ -43,6 +43,7 @@ from hybridlog_storage.messages import Batch, Channel, Schema
 from hybridlog_storage.segments.segment_format import LOSSES_METADATA, json_metadata
 from hybridlog_storage.segments.segment_writer import RecordingWriter, SegmentSettings
 from tests import places
+from tests.damage import flip
 
 TEXT = Schema("std_msgs/String", "ros1msg", b"string data\n")
 TOPICS = [Channel(topic, "ros1", TEXT) for topic in ("/a", "/b", "/c")]
@@ -505,9 +506,7 @@ def test_a_byte_that_changes_behind_the_catalog(made: Made) -> None:
     opened(made.directory)
     path = made.segments[3]
     about = path.stat()
-    data = bytearray(path.read_bytes())
-    data[-40] ^= 1
-    path.write_bytes(data)
+    flip(path, -40)
     os.utime(path, ns=(about.st_atime_ns, about.st_mtime_ns))
     (entry,), _ = opened(made.directory)
     check(entry, 3)

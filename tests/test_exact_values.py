@@ -17,14 +17,13 @@ import numpy as np
 import pandas as pd
 import polars as pl
 import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 from mcap.reader import make_reader
 
 import hybridlog as hl
-from hybridlog.cli.answers import write_answer
 from hybridlog_storage.errors import PayloadError, TopicError
 from hybridlog_storage.messages import Channel, Schema
+from tests.every_output import parquet, written
 from tests.limits import Limit
 
 CASES = Path(__file__).parent / "cases"
@@ -81,19 +80,9 @@ def payloads(name: str, topic: str) -> list[bytes]:
         return [m.data for _, c, m in make_reader(file).iter_messages(topics=[topic])]
 
 
-def written(query: Any, form: str) -> bytes:
-    stream = io.BytesIO()
-    write_answer(query, form, stream)
-    return stream.getvalue()
-
-
 def json_lines(query: Any) -> list[dict[str, Any]]:
     lines = written(query, "jsonl").decode().splitlines()
     return [json.loads(line, parse_constant=pytest.fail) for line in lines]
-
-
-def parquet(query: Any) -> pa.Table:
-    return pq.read_table(io.BytesIO(written(query, "parquet")))
 
 
 def csv_rows(query: Any) -> list[dict[str, str]]:

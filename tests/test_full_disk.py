@@ -20,8 +20,7 @@ from hybridlog_storage.messages import Channel
 from tests import places
 from tests.calls import Calls
 from tests.cli.within import answer
-
-NOWHERE = "mongodb://127.0.0.1:9/x?serverSelectionTimeoutMS=50&connectTimeoutMS=50"
+from tests.running.running import NO_MONGODB as NOWHERE
 
 
 class FullDisk(System):

@@ -7,7 +7,6 @@ import os
 import resource
 import shutil
 import signal
-import socket
 import sqlite3
 import subprocess
 import sys
@@ -40,7 +39,7 @@ from tests.calls import Calls
 from tests.cli.running import run
 from tests.damage import WAYS
 from tests.indexed import EVERYTHING
-from tests.servers.mongods import Mongod
+from tests.servers.mongods import Mongod, free_port
 from tests.some import in_turn
 from tests.waiting import wait_for
 
@@ -237,9 +236,7 @@ def test_an_unreachable_server_is_not_waited_for_by_each_question(
     store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, calls: Calls
 ) -> None:
     tried = calls(Database, "connect")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     uri = f"mongodb://127.0.0.1:{port}/healing?directConnection=true&serverSelectionTimeoutMS=100"
     with hl.open(store, mongo=uri) as opened:
         for _ in range(3):

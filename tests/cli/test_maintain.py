@@ -9,6 +9,7 @@ import pytest
 
 import hybridlog as hl
 from tests import places
+from tests.damage import flip
 from tests.other_user import User, needs_root, open_place
 
 from .running import run
@@ -17,10 +18,7 @@ pytestmark = pytest.mark.mongo
 
 
 def test_verify_lists_what_is_off(fresh: Path) -> None:
-    path = places.segment(fresh, "small", 1)
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 1
-    path.write_bytes(data)
+    flip(places.segment(fresh, "small", 1), 1 / 2)
     with hl.open(fresh) as store:
         assert store.database is not None
         store.database.delete("imu__data", {"_meta.seq": {"$lt": 20}})

@@ -126,6 +126,9 @@ def test_requests_to_a_bucket(make: Makes, proxy: Proxy) -> None:
     proxy.reset()
     copy(source.source, BucketStore(Bucket(target.bucket.address)), RECORDING)
     assert len(proxy.requests) <= 3
+    proxy.reset()
+    BucketManifests(Bucket(target.bucket.address)).change(RECORDING, edited)
+    assert len(proxy.requests) <= 4
 
 
 def test_a_server_without_conditions_is_refused_before_the_first_write(

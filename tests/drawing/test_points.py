@@ -233,6 +233,14 @@ def test_damaged_clouds(change: dict[str, Any], message: str) -> None:
         points_of("sensor_msgs/PointCloud2", damaged)
 
 
+def test_256_fields_of_one_name() -> None:
+    fields = [field("x", kind=2)] * 255 + [field("y", 4)]
+    got = points_of("sensor_msgs/PointCloud2", simple([(1, 2, 3)], fields=fields))
+    assert got.names[:2] == ("x_", "x__")
+    assert len(got.names) == 64
+    assert got.xyz[0, 1] == 2
+
+
 def test_empty_messages() -> None:
     got = points_of("sensor_msgs/PointCloud2", simple([(1, 2, 3)], width=0, fields=[]))
     assert (got.total, got.xyz.shape, got.frame) == (0, (0, 3), "lidar")

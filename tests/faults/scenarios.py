@@ -7,6 +7,7 @@ from pathlib import Path
 
 from hybridlog_storage.manifest import Manifest, replace
 from tests import places
+from tests.damage import flip
 from tests.faults import logs
 from tests.faults.cases import (
     Bench,
@@ -84,10 +85,7 @@ def _import(bench: Bench) -> Scenario:
 
 def _repair(bench: Bench) -> Scenario:
     def damage(store: Path) -> None:
-        a = places.folder(store, "a")
-        summary = bytearray((a / "000002.mcap").read_bytes())
-        summary[-60] ^= 1
-        (a / "000002.mcap").write_bytes(summary)
+        flip(places.folder(store, "a") / "000002.mcap", -60)
         places.manifest_of(places.folder(store, "b")).write_bytes(b"damaged")
 
     def allowed(state: State, _before: State, _outcome: str) -> bool:

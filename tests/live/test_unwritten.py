@@ -9,13 +9,14 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
-from hybridlog_storage.errors import IncompleteError
+from hybridlog_storage.errors import HeldError, IncompleteError
 from tests.cli.running import run
 from tests.indexed import documents_of
 from tests.limits import Limit
 from tests.live.robot import robot
 from tests.live.speaker import text, text_channel
 from tests.live.test_follow import NOWHERE, wait_until_flushed
+from tests.waiting import wait_for
 
 SECOND = 1_000_000_000
 CHANNEL = text_channel("/a")
@@ -175,3 +176,25 @@ def test_what_the_index_lacks_is_told_where_mongodb_answers(tmp_path: Path, limi
         recording.close()
         assert raw.count() == 5
         assert raw.counters.unindexed == 0
+
+
+def test_a_killed_recording_is_not_said_to_go_on(tmp_path: Path) -> None:
+    path = tmp_path / "store"
+    with robot(path, "load", flush_s=0.05) as killed:
+        killed.say("/a", "x")
+        before = hl.open(path)
+        wait_for(lambda: before.summaries()[0].messages)
+        assert [entry.status for entry in before.recordings()] == ["open"]
+        with pytest.raises(HeldError, match=f"is being written by process {killed.pid} "):
+            before.remove("load")
+        killed.kill()
+    with before:
+        # Another process is about to recover it, so nobody else can.
+        with before.directory.writing(before.entry("load").id), hl.open(path) as after:
+            for store in (before, after):
+                assert [one.status for one in store.summaries()] == ["unfinished"]
+                assert [entry.status for entry in store.recordings()] == ["unfinished"]
+                assert store.recordings()[0].messages > 0
+        with hl.open(path) as after:
+            for store in (after, before):
+                assert [entry.status for entry in store.recordings()] == ["recovered"]

@@ -20,6 +20,7 @@ from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
+from tests.damage import flip
 from tests.running.running import NO_MONGODB
 
 CHANNELS = [Channel("/a", "json", None), Channel("/b", "json", None)]
@@ -130,13 +131,11 @@ def test_what_cannot_be_read_is_a_loss(running: Running, tmp_path: Path, *, is_f
     shutil.copytree(running.path, tmp_path / "store")
     (path,) = places.folder(tmp_path / "store", "live").glob("*.mcap.open")
     place = running.entry.flushed[int(path.name[:6])].table.chunks[0]
-    data = bytearray(path.read_bytes())
-    data[int(place["offset"]) + 60] ^= 1
-    data[int(place["offset"]) + int(place["length"]) + 20] ^= 1
-    path.unlink()
+    begin, length = int(place["offset"]), int(place["length"])
     if is_file:
-        path.write_bytes(data)
+        flip(path, begin + 60, begin + length + 20)
     else:
+        path.unlink()
         path.mkdir()
     found = running.follow(StoreDirectory(tmp_path / "store"))
     (loss,) = found.end["losses"]

@@ -32,7 +32,7 @@ from hybridlog_storage.mcap.mcap_content import MAX_CHUNK_HEAD, chunk_head_of
 from hybridlog_storage.messages import Batch, Channel, LooseBatch, Schema
 from hybridlog_storage.segments import open_chunk, segment_writer
 from hybridlog_storage.segments.attachments import Attachment
-from hybridlog_storage.segments.chunk import StoredChunk
+from hybridlog_storage.segments.chunk import PackedChunk, StoredChunk, pack
 from hybridlog_storage.segments.compression import FilePart
 from hybridlog_storage.segments.recovery import Recovered, recover_segment
 from hybridlog_storage.segments.segment_check import damage_of
@@ -199,6 +199,31 @@ def test_chunks_are_as_large_as_their_bound_however_messages_come(
         # It was closed because the next message would not have found room.
         if number + 1 < len(chunks) and size < bound:
             assert size + 31 + len(payloads[int(chunks[number + 1].seq[0])]) > bound
+
+
+@pytest.mark.parametrize(("has", "side_by_side"), [(1, 1), (2, 1), (3, 2), (16, 2)])
+def test_a_processor_is_left_to_who_brings_messages(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has: int, side_by_side: int
+) -> None:
+    lock, at_work, seen = threading.Lock(), 0, []
+
+    def slowly(*arguments: Any, **options: Any) -> PackedChunk:
+        nonlocal at_work
+        with lock:
+            at_work += 1
+            seen.append(at_work)
+        time.sleep(0.05)
+        with lock:
+            at_work -= 1
+        return pack(*arguments, **options)
+
+    monkeypatch.setattr(segment_writer, "pack", slowly)
+    monkeypatch.setattr(segment_writer, "processors", lambda: has)
+    writer = recorder(tmp_path, setup=SegmentSettings(chunk_size=1 << 10), on_written=done)
+    for n in range(10):
+        writer.append(loose([(0, bytes([n]) * 1024, n, n, n)]), CHANNELS)
+    writer.close()
+    assert (len(seen), max(seen)) == (10, side_by_side)
 
 
 @pytest.mark.parametrize("noise", [0.3, 0.1])

@@ -16,6 +16,7 @@ from hybridlog.live import LiveRecording
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
+from tests.damage import flip
 from tests.view.conftest import Asking, served, unpacked
 from tests.waiting import wait_for
 
@@ -256,9 +257,7 @@ def test_what_is_lost_is_said(page: Page, demo_store: hl.Store, tmp_path: Path) 
     table = demo_store.session.chunk_table(entry, 0)
     chunk = table.chunks[len(table.chunks) // 2]
     path = places.segment(tmp_path / "store", "robot")
-    content = bytearray(path.read_bytes())
-    content[int(chunk["offset"]) + int(chunk["length"]) // 2] ^= 0xFF
-    path.write_bytes(content)
+    flip(path, int(chunk["offset"]) + int(chunk["length"]) // 2, bits=0xFF)
     with hl.open(tmp_path / "store") as store:
         store.verify()
         store.refresh()
