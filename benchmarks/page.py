@@ -51,9 +51,9 @@ class Results:
     """
 
     def __init__(self, journal: Journal) -> None:
-        self.headers = journal.headers
-        self.scale = str(journal.headers[-1]["scale"]) if journal.headers else "tiny"
-        self._samples = list(journal.samples.values())
+        self.header = journal.header
+        self.scale = str(journal.header["scale"])
+        self._samples = journal.samples
         self.failed = [one for one in self._samples if one.status == "failed"]
         self.missing = sorted(
             {(s.backend, s.reason) for s in self._samples if s.status == "missing"}
@@ -194,20 +194,16 @@ def page(journal: Journal) -> str:
 
 
 def conditions(results: Results) -> str:
-    """Date, revision, machine and time of the runs, in a sentence or two."""
-    first, last = results.headers[0], results.headers[-1]
-    revisions = list(dict.fromkeys(str(header["revision"]) for header in results.headers))
-    machine = f"{last['cpu']}, {last['cores']} processors, {last['memory_gib']} GiB, {last['disk']}"
-    named = revisions[0]
-    if len(revisions) > 1:
-        named = f"{revisions[0]} to {revisions[-1]}: figures are of {len(revisions)} revisions"
-    dates = list(dict.fromkeys(str(header["started"])[:10] for header in (first, last)))
-    text = f"Revision {named}; {' to '.join(dates)}, on {machine}."
-    return escaped(text)
+    """Date, revision and machine of the run, in a sentence."""
+    about = results.header
+    machine = (
+        f"{about['cpu']}, {about['cores']} processors, {about['memory_gib']} GiB, {about['disk']}"
+    )
+    return escaped(f"Revision {about['revision']}; {about['started'][:10]}, on {machine}.")
 
 
 def _about(results: Results) -> str:
-    last = results.headers[-1]
+    last = results.header
     quick = {
         "full": "",
         "quick": "\n\n> **A short run: loads are only doubled, and each is searched once.**",

@@ -18,7 +18,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
@@ -145,22 +145,29 @@ def _how_it_ended(code: int, errors: Path) -> str:
     return f"it crashed: {said[-1500:] or f'exit code {code}'}"
 
 
-def warm_cache(places: Sequence[Path]) -> None:
-    """Read files, and all files of directories, so that they are in the file cache."""
+def warm_cache(file: Path) -> None:
+    """Read a file, so that it is in the file cache."""
     buffer = bytearray(_WARM_BLOCK)
-    for place in places:
-        for file in [place] if place.is_file() else sorted(place.rglob("*")):
-            if file.is_file():
-                with file.open("rb", buffering=0) as stream:
-                    while stream.readinto(buffer):
-                        pass
+    with file.open("rb", buffering=0) as stream:
+        while stream.readinto(buffer):
+            pass
+
+
+def spelled(kind: type) -> str:
+    """A class as `module:class`, for another process."""
+    return f"{kind.__module__}:{kind.__qualname__}"
+
+
+def named(name: str) -> Any:
+    """What is called `module:name`."""
+    module, _, name = name.partition(":")
+    return getattr(import_module(module), name)
 
 
 def _main() -> None:
     from benchmarks.usage import own_peak
 
-    module, _, name = sys.argv[1].partition(":")
-    result: Values = getattr(import_module(module), name)(**json.load(sys.stdin))
+    result: Values = named(sys.argv[1])(**json.load(sys.stdin))
     print(json.dumps({**result, "peak_rss": own_peak()}))
 
 

@@ -8,7 +8,6 @@ import time
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
 
 import psutil
 
@@ -16,23 +15,10 @@ _MONGOD_END_S = 60.0
 _SPIN = 250_000
 
 
-class Machine(NamedTuple):
-    """CPU time of all processors since the machine was started, seconds.
-
-    Attributes:
-        busy: In which something ran.
-        stolen: In which the host of a virtual machine let it wait.
-    """
-
-    busy: float
-    stolen: float
-
-
-def machine() -> Machine:
-    """What the machine has used."""
-    used = psutil.cpu_times()
-    busy = used.user + used.nice + used.system + used.irq + used.softirq
-    return Machine(busy, used.steal)
+def stolen_s() -> float:
+    """CPU time that the host of a virtual machine let it wait since it was started, seconds."""
+    found: float = psutil.cpu_times().steal
+    return found
 
 
 def with_children(pids: Iterable[int]) -> set[int]:

@@ -23,7 +23,6 @@ class BagFile(FileBackend):
     """An uncompressed ROS 1 bag, as `rosbag record` writes it: the paper's flat file."""
 
     name = "bagfile"
-    about = "a ROS 1 bag, written by rosbags"
     suffix = ".bag"
 
     @classmethod

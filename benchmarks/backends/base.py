@@ -8,12 +8,10 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar
 
 if TYPE_CHECKING:
     from hybridlog_storage.messages import Channel
-
-Kind = Literal["file", "database", "hybrid", "none"]
 
 
 class BackendMissingError(Exception):
@@ -33,13 +31,9 @@ class Backend(ABC):
 
     Attributes:
         name: As on the command line and in tables.
-        about: One line: what it is and how it is set up.
-        kind: `file`, `database`, `hybrid` (both), or `none` (keeps nothing).
     """
 
     name: ClassVar[str]
-    about: ClassVar[str]
-    kind: ClassVar[Kind]
 
     def __init__(self, directory: Path) -> None:
         self.directory = directory
@@ -86,5 +80,5 @@ class Backend(ABC):
         """Stop what was started; the data stays. Also called after a failure."""
 
     def processes(self) -> Sequence[int]:
-        """Process ids of the servers that belong to it, children included."""
+        """Process ids of the servers that belong to it, without their children."""
         return ()

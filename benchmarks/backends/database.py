@@ -22,8 +22,6 @@ def schema_of(channel: Channel) -> Schema:
 class DatabaseBackend(Backend):
     """A backend whose messages are decoded first."""
 
-    kind = "database"
-
     def __init__(self, directory: Path) -> None:
         super().__init__(directory)
         self._channels: Sequence[Channel] = ()

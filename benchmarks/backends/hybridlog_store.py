@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import threading
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,15 +18,11 @@ if TYPE_CHECKING:
     from hybridlog.store import Store
     from hybridlog_storage.messages import Channel
 
-_LINGER = "HYBRIDLOG_MONGOD_LINGER_S"
-
 
 class Hybridlog(Backend):
     """A store with its default settings; each run is a recording of its own."""
 
     name = "hybridlog"
-    about = "hybridlog: payloads in MCAP segments, fields in its embedded MongoDB"
-    kind = "hybrid"
 
     def __init__(self, directory: Path) -> None:
         super().__init__(directory)
@@ -63,10 +58,7 @@ class Hybridlog(Backend):
         self._channels = channels
         fresh = not self.path.exists()
         try:
-            with _no_linger():
-                self._opened = hl.open(
-                    self.path, mongo="embedded", create=True, require_database=True
-                )
+            self._opened = hl.open(self.path, mongo="embedded", create=True, require_database=True)
         except HybridlogError as error:
             raise BackendMissingError(f"hybridlog: {error}") from error
         if fresh:
@@ -133,17 +125,3 @@ class Hybridlog(Backend):
 
     def processes(self) -> Sequence[int]:
         return working_below(self.path, "mongod") if self._opened is not None else ()
-
-
-@contextmanager
-def _no_linger() -> Iterator[None]:
-    """Let a mongod that is started here end with its last user, not seconds later."""
-    before = os.environ.get(_LINGER)
-    os.environ[_LINGER] = "0.1"
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ[_LINGER]
-        else:
-            os.environ[_LINGER] = before

@@ -21,7 +21,6 @@ class McapFile(FileBackend):
     """The `mcap` package's writer with its default settings: chunks of 1 MiB, zstd."""
 
     name = "mcap"
-    about = "a plain MCAP file, written by the mcap package with its default settings"
     suffix = ".mcap"
 
     @classmethod

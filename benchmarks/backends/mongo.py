@@ -61,10 +61,6 @@ class Mongo(DatabaseBackend):
     """
 
     name = "mongo"
-    about = (
-        "MongoDB: one document a message, one collection a topic, one unordered insert_many for "
-        "2 s or 256 KiB of a topic; default settings"
-    )
 
     _is_indexed = False
 
@@ -202,7 +198,6 @@ class MongoIndexed(Mongo):
     """
 
     name = "mongo_indexed"
-    about = "MongoDB as mongo, with the indexes of the paper's appendix A and one on the time"
 
     _is_indexed = True
 

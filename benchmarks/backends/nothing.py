@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, ClassVar
 
-from benchmarks.backends.base import Backend, BackendFailedError, Kind
+from benchmarks.backends.base import Backend, BackendFailedError
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -25,8 +25,6 @@ class Nothing(Backend):
     """
 
     name: ClassVar[str] = "nothing"
-    about: ClassVar[str] = "counts messages and keeps nothing: the bound of the harness"
-    kind: ClassVar[Kind] = "none"
 
     def __init__(self, directory: Path) -> None:
         super().__init__(directory)

@@ -79,10 +79,6 @@ class Postgres(DatabaseBackend):
     """
 
     name = "postgres"
-    about = (
-        "PostgreSQL: json, shared_buffers 25 % and effective_cache_size 75 % of memory, "
-        "max_wal_size 4 GB, wal_level minimal, one COPY and transaction for 2 s or 16 MiB"
-    )
 
     _type: ClassVar[str] = "json"
     _is_indexed: ClassVar[bool] = False
@@ -229,10 +225,6 @@ class PostgresIndexed(Postgres):
     """
 
     name = "postgres_indexed"
-    about = (
-        "PostgreSQL as postgres, but jsonb, with expression indexes on the fields of "
-        "the paper's appendix A"
-    )
 
     _type = "jsonb"
     _is_indexed = True

@@ -143,9 +143,7 @@ def _as_another_user() -> tuple[tuple[str, ...], int]:
         privilege = "-all,+dac_override"
         prefix = (
             *(setpriv, f"--reuid={account.pw_uid}", f"--regid={account.pw_gid}"),
-            *("--clear-groups", f"--inh-caps={privilege}", f"--ambient-caps={privilege}"),
-            # Set by the server's parent, but lost with the change of the user.
-            *("--pdeathsig", "INT", "--"),
+            *("--clear-groups", f"--inh-caps={privilege}", f"--ambient-caps={privilege}", "--"),
         )
         if subprocess.run([*prefix, "true"], capture_output=True, check=False).returncode == 0:
             return prefix, account.pw_uid

@@ -1,9 +1,4 @@
-"""What the backends that write recording files have in common.
-
-A file of a recording cannot be added to once it has come to its end. A backend that is
-opened on a directory with files from before, perhaps only to read them, therefore begins
-a new one, with the next number, when the first message comes; otherwise at once.
-"""
+"""What the backends that write recording files have in common."""
 
 from __future__ import annotations
 
@@ -34,62 +29,46 @@ class Recorder(Protocol):
 class FileBackend(Backend):
     """Recorders under one lock: files are written by one thread at a time."""
 
-    kind = "file"
-
     suffix: ClassVar[str]
     """Of the files' names."""
 
     def __init__(self, directory: Path) -> None:
         super().__init__(directory)
+        self.path = directory / f"recording{self.suffix}"
+        """The file."""
         self._channels: Sequence[Channel] = ()
         self._recorder: Recorder | None = None
-        self._started: Path | None = None
         self._lock = threading.Lock()
-
-    @property
-    def paths(self) -> list[Path]:
-        """All files, oldest first."""
-        return sorted(self.directory.glob(f"recording-*{self.suffix}"))
-
-    @property
-    def path(self) -> Path:
-        """The newest file."""
-        return self.paths[-1]
 
     def open(self, channels: Sequence[Channel]) -> None:
         self.check()
         self._channels = channels
-        if not self.paths:
-            with self._lock, self._failures():
-                self._begin()
+        if not self.path.exists():
+            with self._failures():
+                self._recorder = self._record(self.path)
 
     def insert(self, channel: int, log_time: int, payload: bytes) -> None:
         with self._lock, self._failures():
-            recorder = self._recorder or self._begin()
-            recorder.write(channel, log_time, payload)
-
-    def _begin(self) -> Recorder:
-        self._started = self.directory / f"recording-{len(self.paths) + 1:04d}{self.suffix}"
-        self._recorder = self._record(self._started)
-        return self._recorder
+            assert self._recorder is not None
+            self._recorder.write(channel, log_time, payload)
 
     def finish(self) -> None:
         with self._lock:
             recorder, self._recorder = self._recorder, None
-            if recorder is None or self._started is None:
-                return
-            with self._failures():
-                recorder.close()
-                _sync(self._started)
-                _sync(self.directory)
+            if recorder is not None:
+                with self._failures():
+                    recorder.close()
+                    for place in (self.path, self.directory):
+                        descriptor = os.open(place, os.O_RDONLY)
+                        try:
+                            os.fsync(descriptor)
+                        finally:
+                            os.close(descriptor)
 
     def counts(self) -> Mapping[str, int]:
         found = dict.fromkeys((channel.topic for channel in self._channels), 0)
         with self._failures():
-            for path in self.paths:
-                for topic, count in self._count(path).items():
-                    found[topic] = found.get(topic, 0) + count
-        return found
+            return found | self._count(self.path)
 
     def close(self) -> None:
         with self._lock:
@@ -115,13 +94,3 @@ class FileBackend(Backend):
             of_system = isinstance(error, OSError) and error.strerror
             reason = of_system or str(error)
             raise BackendFailedError(f"{self.name}: {type(error).__name__}: {reason}") from error
-
-
-def _sync(path: Path) -> None:
-    """See a file, or everything in a directory, on the disk."""
-    for place in (path, *path.iterdir()) if path.is_dir() else (path,):
-        descriptor = os.open(place, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)

@@ -50,9 +50,6 @@ class Sqlite(DatabaseBackend):
     """
 
     name = "sqlite"
-    about = (
-        "SQLite: JSON text, one table a topic, one transaction a message, WAL, synchronous NORMAL"
-    )
 
     _is_indexed: ClassVar[bool] = False
 
@@ -145,10 +142,6 @@ class SqliteIndexed(Sqlite):
     """
 
     name = "sqlite_indexed"
-    about = (
-        "SQLite: JSON text, one table a topic, transactions of 2 s or 16 MiB, WAL, synchronous "
-        "NORMAL, indexes on json_extract of the fields of the paper's appendix A"
-    )
 
     _is_indexed = True
 

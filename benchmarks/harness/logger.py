@@ -16,7 +16,6 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib import import_module
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -27,7 +26,7 @@ from benchmarks.harness.counters import Counters
 from benchmarks.harness.publisher import READY
 from benchmarks.harness.subscribers import Subscribers
 from benchmarks.loads.base import Load
-from benchmarks.side import Values
+from benchmarks.side import Values, named
 
 Publishing = dict[str, Any]
 """What the publisher needs besides: `counters`, a file that is made; `speed`; `limit`, the
@@ -57,10 +56,9 @@ def log(*, load: str, backend: str, directory: str, publishing: Publishing) -> V
     opened = Load.open(Path(load))
     values: Values = {"status": "ok", "reason": ""}
     with ended_by_signals():
-        kind = _backend(backend)
-        system = kind(Path(directory))
+        system = named(backend)(Path(directory))
         try:
-            kind.check()
+            system.check()
             system.open(opened.channels)
             _run(system, opened, publishing, values, parent)
         except BackendMissingError as error:
@@ -81,7 +79,7 @@ def count(*, load: str, backend: str, directory: str) -> Values:
     opened = Load.open(Path(load))
     values: Values = {"status": "ok", "reason": ""}
     with ended_by_signals():
-        system = _backend(backend)(Path(directory))
+        system = named(backend)(Path(directory))
         try:
             system.open(opened.channels)
             values["counts"] = {topic: int(n) for topic, n in system.counts().items()}
@@ -90,12 +88,6 @@ def count(*, load: str, backend: str, directory: str) -> Values:
         finally:
             _close(system, values)
     return values
-
-
-def _backend(name: str) -> type[Backend]:
-    module, _, kind = name.partition(":")
-    found: type[Backend] = getattr(import_module(module), kind)
-    return found
 
 
 def _close(system: Backend, values: Values) -> None:
@@ -189,19 +181,17 @@ class _Meter:
         self._system = system
         self._servers = usage.cpu_s(self._pids())
         self._own = self._own_cpu()
-        self._machine = usage.machine()
+        self._stolen = usage.stolen_s()
         self._started = self._stopped = time.monotonic_ns()
 
     def stop(self) -> None:
         """Read all clocks."""
         self._stopped = time.monotonic_ns()
         self._own = self._own_cpu() - self._own
-        machine = usage.machine()
         pids = self._pids()
         self._servers = max(usage.cpu_s(pids) - self._servers, 0.0)
         self._server_peak = usage.peak_rss(pids)
-        self._busy = machine.busy - self._machine.busy
-        self._stolen = max(machine.stolen - self._machine.stolen, 0.0)
+        self._stolen = max(usage.stolen_s() - self._stolen, 0.0)
 
     def note(self, values: Values, published: dict[str, Any]) -> None:
         """Note what was used.
@@ -212,16 +202,13 @@ class _Meter:
         """
         values |= published
         start = values.pop("start_ns", self._started)
-        publisher = values.pop("cpu_s", 0.0)
         values |= {
             "publish_s": (values.pop("end_ns", self._stopped) - start) / 1e9,
             "wall_s": (self._stopped - start) / 1e9,
             "cpu_s": self._own,
-            "publisher_cpu_s": publisher,
             "server_cpu_s": self._servers,
             "server_peak_rss": self._server_peak,
             "steal_s": self._stolen,
-            "other_cpu_s": max(self._busy - self._own - self._servers - publisher, 0.0),
         }
 
     def _pids(self) -> set[int]:

@@ -15,7 +15,6 @@ import json
 import os
 import sys
 import time
-from array import array
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -37,46 +36,16 @@ _BATCH = 512
 """Messages after which the clock is looked at again by a publisher that is late."""
 _NAP_NS = 250_000_000
 """Longest sleep; after each the publisher sees whether its logger is still there."""
-_PERCENTILES = {"p50": 50, "p90": 90, "p99": 99, "max": 100}
 
 
 class _OrphanedError(Exception):
     """The logger has gone."""
 
 
-class Track:
-    """What is noted of every message on its way.
-
-    Args:
-        rows: Number of messages.
-
-    Attributes:
-        depth: int32[rows], messages that were ahead in the queue.
-        late_us: int32[rows], µs from when it was due until it was published.
-        rows: Messages noted.
-    """
-
-    def __init__(self, rows: int) -> None:
-        self.depth = array("i", bytes(4 * rows))
-        self.late_us = array("i", bytes(4 * rows))
-        self.rows = 0
-
-    def values(self) -> dict[str, float]:
-        """Percentiles, of all messages that were due."""
-        found: dict[str, float] = {}
-        for name, column, unit in (("depth", self.depth, 1), ("late_ms", self.late_us, 1000)):
-            values = np.frombuffer(column, np.int32)[: self.rows]
-            if len(values):
-                at = np.percentile(values, list(_PERCENTILES.values()), method="inverted_cdf")
-                for label, value in zip(_PERCENTILES, (at / unit).tolist(), strict=True):
-                    found[f"{name}_{label}"] = value
-        return found
-
-
 def publish_to_queues(
     load: Load, counters: Counters, *, start: int, speed: float, pipes: Sequence[int], limit: int
-) -> Track:
-    """Publish into a queue a topic.
+) -> int:
+    """Publish into a queue a topic; returns when the last message was published.
 
     Args:
         load: What.
@@ -86,16 +55,12 @@ def publish_to_queues(
         pipes: Where the tokens go, a descriptor a channel.
         limit: Messages that a queue holds.
     """
-    track = Track(len(load))
-    depths, late_us = track.depth, track.late_us
     all_sent, all_dropped, taken = counters.sent, counters.dropped, counters.taken
     sent, dropped = [0] * len(pipes), [0] * len(pipes)
-    clock, write = time.monotonic_ns, os.write
-    for first, channels, due in _batches(load, start, speed):
-        for row, channel, when in zip(range(first, len(load)), channels, due, strict=False):
-            late_us[row] = (clock() - when) // 1000
-            depths[row] = depth = sent[channel] - taken[channel]
-            if depth < limit:
+    write = os.write
+    for first, channels in _batches(load, start, speed):
+        for row, channel in enumerate(channels, first):
+            if sent[channel] - taken[channel] < limit:
                 sent[channel] += 1
                 # First: whoever takes a message has been counted as a waiting one.
                 all_sent[channel] = sent[channel]
@@ -103,12 +68,11 @@ def publish_to_queues(
             else:
                 dropped[channel] += 1
                 all_dropped[channel] = dropped[channel]
-        track.rows = first + len(channels)
-    return track
+    return time.monotonic_ns()
 
 
-def _batches(load: Load, start: int, speed: float) -> Iterator[tuple[int, list[int], list[int]]]:
-    """Sleep until messages are due; give the first row, the channels and the due times."""
+def _batches(load: Load, start: int, speed: float) -> Iterator[tuple[int, list[int]]]:
+    """Sleep until messages are due; give the first row and the channels."""
     clock, parent = time.monotonic_ns, os.getppid()
     for block in range(0, len(load), _BLOCK):
         rows = slice(block, block + _BLOCK)
@@ -123,7 +87,7 @@ def _batches(load: Load, start: int, speed: float) -> Iterator[tuple[int, list[i
                     raise _OrphanedError
                 continue
             stop = bisect_right(due, now, at, min(at + _BATCH, len(due)))
-            yield block + at, channels[at:stop], due[at:stop]
+            yield block + at, channels[at:stop]
             at = stop
 
 
@@ -138,21 +102,18 @@ def main(*, load: str, counters: str, pipes: list[int], limit: int, speed: float
         speed: Times as fast as the load says.
 
     Returns:
-        `start_ns` and `end_ns` of the monotonic clock (the start, and when the last
-        message was published), `cpu_s`, and percentiles.
+        `start_ns` and `end_ns` of the monotonic clock: the start, and when the last
+        message was published.
     """
     opened = Load.open(Path(load))
     shared = Counters(Path(counters))
     print(READY, flush=True)
     sys.stdin.readline()
-    used = time.process_time()
     start = time.monotonic_ns() + _HEAD_START_NS
-    track = publish_to_queues(opened, shared, start=start, speed=speed, pipes=pipes, limit=limit)
-    used = time.process_time() - used
+    end = publish_to_queues(opened, shared, start=start, speed=speed, pipes=pipes, limit=limit)
     for pipe in pipes:
         os.close(pipe)
-    end = start + round(int(opened.due[-1]) / speed) + track.late_us[-1] * 1000
-    return {"start_ns": start, "end_ns": end, "cpu_s": used, **track.values()}
+    return {"start_ns": start, "end_ns": end}
 
 
 if __name__ == "__main__":

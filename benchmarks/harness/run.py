@@ -15,7 +15,7 @@ from benchmarks.backends.base import Backend
 from benchmarks.harness.counters import Counters
 from benchmarks.loads.base import Load
 from benchmarks.samples import Status
-from benchmarks.side import SideError, Values, run_side, warm_cache
+from benchmarks.side import SideError, Values, run_side, spelled, warm_cache
 
 QUEUE = 10
 """Messages that the queue of a topic holds."""
@@ -23,25 +23,6 @@ QUEUE = 10
 _COUNT_S = 900.0
 _COUNT_FAILED_S = 60.0
 _START_S = 300.0
-
-
-@dataclass(frozen=True, slots=True)
-class Setting:
-    """How a load is published.
-
-    Attributes:
-        speed: Times as fast as the load says.
-        queue: Messages that a topic's queue holds.
-        timeout_s: A run is ended after it; None for thrice its duration and five minutes.
-    """
-
-    speed: float = 1.0
-    queue: int = QUEUE
-    timeout_s: float | None = None
-
-    def __post_init__(self) -> None:
-        if not self.speed > 0:
-            raise ValueError(f"speed is {self.speed}; give a number above 0")
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,52 +40,37 @@ class Outcome:
     reason: str = ""
 
 
-def run(
-    load: Load, backend: type[Backend], directory: Path, setting: Setting | None = None
-) -> Outcome:
+def run(load: Load, backend: type[Backend], directory: Path, speed: float = 1.0) -> Outcome:
     """Publish a load into a backend, close it, and count what another process finds in it.
 
     Values: `published`, `dropped`, `errors` (inserts that raised), `persisted` (counted
     afterwards), `lost` (taken without an error and not found), `topics` (published,
     dropped, persisted of each), `published_bytes`, `persisted_bytes`, `due_s` (from the
     first until the last message should be published), `publish_s` (until it was),
-    `wall_s` (from the first publication until `finish` had returned), `depth_*` and
-    `late_ms_*` (percentiles), `cpu_s` of the logger, `publisher_cpu_s`, `server_cpu_s`,
-    `server_peak_rss`, `peak_rss` (without the payloads), `disk_bytes`, `steal_s` and
-    `other_cpu_s` of the machine (the kernel's writing threads are among the others),
-    `spin_ms`.
+    `wall_s` (from the first publication until `finish` had returned), `cpu_s` of the logger,
+    `server_cpu_s`, `server_peak_rss`, `peak_rss` (without the payloads), `disk_bytes`,
+    `steal_s` of the machine, `spin_ms`.
 
     Args:
         load: What; its directory must stay where it is.
         backend: A class at the top of a module.
         directory: Empty and nobody else's. The caller removes it.
-        setting: How.
+        speed: Times as fast as the load says.
     """
-    setting = setting or Setting()
-    if not len(load):
-        raise ValueError(f"the load {load.name!r} has no messages; nothing can be measured")
     directory = directory.resolve()
     data = directory / "data"
     data.mkdir()
     common = {
         "load": str(load.payloads.parent.resolve()),
-        "backend": f"{backend.__module__}:{backend.__qualname__}",
+        "backend": spelled(backend),
         "directory": str(data),
     }
     counters = directory / "counters"
-    arguments = {
-        **common,
-        "publishing": {
-            "counters": str(counters),
-            "speed": setting.speed,
-            "limit": setting.queue,
-        },
-    }
-    timeout = setting.timeout_s
-    if timeout is None:
-        timeout = 3 * load.duration_s / setting.speed + _START_S
-    warm_cache([load.payloads])
+    publishing = {"counters": str(counters), "speed": speed, "limit": QUEUE}
+    timeout = 3 * load.duration_s / speed + _START_S
+    warm_cache(load.payloads)
     try:
+        arguments = {**common, "publishing": publishing}
         values = run_side("benchmarks.harness.logger:log", arguments, directory, timeout)
     except SideError as error:
         values = {"status": "failed", "reason": str(error)}
@@ -113,7 +79,7 @@ def run(
         values["peak_rss"] -= values.pop("peak_rss_payloads", 0)
     if status == "missing" or not counters.is_file():
         return Outcome(status, {}, reason)
-    values["due_s"] = load.duration_s / setting.speed
+    values["due_s"] = load.duration_s / speed
     values["disk_bytes"] = usage.disk_bytes(data)
     try:
         limit_s = _COUNT_S if status == "ok" else _COUNT_FAILED_S

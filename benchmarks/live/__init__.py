@@ -1,1 +1,1 @@
-"""Recording a running robot under load, beside `rosbag record`, and when things fail."""
+"""Recording a running robot under load, and when things fail."""

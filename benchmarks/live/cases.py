@@ -9,18 +9,18 @@ import statistics
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 from os import kill
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from benchmarks.live.master import Master
-from benchmarks.live.recorders import Kept, Ours, Rosbag, rosbag, speech
+from benchmarks.live.recorders import Kept, Recorder, speech
 from benchmarks.live.talker import Data, Load
 from benchmarks.samples import Sample, Status
 from benchmarks.side import SideError
-from benchmarks.usage import cpu_s, machine, rss, with_children, working_below
+from benchmarks.usage import cpu_s, rss, stolen_s, wait_for_mongods, with_children, working_below
+from tests.live.sources.ros1_peers import FakeMaster
 
 if TYPE_CHECKING:
     from benchmarks.studies.runs import Context
@@ -60,36 +60,23 @@ class Case(NamedTuple):
     run: Callable[[Path, bool], Iterator[Row]]
 
 
-def _beside(name: str, load: Load) -> Case:
-    """The same load to ours and to `rosbag record`, one after the other."""
+def _plain(name: str, load: Load) -> Case:
+    """A load and nothing else."""
 
     def run(work: Path, quick: bool) -> Iterator[Row]:  # noqa: FBT001 - one shape for all cases
         said = load._replace(seconds=2.0) if quick else load
-        yield _recorded(name, said, work, "hybridlog")
-        if rosbag() is not None:
-            yield _recorded(name, said, work, "rosbag record")
-
-    about = (
-        f"{load.topics} topic{'s'[: load.topics > 1]} of {_size(load.size)} at {load.hz:g} Hz"
-        f"{f' in bursts of {load.burst}' if load.burst > 1 else ''}, "
-        f"{load.megabytes_per_s:,.0f} MB/s"
-    )
-    return Case(about, run)
-
-
-def _recorded(name: str, load: Load, work: Path, recorder: str) -> Row:
-    with _clean(work), Master() as master, _steal() as stolen:
-        running: Ours | Rosbag
-        if recorder == "hybridlog":
-            running = Ours(work / "store", master.uri, "--reserve", "0")
-        else:
-            running = Rosbag(work / "it.bag", master.uri)
-        with closing(running):
-            with speech(load, master.uri) as talker:
+        with _recording(work, "--reserve", "0") as (running, master), _steal() as stolen:
+            with speech(said, master) as talker:
                 did = talker.ended()
             time.sleep(1)
             kept = running.stop()
-    return _row(name, recorder, _Recorded(load, did, kept, stolen[0]))
+        yield _row(name, "hybridlog", _Recorded(said, did, kept, stolen[0]))
+
+    about = (
+        f"{load.topics} topic{'s'[: load.topics > 1]} of {_size(load.size)} at {load.hz:g} Hz, "
+        f"{load.megabytes_per_s:,.0f} MB/s"
+    )
+    return Case(about, run)
 
 
 class _Recorded(NamedTuple):
@@ -132,14 +119,8 @@ def _stopped_database(work: Path, quick: bool) -> Iterator[Row]:  # noqa: FBT001
     pause = 3.0 if quick else 10.0
     load = Load(20, 40_000, 50, 2 * pause + 4)
     for how in ("halted", "killed"):
-        with (
-            _clean(work),
-            Master() as master,
-            _steal() as stolen,
-            closing(Ours(work / "store", master.uri, "--reserve", "0")) as running,
-        ):
-            with speech(load, master.uri) as talker:
-                talker.began()
+        with _recording(work, "--reserve", "0") as (running, master), _steal() as stolen:
+            with speech(load, master) as talker:
                 time.sleep(2)
                 _disturb(work / "store", how, pause)
                 did = talker.ended()
@@ -167,12 +148,8 @@ def _kills(work: Path, quick: bool) -> Iterator[Row]:  # noqa: FBT001
     lost_s, stored, wrong = [], 0, 0
     count = 3 if quick else 15
     for _ in range(count):
-        with _clean(work), Master() as master:
-            with (
-                closing(Ours(work / "store", master.uri, "--reserve", "0")) as running,
-                speech(load, master.uri) as talker,
-            ):
-                talker.began()
+        with _recording(work, "--reserve", "0") as (running, master):
+            with speech(load, master):
                 time.sleep(moments.uniform(0, 6))
                 killed_ns = running.kill()
             behind, messages, faults = _recovered(work / "store", load, killed_ns)
@@ -199,7 +176,7 @@ def _recovered(store: Path, load: Load, killed_ns: int) -> tuple[float, int, int
     """Age in seconds of the last message at the kill, messages, and faults among them."""
     import hybridlog
 
-    data = Data(load)
+    data = Data(load.size)
     last_ns, wrong = 0, 0
     before: dict[str, int] = defaultdict(int)
     with hybridlog.open(store) as opened:
@@ -236,14 +213,8 @@ def _watched(case: str, name: str, load: Load, work: Path, *options: str) -> Row
     recorder: list[int] = []
     database: list[int] = []
     servers: set[int] = set()
-    with (
-        _clean(work),
-        Master() as master,
-        _steal() as stolen,
-        closing(Ours(work / "store", master.uri, *options)) as running,
-    ):
-        with speech(load, master.uri) as talker:
-            talker.began()
+    with _recording(work, *options) as (running, master), _steal() as stolen:
+        with speech(load, master) as talker:
             begin = time.monotonic()
             while time.monotonic() - begin < seconds - 1:
                 time.sleep(1)
@@ -275,26 +246,29 @@ def _watched(case: str, name: str, load: Load, work: Path, *options: str) -> Row
 
 
 @contextmanager
-def _clean(work: Path) -> Iterator[None]:
-    """An empty directory, and nothing of it afterwards; servers in it have ended."""
+def _recording(work: Path, *options: str) -> Iterator[tuple[Recorder, FakeMaster]]:
+    """A recorder in an empty directory, and its master; nothing of them is left afterwards."""
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True)
     try:
-        yield
+        with (
+            FakeMaster() as master,
+            closing(Recorder(work / "store", master.uri, *options)) as running,
+        ):
+            yield running, master
     finally:
-        deadline = time.monotonic() + 30
-        while working_below(work, "mongod") and time.monotonic() < deadline:
-            time.sleep(0.1)
+        with suppress(TimeoutError):
+            wait_for_mongods(work)
         shutil.rmtree(work, ignore_errors=True)
 
 
 @contextmanager
 def _steal() -> Iterator[list[float]]:
     """Processor seconds that the host took from the machine while the block ran."""
-    before = machine()
+    before = stolen_s()
     found = [0.0]
     yield found
-    found[0] = machine().stolen - before.stolen
+    found[0] = stolen_s() - before
 
 
 def _size(size: int) -> str:
@@ -306,8 +280,8 @@ def _share(part: float, whole: float) -> str:
 
 
 CASES: dict[str, Case] = {
-    "small": _beside("small", Load(1, 500, 30_000, 15, queue=1000)),
-    "large": _beside("large", Load(12, 640_000, 128, 10)),
+    "small": _plain("small", Load(1, 500, 30_000, 15, queue=1000)),
+    "large": _plain("large", Load(12, 640_000, 128, 10)),
     "database": Case("mongod halted, and killed", _stopped_database),
     "kills": Case("kill -9 at random moments under 80 MB/s", _kills),
     "robot": Case("50 MB/s, --budget 128MiB, without and with MongoDB", _robot),
@@ -315,23 +289,20 @@ CASES: dict[str, Case] = {
 
 
 def run(context: Context, name: str) -> None:
-    """Do a case that is not in the journal.
+    """Do a case.
 
     Args:
         context: Where and how.
         name: Key of `CASES`.
     """
     wanted = Sample(STUDY, {"case": name}, "hybridlog", 0)
-    if not context.to_do(wanted):
-        return
     case, rows, reason = CASES[name], [], ""
     with context.progress.step(f"live: {case.about}"):
         try:
             rows = list(case.run(context.work / "live", context.scale != "full"))
         except SideError as error:
             reason = str(error)
-    ours = [row for row in rows if row.recorder.startswith("hybridlog")]
-    reason = reason or "; ".join(row.text for row in ours if not row.holds)
+    reason = reason or "; ".join(row.text for row in rows if not row.holds)
     status: Status = "failed" if reason else "ok"
     values = {"rows": [row._asdict() for row in rows]}
     context.journal.add(replace(wanted, status=status, values=values, reason=reason))

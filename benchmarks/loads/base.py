@@ -28,7 +28,6 @@ class Load:
     Rows may share a payload: a stream of many messages needs a file of only a few.
 
     Attributes:
-        name: Short, for tables: `5 kB 64 Hz`, `robot`.
         seed: From which it was made.
         channels: One a topic.
         channel: int32[n], index into `channels`.
@@ -39,8 +38,7 @@ class Load:
         payloads: The payload file.
     """
 
-    name: str
-    seed: int | None
+    seed: int
     channels: tuple[Channel, ...]
     channel: NDArray[np.int32]
     due: NDArray[np.int64]
@@ -80,17 +78,10 @@ class Load:
             length=self.length,
         )
         about = {
-            "name": self.name,
             "seed": self.seed,
             "channels": [_channel_to_json(channel) for channel in self.channels],
         }
-        # Last: a directory without it is a load that was not finished.
         (directory / _ABOUT).write_text(json.dumps(about, indent=1), encoding="utf-8")
-
-    @classmethod
-    def is_complete(cls, directory: Path) -> bool:
-        """Whether a whole load lies in a directory."""
-        return (directory / _ABOUT).is_file()
 
     @classmethod
     def open(cls, directory: Path) -> Load:
@@ -98,7 +89,6 @@ class Load:
         about = json.loads((directory / _ABOUT).read_text(encoding="utf-8"))
         with np.load(directory / _COLUMNS) as columns:
             return cls(
-                name=about["name"],
                 seed=about["seed"],
                 channels=tuple(_channel_from_json(value) for value in about["channels"]),
                 payloads=directory / PAYLOADS,

@@ -21,7 +21,6 @@ from benchmarks.loads.made import RobotTypes, Values, payloads, yaw
 from benchmarks.loads.spool import Spool
 from benchmarks.loads.truth import BEFORE_ERROR_NS, MINUTE_NS, RobotError, Truth
 from benchmarks.loads.user import ARM_GRID, GRASPS, TICK_NS, Drag, ViewpointPlan, plan_drags
-from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -85,22 +84,17 @@ def hcr_like(
     directory: Path,
     *,
     seed: int,
-    sessions: int = 8,
-    minutes: float = 10.0,
+    sessions: int,
+    minutes: float,
 ) -> Load:
     """Make a load of some sessions, one after the other with a gap, and its truth.
 
     Args:
-        directory: Where it goes; what lies there is replaced.
+        directory: Where it goes; exists.
         seed: Not negative.
         sessions: How many, above 0.
         minutes: Length of each, at least 1.
     """
-    if sessions < 1 or not minutes >= 1 or seed < 0:
-        raise UsageError(
-            f"no load of {sessions} sessions of {minutes:g} minutes from seed {seed}; choose at "
-            "least 1 session of at least 1 minute, and a seed that is not negative"
-        )
     types = RobotTypes()
     topics = list(_TYPES)
     channels = [types.channel(topic, *_TYPES[topic]) for topic in topics]
@@ -112,7 +106,7 @@ def hcr_like(
             plan = _plan(seed, number, start, ticks)
             _write(spool, types, topics, plan)
             plans.append(plan)
-        load = spool.finish("hcr_like", seed, channels)
+        load = spool.finish(seed, channels)
     _truth(plans).save(directory)
     return load
 

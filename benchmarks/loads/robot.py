@@ -189,7 +189,7 @@ def robot_load(directory: Path, *, seconds: int, seed: int) -> Load:
         for found in messages(seconds, seed):
             times, numbers, payloads = zip(*found, strict=True)
             spool.messages(np.array(numbers, np.int32), payloads, np.array(times, np.int64))
-        return spool.finish("robot", seed, channels())
+        return spool.finish(seed, channels())
 
 
 def write_log(path: Path, *, seconds: int, seed: int) -> int:

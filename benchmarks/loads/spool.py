@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 
 from benchmarks.loads.base import PAYLOADS, Load
-from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -19,7 +18,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.messages import Channel
 
 _BUFFER = 1 << 20
-_ABOUT = "load.json"
 
 _Columns = tuple["NDArray[np.int32]", "NDArray[np.int64]", "NDArray[np.int64]", "NDArray[np.int64]"]
 
@@ -28,26 +26,17 @@ class Spool:
     """A load that is being written. Use it as a context manager.
 
     Messages may come in any order. Payloads do not stay in memory, only 28 bytes a
-    message do. When the block ends with an error, the payloads are removed.
+    message do.
 
     Args:
-        directory: Made when it is not there; a load that lies in it is replaced.
+        directory: Exists.
     """
 
     def __init__(self, directory: Path) -> None:
         self._directory = directory
         self._at = 0
         self._columns: list[_Columns] = []
-        try:
-            directory.mkdir(parents=True, exist_ok=True)
-            # From here on until it is finished, no load lies here.
-            (directory / _ABOUT).unlink(missing_ok=True)
-            self._file = (directory / PAYLOADS).open("wb", buffering=_BUFFER)
-        except OSError as error:
-            raise UsageError(
-                f"{directory}: no load can be written here ({error.strerror or error}); "
-                "choose another directory"
-            ) from error
+        self._file = (directory / PAYLOADS).open("wb", buffering=_BUFFER)
 
     def __enter__(self) -> Self:
         return self
@@ -59,8 +48,6 @@ class Spool:
         trace: TracebackType | None,
     ) -> None:
         self._file.close()
-        if kind is not None:
-            (self._directory / PAYLOADS).unlink(missing_ok=True)
 
     def messages(
         self,
@@ -84,8 +71,7 @@ class Spool:
 
     def finish(
         self,
-        name: str,
-        seed: int | None,
+        seed: int,
         channels: Sequence[Channel],
     ) -> Load:
         """Order what was added by log time, and save it.
@@ -94,15 +80,9 @@ class Spool:
         first one. Of equal log times, the one that was added first comes first.
 
         Args:
-            name: Of the load.
             seed: From which it was made.
             channels: One a topic.
         """
-        if not self._columns:
-            raise UsageError(f"{name}: no messages; choose a longer time or another log")
-        if not self._at:
-            # An empty file could not be mapped.
-            self._file.write(b"\0")
         self._file.close()
         channel, log_time, offset, length = (
             np.concatenate(parts) for parts in zip(*self._columns, strict=True)
@@ -110,7 +90,6 @@ class Spool:
         order = np.argsort(log_time, kind="stable")
         due = log_time[order] - log_time[order[0]]
         load = Load(
-            name=name,
             seed=seed,
             channels=tuple(channels),
             channel=channel[order],

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 START_NS = 1_700_000_000 * 1_000_000_000
 """Log time of a stream's first message, ns since the epoch."""
 TYPE = "hybridlog_benchmarks/Frame"
-MIN_SIZE = 128
-"""Bytes of the smallest message: both arrays have something in them."""
 
 _FIELDS = "Header header\nfloat32[] ranges\nuint8[] data\n"
 _HEADER = "uint32 seq\ntime stamp\nstring frame_id\n"
@@ -50,8 +48,8 @@ def stream(
     *,
     size: int,
     rate: float,
-    topics: int = 20,
-    messages: int = 500,
+    topics: int,
+    messages: int,
     seed: int,
     pool: Path | None = None,
 ) -> Load:
@@ -70,10 +68,6 @@ def stream(
         pool: Payload file of a stream of the same size, seed and `pool_messages`: it is
             shared, as a hard link.
     """
-    if size < MIN_SIZE:
-        raise ValueError(f"a message of {size} bytes is too small; give {MIN_SIZE} or more")
-    if not rate > 0 or topics < 1 or messages < 1:
-        raise ValueError(f"{messages} messages on {topics} topics at {rate} Hz are no stream")
     payloads = directory / PAYLOADS
     count = pool_messages(size, topics, messages)
     if pool is None:
@@ -83,7 +77,6 @@ def stream(
     rows = np.arange(topics * messages)
     due = np.rint(rows * (1e9 / (rate * topics))).astype(np.int64)
     load = Load(
-        name=f"{_amount(size)} {rate:g} Hz",
         seed=seed,
         channels=tuple(_channel(number, topics) for number in range(topics)),
         channel=(rows % topics).astype(np.int32),
@@ -95,10 +88,6 @@ def stream(
     )
     load.save(directory)
     return load
-
-
-def _amount(size: int) -> str:
-    return f"{size / 1000:g} kB"
 
 
 def _channel(number: int, topics: int) -> Channel:

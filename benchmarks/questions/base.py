@@ -30,9 +30,6 @@ WIDE_NS: Final = SECOND_NS // 2
 """Half of the window of Q4, as the code in the paper's appendix has it."""
 NEAR_NS: Final = SECOND_NS // 10
 """The same as the paper's text has it."""
-SLOW_S = 10.0
-"""What takes longer is asked `SLOW_TIMES` in all, each time for the first time."""
-SLOW_TIMES = 2
 _CHECK = 1_000_000_007
 
 Answer = int | list[int] | list[float]

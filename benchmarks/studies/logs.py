@@ -38,7 +38,7 @@ SETTINGS: dict[Scale, Settings] = {
 
 
 def run(context: Context, repetition: int) -> None:
-    """Look for the speeds that are not known yet; the backends take turns."""
+    """Look for the greatest speeds; the backends take turns."""
     seconds, bounds = SETTINGS[context.scale]
 
     def search(name: str) -> Search:
@@ -47,7 +47,7 @@ def run(context: Context, repetition: int) -> None:
             load = partial(make_load, context, seconds)
             return Trial(Sample(STUDY, case, name, repetition), load, speed)
 
-        return Search("speed", bounds, trial)
+        return Search(bounds, trial)
 
     take_turns(context, [search(name) for name in chosen(context.backends, BACKENDS)])
 

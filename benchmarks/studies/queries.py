@@ -7,24 +7,17 @@ is wrong makes the sample a failure.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import NamedTuple
 
 from benchmarks.loads.hcr_like import hcr_like
 from benchmarks.loads.truth import Truth
-from benchmarks.questions import run as turns
 from benchmarks.questions.askers import ASKERS
 from benchmarks.questions.base import QUESTIONS, true_answers
-from benchmarks.questions.run import Turn
+from benchmarks.questions.run import judged, turns
 from benchmarks.samples import Sample, Scale
-from benchmarks.studies.runs import Context, chosen
-
-if TYPE_CHECKING:
-    from benchmarks.harness.run import Outcome
-    from benchmarks.loads.base import Load
+from benchmarks.studies.runs import Context
 
 STUDY = "queries"
-_SIDE = "benchmarks.questions.sides:ask"
 
 
 class Settings(NamedTuple):
@@ -34,7 +27,7 @@ class Settings(NamedTuple):
         sessions: Of the load.
         minutes: Length of each session, at least 1.
         repetitions: Of each question, for the first time since the backend was opened, and
-            after one of those; what takes more than 10 s is asked twice in all.
+            after one of those.
     """
 
     sessions: int
@@ -49,78 +42,25 @@ SETTINGS: dict[Scale, Settings] = {
 }
 
 
-def plan(context: Context) -> list[Turn]:
-    """Every backend's turn, those that the journal has included."""
-    settings = SETTINGS[context.scale]
-    return [
-        Turn(
-            name,
-            ASKERS[name],
-            [
-                Sample(STUDY, _case(question, settings), name, repetition)
-                for question in QUESTIONS
-                for repetition in range(settings.repetitions)
-            ],
-        )
-        for name in chosen(context.backends, list(ASKERS))
-    ]
-
-
 def run(context: Context) -> None:
-    """Do what is still to be done."""
-    settings = SETTINGS[context.scale]
-
-    def load() -> Load:
-        return make_load(context, settings)
-
-    def samples_of(outcome: Outcome, results: Sequence[turns.Result]) -> Iterable[Sample]:
-        truth = true_answers(Truth.open(load().payloads.parent))
-        # The last that was told of a question has all its times.
-        latest = {result["question"]: result for result in results}
-        for result in latest.values():
-            yield from _samples(outcome, result, truth, settings)
-
-    arguments = {"questions": list(QUESTIONS), "repetitions": settings.repetitions}
-    for turn in plan(context):
-        turns.do(context, turn, side=_SIDE, load=load, arguments=arguments, samples_of=samples_of)
-
-
-def make_load(context: Context, settings: Settings) -> Load:
-    """The load, made once; its truth lies beside it."""
-    sessions, minutes, _ = settings
-    about = {"seed": context.seed, "sessions": sessions, "minutes": minutes}
-    return context.load(
+    """Ask all of all."""
+    sessions, minutes, repetitions = SETTINGS[context.scale]
+    about = {"sessions": sessions, "minutes": minutes}
+    seed = context.seed
+    load = context.load(
         "questions",
-        about,
-        lambda directory: hcr_like(
-            directory, seed=context.seed, sessions=sessions, minutes=minutes
-        ),
+        {**about, "seed": seed},
+        lambda place: hcr_like(place, seed=seed, sessions=sessions, minutes=minutes),
     )
-
-
-def _samples(
-    outcome: Outcome, result: turns.Result, truth: dict[str, Any], settings: Settings
-) -> Iterable[Sample]:
-    """One sample a repetition; of a question that was slow, one for each time it was asked."""
-    question = result["question"]
-    error = result.get("error", "")
-    values = dict(outcome.values)
-    first_times: list[float] = [] if error else result["cold_ms"]
-    times: list[float] = [] if error else result["ms"]
-    if not error:
-        values["answer"] = result["answer"]
-    if not times:
-        values[turns.SLOW] = True
-        times = first_times or [0.0]
-    for repetition, ms in enumerate(times):
-        wanted = Sample(STUDY, _case(question, settings), result["row"], repetition)
-        timed = dict(values)
-        if not error:
-            timed["ms"] = ms
-            if repetition < len(first_times):  # fewer when the side was ended
-                timed["cold_ms"] = first_times[repetition]
-        yield turns.judged(wanted, timed, truth[question], error)
-
-
-def _case(question: str, settings: Settings) -> dict[str, Any]:
-    return {"question": question, "sessions": settings.sessions, "minutes": settings.minutes}
+    truth = true_answers(Truth.open(load.payloads.parent))
+    for name, outcome, results in turns(context, "ask", ASKERS, load, repetitions):
+        for question in QUESTIONS:
+            case = {"question": question, **about}
+            result = results.get(question)
+            for repetition in range(repetitions):
+                wanted = Sample(STUDY, case, name, repetition)
+                one = result
+                if result is not None and "error" not in result:
+                    times = {key: result[key][repetition] for key in ("ms", "cold_ms")}
+                    one = {**result, **times}
+                context.journal.add(judged(wanted, outcome, one, truth[question]))

@@ -6,25 +6,16 @@ closed, opened again, and read from. What must come out is decoded from the load
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import NamedTuple
 
-from benchmarks.questions import run as turns
 from benchmarks.questions import tasks
 from benchmarks.questions.askers import READERS
-from benchmarks.questions.base import SLOW_S
-from benchmarks.questions.run import Turn
+from benchmarks.questions.run import judged, turns
 from benchmarks.samples import Sample, Scale
 from benchmarks.studies import logs
-from benchmarks.studies.runs import Context, chosen
-
-if TYPE_CHECKING:
-    from benchmarks.harness.run import Outcome
-    from benchmarks.loads.base import Load
+from benchmarks.studies.runs import Context
 
 STUDY = "reading"
-_SIDE = "benchmarks.questions.sides:read"
-_USUAL_MEASURES = ("first_ms", "ms", "total_ms", "answer")
 
 
 class Settings(NamedTuple):
@@ -32,7 +23,7 @@ class Settings(NamedTuple):
 
     Attributes:
         seconds: Of the load.
-        repetitions: Of each task; one of which the first takes more than 10 s is done twice.
+        repetitions: Of each task.
     """
 
     seconds: int
@@ -46,57 +37,14 @@ SETTINGS: dict[Scale, Settings] = {
 }
 
 
-def plan(context: Context) -> list[Turn]:
-    """Every backend's turn, those that the journal has included."""
-    settings = SETTINGS[context.scale]
-    return [
-        Turn(
-            name,
-            READERS[name],
-            [
-                Sample(STUDY, _case(task, settings), name, repetition)
-                for task in tasks.TASKS
-                for repetition in range(settings.repetitions)
-            ],
-        )
-        for name in chosen(context.backends, list(READERS))
-    ]
-
-
 def run(context: Context) -> None:
-    """Do what is still to be done."""
-    settings = SETTINGS[context.scale]
-    truth: dict[tuple[str, int], list[int]] = {}
-
-    def load() -> Load:
-        return logs.make_load(context, settings.seconds)
-
-    def samples_of(outcome: Outcome, results: Sequence[turns.Result]) -> Iterable[Sample]:
-        if results and not truth:
-            truth.update(tasks.true_answers(load(), settings.repetitions))
-        return [_sample(outcome, result, truth, settings) for result in results]
-
-    for turn in plan(context):
-        arguments = {"repetitions": settings.repetitions}
-        turns.do(context, turn, side=_SIDE, load=load, arguments=arguments, samples_of=samples_of)
-
-
-def _sample(
-    outcome: Outcome,
-    result: turns.Result,
-    truth: dict[tuple[str, int], list[int]],
-    settings: Settings,
-) -> Sample:
-    task, repetition = result["task"], result["repetition"]
-    error = result.get("error", "")
-    values = dict(outcome.values)
-    if not error:
-        values |= {name: result[name] for name in _USUAL_MEASURES}
-        if repetition == 0 and result["total_ms"] > SLOW_S * 1e3:
-            values[turns.SLOW] = True
-    wanted = Sample(STUDY, _case(task, settings), result["row"], repetition)
-    return turns.judged(wanted, values, truth[task, repetition], error)
-
-
-def _case(task: str, settings: Settings) -> dict[str, Any]:
-    return {"task": task, "seconds": settings.seconds}
+    """Read all from all."""
+    seconds, repetitions = SETTINGS[context.scale]
+    load = logs.make_load(context, seconds)
+    truth = tasks.true_answers(load, repetitions)
+    for name, outcome, results in turns(context, "read", READERS, load, repetitions):
+        for task in tasks.TASKS:
+            found = results.get(task, [None] * repetitions)
+            for repetition, result in enumerate(found):
+                wanted = Sample(STUDY, {"task": task, "seconds": seconds}, name, repetition)
+                context.journal.add(judged(wanted, outcome, result, truth[task, repetition]))

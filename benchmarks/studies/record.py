@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import os
-from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -55,7 +54,7 @@ SETTINGS: dict[Scale, Settings] = {
 
 
 def run(context: Context, size: int, repetition: int) -> None:
-    """Look for the ceilings that are not known yet; the backends take turns.
+    """Look for the ceilings; the backends take turns.
 
     Args:
         context: Where and how.
@@ -75,7 +74,7 @@ def _search(context: Context, name: str, size: int, repetition: int) -> Search:
         load = partial(make_stream, context, size=size, rate=rate, messages=messages)
         return Trial(Sample(STUDY, case, name, repetition), load)
 
-    return Search("rate", settings.bounds, trial)
+    return Search(settings.bounds, trial)
 
 
 def make_stream(context: Context, *, size: int, rate: float, messages: int) -> Load:
@@ -97,8 +96,7 @@ def make_stream(context: Context, *, size: int, rate: float, messages: int) -> L
             pool=shared,
         )
         if shared is None:
-            with suppress(FileExistsError):
-                os.link(made.payloads, pool)
+            os.link(made.payloads, pool)
         return made
 
     return context.load(f"stream-{size}-{rate:g}", about, make)

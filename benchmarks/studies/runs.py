@@ -1,10 +1,8 @@
-"""What the studies share: one run of one case, kept in the journal, done once."""
+"""What the studies share: one run of one case, kept in the journal."""
 
 from __future__ import annotations
 
 import json
-import os
-import shutil
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -14,17 +12,19 @@ from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from benchmarks.disturbance import MAX_RUNS, is_disturbed
-from benchmarks.harness.run import Setting
 from benchmarks.harness.run import run as run_load
 from benchmarks.loads.base import Load
 from benchmarks.progress import Progress
-from benchmarks.samples import Journal, Sample, Scale, Status
+from benchmarks.samples import Journal, Sample, Scale
+from hybridlog_storage.threads import processors
 
 if TYPE_CHECKING:
     from benchmarks.backends.base import Backend
 
-_PART = "part-"
+_TAKEN_SHARE = 0.05
+"""A host that takes more of the processors' time away than this disturbs a run."""
+_MAX_RUNS = 3
+"""So often a disturbed run is done altogether."""
 _DIGESTED_S = 500e6  # bytes a second of what a run has kept that the machine is done with,
 _DIGESTING_S = 12.0  # and seconds after which it is done with all
 
@@ -36,7 +36,7 @@ class Context:
     Attributes:
         work: Directory for loads (kept) and the data of runs (removed after each).
         backends: Those that take part, by name, in the order in which they take turns.
-        journal: Where samples go, and where those lie that need not be run again.
+        journal: Where samples go.
         scale: How much is measured.
         seed: Of all loads.
         progress: Where steps are told.
@@ -64,34 +64,13 @@ class Context:
         """
         text = json.dumps([name, settings], sort_keys=True)
         place = self.work / "loads" / f"{name}-{sha256(text.encode()).hexdigest()[:16]}"
-        if not Load.is_complete(place):
-            place.parent.mkdir(parents=True, exist_ok=True)
-            part = Path(tempfile.mkdtemp(prefix=_PART, dir=place.parent))
-            try:
-                make(part)
-                shutil.rmtree(place, ignore_errors=True)
-                part.rename(place)
-            finally:
-                shutil.rmtree(part, ignore_errors=True)
+        if not place.exists():
+            place.mkdir(parents=True)
+            make(place)
         return Load.open(place)
 
-    def to_do(self, sample: Sample) -> bool:
-        """Whether a run has still to be done.
-
-        It is not in the journal as a success, or the machine disturbed it, and it has not
-        been repeated often enough. Only a full run repeats any.
-        """
-        if not self.journal.has(sample):
-            return True
-        known = self.journal.samples[sample.key]
-        return (
-            self.scale == "full"
-            and is_disturbed(known.values)
-            and self.journal.successes(sample) < MAX_RUNS
-        )
-
     def run(self, wanted: Sample, load: Callable[[], Load], *, speed: float = 1.0) -> Sample:
-        """Run one case with one backend, unless the journal has it; again when disturbed.
+        """Run one case with one backend; a full run does it again when the host disturbed it.
 
         Args:
             wanted: Study, case, backend and repetition.
@@ -101,32 +80,41 @@ class Context:
         Returns:
             The sample, which is in the journal.
         """
-        if not self.to_do(wanted):
-            return self.journal.samples[wanted.key]
         reason = self.missing.get(wanted.backend)
         if reason is not None:
-            sample = _filled(wanted, "missing", {}, reason)
-            self.journal.add(sample)
-            return sample
-        while self.to_do(wanted):
-            with self.progress.step(describe_run(wanted)):
-                sample = self._run(wanted, load(), speed)
-            self.journal.add(sample)
-            if sample.status == "missing":
-                self.missing[wanted.backend] = sample.reason
-            if sample.status != "ok":
-                return sample
-        return self.journal.samples[wanted.key]
+            sample = replace(wanted, status="missing", reason=reason)
+        else:
+            with self.progress.step(_described(wanted)):
+                sample = self._run_undisturbed(wanted, load(), speed)
+        if sample.status == "missing":
+            self.missing[wanted.backend] = sample.reason
+        self.journal.add(sample)
+        return sample
+
+    def _run_undisturbed(self, wanted: Sample, load: Load, speed: float) -> Sample:
+        """The sample of the run that the host disturbed least."""
+        best = self._run(wanted, load, speed)
+        for _ in range(1, _MAX_RUNS):
+            values = best.values
+            # A run that kept everything kept it in spite of the machine.
+            lost = best.status == "ok" and values["published"] != values["persisted"]
+            if self.scale != "full" or not lost or _share_taken(values) <= _TAKEN_SHARE:
+                break
+            again = self._run(wanted, load, speed)
+            if again.status != "ok":
+                return again
+            best = min(again, best, key=lambda sample: _share_taken(sample.values))
+        return best
 
     def _run(self, wanted: Sample, load: Load, speed: float) -> Sample:
         backend = self.backends[wanted.backend]
         if self.scale == "full":
             time.sleep(max(self.quiet_at - time.monotonic(), 0))
         with run_directory(self.work) as directory:
-            outcome = run_load(load, backend, directory, Setting(speed=speed))
+            outcome = run_load(load, backend, directory, speed)
         self.quiet_at = time.monotonic() + _digesting_s(outcome.values)
         values = {name: v for name, v in outcome.values.items() if name != "topics"}
-        return _filled(wanted, outcome.status, values, outcome.reason)
+        return replace(wanted, status=outcome.status, values=values, reason=outcome.reason)
 
 
 def chosen(backends: Mapping[str, type[Backend]], names: Sequence[str]) -> dict[str, type[Backend]]:
@@ -134,10 +122,16 @@ def chosen(backends: Mapping[str, type[Backend]], names: Sequence[str]) -> dict[
     return {name: backends[name] for name in names if name in backends}
 
 
-def describe_run(sample: Sample) -> str:
+def _described(sample: Sample) -> str:
     """A run in a line of progress."""
     case = ", ".join(f"{name} {value}" for name, value in sample.case.items())
     return f"{sample.study}: {sample.backend}, {case}, round {sample.repetition + 1}"
+
+
+def _share_taken(values: Mapping[str, Any]) -> float:
+    """Share of all processors' time that the host of this machine took during a run."""
+    taken: float = values["steal_s"]
+    return taken / (values["wall_s"] * processors())
 
 
 def _digesting_s(values: Mapping[str, Any]) -> float:
@@ -153,31 +147,7 @@ def _digesting_s(values: Mapping[str, Any]) -> float:
 
 @contextmanager
 def run_directory(work: Path) -> Iterator[Path]:
-    """An empty directory for one run, removed with all that is in it, however the run ends.
-
-    What runs of processes that were killed have left behind goes, too.
-    """
-    runs = work / "runs"
-    runs.mkdir(parents=True, exist_ok=True)
-    for left in runs.iterdir():
-        if not _is_alive(left.name.split("-")[0]):
-            shutil.rmtree(left, ignore_errors=True)
-    directory = Path(tempfile.mkdtemp(prefix=f"{os.getpid()}-", dir=runs))
-    try:
-        yield directory
-    finally:
-        shutil.rmtree(directory, ignore_errors=True)
-
-
-def _is_alive(pid: str) -> bool:
-    try:
-        os.kill(int(pid), 0)
-    except (ValueError, ProcessLookupError):
-        return False
-    except PermissionError:
-        pass
-    return True
-
-
-def _filled(wanted: Sample, status: Status, values: Mapping[str, Any], reason: str) -> Sample:
-    return replace(wanted, status=status, values=dict(values), reason=reason)
+    """An empty directory for one run, removed with all that is in it, however the run ends."""
+    work.mkdir(exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=work, ignore_cleanup_errors=True) as directory:
+        yield Path(directory)

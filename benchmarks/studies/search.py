@@ -1,16 +1,15 @@
 """The search for the greatest rate at which a backend still keeps everything.
 
-The rate is doubled until something is lost, then the gap is halved a few times. Each
-trial is a sample, and what to try next follows from the samples alone, so a search that
-was stopped goes on where it was. Chance decides about the last trials, so each search
-is made several times, and every one of them begins anew.
+The rate is doubled until something is lost, then the gap is halved a few times. Chance
+decides about the last trials, so each search is made several times, and every one of them
+begins anew.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 from benchmarks.samples import Sample
@@ -63,14 +62,14 @@ class Search:
     """One search of one backend.
 
     Attributes:
-        axis: Name of the rate in the case of a trial.
         bounds: Where it looks.
         trial: Gives the trial at a rate.
+        kept: Of the rates that were tried, whether all was kept.
     """
 
-    axis: str
     bounds: Bounds
     trial: Callable[[float], Trial]
+    kept: dict[float, bool] = field(default_factory=dict)
 
 
 def verdict(sample: Sample) -> Verdict:
@@ -121,52 +120,21 @@ def next_rate(kept: Mapping[float, bool], bounds: Bounds) -> float | None:
     return (best + lost) / 2 if is_wide else None
 
 
-def next_trial(context: Context, search: Search, failed: Collection[str] = ()) -> Trial | None:
-    """What a search tries next.
-
-    Args:
-        context: Its journal holds the trials so far.
-        search: The search.
-        failed: Keys of the trials that count although they failed.
-
-    Returns:
-        None at the end of the search.
-    """
-    first = search.trial(search.bounds.start).sample
-    kept: dict[float, bool] = {}
-    for sample in context.journal.samples.values():
-        is_of_search = (
-            (sample.study, sample.backend, sample.repetition)
-            == (first.study, first.backend, first.repetition)
-            and search.axis in sample.case
-            and (sample.status == "ok" or sample.key in failed)
-        )
-        if not is_of_search:
-            continue
-        tried = float(sample.case[search.axis])
-        if sample.key == search.trial(tried).sample.key:
-            kept[tried] = verdict(sample) == "kept"
-    rate = next_rate(kept, search.bounds)
-    return None if rate is None else search.trial(rate)
-
-
 def take_turns(context: Context, searches: Iterable[Search]) -> None:
-    """Do the trials that some searches still need; the searches take turns."""
-    # A trial that failed is tried again by the next process, not by this one.
-    failed: set[str] = set()
+    """Do searches, which take turns."""
     waiting = list(searches)
     while waiting:
-        waiting = [search for search in waiting if _try(context, search, failed)]
+        waiting = [search for search in waiting if _try(context, search)]
 
 
-def _try(context: Context, search: Search, failed: set[str]) -> bool:
+def _try(context: Context, search: Search) -> bool:
     """Do the next trial of a search; returns whether there was one."""
-    trial = next_trial(context, search, failed)
-    if trial is None:
+    rate = next_rate(search.kept, search.bounds)
+    if rate is None:
         return False
+    trial = search.trial(rate)
     found = context.run(trial.sample, trial.load, speed=trial.speed)
-    if found.status == "failed":
-        failed.add(found.key)
+    search.kept[rate] = verdict(found) == "kept"
     return found.status != "missing"
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import statistics
 import struct
 import subprocess
@@ -99,7 +98,7 @@ SQL = {
 
 
 def run(context: Context, group: str) -> None:
-    """Do a group that is not in the journal.
+    """Do a group.
 
     Args:
         context: Where and how.
@@ -107,8 +106,6 @@ def run(context: Context, group: str) -> None:
     """
     settings = SETTINGS[context.scale]
     wanted = Sample(STUDY, {"group": group, **settings._asdict()}, "hybridlog", 0)
-    if not context.to_do(wanted):
-        return
     with context.progress.step(f"tasks: {group}"), run_directory(context.work) as directory:
         arguments = {"directory": str(directory), "seed": context.seed, **settings._asdict()}
         try:
@@ -126,19 +123,10 @@ def robot_store(context: Context, settings: Settings) -> Path:
     """The store with the robot's log, recorded once; the log lies beside it."""
     place = context.work / "loads" / f"robot-{settings.seconds}-{context.seed}"
     if not place.exists():
-        part = Path(tempfile.mkdtemp(prefix="part-", dir=_made(place.parent)))
-        try:
-            robot.write_log(part / "robot.mcap", seconds=settings.seconds, seed=context.seed)
-            _recorded(part / "robot.mcap", part / "store")
-            part.rename(place)
-        finally:
-            shutil.rmtree(part, ignore_errors=True)
+        place.mkdir(parents=True)
+        robot.write_log(place / "robot.mcap", seconds=settings.seconds, seed=context.seed)
+        _recorded(place / "robot.mcap", place / "store")
     return place / "store"
-
-
-def _made(place: Path) -> Path:
-    place.mkdir(parents=True, exist_ok=True)
-    return place
 
 
 def _recorded(log: Path, store: Path) -> Values:

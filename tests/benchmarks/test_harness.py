@@ -88,7 +88,6 @@ def make_load(
     (directory / PAYLOADS).write_bytes(rng.bytes(int(length.sum())))
     due = np.rint(np.arange(rows) * 1e9 / rate / topics).astype(np.int64)
     load = Load(
-        name="test",
         seed=1,
         channels=tuple(Channel(f"/topic/{n}", "ros1", None) for n in range(topics)),
         channel=(np.arange(rows) % topics).astype(np.int32),
@@ -145,14 +144,11 @@ def test_values_of_a_good_run(tmp_path: Path, start: Runner) -> None:
     assert values["topics"] == {f"/topic/{n}": [30, 0, 30] for n in range(3)}
     assert values["due_s"] == load.duration_s
     assert load.duration_s <= values["publish_s"] <= values["wall_s"] < load.duration_s + 2
-    assert 0 <= values["depth_p50"] <= values["depth_p99"] <= values["depth_max"] <= 10
-    assert 0 <= values["late_ms_p50"] <= values["late_ms_p99"] <= values["late_ms_max"]
     assert 0 < values["cpu_s"] < 2
     assert values["server_peak_rss"] > 30 << 20
     assert 5 << 20 < values["peak_rss"] < 200 << 20
     assert values["disk_bytes"] > 0
     assert 1 < values["spin_ms"] < 2000
-    assert values["other_cpu_s"] >= 0
     assert values["steal_s"] >= 0
 
 
@@ -167,7 +163,6 @@ def test_a_full_queue_drops_and_only_its_own_messages(tmp_path: Path, start: Run
     assert values["topics"]["/topic/1"] == values["topics"]["/topic/2"] == [60, 0, 60]
     assert values["published"] == values["persisted"] + values["dropped"]
     assert values["dropped"] == dropped
-    assert values["depth_max"] == 10
     # The publisher does not wait for who is slow; the end does.
     assert values["publish_s"] < load.duration_s + 0.3
     assert values["wall_s"] > 0.02 * persisted

@@ -79,8 +79,7 @@ def samples() -> list[Sample]:
 
 
 def journal(directory: Path, found: list[Sample], scale: str = "full") -> Journal:
-    made = Journal(directory)
-    made.begin({"scale": scale, "seed": 1, "command": [], **describe(directory)})
+    made = Journal(directory, {"scale": scale, "seed": 1, "command": [], **describe(directory)})
     for sample in found:
         made.add(sample)
     return made
