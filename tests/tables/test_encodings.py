@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import duckdb
 import pyarrow.parquet as pq
 
 import hybridlog as hl
@@ -31,25 +30,6 @@ def rows(store: hl.Store, topic: str = "/a") -> list[dict[str, Any]] | None:
     if table is None:
         return None
     return [row for block in table.scan(None) for row in block.records.to_pylist()]
-
-
-def test_json(store: hl.Store, tmp_path: Path) -> None:
-    values = [
-        {"n": 2**53 + 1, "yes": True, "list": [1.5, 2.5], "s": {"t": None, "T": "x"}},
-        {"n": 2, "list": []},
-        {"yes": False, "s": {"T": ""}, "n": None},
-    ] * 400
-    record(store, tmp_path, values)
-    found = rows(store)
-    assert found is not None
-    assert [row["n"] for row in found[:3]] == [2**53 + 1, 2, None]
-    assert [row["yes"] for row in found[:3]] == [True, None, False]
-    assert [row["list"] for row in found[:3]] == [[1.5, 2.5], [], None]
-    assert [row["s"] and row["s"]["T"] for row in found[:3]] == ["x", None, ""]
-    assert len(found) == 1200
-    files = str(store.directory.path / "tables/any~*/*.parquet")
-    query = "select count(*) from read_parquet(?) where n = 9007199254740993"
-    assert duckdb.connect().execute(query, [files]).fetchone() == (400,)
 
 
 def test_an_empty_message_that_is_missing_at_times(store: hl.Store, tmp_path: Path) -> None:

@@ -12,7 +12,6 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.follow import follower
-from hybridlog.query.rows import Rows
 from hybridlog_storage.messages import Channel, Schema
 
 SECOND = 10**9
@@ -54,24 +53,3 @@ def test_a_topic_without_a_table_is_tried_once(
         assert store.topic("/imu").where("x > 1").count() > 0
         store.mend()
     assert made == [{"/imu", "/mixed"}]  # which share their chunks
-
-
-def test_frames_come_from_tables(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    for query in (
-        store.topic("/imu"),
-        store.topic("/imu").fields("n", "s"),
-        store.topic("/imu").where("x > 100").fields("a", "n"),
-        store.topic("/imu").between(10 * SECOND, 20 * SECOND).fields("x"),
-        store.topic("/imu").where("s ~ '^m1[0-9]$'").reverse(),
-    ):
-        table, frame = query.to_arrow(), query.to_pandas()
-        assert query.counters.chunks_read == 0
-        assert query.counters.messages == table.num_rows == len(frame) == query.count()
-        streamed = sum(part.num_rows for part in query.to_tables())
-        assert streamed == table.num_rows
-        with monkeypatch.context() as patch:
-            patch.setattr(Rows, "tabled", lambda *_: None)
-            decoded = query.to_arrow()
-            assert query.counters.chunks_read > 0
-        assert table.schema == decoded.schema
-        assert repr(table.to_pylist()) == repr(decoded.to_pylist())  # NaN is NaN

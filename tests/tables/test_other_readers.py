@@ -219,20 +219,6 @@ def test_each_folder_has_one_schema(many: hl.Store) -> None:
     assert any(len(list(folder.iterdir())) > 2 for folder in folders)
 
 
-def test_no_reader_needs_hybridlog(recorded: hl.Store) -> None:
-    script = (
-        "import sys, pyarrow.parquet as pq\n"
-        "table = pq.read_table(sys.argv[1])\n"
-        "assert not any(name.startswith('hybridlog') for name in sys.modules)\n"
-        "print(table.num_rows)\n"
-    )
-    (path,) = Path(recorded.directory.path).glob("tables/*/*.parquet")
-    done = subprocess.run(
-        [sys.executable, "-c", script, str(path)], capture_output=True, text=True, check=True
-    )
-    assert done.stdout == "1800\n"
-
-
 READ_ON = """
 import json, sys
 sys.path.insert(0, sys.argv[2])

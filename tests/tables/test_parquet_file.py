@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import hybridlog as hl
-from hybridlog.columns.column_file import ColumnFile, leaves
+from hybridlog.columns.column_file import ColumnFile
 from hybridlog.columns.layout import (
     Section,
     TopicCounts,
@@ -58,22 +58,6 @@ def path(tmp_path: Path) -> Path:
     place = tmp_path / "1" / "2" / "3"
     place.mkdir(parents=True)
     return place / "a.parquet"
-
-
-def test_what_is_written_is_read(path: Path, table: pa.Table) -> None:
-    said = write(path, table)
-    reader = ColumnFile(path)
-    assert reader.about.sections == [said]
-    assert reader.groups == [ROWS, ROWS]
-    names = [leaf.names for leaf in leaves(reader.schema)]
-    assert names == [("t",), ("x",), ("point", "x"), ("point", "list"), ("text",), ("seq",)]
-    assert reader.read(1, [0, 1, 2, 3, 4, 5]).equals(table)
-    some = reader.read(0, [1, 3])
-    assert some.column("x").equals(table.column("x"))
-    assert some.schema.field("point").type.num_fields == 1
-    assert reader.size(0, [0]) < reader.size(0, [0, 1])
-    reader.check()
-    assert pq.read_table(path).num_rows == 2 * ROWS
 
 
 def test_a_flipped_bit_is_found_or_changes_nothing(path: Path, table: pa.Table) -> None:

@@ -23,7 +23,6 @@ from hybridlog.columns.tables import Tables
 from hybridlog.columns.topic_table import TopicTable
 from hybridlog.follow.follower import make_tables
 from hybridlog_storage.cache import Cache
-from hybridlog_storage.errors import StoreError
 from tests.damage import flip
 from tests.some import in_turn
 from tests.tables.logs import decoded, table_of
@@ -41,29 +40,6 @@ def file_of(store: hl.Store, topic: str = "/large") -> Path:
 
 
 # --- scanning -------------------------------------------------------------------------
-
-
-def test_only_what_is_wanted_is_read(recorded: hl.Store) -> None:
-    table = table_of(recorded, "/large")
-    (block,) = table.scan(["header.stamp", "points[].X", "Name", "covariance.max"], own=["pub"])
-    kind = block.records.type
-    assert [kind.field(n).name for n in range(kind.num_fields)] == [
-        "header",
-        "covariance",
-        "points",
-        "Name",
-    ]
-    assert kind.field("header").type.num_fields == 1
-    assert kind.field("points").type.value_type.field(0).name == "X"
-    assert kind.field("covariance").type.field(0).name == "max"
-    assert set(block.own) == {"pub"}
-    assert table.fields(["header.stamp", "points[].X", "Name", "covariance.max"]) == kind
-    assert 0 < table.size(["i8"]) < table.size(["header", "i8"]) < table.size(None)
-    assert table.has("header.stamp")
-    assert table.has("t")
-    assert table.has("points[].X")
-    assert not table.has("seq")
-    assert not table.has("header.stamp.sec")
 
 
 INTEGERS = pa.schema([(name, pa.int64()) for name in ("t", "seq", "n")])
@@ -142,20 +118,6 @@ def test_damaged_tables_are_none_and_are_made_again(
     assert recorded.verify().findings == []
     assert path.read_bytes() == whole
     assert compare(recorded) == 1800
-
-
-def test_damage_that_is_met_while_reading(recorded: hl.Store, tables: Tables) -> None:
-    (entry,) = recorded.recordings()
-    table = tables.of(entry, "/large")
-    assert table is not None
-    path = file_of(recorded)
-    content = bytearray(path.read_bytes())
-    content[: len(content) - 20_000] = bytes(len(content) - 20_000)
-    path.write_bytes(content)
-    with pytest.raises(StoreError, match="damaged"):
-        list(table.scan(None))
-    tables.reject(entry, "/large")
-    assert tables.of(entry, "/large") is None  # from now on
 
 
 def test_a_segment_more_or_less_is_noticed(recorded: hl.Store, tables: Tables) -> None:
@@ -262,35 +224,4 @@ def test_fields_become_columns_and_fields_again(rows: list[Any], start: int) -> 
     assert joined([columns.slice(1), columns]).to_pylist() == [
         *columns.slice(1).to_pylist(),
         *columns.to_pylist(),
-    ]
-
-
-def struct(rows: list[Any], **fields: Any) -> Any:
-    return pa.array(rows, pa.struct(list(fields.items())))
-
-
-def test_arrays_over_the_limit_are_summaries() -> None:
-    shape = FieldShape()
-    short = struct([{"a": [1.0, None]}, {"a": None}], a=pa.list_(pa.float64()))
-    found = shape.columns(short)
-    assert found.field("a").to_pylist() == [[1.0, None], None]
-    assert found.field("a_summary").null_count == 2
-    long = struct(
-        [{"a": [float("nan"), 2.0, *[1.0] * 38]}, {"a": []}, {"a": None}], a=pa.list_(pa.float64())
-    )
-    mixed = shape.columns(long)
-    assert mixed.type == found.type == shape.columns(long.slice(0, 0)).type
-    assert mixed.field("a").to_pylist() == [None, [], None]
-    first, *others = mixed.field("a_summary").to_pylist()
-    assert (first["n"], first["min"], first["max"]) == (40, 1.0, 2.0)
-    assert others == [None, None]
-    # Where one is too long, all are summaries for who asks about fields.
-    assert records_of(found).to_pylist() == short.to_pylist()
-    summaries = records_of(mixed, lambda path: path == ("a",)).field("a").to_pylist()
-    assert summaries == [first, {"n": 0, "min": None, "max": None, "mean": None}, None]
-    together = joined([records_of(found), records_of(mixed, lambda _: True)])
-    assert together.field("a").to_pylist() == [
-        {"n": 2, "min": 1.0, "max": 1.0, "mean": 1.0},
-        None,
-        *summaries,
     ]

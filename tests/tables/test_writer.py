@@ -88,10 +88,6 @@ def compare_rows(block: TableRows, messages: list[Decoded]) -> None:
             assert same(value, getattr(message.value, name)), name
 
 
-def references(block: TableRows) -> list[tuple[int, int, int, int]]:
-    return [(r["seg"], r["chunk"], r["off"], r["len"]) for r in block.own["ref"].to_pylist()]
-
-
 @pytest.mark.parametrize(
     ("arena", "rows", "pending"),
     [
@@ -119,16 +115,6 @@ def test_tables_are_what_the_messages_say(
     write_log(tmp_path / "log.mcap", said)
     store.record(tmp_path / "log.mcap", name="log", settings=SMALL_CHUNKS)
     assert compare(store) == 300
-
-
-def test_where_a_message_lies(recorded: hl.Store) -> None:
-    table = table_of(recorded, "/large")
-    with hl.open(recorded.directory.path, mongo="embedded") as indexed:
-        documents = documents_of(indexed, "/large")
-    want = [
-        (r["seg"], r["chunk"], r["off"], r["len"]) for r in (d["_meta"]["ref"] for d in documents)
-    ]
-    assert [r for block in table.scan(own=["ref"]) for r in references(block)] == want
 
 
 def test_a_segment_has_its_tables_once_it_is_sealed(store: hl.Store, limit: Limit) -> None:
