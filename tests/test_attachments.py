@@ -107,16 +107,6 @@ def store(log: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.St
         yield store
 
 
-def test_everything_is_listed(store: hl.Store) -> None:
-    (entry,) = store.recordings()
-    assert (entry.attachments, entry.metadata_records) == (5, 3)
-    assert listed(store.attachments("drive")) == ATTACHMENTS
-    assert [a.create_time_ns for a in store.attachments(entry)] == [a[0] + 1 for a in ATTACHMENTS]
-    assert store.metadata("drive") == METADATA
-    assert store.topics() == ["/bare", "/n", "/silent"]
-    assert [c.stats.messages for c in entry.channels] == [10, 0, 0, 0]
-
-
 def test_a_channel_without_messages_changes_no_answer(store: hl.Store) -> None:
     assert store.topic("/silent").count() == 0
     assert list(store.topic("/silent")) == []

@@ -370,46 +370,12 @@ def test_columns_of_ours(store: hl.Store) -> None:
         store.topic("/plain").fields("arrival")
 
 
-def test_recording_is_a_column_when_there_are_several(store: hl.Store) -> None:
-    both = store.topic("/opt")
-    labels = ["json_optional_keys"] * 4 + ["again"] * 4
-    for table in (both.to_arrow(), parquet(both)):
-        assert sorted(table["recording"].to_pylist()) == sorted(labels)
-    assert sorted(row["recording"] for row in json_lines(both)) == sorted(labels)
-    assert sorted(both.to_pandas()["recording"]) == sorted(labels)
-    one = both.in_recording("again")
-    assert "recording" not in one.to_arrow().column_names
-    assert "recording" not in json_lines(one)[0]
-    ours = one.fields("recording", "n").to_arrow()
-    assert ours.column_names == ["log_time", "recording", "n"]
-
-
-def test_a_json_field_called_as_a_column_of_ours(tmp_path: Path) -> None:
-    with hl.open(tmp_path / "store", create=True) as store:
-        with store.start("x") as recorder:
-            for n in range(3):
-                text = json.dumps({"seq": 10 * n, "stamp": "a"}).encode()
-                recorder.write(Channel("/o", "json", None), text, log_time=1 + n)
-        query = store.topic("/o").fields("seq")
-        assert query.to_arrow().to_pydict()["seq_"] == [0, 10, 20]
-        assert query.to_arrow()["seq"].to_pylist() == sorted(query.to_arrow()["seq"].to_pylist())
-        assert [row["seq_"] for row in json_lines(query)] == [0, 10, 20]
-        assert "seq_" not in store.topic("/o").to_arrow().column_names
-
-
 # --- other libraries --------------------------------------------------------------------
 
 EVERY = [
     *("/j", "/k", "/a", "/opt", "/ints", "/ints2", "/mix"),
     *("/zoo", "/cam", "/raw", "/pc", "/log", "/c", "/own", "/plain"),
 ]
-
-
-@pytest.fixture(scope="module", params=EVERY)
-def frame(request: pytest.FixtureRequest, store: hl.Store) -> pd.DataFrame:
-    found = store.topic(request.param).to_pandas()
-    assert len(found)
-    return found
 
 
 def test_duckdb_reads_arrow_and_parquet(store: hl.Store, tmp_path: Path) -> None:
@@ -422,15 +388,3 @@ def test_duckdb_reads_arrow_and_parquet(store: hl.Store, tmp_path: Path) -> None
         assert len(duckdb.connect().sql(f"select * from '{path}'").fetchall()) == rows.num_rows
         assert pl.read_parquet(path).height == rows.num_rows
         assert pl.from_arrow(rows).shape[0] == rows.num_rows
-
-
-def test_a_frame_comes_back_from_parquet(frame: pd.DataFrame) -> None:
-    file = io.BytesIO()
-    frame.to_parquet(file)
-    back = pd.read_parquet(file)
-    assert back.index.equals(frame.index)
-    assert list(back.columns) == list(frame.columns)
-    for name in frame.columns:
-        assert back[name].isna().tolist() == frame[name].isna().tolist()
-        if not isinstance(frame[name].iloc[0], np.ndarray | list):
-            assert str(back[name].tolist()) == str(frame[name].tolist())

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import gc
-import json
 import tracemalloc
 from collections import defaultdict
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
@@ -32,7 +29,6 @@ from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.data import DATA
 from tests.indexed import documents_of
-from tests.waiting import at_once
 
 pytestmark = pytest.mark.mongo
 
@@ -117,21 +113,6 @@ def start_of(store: hl.Store, recording: str = "robot") -> int:
     return entry.span[0]
 
 
-def test_summaries_beside_their_arrays(store: hl.Store, robot: Truth) -> None:
-    query = store.topic("/base/scan").fields("header.seq", "ranges.min", "ranges", "ranges.n")
-    frame = query.to_pandas()
-    assert query.counters.documents_read == 0
-    assert query.counters.messages == len(frame)
-    assert list(frame.columns) == ["header.seq", "ranges.min", "ranges", "ranges.n"]
-    assert frame["header.seq"].tolist() == [m.message.header.seq for m in robot["/base/scan"]]
-    want = [m.message.ranges[np.isfinite(m.message.ranges)].min() for m in robot["/base/scan"]]
-    assert frame["ranges.min"].tolist() == [float(value) for value in want]
-    assert frame["ranges.n"].tolist() == [len(cell) for cell in frame["ranges"]]
-    indexed = [document["ranges"]["min"] for document in documents_of(store, "/base/scan")]
-    assert frame["ranges.min"].tolist() == indexed
-    assert frame.attrs["hybridlog"]["chunks_read"] > 0
-
-
 @pytest.mark.parametrize("topic", ["/base/scan", "/imu/data", "/camera/front/image_raw"])
 def test_each_chunk_is_read_once(store: hl.Store, robot: Truth, topic: str) -> None:
     query = store.topic(topic)
@@ -199,19 +180,6 @@ def test_a_table_without_rows_has_all_columns(store: hl.Store) -> None:
     assert query.to_arrow().column_names == whole
     assert list(query.to_pandas().columns) == whole[1:]
     assert list(query) == []
-
-
-def test_fields_of_a_message_are_its_document(store: hl.Store) -> None:
-    for topic in ("/base/scan", "/imu/data", "/tf", "/diagnostics"):
-        query = store.topic(topic).in_recording("robot").limit(20)
-        key = store.entry("robot").key
-        own = [d for d in documents_of(store, topic) if d["_meta"]["rec"] == key]
-        for message, document in zip(query, own[:20], strict=True):
-            meta = document.pop("_meta")
-            document.pop("_id")
-            # NaN equals NaN here, and nothing is rounded.
-            assert json.dumps(message.fields) == json.dumps(document)
-            assert (meta["seq"], meta["t"]) == (message.seq, message.log_time_ns)
 
 
 # Which messages.
@@ -324,18 +292,6 @@ def test_memory_is_bounded_by_chunks_not_by_the_store(tmp_path: Path) -> None:
             tracemalloc.stop()
             assert total > 0
             assert peak < size / 3, each
-
-
-def test_several_threads_share_a_store(store: hl.Store, robot: Truth) -> None:
-    def ask(topic: str) -> None:
-        for _ in range(3):
-            query = store.topic(topic).in_recording("robot")
-            assert [m.raw for m in query] == [m.raw for m in robot[topic]]
-            assert query.where("header.seq >= 0").count() == len(robot[topic])
-            assert len(query.to_pandas()) == len(robot[topic])
-
-    topics = ["/odom", "/base/scan", "/imu/data", "/camera/front/image_raw"]
-    at_once(*(partial(ask, topic) for topic in topics))
 
 
 def test_an_answer_survives_its_store(base: Path, store: hl.Store, robot: Truth) -> None:

@@ -74,21 +74,6 @@ def test_what_only_mongodb_can_is_refused(stores: dict[str, hl.Store]) -> None:
     assert store.shared.index.place == "none"
 
 
-def test_header_statistics_and_marks(
-    stores: dict[str, hl.Store], bag: Path, tmp_path: Path
-) -> None:
-    (want,) = stores[EMBEDDED].recordings()
-    with hl.open(tmp_path / "store", create=True, mongo=NONE) as store:
-        entry = store.record(bag, settings=SMALL).entry
-        stats = [c.stats for c in entry.channels]
-        assert stats == [c.stats for c in want.channels]
-        assert any(of.stamped for of in stats)
-        marked = store.mark(entry.id, "+1s", "here")
-        assert marked.is_decoded
-        assert store.topic("/hybridlog/marks").count() == 1
-        assert store.topic("scan").stats("range_max")[0].count == store.topic("scan").count()
-
-
 @pytest.mark.parametrize("way", ["option", "variable", "settings"])
 def test_the_ways_to_say_so(
     way: str, bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import random
 import struct
@@ -17,7 +16,6 @@ import hybridlog as hl
 from hybridlog.query.intervals import Intervals
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.messages import Channel, Schema
-from tests.cli.within import answer as run
 
 from .conftest import BASE, MS, Logs, Said
 
@@ -146,14 +144,6 @@ def test_what_is_refused(logs: Logs) -> None:
         query.resample("1s", how="sum")
     with pytest.raises(UsageError, match="choose asof, nearest, interpolate"):
         logs.store.align("base", "left/pose", how="mean")
-
-
-def test_the_command(logs: Logs) -> None:
-    asked = ("align", "-t", "*/pose", "--step", "200ms", "--how", "max", "--fields", "ticks")
-    lines = [json.loads(line) for line in run(*asked, store=logs.store.directory.path).lines]
-    want = logs.store.topic("*/pose").fields("ticks").resample("200ms", how="max").to_arrow()
-    assert [row["left/pose.ticks"] for row in lines] == want["left/pose.ticks"].to_pylist()
-    assert [row["right/pose.count"] for row in lines] == want["right/pose.count"].to_pylist()
 
 
 def test_means_of_large_doubles(tmp_path: Path) -> None:

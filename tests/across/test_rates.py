@@ -25,7 +25,6 @@ from hybridlog.query.answers.statistics import _Running
 from hybridlog_storage.errors import TimeError, TopicError, UsageError
 from hybridlog_storage.messages import Channel
 from tests.calls import Calls
-from tests.cli.within import answer as run
 from tests.limits import Limit
 
 from .conftest import BASE, MS, Logs
@@ -34,25 +33,6 @@ from .conftest import BASE, MS, Logs
 def ends(logs: Logs, label: str) -> tuple[int, int]:
     times = [m.time for m in logs.said[label]]
     return min(times), max(times) + 1
-
-
-def test_rates_of_whole_recordings_come_from_the_catalog(logs: Logs) -> None:
-    query = logs.store.topic("/base", "**/pose")
-    found = query.rate().to_pylist()
-    assert query.counters.bytes_read == query.counters.documents_read == 0
-    want = []
-    for label in logs.said:
-        for topic in ("/base", "/left/pose", "/right/pose"):
-            times = [m.time for m in logs.of(label, topic)]
-            if times:
-                mean = (len(times) - 1) / ((times[-1] - times[0]) / 1e9)
-                want.append((label, topic, len(times), times[0], times[-1] + 1, mean))
-    rows = [
-        (r["recording"], r["topic"], r["messages"], r["begin"].value, r["end"].value, r["rate"])
-        for r in found
-    ]
-    assert [row[:5] for row in sorted(rows)] == [row[:5] for row in sorted(want)]
-    assert [row[5] for row in sorted(rows)] == pytest.approx([row[5] for row in sorted(want)])
 
 
 @pytest.mark.parametrize(
@@ -243,32 +223,6 @@ def test_what_is_refused(logs: Logs) -> None:
         base.stats("state")
     with pytest.raises(TimeError, match="Nothing was recorded"):
         base.between("2001-01-01", "2001-01-02").stats()
-
-
-def test_the_commands(logs: Logs) -> None:
-    store = logs.store.directory.path
-    rates = run("stats", "--rate", "-t", "base", "--window", "500ms", "-F", "csv", store=store)
-    assert rates.lines[0] == '"begin_ns","end_ns","recording","topic","messages","rate"'
-    assert "index document" not in rates.err
-    assert run(
-        "intervals", "--gaps", "-t", "right/pose", "-r", "b", "--count", "-q", store=store
-    ).out == (f"{len(logs.store.topic('right/pose').in_recording('b').gaps())}\n")
-    rows = run("stats", "-t", "base", "--fields", "x,list.n", "--json", store=store).json
-    (x, n) = logs.store.topic("base").stats("x", "list.n")
-    assert [(r["field"], r["count"], r["min"], r["std"]) for r in rows] == [
-        (s.field, s.count, s.min, s.std) for s in (x, n)
-    ]
-    shown = run("stats", "-t", "base", store=store)
-    assert shown.lines[0].split() == [
-        "field",
-        "count",
-        "nan",
-        "infinite",
-        "min",
-        "max",
-        "mean",
-        "std",
-    ]
 
 
 @settings(max_examples=200, deadline=None)

@@ -9,19 +9,10 @@ import pytest
 
 from hybridlog.formats import reading as module
 from hybridlog.formats.reading import SAMPLE_BYTES, SAMPLES, WHOLE
-from hybridlog_storage.errors import SourceError
 
 
 def fingerprint(files: Sequence[Path]) -> str:
     return module.fingerprint(files).whole
-
-
-def test_each_part_has_its_own(tmp_path: Path) -> None:
-    large = write(tmp_path / "large", bytes(range(256)) * (WHOLE // 256 + 1))
-    files = [write(tmp_path / "a", b"a"), large, write(tmp_path / "b", b"b")]
-    found = module.fingerprint(files)
-    assert list(found.parts) == [fingerprint([path]) for path in files]
-    assert found.whole not in found.parts
 
 
 def write(path: Path, data: bytes) -> Path:
@@ -81,8 +72,3 @@ def test_large_files_are_sampled(tmp_path: Path) -> None:
     with path.open("r+b") as file:
         file.truncate(size + 1)
     assert fingerprint([path]) != before
-
-
-def test_missing(tmp_path: Path) -> None:
-    with pytest.raises(SourceError, match="no such file"):
-        fingerprint([tmp_path / "a"])

@@ -25,7 +25,6 @@ from hybridlog.formats.writing import Sink
 from hybridlog_storage.disk import unfinished
 from hybridlog_storage.disk.unfinished import (
     beside,
-    is_published,
     scratch_directory,
     undo_unfinished,
     undone,
@@ -347,14 +346,6 @@ def test_what_was_done_is_undone_when_the_process_is_stopped_or_the_work_fails()
         undo_unfinished()
     undo_unfinished()
     assert done == ["failed", "inner", "outer"]
-
-
-def test_a_file_is_published_once_it_has_its_name(tmp_path: Path) -> None:
-    place = beside(tmp_path / "x")
-    place.path.touch()
-    assert not is_published(tmp_path / "x")
-    place.publish(tmp_path / "x")
-    assert is_published(tmp_path / "x")
 
 
 def test_a_scratch_directory_is_private(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

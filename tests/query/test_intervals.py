@@ -394,20 +394,6 @@ def test_containing_keeps_to_what_is_asked(plain: hl.Store) -> None:
             windows.containing(wrong)
 
 
-def test_times_within_windows_by_another_clock(plain: hl.Store) -> None:
-    windows = plain.topic("/state").where("s == 1").windows(after="1s")
-    query = plain.topic("/state").during(windows)
-    assert query.between("+2s", "+6s").count() == 2
-    assert [m.log_time_ns for m in query.between("+2s", "+6s")] == [
-        BASE + 3 * SECOND,
-        BASE + 5 * SECOND,
-    ]
-    assert query.between("+2s", "+6s").clock("publish").count() == 2
-    assert len(list(query.between("+2s", "+6s").clock("publish"))) == 2
-    # What holds during the windows is what holds, and is in a window.
-    assert seconds(query.where("s >= 0").intervals()) == seconds(windows)
-
-
 def test_the_cost_is_counted_and_no_payload_is_read(plain: hl.Store) -> None:
     query = plain.topic("/state").where("s == 1")
     for _ in range(2):

@@ -13,10 +13,8 @@ import hybridlog as hl
 from hybridlog.query.query import Query
 from hybridlog.record.recorder import RecordOptions
 from hybridlog_storage.errors import SegmentError, TopicError
-from hybridlog_storage.segments.segment_reader import SegmentReader
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
-from tests.calls import Calls
 from tests.query.conftest import AWAY, PADDING
 from tests.query.test_intervals import BASE, SECOND, Model, recorded, several
 
@@ -136,11 +134,3 @@ def test_who_changes_a_message_does_not_change_what_is_kept(
 
 
 # What is kept.
-
-
-def test_a_segment_is_read_where_its_chunk_lies(many: hl.Store, calls: Calls) -> None:
-    """The chunks before a time are not read one after the other."""
-    read = calls(SegmentReader, "read_chunk")
-    for moment in (150, 20, 90):  # the first question, the second, and one that knows all
-        assert many.topic("/state").at(f"+{moment}s").fields["n"] == moment
-    assert len(read) == 3
