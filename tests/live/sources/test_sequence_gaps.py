@@ -149,25 +149,6 @@ def test_a_gap_lies_between_two_messages() -> None:
     assert detected([*range(MODULUS - 20, MODULUS), 3]) == [SequenceGap(3, 19, 20)]
 
 
-def test_a_gap_is_confirmed_by_the_messages_after_it() -> None:
-    detector = SequenceGapDetector(trust_after=3, confirm_after=2, max_gap=10)
-    for number in [0, 1, 2, 3, 6, 7]:
-        detector.see(number, number)
-        assert detector.confirmed() == []
-    assert detector.waiting
-    detector.see(8, 8)
-    assert detector.confirmed() == [SequenceGap(2, 3, 6)]
-    assert detector.confirmed() == detector.waiting == detector.finish() == []
-
-
-def test_a_confirmed_gap_survives_a_number_that_goes_back() -> None:
-    detector = SequenceGapDetector(trust_after=3, confirm_after=2)
-    for number in [*range(5), 7, 8, 9, 2]:
-        detector.see(number, 0)
-    assert [gap.missing for gap in detector.confirmed()] == [2]
-    assert detector.finish() == []
-
-
 def test_gaps_of_messages_that_were_received_together_are_one() -> None:
     detector = SequenceGapDetector()
     for number in range(20):
