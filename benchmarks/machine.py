@@ -10,9 +10,10 @@ import subprocess
 import tempfile
 from collections.abc import Sequence
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 
+from hybridlog_storage.mongo.mongod import find_mongod
 from hybridlog_storage.threads import processors
 
 _PACKAGES = ("hybridlog", "mcap", "numpy", "pandas", "psycopg", "pyarrow", "pymongo", "rosbags")
@@ -36,8 +37,8 @@ def describe(work: Path | None = None) -> dict[str, object]:
         "disk": _disk(work or Path(tempfile.gettempdir())),
         "system": f"{platform.system()} {platform.release()} {platform.machine()}",
         "python": platform.python_version(),
-        "packages": {name: _version(name) for name in _PACKAGES},
-        "mongod": _mongod_version(),
+        "packages": {name: version(name) for name in _PACKAGES},
+        "mongod": _said([str(find_mongod()), "--version"], r"db version v(\S+)"),
         "postgres": _postgres_version(),
         "sqlite": sqlite3.sqlite_version,
         # With a plus sign when files differ from the commit.
@@ -63,23 +64,6 @@ def _disk(directory: Path) -> str:
             kind, source = fields[fields.index("-") + 1 :][:2]
             return f"{kind} on {Path(source).name}"
     return "unknown"
-
-
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "absent"
-
-
-def _mongod_version() -> str:
-    from hybridlog_storage.errors import MissingDependencyError
-    from hybridlog_storage.mongo.mongod import find_mongod
-
-    try:
-        return _said([str(find_mongod()), "--version"], r"db version v(\S+)")
-    except MissingDependencyError:
-        return "absent"
 
 
 def _postgres_version() -> str:

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 from benchmarks.backends.database import schema_of
 from benchmarks.backends.recording_files import FileBackend, Recorder
-from benchmarks.backends.requirements import need
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -24,10 +23,6 @@ class BagFile(FileBackend):
 
     name = "bagfile"
     suffix = ".bag"
-
-    @classmethod
-    def check(cls) -> None:
-        need("rosbags", "rosbags")
 
     def _record(self, path: Path) -> Recorder:
         return _Ros1Recorder(path, self._channels)

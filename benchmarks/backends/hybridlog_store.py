@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -29,7 +28,6 @@ class Hybridlog(Backend):
         self._opened: Store | None = None
         self._recording: LiveRecording | None = None
         self._channels: Sequence[Channel] = ()
-        self._lock = threading.Lock()
 
     @property
     def path(self) -> Path:
@@ -61,23 +59,17 @@ class Hybridlog(Backend):
             self._opened = hl.open(self.path, mongo="embedded", create=True, require_database=True)
         except HybridlogError as error:
             raise BackendMissingError(f"hybridlog: {error}") from error
-        if fresh:
+        if fresh:  # or it is opened to be asked
+            self._recording = self.store.start("benchmark")
             # As a recorder would that has just subscribed.
-            self._start().expect(*channels)
+            self._recording.expect(*channels)
 
     def insert(self, channel: int, log_time: int, payload: bytes) -> None:
+        assert self._recording is not None
         try:
-            recording = self._recording or self._start()
-            recording.write(self._channels[channel], payload, log_time=log_time)
+            self._recording.write(self._channels[channel], payload, log_time=log_time)
         except (HybridlogError, OSError) as error:
             raise BackendFailedError(f"hybridlog: {error}") from error
-
-    def _start(self) -> LiveRecording:
-        """The recording of this run. A store that is there already may be opened to count."""
-        with self._lock:
-            if self._recording is None:
-                self._recording = self.store.start("benchmark")
-            return self._recording
 
     def finish(self) -> None:
         recording, self._recording = self._recording, None

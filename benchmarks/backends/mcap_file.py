@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 from benchmarks.backends.database import schema_of
 from benchmarks.backends.recording_files import FileBackend, Recorder
-from benchmarks.backends.requirements import need
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -22,11 +21,6 @@ class McapFile(FileBackend):
 
     name = "mcap"
     suffix = ".mcap"
-
-    @classmethod
-    def check(cls) -> None:
-        need("mcap", "mcap")
-        need("zstandard", "zstandard")
 
     def _record(self, path: Path) -> Recorder:
         return _McapRecorder(path, self._channels)

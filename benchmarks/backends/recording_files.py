@@ -41,7 +41,6 @@ class FileBackend(Backend):
         self._lock = threading.Lock()
 
     def open(self, channels: Sequence[Channel]) -> None:
-        self.check()
         self._channels = channels
         if not self.path.exists():
             with self._failures():

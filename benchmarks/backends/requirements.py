@@ -14,11 +14,7 @@ def need(module: str, package: str) -> None:
         module: What is imported.
         package: What is installed, as pip calls it.
     """
-    try:
-        found = find_spec(module)
-    except (ImportError, ValueError):
-        found = None
-    if found is None:
+    if find_spec(module) is None:
         raise BackendMissingError(
             f"The package {package} is not installed. Install it: pip install {package}, "
             "or all that the benchmarks use: pip install 'hybridlog[bench]'."

@@ -4,12 +4,14 @@ A user drags the arms of a PR2 about by markers, looks at it from viewpoints tha
 changed now and then, and opens and closes the grippers. Topics and types are those that
 the study's own launch file records; `docs/benchmarks-method.md` has the sources.
 
-Everything is planned first, so what must be found in the load is known before a message
-is made: `truth.json` beside it.
+Everything is planned first, so what must be answered about the load is known before a
+message is made: a file of answers lies beside it. No message lies within a millisecond of
+the edge of a window, so that a system that keeps milliseconds finds the same.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -19,8 +21,19 @@ import numpy as np
 from benchmarks.loads import made, user
 from benchmarks.loads.made import RobotTypes, Values, payloads, yaw
 from benchmarks.loads.spool import Spool
-from benchmarks.loads.truth import BEFORE_ERROR_NS, MINUTE_NS, RobotError, Truth
 from benchmarks.loads.user import ARM_GRID, GRASPS, TICK_NS, Drag, ViewpointPlan, plan_drags
+from benchmarks.questions.base import (
+    ARM,
+    BEFORE_NS,
+    ERROR,
+    GRIPPER,
+    ROSOUT,
+    VIEWPOINT,
+    Answer,
+    checked,
+    whole_minutes,
+    windows_before,
+)
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -31,28 +44,22 @@ if TYPE_CHECKING:
 
 Times = np.ndarray[Any, np.dtype[np.int64]]
 
-RIGHT_GRIPPER = "/r_gripper_controller/command"
 LEFT_GRIPPER = "/l_gripper_controller/command"
-VIEWPOINT = "/rviz_camera_publisher/camera_pose"
-RIGHT_ARM = "/r_cart/command_pose"
 LEFT_ARM = "/l_cart/command_pose"
 FEEDBACK = "/pr2_marker_control_transparent/feedback"
 DIAGNOSTICS = "/diagnostics_agg"
-ROSOUT = "/rosout"
 
+_ANSWERS = "answers.json"
 _GRIPPER = "pr2_controllers_msgs/msg/Pr2GripperCommand"
 START_NS = 1_383_588_000_000_000_000  # 2013-11-04 18:00 UTC
 GAP_S = 1200
 """Seconds between two sessions: another user comes."""
-ERROR_LEVEL = 8
-"""rosgraph_msgs/Log.ERROR"""
-
 _INFO_LEVEL, _WARN_LEVEL = 2, 4
 _CLEAR_NS = 1_500_000
 """No message is nearer to the edge of a window than this."""
-_REST = {RIGHT_ARM: 20, LEFT_ARM: 400}
+_REST = {ARM: 20, LEFT_ARM: 400}
 """Mean ticks between two drags of an arm."""
-_MARKERS = {RIGHT_ARM: "r_gripper_control", LEFT_ARM: "l_gripper_control"}
+_MARKERS = {ARM: "r_gripper_control", LEFT_ARM: "l_gripper_control"}
 _POSE_UPDATE, _MOUSE_DOWN, _MOUSE_UP = 1, 4, 5
 _ERRORS = (
     "EtherCAT dropped a packet: motors halted",
@@ -68,10 +75,10 @@ _REMARKS = (
 )
 
 _TYPES = {
-    RIGHT_GRIPPER: (_GRIPPER, "/pr2_marker_control"),
+    GRIPPER: (_GRIPPER, "/pr2_marker_control"),
     LEFT_GRIPPER: (_GRIPPER, "/pr2_marker_control"),
     VIEWPOINT: ("geometry_msgs/msg/Pose", "/rviz"),
-    RIGHT_ARM: ("geometry_msgs/msg/PoseStamped", "/pr2_marker_control"),
+    ARM: ("geometry_msgs/msg/PoseStamped", "/pr2_marker_control"),
     LEFT_ARM: ("geometry_msgs/msg/PoseStamped", "/pr2_marker_control"),
     FEEDBACK: ("visualization_msgs/msg/InteractiveMarkerFeedback", "/rviz"),
     DIAGNOSTICS: ("diagnostic_msgs/msg/DiagnosticArray", "/diag_agg"),
@@ -87,7 +94,7 @@ def hcr_like(
     sessions: int,
     minutes: float,
 ) -> Load:
-    """Make a load of some sessions, one after the other with a gap, and its truth.
+    """Make a load of some sessions, one after the other with a gap, and its answers.
 
     Args:
         directory: Where it goes; exists.
@@ -100,15 +107,21 @@ def hcr_like(
     channels = [types.channel(topic, *_TYPES[topic]) for topic in topics]
     ticks = round(minutes * 60e9 / TICK_NS)
     plans = []
-    with Spool(directory) as spool:
-        for number in range(sessions):
-            start = START_NS + number * round((minutes * 60 + GAP_S) * 1e9)
-            plan = _plan(seed, number, start, ticks)
-            _write(spool, types, topics, plan)
-            plans.append(plan)
-        load = spool.finish(seed, channels)
-    _truth(plans).save(directory)
+    spool = Spool(directory)
+    for number in range(sessions):
+        start = START_NS + number * round((minutes * 60 + GAP_S) * 1e9)
+        plan = _plan(seed, number, start, ticks)
+        _write(spool, types, topics, plan)
+        plans.append(plan)
+    load = spool.finish(seed, channels)
+    (directory / _ANSWERS).write_text(json.dumps(_answers(plans)))
     return load
+
+
+def true_answers(load: Load) -> dict[str, Answer]:
+    """What must be answered about such a load, by question."""
+    found: dict[str, Answer] = json.loads((load.payloads.parent / _ANSWERS).read_text())
+    return found
 
 
 @dataclass(slots=True)
@@ -153,10 +166,10 @@ def _plan(seed: int, number: int, start: int, ticks: int) -> _Plan:
     times = plan.times
     jitter = rng.uniform(0, 3e6, ticks).astype(np.int64)
     times[VIEWPOINT] = plan.at(np.arange(ticks), 1) + jitter
-    times[RIGHT_GRIPPER] = plan.at([c.tick for c in plan.viewpoint.commands], -TICK_NS / 2e6)
+    times[GRIPPER] = plan.at([c.tick for c in plan.viewpoint.commands], -TICK_NS / 2e6)
     times[LEFT_GRIPPER] = plan.at(np.sort(rng.choice(ticks, len(plan.left), replace=False)), 20)
     feedback = []
-    for arm, offset in ((RIGHT_ARM, 11), (LEFT_ARM, 13)):
+    for arm, offset in ((ARM, 11), (LEFT_ARM, 13)):
         moved = _ticks_of(plan.drags[arm], ends=False)
         times[arm] = plan.at(moved, offset) + rng.integers(0, 2_000_000, len(moved))
         feedback.append(plan.at(_ticks_of(plan.drags[arm], ends=True), offset - 4))
@@ -190,8 +203,8 @@ def _plan_errors(plan: _Plan) -> None:
     for _ in range(max(1, round(plan.seconds / 180))):
         near = plan.start + int(rng.uniform(0.15, 0.95) * length)
         for moment in range(near, near + length // 50, 1_000_000):
-            others = np.array([edge for e in plan.errors for edge in (e, e - BEFORE_ERROR_NS)])
-            edges = (moment, moment - BEFORE_ERROR_NS)
+            others = np.array([edge for e in plan.errors for edge in (e, e - BEFORE_NS)])
+            edges = (moment, moment - BEFORE_NS)
             is_clear = all(_is_clear(times, edge) for edge in edges)
             if is_clear and (np.abs(others - moment) > _CLEAR_NS).all():
                 plan.errors.append(moment)
@@ -206,63 +219,30 @@ def _is_clear(times: Times, edge: int) -> bool:
     return bool(first == last)
 
 
-def _truth(plans: Sequence[_Plan]) -> Truth:
-    """Add the plans up."""
-    counts: dict[str, int] = {}
-    closed: list[tuple[int, int]] = []
-    behind = []
-    errors: list[RobotError] = []
+def _answers(plans: Sequence[_Plan]) -> dict[str, Answer]:
+    """What the plans say, added up."""
+    behind = np.concatenate([plan.viewpoint.behind() for plan in plans])
+    users = [plan.viewpoint for plan in plans]
     before_errors = 0
     for plan in plans:
-        for topic, times in plan.times.items():
-            counts[topic] = counts.get(topic, 0) + len(times)
-        counts[ROSOUT] += len(plan.errors)
-        behind.append(plan.viewpoint.behind())
-        for ticks in plan.viewpoint.closed:
-            begin, end = plan.at(ticks, -TICK_NS / 2e6).tolist()
-            closed.append((begin, end))
         times = np.sort(np.concatenate([*plan.times.values(), np.array(plan.errors, np.int64)]))
-        windows = [(error - BEFORE_ERROR_NS, error) for error in plan.errors]
-        for begin, end in windows:
-            errors.append(RobotError(end, _between(times, begin, end)))
-        before_errors += sum(_between(times, *window) for window in _joined(windows))
-    sums = np.concatenate(behind).sum(axis=0) / user.GRID
-    return Truth(
-        sessions=tuple((p.start, p.start + round(p.seconds * 1e9)) for p in plans),
-        messages=counts,
-        q1=sum(c.position == 0.0 for plan in plans for c in plan.viewpoint.commands),
-        q2=sum(len(points) for points in behind),
-        q2_sum=(float(sums[0]), float(sums[1]), float(sums[2])),
-        q3=sum(drag.inside for plan in plans for drag in plan.drags[RIGHT_ARM]),
-        q4_near=sum(plan.viewpoint.near for plan in plans),
-        q4_wide=sum(plan.viewpoint.wide for plan in plans),
-        viewpoint_changes=sum(plan.viewpoint.changes for plan in plans),
-        closed=tuple(closed),
-        closed_minutes=tuple(
-            begin + minute * MINUTE_NS
-            for begin, end in closed
-            for minute in range((end - begin) // MINUTE_NS)
-        ),
-        errors=tuple(errors),
-        before_errors=before_errors,
-    )
-
-
-def _between(times: Times, begin: int, end: int) -> int:
-    """How many of the ascending times lie in `[begin, end)`."""
-    first, last = np.searchsorted(times, (begin, end))
-    return int(last - first)
-
-
-def _joined(windows: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Windows, ordered by their begin, of which none overlap any more."""
-    found: list[tuple[int, int]] = []
-    for begin, end in windows:
-        if found and begin <= found[-1][1]:
-            found[-1] = (found[-1][0], end)
-        else:
-            found.append((begin, end))
-    return found
+        for window in windows_before(plan.errors):
+            first, last = np.searchsorted(times, window)
+            before_errors += int(last - first)
+    closed = [
+        plan.at(ticks, -TICK_NS / 2e6).tolist() for plan in plans for ticks in plan.viewpoint.closed
+    ]
+    return {
+        "Q1": sum(command.position == 0.0 for one in users for command in one.commands),
+        "Q2": len(behind),
+        "Q3": sum(drag.inside for plan in plans for drag in plan.drags[ARM]),
+        "Q4": sum(one.wide for one in users),
+        "Q2 positions": [float(len(behind)), *(behind.sum(axis=0) / user.GRID).tolist()],
+        "Q4 ±0.1 s": sum(one.near for one in users),
+        "viewpoint changes": sum(one.changes for one in users),
+        "closed minutes": checked(whole_minutes(closed)),
+        "before errors": before_errors,
+    }
 
 
 def _write(
@@ -284,7 +264,7 @@ def _write(
     add(VIEWPOINT, plan.times[VIEWPOINT], {}, made.xyz("position", *at.T) | turned)
     commands = plan.viewpoint.commands
     right = {name: [getattr(c, name) for c in commands] for name in ("position", "max_effort")}
-    add(RIGHT_GRIPPER, plan.times[RIGHT_GRIPPER], {}, right)
+    add(GRIPPER, plan.times[GRIPPER], {}, right)
     left = {"position": plan.left, "max_effort": np.full(len(plan.left), 100.0)}
     add(LEFT_GRIPPER, plan.times[LEFT_GRIPPER], {}, left)
     _write_arms(add, plan)
@@ -329,7 +309,7 @@ def _write_rosout(add: _Add, plan: _Plan) -> None:
         for time, choice in zip(plan.times[ROSOUT].tolist(), chosen.tolist(), strict=True)
     ]
     said += [
-        (time, ERROR_LEVEL, _ERRORS[int(rng.integers(len(_ERRORS)))], "/realtime_loop")
+        (time, ERROR, _ERRORS[int(rng.integers(len(_ERRORS)))], "/realtime_loop")
         for time in plan.errors
     ]
     said.sort()

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
 from benchmarks.loads.made import RobotTypes
@@ -19,6 +18,7 @@ from benchmarks.loads.spool import Spool
 if TYPE_CHECKING:
     from benchmarks.loads.base import Load
     from hybridlog_storage.messages import Channel
+from tests.independent import write_mcap
 
 START_NS = 1_700_000_000 * 10**9
 SECOND_NS = 10**9
@@ -185,27 +185,19 @@ def robot_load(directory: Path, *, seconds: int, seed: int) -> Load:
         seconds: Its length.
         seed: Of its noise.
     """
-    with Spool(directory) as spool:
-        for found in messages(seconds, seed):
-            times, numbers, payloads = zip(*found, strict=True)
-            spool.messages(np.array(numbers, np.int32), payloads, np.array(times, np.int64))
-        return spool.finish(seed, channels())
+    spool = Spool(directory)
+    for found in messages(seconds, seed):
+        times, numbers, payloads = zip(*found, strict=True)
+        spool.messages(np.array(numbers, np.int32), payloads, np.array(times, np.int64))
+    return spool.finish(seed, channels())
 
 
-def write_log(path: Path, *, seconds: int, seed: int) -> int:
-    """Write the log as an MCAP file; returns the bytes of its payloads."""
-    size = 0
-    with path.open("wb") as file:
-        writer = Writer(file, chunk_size=1 << 20, compression=CompressionType.ZSTD)
-        writer.start(profile="ros1")
-        numbers = []
-        for channel in channels():
-            assert channel.schema is not None
-            schema = writer.register_schema(channel.schema.name, "ros1msg", channel.schema.data)
-            numbers.append(writer.register_channel(channel.topic, "ros1", schema))
-        for found in messages(seconds, seed):
-            for log_time, number, payload in found:
-                writer.add_message(numbers[number], log_time, payload, log_time)
-                size += len(payload)
-        writer.finish()  # type: ignore[no-untyped-call]
-    return size
+def write_log(path: Path, *, seconds: int, seed: int) -> None:
+    """Write the log as an MCAP file."""
+    known = channels()
+    said = (
+        (known[number], log_time, payload)
+        for found in messages(seconds, seed)
+        for log_time, number, payload in found
+    )
+    write_mcap(path, said)

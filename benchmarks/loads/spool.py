@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,7 +11,6 @@ from benchmarks.loads.base import PAYLOADS, Load
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
     from pathlib import Path
-    from types import TracebackType
 
     from numpy.typing import NDArray
 
@@ -23,7 +22,7 @@ _Columns = tuple["NDArray[np.int32]", "NDArray[np.int64]", "NDArray[np.int64]", 
 
 
 class Spool:
-    """A load that is being written. Use it as a context manager.
+    """A load that is being written.
 
     Messages may come in any order. Payloads do not stay in memory, only 28 bytes a
     message do.
@@ -37,17 +36,6 @@ class Spool:
         self._at = 0
         self._columns: list[_Columns] = []
         self._file = (directory / PAYLOADS).open("wb", buffering=_BUFFER)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._file.close()
 
     def messages(
         self,

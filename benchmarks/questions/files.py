@@ -27,6 +27,7 @@ from benchmarks.questions.base import (
     Reading,
     Window,
     checked,
+    sums,
     whole_minutes,
     windows_before,
 )
@@ -78,82 +79,8 @@ class _File(ABC):
         """Messages of topics with a log time in `[begin, end)`, in order."""
 
     @abstractmethod
-    def times(self) -> Iterator[int]:
-        """Log times of all messages, none decoded."""
-
-    @abstractmethod
     def last_before(self, topic: str, time: int) -> Any:
         """The last message of a topic with a log time up to `time`."""
-
-
-class _FileAsker(_File, Asker):
-    """The loops."""
-
-    def closings(self) -> int:
-        return sum(message.position == 0.0 for _, _, message in self.messages([GRIPPER]))
-
-    def behind(self) -> int:
-        return sum(message.position.x <= 0 for _, _, message in self.messages([VIEWPOINT]))
-
-    def positions(self) -> list[float]:
-        found = [
-            (message.position.x, message.position.y, message.position.z)
-            for _, _, message in self.messages([VIEWPOINT])
-            if message.position.x <= 0
-        ]
-        sums = np.array(found).reshape(-1, 3).sum(axis=0)
-        return [float(len(found)), *map(float, sums)]
-
-    def in_region(self) -> int:
-        found = 0
-        for _, _, message in self.messages([ARM]):
-            place = message.pose.position
-            found += place.z > 1 and -0.5 < place.y < 0.5 and 0.5 < place.x < 1
-        return found
-
-    def grasps(self, half_ns: int) -> int:
-        closings, in_front = [], []
-        for topic, time, message in self.messages([GRIPPER, VIEWPOINT]):
-            if topic == GRIPPER:
-                if message.position == 0.0:
-                    closings.append(time)
-            elif message.position.x >= 0:
-                in_front.append(time)
-        in_front.sort()
-        return sum(
-            bisect_right(in_front, time - half_ns) < bisect_left(in_front, time + half_ns)
-            for time in closings
-        )
-
-    def changes(self) -> int:
-        found, last, was_moving = 0, None, False
-        for _, _, message in self.messages([VIEWPOINT]):
-            here = (message.position, message.orientation)
-            is_moving = last is not None and here != last
-            found += is_moving and not was_moving
-            last, was_moving = here, is_moving
-        return found
-
-    def closed_minutes(self) -> list[int]:
-        closed: list[Window] = []
-        since: int | None = None
-        for _, time, message in self.messages([GRIPPER]):
-            if message.position == 0.0:
-                since = time if since is None else since
-            elif since is not None:
-                closed.append((since, time))
-                since = None
-        return checked(whole_minutes(closed))
-
-    def before_errors(self) -> int:
-        errors = [time for _, time, m in self.messages([ROSOUT]) if m.level == ERROR]
-        windows = windows_before(errors)
-        begins, ends = [begin for begin, _ in windows], [end for _, end in windows]
-        found = 0
-        for time in self.times():
-            place = bisect_right(begins, time) - 1
-            found += place >= 0 and time < ends[place]
-        return found
 
 
 class _FileReading(_File, Reading):
@@ -239,11 +166,6 @@ class _Mcap(_File):
             ):
                 yield channel.topic, message.log_time, decode(schema, message.data)
 
-    def times(self) -> Iterator[int]:
-        with self.opened() as reader:
-            for _, _, message in reader.iter_messages():
-                yield message.log_time
-
     def last_before(self, topic: str, time: int) -> Any:
         decode = _Decoder()
         with self.opened() as reader:
@@ -270,8 +192,73 @@ class _Decoder:
         return types.deserialize_ros1(data, name)
 
 
-class BagAsker(_Bag, _FileAsker):
+class BagAsker(_Bag, Asker):
     """A loop over a bag."""
+
+    def closings(self) -> int:
+        return sum(message.position == 0.0 for _, _, message in self.messages([GRIPPER]))
+
+    def behind(self) -> int:
+        return sum(message.position.x <= 0 for _, _, message in self.messages([VIEWPOINT]))
+
+    def positions(self) -> list[float]:
+        found = [
+            (message.position.x, message.position.y, message.position.z)
+            for _, _, message in self.messages([VIEWPOINT])
+            if message.position.x <= 0
+        ]
+        return sums(found)
+
+    def in_region(self) -> int:
+        found = 0
+        for _, _, message in self.messages([ARM]):
+            place = message.pose.position
+            found += place.z > 1 and -0.5 < place.y < 0.5 and 0.5 < place.x < 1
+        return found
+
+    def grasps(self, half_ns: int) -> int:
+        closings, in_front = [], []
+        for topic, time, message in self.messages([GRIPPER, VIEWPOINT]):
+            if topic == GRIPPER:
+                if message.position == 0.0:
+                    closings.append(time)
+            elif message.position.x >= 0:
+                in_front.append(time)
+        in_front.sort()
+        return sum(
+            bisect_right(in_front, time - half_ns) < bisect_left(in_front, time + half_ns)
+            for time in closings
+        )
+
+    def changes(self) -> int:
+        found, last, was_moving = 0, None, False
+        for _, _, message in self.messages([VIEWPOINT]):
+            here = (message.position, message.orientation)
+            is_moving = last is not None and here != last
+            found += is_moving and not was_moving
+            last, was_moving = here, is_moving
+        return found
+
+    def closed_minutes(self) -> list[int]:
+        closed: list[Window] = []
+        since: int | None = None
+        for _, time, message in self.messages([GRIPPER]):
+            if message.position == 0.0:
+                since = time if since is None else since
+            elif since is not None:
+                closed.append((since, time))
+                since = None
+        return checked(whole_minutes(closed))
+
+    def before_errors(self) -> int:
+        errors = [time for _, time, m in self.messages([ROSOUT]) if m.level == ERROR]
+        windows = windows_before(errors)
+        begins, ends = [begin for begin, _ in windows], [end for _, end in windows]
+        found = 0
+        for time in self.times():
+            place = bisect_right(begins, time) - 1
+            found += place >= 0 and time < ends[place]
+        return found
 
 
 class BagReading(_Bag, _FileReading):

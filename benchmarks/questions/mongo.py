@@ -16,6 +16,7 @@ from benchmarks.questions.base import (
     Asker,
     Reading,
     checked,
+    sums,
     whole_minutes,
     windows_before,
 )
@@ -53,9 +54,7 @@ class MongoAsker(Asker):
 
     def positions(self) -> list[float]:
         found = self._of(VIEWPOINT).find({"position.x": {"$lte": 0}}, {"_id": 0, "position": 1})
-        rows = [tuple(row["position"][axis] for axis in "xyz") for row in found]
-        sums = np.array(rows).reshape(-1, 3).sum(axis=0)
-        return [float(len(rows)), *map(float, sums)]
+        return sums([tuple(row["position"][axis] for axis in "xyz") for row in found])
 
     def in_region(self) -> int:
         return self._of(ARM).count_documents(

@@ -17,6 +17,7 @@ from benchmarks.questions.base import (
     Asker,
     Reading,
     checked,
+    sums,
     whole_minutes,
     windows_before,
 )
@@ -95,15 +96,26 @@ class SqlAsker(Sql, Asker):
     def pose(self) -> str:
         """Expression of a viewpoint as a whole."""
 
-    def closed(self) -> str:
-        """Condition that a command closes the gripper."""
-        return f"{self.field('position')} = 0"
-
     def changes(self) -> int:
-        return self.number(changes(self.name(VIEWPOINT), self.time, self.pose()))
+        read = f"SELECT {self.time} AS t, {self.pose()} AS pose FROM {self.name(VIEWPOINT)}"
+        return self.number(
+            "WITH poses AS (SELECT t, pose, lag(pose) OVER (ORDER BY t) AS last "
+            f"FROM ({read}) AS read), "
+            "steps AS (SELECT t, CASE WHEN last IS NOT NULL AND pose <> last THEN 1 ELSE 0 END "
+            "AS differs FROM poses), "
+            "runs AS (SELECT differs, lag(differs) OVER (ORDER BY t) AS before FROM steps) "
+            "SELECT COUNT(*) FROM runs WHERE differs = 1 AND coalesce(before, 0) = 0"
+        )
 
     def closed_minutes(self) -> list[int]:
-        found = self.rows(closed(self.name(GRIPPER), self.time, self.closed()))
+        closes = f"CASE WHEN {self.field('position')} = 0 THEN 1 ELSE 0 END"
+        found = self.rows(
+            "WITH commands AS (SELECT t, closed, lag(closed) OVER (ORDER BY t) AS before FROM "
+            f"(SELECT {self.time} AS t, {closes} AS closed FROM {self.name(GRIPPER)}) AS read), "
+            "changes AS (SELECT t, closed, lead(t) OVER (ORDER BY t) AS until FROM commands "
+            "WHERE before IS NULL OR closed <> before) "
+            "SELECT t, until FROM changes WHERE closed = 1 AND until IS NOT NULL"
+        )
         return checked(whole_minutes((begin, end) for begin, end in found))
 
     def before_errors(self) -> int:
@@ -147,45 +159,3 @@ class SqlReading(Sql, Reading):
         query = f"SELECT {self.ranges} FROM {self.name(topic)} WHERE {condition}"
         rows = self.rows(query, values)
         return np.array([self.loaded_ranges(row[0]) for row in rows], np.float32)
-
-
-def changes(table: str, time: str, pose: str) -> str:
-    """How many runs of rows there are that each differ from the one before.
-
-    Args:
-        table: Quoted.
-        time: Expression of a row's time.
-        pose: Expression of what must differ.
-    """
-    return (
-        "WITH poses AS (SELECT t, pose, lag(pose) OVER (ORDER BY t) AS last "
-        f"FROM (SELECT {time} AS t, {pose} AS pose FROM {table}) AS read), "
-        "steps AS (SELECT t, CASE WHEN last IS NOT NULL AND pose <> last THEN 1 ELSE 0 END "
-        "AS differs FROM poses), "
-        "runs AS (SELECT differs, lag(differs) OVER (ORDER BY t) AS before FROM steps) "
-        "SELECT COUNT(*) FROM runs WHERE differs = 1 AND coalesce(before, 0) = 0"
-    )
-
-
-def closed(table: str, time: str, is_closed: str) -> str:
-    """Begin and end of each time for which something is closed.
-
-    Args:
-        table: Quoted.
-        time: Expression of a row's time.
-        is_closed: Expression of whether a row closes it, or leaves it closed.
-    """
-    return (
-        "WITH commands AS (SELECT t, closed, lag(closed) OVER (ORDER BY t) AS before "
-        f"FROM (SELECT {time} AS t, CASE WHEN {is_closed} THEN 1 ELSE 0 END AS closed "
-        f"FROM {table}) AS read), "
-        "changes AS (SELECT t, closed, lead(t) OVER (ORDER BY t) AS until FROM commands "
-        "WHERE before IS NULL OR closed <> before) "
-        "SELECT t, until FROM changes WHERE closed = 1 AND until IS NOT NULL"
-    )
-
-
-def sums(rows: Sequence[tuple[Any, ...]]) -> list[float]:
-    """Number of rows, and the sum of each of three columns."""
-    columns = np.array(rows, np.float64).reshape(-1, 3).sum(axis=0)
-    return [float(len(rows)), *map(float, columns)]

@@ -7,9 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.simulator.plan import Floats, FloorPlan
-from hybridlog_storage.errors import UsageError
 
-MAX_DURATION_S = 7 * 86_400.0
 MOTOR_WARN, MOTOR_ERROR = 70.0, 80.0
 """Motor temperatures in degrees Celsius that cause a warning and an error."""
 
@@ -88,11 +86,6 @@ class Robot:
     """
 
     def __init__(self, duration_s: float, seed: int) -> None:
-        if not 0 < duration_s <= MAX_DURATION_S:
-            limits = f"above 0 s and up to {MAX_DURATION_S:.0f} s"
-            raise UsageError(f"a robot cannot drive for {duration_s} s; choose {limits}")
-        if seed < 0:
-            raise UsageError(f"seed is {seed}; it must not be negative")
         self.duration_s, self.seed = float(duration_s), seed
         self.plan = FloorPlan(seed)
         # A day for each seed, so that recordings do not overlap.

@@ -10,7 +10,7 @@ from benchmarks.loads.robot import robot_load
 from benchmarks.samples import Sample, Scale
 from benchmarks.studies.record import BACKENDS, short
 from benchmarks.studies.runs import Context, chosen
-from benchmarks.studies.search import Bounds, Search, Trial, take_turns
+from benchmarks.studies.search import Bounds, Search, take_turns
 
 if TYPE_CHECKING:
     from benchmarks.loads.base import Load
@@ -42,14 +42,14 @@ def run(context: Context, repetition: int) -> None:
     seconds, bounds = SETTINGS[context.scale]
 
     def search(name: str) -> Search:
-        def trial(speed: float) -> Trial:
+        def trial(speed: float) -> Sample:
             case = {"seconds": seconds, "speed": short(speed)}
             load = partial(make_load, context, seconds)
-            return Trial(Sample(STUDY, case, name, repetition), load, speed)
+            return context.run(Sample(STUDY, case, name, repetition), load, speed=speed)
 
         return Search(bounds, trial)
 
-    take_turns(context, [search(name) for name in chosen(context.backends, BACKENDS)])
+    take_turns([search(name) for name in chosen(context.backends, BACKENDS)])
 
 
 def make_load(context: Context, seconds: int) -> Load:

@@ -9,10 +9,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from benchmarks.loads.hcr_like import hcr_like
-from benchmarks.loads.truth import Truth
+from benchmarks.loads.hcr_like import hcr_like, true_answers
 from benchmarks.questions.askers import ASKERS
-from benchmarks.questions.base import QUESTIONS, true_answers
+from benchmarks.questions.base import QUESTIONS
 from benchmarks.questions.run import judged, turns
 from benchmarks.samples import Sample, Scale
 from benchmarks.studies.runs import Context
@@ -52,7 +51,7 @@ def run(context: Context) -> None:
         {**about, "seed": seed},
         lambda place: hcr_like(place, seed=seed, sessions=sessions, minutes=minutes),
     )
-    truth = true_answers(Truth.open(load.payloads.parent))
+    truth = true_answers(load)
     for name, outcome, results in turns(context, "ask", ASKERS, load, repetitions):
         for question in QUESTIONS:
             case = {"question": question, **about}

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from benchmarks.loads import streams
 from benchmarks.samples import Sample, Scale
 from benchmarks.studies.runs import Context, chosen
-from benchmarks.studies.search import Bounds, Search, Trial, take_turns
+from benchmarks.studies.search import Bounds, Search, take_turns
 
 if TYPE_CHECKING:
     from benchmarks.loads.base import Load
@@ -62,17 +62,17 @@ def run(context: Context, size: int, repetition: int) -> None:
         repetition: Which of the searches.
     """
     names = chosen(context.backends, BACKENDS)
-    take_turns(context, [_search(context, name, size, repetition) for name in names])
+    take_turns([_search(context, name, size, repetition) for name in names])
 
 
 def _search(context: Context, name: str, size: int, repetition: int) -> Search:
     settings = SETTINGS[context.scale]
 
-    def trial(rate: float) -> Trial:
+    def trial(rate: float) -> Sample:
         messages = max(math.ceil(rate * settings.seconds), settings.messages)
         case = {"size": size, "rate": short(rate), "topics": TOPICS, "messages": messages}
         load = partial(make_stream, context, size=size, rate=rate, messages=messages)
-        return Trial(Sample(STUDY, case, name, repetition), load)
+        return context.run(Sample(STUDY, case, name, repetition), load)
 
     return Search(settings.bounds, trial)
 

@@ -10,13 +10,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from benchmarks.samples import Sample
-
-if TYPE_CHECKING:
-    from benchmarks.loads.base import Load
-    from benchmarks.studies.runs import Context
 
 Verdict = Literal["kept", "lost", "late"]
 """`late`: the publisher could not keep its own schedule, so the load was not offered."""
@@ -43,32 +39,17 @@ class Bounds:
 
 
 @dataclass(frozen=True, slots=True)
-class Trial:
-    """One run of a search.
-
-    Attributes:
-        sample: Study, case, backend and repetition.
-        load: Gives what is published; called only when it is needed.
-        speed: Times as fast as the load says.
-    """
-
-    sample: Sample
-    load: Callable[[], Load]
-    speed: float = 1.0
-
-
-@dataclass(frozen=True, slots=True)
 class Search:
     """One search of one backend.
 
     Attributes:
         bounds: Where it looks.
-        trial: Gives the trial at a rate.
+        trial: Does the trial at a rate.
         kept: Of the rates that were tried, whether all was kept.
     """
 
     bounds: Bounds
-    trial: Callable[[float], Trial]
+    trial: Callable[[float], Sample]
     kept: dict[float, bool] = field(default_factory=dict)
 
 
@@ -120,20 +101,19 @@ def next_rate(kept: Mapping[float, bool], bounds: Bounds) -> float | None:
     return (best + lost) / 2 if is_wide else None
 
 
-def take_turns(context: Context, searches: Iterable[Search]) -> None:
+def take_turns(searches: Iterable[Search]) -> None:
     """Do searches, which take turns."""
     waiting = list(searches)
     while waiting:
-        waiting = [search for search in waiting if _try(context, search)]
+        waiting = [search for search in waiting if _try(search)]
 
 
-def _try(context: Context, search: Search) -> bool:
+def _try(search: Search) -> bool:
     """Do the next trial of a search; returns whether there was one."""
     rate = next_rate(search.kept, search.bounds)
     if rate is None:
         return False
-    trial = search.trial(rate)
-    found = context.run(trial.sample, trial.load, speed=trial.speed)
+    found = search.trial(rate)
     search.kept[rate] = verdict(found) == "kept"
     return found.status != "missing"
 

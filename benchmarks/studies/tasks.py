@@ -26,6 +26,8 @@ from benchmarks.samples import Sample, Scale
 from benchmarks.side import SideError, Values, run_side
 from benchmarks.studies.runs import Context, run_directory
 from benchmarks.usage import disk_bytes
+from hybridlog_storage.messages import Channel, Schema
+from tests.independent import write_mcap
 
 if TYPE_CHECKING:
     from hybridlog.store import Store
@@ -267,22 +269,14 @@ def _record_day(store: Store, logs: Path, day: int) -> None:
 
 def _write_day(path: Path, day: int) -> Path:
     """A log of one day."""
-    from mcap.writer import Writer
-
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start(profile="ros1")
-        kind = writer.register_schema(
-            "geometry_msgs/Vector3", "ros1msg", b"float64 x\nfloat64 y\nfloat64 z\n"
-        )
-        topics = ("/pose", "/imu", "/tf", "/joint_states")
-        channels = [writer.register_channel(topic, "ros1", kind) for topic in topics]
-        for number in range(_MANY_MESSAGES):
-            log_time = robot.START_NS + day * _DAY_NS + number * 10**7
-            payload = struct.pack("<3d", number, day, number * 0.01)
-            writer.add_message(channels[number % len(channels)], log_time, payload, log_time)
-        writer.finish()  # type: ignore[no-untyped-call]
-    return path
+    kind = Schema("geometry_msgs/Vector3", "ros1msg", b"float64 x\nfloat64 y\nfloat64 z\n")
+    channels = [Channel(t, "ros1", kind) for t in ("/pose", "/imu", "/tf", "/joint_states")]
+    begin = robot.START_NS + day * _DAY_NS
+    said = [
+        (channels[n % 4], begin + n * 10**7, struct.pack("<3d", n, day, n * 0.01))
+        for n in range(_MANY_MESSAGES)
+    ]
+    return write_mcap(path, said)
 
 
 def page_side(*, store: str, times: int, seed: int, **_: Any) -> Values:
