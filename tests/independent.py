@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import io
 import sqlite3
+from collections.abc import Iterable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+from hybridlog_storage.messages import Channel, Schema
 
 
 class Seen(NamedTuple):
@@ -53,3 +56,35 @@ def read_sqlite(path: Path) -> list[Seen]:
     finally:
         connection.close()
     return [Seen(topic, time, bytes(data)) for topic, time, data in rows]
+
+
+def write_mcap(
+    path: Path, said: Iterable[tuple[Any, ...]], silent: Iterable[Channel] = (), **options: Any
+) -> Path:
+    """An MCAP file of messages: channel, log time and payload of each, and its publish time.
+
+    Channels that may be silent come first.
+    """
+    from mcap.writer import Writer
+
+    with path.open("wb") as file:
+        writer = Writer(file, **options)
+        writer.start()
+        schemas: dict[Schema | None, int] = {None: 0}
+        ids: dict[Channel, int] = {}
+
+        def id_of(channel: Channel) -> int:
+            kind = channel.schema
+            if kind is not None and kind not in schemas:
+                schemas[kind] = writer.register_schema(kind.name, kind.encoding, kind.data)
+            if channel not in ids:
+                about = (channel.topic, channel.message_encoding, schemas[kind])
+                ids[channel] = writer.register_channel(*about, dict(channel.metadata))
+            return ids[channel]
+
+        for channel in silent:
+            id_of(channel)
+        for channel, time, payload, *publish in said:
+            writer.add_message(id_of(channel), time, payload, *(publish or [time]))
+        writer.finish()
+    return path

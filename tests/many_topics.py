@@ -5,11 +5,12 @@ from __future__ import annotations
 import struct
 from pathlib import Path
 
-from mcap.writer import Writer
-
 import hybridlog as hl
+from hybridlog_storage.messages import Channel, Schema
+from tests.independent import write_mcap
 
 BASE = 1_600_000_000 * 10**9
+FLOAT = Schema("std_msgs/Float32", "ros1msg", b"float32 data\n")
 
 
 def topic(number: int, prefix: str = "/robot") -> str:
@@ -21,22 +22,13 @@ def write_log(
     path: Path, topics: int, messages: int = 5, *, start: int = BASE, prefix: str = "/robot"
 ) -> Path:
     """Write a log of Float32 topics; message `m` of topic `t` says `m + t / 65536`."""
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start(profile="ros1", library="test")
-        schema = writer.register_schema("std_msgs/Float32", "ros1msg", b"float32 data\n")
-        channels = [
-            writer.register_channel(topic(number, prefix), "ros1", schema)
-            for number in range(topics)
-        ]
-        time = start
-        for message in range(messages):
-            for number, channel in enumerate(channels):
-                data = struct.pack("<f", message + number / 65536)
-                writer.add_message(channel, time, data, time)
-                time += 10**5
-        writer.finish()
-    return path
+    channels = [Channel(topic(number, prefix), "ros1", FLOAT) for number in range(topics)]
+    values = [m + n / 65536 for m in range(messages) for n in range(topics)]
+    said = [
+        (channels[at % topics], start + at * 10**5, struct.pack("<f", value))
+        for at, value in enumerate(values)
+    ]
+    return write_mcap(path, said)
 
 
 def mongod_of(store: hl.Store) -> Path:

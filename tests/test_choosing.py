@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyarrow.parquet as parquet
 import pytest
-from mcap.writer import Writer
 
 import hybridlog as hl
 from hybridlog.live import LiveOptions
@@ -23,9 +22,10 @@ from hybridlog_storage.errors import (
     UsageError,
     WhereError,
 )
-from hybridlog_storage.messages import Channel
+from hybridlog_storage.messages import Channel, Schema
 from tests.cli.running import run
 from tests.cli.within import Answer, answer
+from tests.independent import write_mcap
 from tests.test_snapshot import summary
 
 DAY = 86_400 * 10**9
@@ -52,16 +52,13 @@ NAMES = ["monday 1", "monday 2", "tuesday", "run[1]", "run1"]
 
 
 def write(path: Path, day: int, topics: dict[str, tuple[str, list[int]]]) -> None:
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        for topic, (kind, values) in topics.items():
-            schema = writer.register_schema(kind, "jsonschema", b'{"type": "object"}')
-            channel = writer.register_channel(topic, "json", schema)
-            for number, n in enumerate(values):
-                time = START + day * DAY + number * 10**9
-                writer.add_message(channel, time, json.dumps({"n": n, "robot": "x"}).encode(), time)
-        writer.finish()
+    said = []
+    for topic, (kind, values) in topics.items():
+        channel = Channel(topic, "json", Schema(kind, "jsonschema", b'{"type": "object"}'))
+        for number, n in enumerate(values):
+            time = START + day * DAY + number * 10**9
+            said.append((channel, time, json.dumps({"n": n, "robot": "x"}).encode()))
+    write_mcap(path, said)
 
 
 @pytest.fixture(scope="module")

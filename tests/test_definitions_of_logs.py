@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from mcap.writer import Writer
 from rosbags.rosbag1 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 import hybridlog as hl
-from hybridlog_storage.messages import SUPPLIED
+from hybridlog_storage.messages import SUPPLIED, Channel, Schema
 from tests.cli.running import run
 from tests.every_output import compare_every_output
+from tests.independent import write_mcap
 from tests.ros_values import ROS1, ROS2, message_of, plain_of
 
 CASES = Path(__file__).parent / "cases"
@@ -63,18 +63,14 @@ def write_db3(path: Path) -> None:
     db.close()
 
 
-def write_mcap(path: Path) -> None:
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start()
-        for topic, encoding, name, kind, data in IN_MCAP:
-            spelled = name.replace("/msg/", "/") if encoding == "ros1" else name
-            schema = writer.register_schema(spelled, kind, data)
-            channel = writer.register_channel(topic, encoding, schema)
-            pairs = messages(*types_of(encoding, name))
-            for at, (_, payload) in enumerate(pairs):
-                writer.add_message(channel, START + at, payload, START + at)
-        writer.finish()
+def write_logs_mcap(path: Path) -> None:
+    said = []
+    for topic, encoding, name, kind, data in IN_MCAP:
+        spelled = name.replace("/msg/", "/") if encoding == "ros1" else name
+        channel = Channel(topic, encoding, Schema(spelled, kind, data))
+        pairs = messages(*types_of(encoding, name))
+        said += [(channel, START + at, payload) for at, (_, payload) in enumerate(pairs)]
+    write_mcap(path, said)
 
 
 def types_of(encoding: str, name: str) -> tuple[Typestore, str, str]:
@@ -87,7 +83,7 @@ def types_of(encoding: str, name: str) -> tuple[Typestore, str, str]:
 def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
     folder = tmp_path_factory.mktemp("definitions")
     write_db3(folder / "old.db3")
-    write_mcap(folder / "bare.mcap")
+    write_logs_mcap(folder / "bare.mcap")
     with hl.open(folder / "store", create=True) as opened:
         for path in (folder / "old.db3", folder / "bare.mcap"):
             opened.record(path)
@@ -186,16 +182,11 @@ def test_exports_have_the_nested_definitions(tmp_path: Path, encoding: str, form
     text = f"# incomplete\nHeader header\ngeometry_msgs/Pose pose\n{nested}"
     if encoding == "cdr":
         text = text.replace("Header header", "std_msgs/Header header")
-    with (tmp_path / "some.mcap").open("wb") as stream:
-        writer = Writer(stream)
-        writer.start("ros2" if encoding == "cdr" else "ros1")
-        kind = "ros2msg" if encoding == "cdr" else "ros1msg"
-        spelled = name if encoding == "cdr" else name.replace("/msg/", "/")
-        schema = writer.register_schema(spelled, kind, text.encode())
-        channel = writer.register_channel("/pose", encoding, schema)
-        for at, (_, payload) in enumerate(sent):
-            writer.add_message(channel, START + at, payload, START + at)
-        writer.finish()
+    kind = "ros2msg" if encoding == "cdr" else "ros1msg"
+    spelled = name if encoding == "cdr" else name.replace("/msg/", "/")
+    channel = Channel("/pose", encoding, Schema(spelled, kind, text.encode()))
+    said = [(channel, START + at, payload) for at, (_, payload) in enumerate(sent)]
+    write_mcap(tmp_path / "some.mcap", said)
     out = tmp_path / form
     run("record", tmp_path / "some.mcap", "-q", store=tmp_path / "store")
     if form.startswith("export"):

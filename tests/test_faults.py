@@ -21,13 +21,13 @@ from zlib import crc32
 import pymongo
 import pytest
 from mcap.opcode import Opcode
-from mcap.writer import Writer
 
 import hybridlog as hl
 from benchmarks.simulator.topics import RobotConfig
 from benchmarks.simulator.write import write_bag
 from hybridlog_storage.catalog import CATALOG, RecordingEntry
 from hybridlog_storage.errors import DatabaseError, IndexChangedError, SegmentError, StoreError
+from hybridlog_storage.messages import Channel
 from hybridlog_storage.mongo.database import Database
 from hybridlog_storage.mongo.index_state import RECORDINGS, STORE
 from hybridlog_storage.mongo.mongod import EmbeddedMongod
@@ -249,13 +249,8 @@ def test_each_message_that_is_missing_in_the_index_is_counted(
 ) -> None:
     """Those of chunks that were sent in vain, and those of chunks that were not sent then."""
     log = tmp_path / "a.mcap"
-    with log.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start()
-        number = writer.register_channel("/a", "json", 0)
-        for at in range(8000):
-            writer.add_message(number, at, b'{"x": "%0100d"}' % at, at)
-        writer.finish()
+    channel = Channel("/a", "json", None)
+    independent.write_mcap(log, [(channel, at, b'{"x": "%0100d"}' % at) for at in range(8000)])
 
     def refused(*_: object, **__: object) -> int:
         raise DatabaseError("MongoDB refuses it.")

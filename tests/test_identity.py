@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mcap.writer import Writer
 
 import hybridlog as hl
 from hybridlog.columns.folders import files_of
@@ -44,6 +43,7 @@ from tests.cli.within import answer
 from tests.copies import bring
 from tests.damage import flip
 from tests.faults import logs
+from tests.independent import write_mcap
 from tests.limits import Limit
 from tests.running.running import NO_MONGODB as NOWHERE
 from tests.waiting import wait_for
@@ -59,15 +59,9 @@ def payload(n: int) -> bytes:
 
 
 def make_log(path: Path, first: int = 0) -> Path:
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        schema = writer.register_schema("n", "jsonschema", b"{}")
-        channel = writer.register_channel("/n", "json", schema)
-        for n in range(first, first + COUNT):
-            writer.add_message(channel, n * SECOND, payload(n), n * SECOND)
-        writer.finish()
-    return path
+    channel = Channel("/n", "json", None)
+    said = [(channel, n * SECOND, payload(n)) for n in range(first, first + COUNT)]
+    return write_mcap(path, said)
 
 
 @pytest.fixture

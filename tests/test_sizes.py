@@ -9,16 +9,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from mcap.writer import Writer
 
 import hybridlog as hl
 from hybridlog.query.topics import matcher
 from hybridlog_storage.catalog import Catalog
+from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.mongo.database import CollectionStats, Database
 from tests import places
 from tests.calls import Calls
 from tests.cli.running import run
-from tests.many_topics import BASE
+from tests.independent import write_mcap
+from tests.many_topics import BASE, FLOAT
 
 pytestmark = pytest.mark.mongo("embedded")
 
@@ -28,24 +29,14 @@ LARGE = 20_000
 
 def write(path: Path, small: int, large: int) -> Path:
     """A log of the topics `/a` and `/b`, each with `small` messages, and `/large`."""
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start(profile="ros1", library="test")
-        number = writer.register_schema("std_msgs/Float32", "ros1msg", b"float32 data\n")
-        text = writer.register_schema("std_msgs/String", "ros1msg", b"string data\n")
-        channels = [writer.register_channel(name, "ros1", number) for name in ("/a", "/b")]
-        of_large = writer.register_channel("/large", "ros1", text)
-        time = BASE
-        for count in range(small):
-            for channel in channels:
-                time += 1000
-                writer.add_message(channel, time, struct.pack("<f", count), time)
-        for count in range(large):
-            time += 1000
-            data = struct.pack("<I", LARGE) + bytes((count * i) % 251 for i in range(LARGE))
-            writer.add_message(of_large, time, data, time)
-        writer.finish()
-    return path
+    channels = [Channel(name, "ros1", FLOAT) for name in ("/a", "/b")]
+    of_large = Channel("/large", "ros1", Schema("std_msgs/String", "ros1msg", b"string data\n"))
+    said = [(channel, struct.pack("<f", count)) for count in range(small) for channel in channels]
+    for count in range(large):
+        data = struct.pack("<I", LARGE) + bytes((count * i) % 251 for i in range(LARGE))
+        said.append((of_large, data))
+    rows = [(one, BASE + 1000 * n, data) for n, (one, data) in enumerate(said, 1)]
+    return write_mcap(path, rows, [*channels, of_large])
 
 
 @pytest.fixture(scope="module")

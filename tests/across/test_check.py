@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.writer import Writer
 
 import hybridlog as hl
 from hybridlog.query.answers.statistics import TopicCheck
+from hybridlog_storage.messages import Channel
 from tests import independent
 from tests.cli.within import answer as run
 from tests.data import DATA, needs_data
@@ -26,16 +26,10 @@ MORE = ("auv_ros2_db3", "leg_tracker_positive_7.bag", "robot_localization_test1.
 
 def write_mcap(path: Path, messages: dict[str, list[int]], payload: bytes = b"{}") -> Path:
     """JSON messages at some log times, by topic, all topics in one file in order of time."""
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        schema = writer.register_schema("Any", "jsonschema", b'{"type":"object"}')
-        ids = {name: writer.register_channel(name, "json", schema) for name in messages}
-        ordered = sorted((time, name) for name, times in messages.items() for time in times)
-        for time, name in ordered:
-            writer.add_message(ids[name], time, payload, time)
-        writer.finish()
-    return path
+    channels = {name: Channel(name, "json", None) for name in messages}
+    sent = sorted((time, name) for name, times in messages.items() for time in times)
+    said = [(channels[name], time, payload) for time, name in sent]
+    return independent.write_mcap(path, said, channels.values())
 
 
 def recorded(log: Path, folder: Path) -> hl.Store:

@@ -5,7 +5,10 @@ from __future__ import annotations
 import struct
 from pathlib import Path
 
-from mcap.writer import CompressionType, Writer
+from mcap.writer import CompressionType
+
+from hybridlog_storage.messages import Channel, Schema
+from tests.independent import write_mcap
 
 START = 10**18
 STEP = 10**8
@@ -28,36 +31,29 @@ def claims_4_gb() -> bytes:
 
 def write(path: Path) -> None:
     """Three messages a topic and type, all in order of log time."""
-    with path.open("wb") as file:
-        writer = Writer(file, compression=CompressionType.NONE)
-        writer.start(profile="ros2")
 
-        def define(name: str, definition: str) -> int:
-            return writer.register_schema(name, "ros2msg", definition.encode())
+    def define(name: str, definition: str) -> Schema:
+        return Schema(name, "ros2msg", definition.encode())
 
-        string = define("std_msgs/msg/String", "string data\n")
-        integer = define("std_msgs/msg/Int32", "int32 data\n")
-        code = define("x/msg/Code", 'int32 __import__("os").system("true")\n')
-        recursive = define("x/msg/Recursive", "x/Recursive child\n")
-        long = define("x/msg/Long", "uint8[] data\n")
-        parts = [
-            ("/a/b", string, "cdr", text("one")),
-            ("/a__b", string, "cdr", text("two")),
-            ("a/b", string, "cdr", text("three")),
-            ("/code", code, "cdr", number(1)),
-            ("/recursive", recursive, "cdr", number(1)),
-            ("/long", long, "cdr", claims_4_gb()),
-            ("/no_definition", 0, "cdr", b"abc"),
-            ("/json", 0, "json", b'{"a": 1, "b": [1, 2]}'),
-            ("/cbor", 0, "cbor", b"\xa0"),
-            ("/change", string, "cdr", text("x")),
-            ("/change", integer, "cdr", number(7)),
-            (HOSTILE_NAME, string, "cdr", text("\x1b[2Jboo")),
-        ]
-        time = START
-        for topic, schema, encoding, payload in parts:
-            channel = writer.register_channel(topic, encoding, schema)
-            for _ in range(PER_TOPIC):
-                writer.add_message(channel, time, payload, time)
-                time += STEP
-        writer.finish()
+    string = define("std_msgs/msg/String", "string data\n")
+    integer = define("std_msgs/msg/Int32", "int32 data\n")
+    code = define("x/msg/Code", 'int32 __import__("os").system("true")\n')
+    recursive = define("x/msg/Recursive", "x/Recursive child\n")
+    long = define("x/msg/Long", "uint8[] data\n")
+    parts = [
+        (Channel("/a/b", "cdr", string), text("one")),
+        (Channel("/a__b", "cdr", string), text("two")),
+        (Channel("a/b", "cdr", string), text("three")),
+        (Channel("/code", "cdr", code), number(1)),
+        (Channel("/recursive", "cdr", recursive), number(1)),
+        (Channel("/long", "cdr", long), claims_4_gb()),
+        (Channel("/no_definition", "cdr", None), b"abc"),
+        (Channel("/json", "json", None), b'{"a": 1, "b": [1, 2]}'),
+        (Channel("/cbor", "cbor", None), b"\xa0"),
+        (Channel("/change", "cdr", string), text("x")),
+        (Channel("/change", "cdr", integer), number(7)),
+        (Channel(HOSTILE_NAME, "cdr", string), text("\x1b[2Jboo")),
+    ]
+    said = [part for part in parts for _ in range(PER_TOPIC)]
+    rows = [(channel, START + n * STEP, data) for n, (channel, data) in enumerate(said)]
+    write_mcap(path, rows, compression=CompressionType.NONE)

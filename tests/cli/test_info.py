@@ -8,15 +8,12 @@ import struct
 from pathlib import Path
 from shlex import quote
 
-from mcap.writer import Writer
-
 import hybridlog as hl
-from hybridlog.cli.info import channel_note
 from hybridlog.cli.output import quoted
 from hybridlog.wording import parse_size
-from hybridlog_storage.messages import REDUCED, Channel, Schema
+from hybridlog_storage.messages import Channel, Schema
 from tests import places
-from tests.independent import read_bag
+from tests.independent import read_bag, write_mcap
 
 from .odd_log import HOSTILE_NAME
 from .running import run
@@ -154,14 +151,9 @@ def test_schema_of_json_has_the_fields_that_messages_have(store: Path, tmp_path:
         {"wind": {"speed": 0.5}, "gusts": [], "ok": True},
         [1, 2],
     ]
-    with (tmp_path / "weather.mcap").open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        channel = writer.register_channel("/weather", "json", 0)
-        for time, message in enumerate(messages):
-            writer.add_message(channel, time, json.dumps(message).encode(), time)
-        writer.add_message(channel, 9, b"{", 9)
-        writer.finish()  # type: ignore[no-untyped-call]
+    channel = Channel("/weather", "json", None)
+    said = [(channel, time, json.dumps(message).encode()) for time, message in enumerate(messages)]
+    write_mcap(tmp_path / "weather.mcap", [*said, (channel, 9, b"{")])
     run("record", tmp_path / "weather.mcap", store=tmp_path / "s")
     (found,) = run("info", "-t", "weather", "--json", store=tmp_path / "s").json
     fields = {f["path"]: (f["type"], f["array"]) for f in found["fields"]}
@@ -192,19 +184,6 @@ def test_control_characters_are_shown_not_obeyed(store: Path) -> None:
     found = run("info", "odd", "--json", store=store)
     assert HOSTILE_NAME in {c["topic"] for c in found.json[0]["channels"]}
     assert "\x1b" not in found.out
-
-
-def test_notes_of_a_channel() -> None:
-    lacks = ("not_indexed", "unreadable", "surplus", "skew_ns", "unset_stamps", "video")
-
-    def notes(encoding: str, **metadata: str) -> str:
-        about = {"topic": "/a", "message_encoding": encoding, "metadata": metadata, "messages": 1}
-        return channel_note({**dict.fromkeys(lacks), **about})
-
-    assert notes("cdr", offered_qos_profiles="- durability: 1\n  depth: 1") == "latched"
-    assert notes("cdr", offered_qos_profiles="- durability: 2") == ""
-    assert notes("ros1", latching="1") == "latched"
-    assert notes(REDUCED) == "fields only"
 
 
 def test_sizes_and_names_as_they_are_typed() -> None:

@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from mcap.writer import Writer
 
 import hybridlog as hl
 from hybridlog.cli import record_live
@@ -30,11 +29,12 @@ from hybridlog.live.sources.base import Sink
 from hybridlog.live.state import RecorderState
 from hybridlog.live.statistics import TopicState
 from hybridlog_storage.errors import UsageError
+from hybridlog_storage.messages import Channel, Schema
 from tests import places
 from tests.cli import odd_log
 from tests.cli.running import BACKGROUND, COMMAND, complete, environment, run
 from tests.cli.within import answer
-from tests.independent import read
+from tests.independent import read, write_mcap
 from tests.limits import Limit
 from tests.live.speaker import Speaker, text, text_channel
 from tests.waiting import wait_for
@@ -245,23 +245,15 @@ def test_what_is_thinned_out_is_told(logs: Path, tmp_path: Path) -> None:
 
 def test_a_simulation_is_recorded_by_its_clock(tmp_path: Path) -> None:
     second = 10**9
-    with (tmp_path / "simulation.mcap").open("wb") as file:
-        writer = Writer(file)
-        writer.start(profile="ros2")
-        kinds = [
-            ("/words", "std_msgs/msg/String", b"string data\n"),
-            ("/clock", "rosgraph_msgs/msg/Clock", CLOCK),
-        ]
-        words, clock = (
-            writer.register_channel(topic, "cdr", writer.register_schema(kind, "ros2msg", text))
-            for topic, kind, text in kinds
-        )
-        for at in range(6):
-            log_time = 10**18 + at * second
-            writer.add_message(words, log_time, odd_log.text(f"{at}"), log_time)
-            payload = b"\0\1\0\0" + struct.pack("<iI", at // 2, 5)
-            writer.add_message(clock, log_time + second // 2, payload, log_time)
-        writer.finish()
+    words = Channel("/words", "cdr", Schema("std_msgs/msg/String", "ros2msg", b"string data\n"))
+    clock = Channel("/clock", "cdr", Schema("rosgraph_msgs/msg/Clock", "ros2msg", CLOCK))
+    said: list[tuple[Channel, int, bytes]] = []
+    for at in range(6):
+        log_time = 10**18 + at * second
+        said.append((words, log_time, odd_log.text(f"{at}")))
+        payload = b"\0\1\0\0" + struct.pack("<iI", at // 2, 5)
+        said.append((clock, log_time + second // 2, payload))
+    write_mcap(tmp_path / "simulation.mcap", said)
     store = tmp_path / "store"
     arguments = ("--speed", 50, "--reserve", 0, "--use-sim-time", "-t", "/words")
     done = run("record", "--replay", tmp_path / "simulation.mcap", *arguments, store=store)

@@ -11,12 +11,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.writer import Writer
 from numpy.typing import NDArray
 from PIL import Image
 
 import hybridlog as hl
+from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests.independent import write_mcap
 from tests.odd_messages import write_odd
 
 MS = 10**6
@@ -102,21 +103,17 @@ FILES = [encoded(SEEN[0], "JPEG"), encoded(SEEN[1], "WEBP"), encoded(SEEN[2], "J
 
 def write_looks(path: Path) -> None:
     """Raw images, the second of which is too short; compressed ones, two at the same time."""
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start("ros1")
-        raw = writer.register_schema("sensor_msgs/Image", "ros1msg", IMAGE)
-        packed = writer.register_schema("sensor_msgs/CompressedImage", "ros1msg", COMPRESSED)
-        front = writer.register_channel("/front", "ros1", raw)
-        rear = writer.register_channel("/rear/compressed", "ros1", packed)
-        broken = writer.register_channel("/broken", "ros1", packed)
-        for n, pixels in enumerate(SEEN):
-            payload = image(pixels, "rgb8" if n != 1 else "rgb16")
-            writer.add_message(front, BASE + n * MS, payload, BASE + n)
-        for n, data in enumerate(FILES):
-            writer.add_message(rear, BASE + n // 2, compressed(data), 0)
-            writer.add_message(broken, BASE + n, compressed(b"no picture", "h265"), 0)
-        writer.finish()
+    front = Channel("/front", "ros1", Schema("sensor_msgs/Image", "ros1msg", IMAGE))
+    packed = Schema("sensor_msgs/CompressedImage", "ros1msg", COMPRESSED)
+    rear, broken = (Channel(name, "ros1", packed) for name in ("/rear/compressed", "/broken"))
+    said: list[tuple[Channel, int, bytes, int]] = []
+    for n, pixels in enumerate(SEEN):
+        payload = image(pixels, "rgb8" if n != 1 else "rgb16")
+        said.append((front, BASE + n * MS, payload, BASE + n))
+    for n, data in enumerate(FILES):
+        said.append((rear, BASE + n // 2, compressed(data), 0))
+        said.append((broken, BASE + n, compressed(b"no picture", "h265"), 0))
+    write_mcap(path, said)
 
 
 @pytest.fixture(scope="session")
@@ -143,20 +140,16 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Drive]:
             [rng.normal(size=n % 4).tolist() for n in range(count)],
             rng.normal(size=(count, 40)).astype(np.float32),
         )
-        with (path / "drive.mcap").open("wb") as file:
-            writer = Writer(file)
-            writer.start("ros1")
-            schema = writer.register_schema("demo/Drive", "ros1msg", DRIVE)
-            any_json = writer.register_schema("Any", "jsonschema", b"{}")
-            channel = writer.register_channel("/drive", "ros1", schema)
-            loose = writer.register_channel("/loose", "json", any_json)
-            for n, time in enumerate(made.times.tolist()):
-                writer.add_message(channel, time, payload(made, n), time)
-                if n % 50 == 0:
-                    said = {"v": n if n % 100 else "no", "w": n / 2, "on": n % 100 > 0 or -5}
-                    said = said if n % 150 else {"name": "a"}
-                    writer.add_message(loose, time, json.dumps(said).encode(), time)
-            writer.finish()
+        channel = Channel("/drive", "ros1", Schema("demo/Drive", "ros1msg", DRIVE))
+        loose = Channel("/loose", "json", Schema("Any", "jsonschema", b"{}"))
+        sent: list[tuple[Channel, int, bytes]] = []
+        for n, time in enumerate(made.times.tolist()):
+            sent.append((channel, time, payload(made, n)))
+            if n % 50 == 0:
+                said = {"v": n if n % 100 else "no", "w": n / 2, "on": n % 100 > 0 or -5}
+                said = said if n % 150 else {"name": "a"}
+                sent.append((loose, time, json.dumps(said).encode()))
+        write_mcap(path / "drive.mcap", sent)
         store.record(path / "drive.mcap", settings=SegmentSettings(chunk_size=1 << 16))
         write_looks(path / "looks.mcap")
         store.record(path / "looks.mcap")

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mcap.writer import Writer
 from numpy.typing import NDArray
 
 import hybridlog as hl
@@ -24,6 +23,7 @@ from hybridlog_storage.segments.segment_reader import SegmentReader
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
 from tests.calls import Calls
+from tests.independent import write_mcap
 from tests.waiting import wait_for
 
 from .conftest import BASE, MS
@@ -57,15 +57,9 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
         for topic, times in TIMES.items()
         for t in times
     )
-    with (folder / "a.mcap").open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        schema = writer.register_schema("Any", "jsonschema", b"{}")
-        channels = {topic: writer.register_channel(topic, "json", schema) for topic in TIMES}
-        for _, t, topic in sent:
-            text = "x" * (3000 if topic == "/large" else 20)
-            writer.add_message(channels[topic], t, f'"{text}"'.encode(), t)
-        writer.finish()
+    channels = {topic: Channel(topic, "json", None) for topic in TIMES}
+    texts = {topic: b'"%s"' % (b"x" * (3000 if topic == "/large" else 20)) for topic in TIMES}
+    write_mcap(folder / "a.mcap", [(channels[topic], t, texts[topic]) for _, t, topic in sent])
     with hl.open(folder / "store", create=True) as opened:
         opened.record(folder / "a.mcap", settings=SETTINGS)
         assert opened.entry("a").segments > 2

@@ -8,10 +8,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from mcap.writer import Writer
-
 import hybridlog as hl
+from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests.independent import write_mcap
 
 HEADER = (
     "std_msgs/Header header\nint32 n\n"
@@ -20,6 +20,12 @@ HEADER = (
 )
 BEGIN_NS = 1_700_000_000_000_000_000
 STEP_NS = 10_000_000
+CHANNELS = {
+    "/number": Channel("/number", "ros1", Schema("a/Number", "ros1msg", b"int32 n\nfloat64 x\n")),
+    "/stamped": Channel("/stamped", "ros1", Schema("a/Stamped", "ros1msg", HEADER.encode())),
+    "/text": Channel("/text", "json", Schema("a/Text", "jsonschema", b'{"type":"object"}')),
+    "/scan": Channel("/scan", "ros1", Schema("a/Scan", "ros1msg", b"int32 n\nfloat32[] ranges\n")),
+}
 SETTINGS = SegmentSettings(chunk_size=1 << 10, segment_size=4_000, compression="none")
 
 
@@ -65,25 +71,9 @@ def content(first: int, count: int, *, scans: bool = False) -> Content:
 
 def write(path: Path, said: Content) -> Path:
     """A log with these messages, as an MCAP file."""
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        number = writer.register_schema("a/Number", "ros1msg", b"int32 n\nfloat64 x\n")
-        stamped = writer.register_schema("a/Stamped", "ros1msg", HEADER.encode())
-        text = writer.register_schema("a/Text", "jsonschema", b'{"type":"object"}')
-        scan = writer.register_schema("a/Scan", "ros1msg", b"int32 n\nfloat32[] ranges\n")
-        channels = {
-            "/number": writer.register_channel("/number", "ros1", number),
-            "/text": writer.register_channel("/text", "json", text),
-            "/stamped": writer.register_channel("/stamped", "ros1", stamped),
-        }
-        if "/scan" in said:
-            channels["/scan"] = writer.register_channel("/scan", "ros1", scan)
-        everything = [(one, channels[topic]) for topic, part in said.items() for one in part]
-        for one, channel in sorted(everything, key=lambda item: item[0].time):
-            writer.add_message(channel, one.time, one.payload, one.time)
-        writer.finish()
-    return path
+    everything = [(CHANNELS[topic], one) for topic, part in said.items() for one in part]
+    ordered = sorted(everything, key=lambda item: item[1].time)
+    return write_mcap(path, [(channel, one.time, one.payload) for channel, one in ordered])
 
 
 def record(

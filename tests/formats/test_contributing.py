@@ -12,10 +12,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.writer import Writer
 
 from hybridlog.formats import LOGS, OUTPUTS
+from hybridlog_storage.messages import Channel, Schema
 from tests.imports import ROOT
+from tests.independent import write_mcap
 
 TABLES = {
     "OUTPUTS": "OutputFormat]] = {\n",
@@ -31,6 +32,8 @@ LINES = '{"log_time_ns": 1000000001, "topic": "/a", "x": 1.5}\nno line\n' + "".j
 HALF = """
 import json, sys
 import hybridlog as hl
+from tests.independent import write_mcap
+from hybridlog_storage.messages import Channel, Schema
 
 with hl.open(sys.argv[1], create=True) as store:
     store.record(sys.argv[2])
@@ -116,17 +119,13 @@ def test_the_examples(extended: Path) -> None:
 
 def test_a_field_type(extended: Path, tmp_path: Path) -> None:
     log = tmp_path / "half.mcap"
-    with log.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start(profile="ros2")
-        schema = writer.register_schema("demo/Half", "ros2msg", b"float16 x\nfloat16[] r\n")
-        channel = writer.register_channel("/half", "cdr", schema)
-        for n in range(100):
-            r = np.arange(n, dtype=np.float16) / 4
-            head = b"\0\1\0\0" + np.float16(n / 2).tobytes() + b"\0\0"
-            payload = head + struct.pack("<I", n) + r.tobytes()
-            writer.add_message(channel, 10**9 + n, payload, 10**9 + n)
-        writer.finish()
+    schema = Schema("demo/Half", "ros2msg", b"float16 x\nfloat16[] r\n")
+    channel, said = Channel("/half", "cdr", schema), []
+    for n in range(100):
+        r = np.arange(n, dtype=np.float16) / 4
+        head = b"\0\1\0\0" + np.float16(n / 2).tobytes() + b"\0\0"
+        said.append((channel, 10**9 + n, head + struct.pack("<I", n) + r.tobytes()))
+    write_mcap(log, said)
     found = execute(extended, "-c", HALF, str(tmp_path / "store"), str(log))[0]
     assert list(map(json.loads, found.splitlines())) == [
         {"where": 2, "x": 49.5, "r": sum(n * (n - 1) / 8 for n in range(100)), "mean": 24.75},

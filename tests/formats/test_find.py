@@ -6,14 +6,15 @@ import os
 from pathlib import Path
 
 import pytest
-from mcap.writer import Writer
 
 from hybridlog.formats import find
 from hybridlog.formats.detect import grouped_parts
 from hybridlog.formats.find import Found, Watch, find_logs
 from hybridlog_storage.errors import SourceError
+from hybridlog_storage.messages import Channel
 from tests import places
 from tests.calls import Calls
+from tests.independent import write_mcap
 
 METADATA = """rosbag2_bagfile_information:
   relative_file_paths: [{files}]
@@ -24,13 +25,8 @@ LONG_AGO = 10**9
 def mcap(path: Path, count: int = 1, *, whole: bool = True) -> Path:
     """An MCAP file of a few messages; without its end if it is not whole."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        channel = writer.register_channel("/n", "json", 0)
-        for number in range(count):
-            writer.add_message(channel, number, b"{}", number)
-        writer.finish()
+    channel = Channel("/n", "json", None)
+    write_mcap(path, [(channel, number, b"{}") for number in range(count)])
     if not whole:
         path.write_bytes(path.read_bytes()[:-10])
     return path

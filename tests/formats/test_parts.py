@@ -9,10 +9,11 @@ from pathlib import Path
 
 import pytest
 import zstandard
-from mcap.writer import Writer
 
 from hybridlog.formats.log_set import LogSet, open_source
 from hybridlog_storage.errors import SourceError
+from hybridlog_storage.messages import Channel, Schema
+from tests.independent import write_mcap
 
 BEGIN = 1_700_000_000_000_000_000
 SECOND = 10**9
@@ -44,15 +45,8 @@ def put_db3(path: Path, numbers: Sequence[int], change: Callable[[bytes], bytes]
 
 
 def put_mcap(path: Path, numbers: Sequence[int]) -> Path:
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start(profile="ros2")
-        schema = writer.register_schema("std_msgs/msg/UInt32", "ros2msg", b"uint32 data\n")
-        channel = writer.register_channel("/n", "cdr", schema)
-        for n in numbers:
-            writer.add_message(channel, BEGIN + n * SECOND, payload(n), BEGIN + n * SECOND)
-        writer.finish()
-    return path
+    channel = Channel("/n", "cdr", Schema("std_msgs/msg/UInt32", "ros2msg", b"uint32 data\n"))
+    return write_mcap(path, [(channel, BEGIN + n * SECOND, payload(n)) for n in numbers])
 
 
 def put_metadata(folder: Path, files: Sequence[str], messages: int, *more: str) -> None:
@@ -234,16 +228,10 @@ def test_payloads_that_are_frames_without_a_word_about_it(tmp_path: Path, kind: 
     if kind == "mcap":
         path.unlink()
         path = tmp_path / "bag" / "bag_0.mcap"
-        with path.open("wb") as file:
-            writer = Writer(file)
-            writer.start()
-            channels = [writer.register_channel("/n", form, 0) for form in ("cdr", "json")]
-            for n in FIFTEEN:
-                data = zstandard.compress(payload(n)) if n % 2 else payload(n)
-                writer.add_message(channels[0], n, data, n)
-            writer.add_message(channels[1], 99, zstandard.compress(b"{}"), 99)
-            writer.add_message(channels[0], 100, b"", 100)
-            writer.finish()
+        cdr, json = (Channel("/n", form, None) for form in ("cdr", "json"))
+        said = [(cdr, n, zstandard.compress(payload(n)) if n % 2 else payload(n)) for n in FIFTEEN]
+        more = [(json, 99, zstandard.compress(b"{}")), (cdr, 100, b"")]
+        write_mcap(path, [*said, *more])
     with open_source(path) as source:
         found = [bytes(b.payload(row)) for b in source.batches() for row in range(len(b))]
         assert source.damage == []

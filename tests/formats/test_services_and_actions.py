@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mcap.writer import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import hybridlog as hl
+from hybridlog_storage.messages import Channel, Schema
 from tests.formats.test_rosbag2 import MESSAGES, TOPICS, database
+from tests.independent import write_mcap
 from tests.schema.wire_oracle import DUMMY
 
 pytestmark = pytest.mark.mongo
@@ -168,17 +169,13 @@ def _interface(kind: str) -> str:
 
 
 def _mcap(path: Path) -> None:
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start("ros2")
-        channels: dict[str, int] = {}
-        for number, (topic, kind, data) in enumerate(_messages()):
-            if topic not in channels:
-                text = TEXTS[_interface(kind)].encode()
-                schema = writer.register_schema(kind, "ros2msg", text)
-                channels[topic] = writer.register_channel(topic, "cdr", schema)
-            writer.add_message(channels[topic], BASE + number, data, BASE)
-        writer.finish()  # type: ignore[no-untyped-call]
+    channels: dict[str, Channel] = {}
+    said = []
+    for number, (topic, kind, data) in enumerate(_messages()):
+        schema = Schema(kind, "ros2msg", TEXTS[_interface(kind)].encode())
+        channel = channels.setdefault(topic, Channel(topic, "cdr", schema))
+        said.append((channel, BASE + number, data, BASE))
+    write_mcap(path, said)
 
 
 def _db3(path: Path) -> None:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mcap.writer import Writer
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
@@ -16,6 +16,7 @@ import hybridlog as hl
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
+from tests.independent import write_mcap
 
 COUNT = 120
 SETTINGS = SegmentSettings(chunk_size=32 << 10, segment_size=60 << 10)
@@ -99,19 +100,12 @@ def write_log(
     path: Path, said: Iterable[tuple[str, str, int, bytes]], chunk_size: int = 1 << 20
 ) -> Path:
     """A log of messages: topic, type, log time and payload of each."""
-    with path.open("wb") as file:
-        writer = Writer(file, chunk_size)
-        writer.start("ros2")
-        schemas: dict[str, int] = {}
-        channels: dict[tuple[str, str], int] = {}
-        for topic, kind, time, payload in said:
-            if kind not in schemas:
-                schemas[kind] = writer.register_schema(kind, "ros2msg", definition(kind).encode())
-            if (topic, kind) not in channels:
-                channels[topic, kind] = writer.register_channel(topic, "cdr", schemas[kind])
-            writer.add_message(channels[topic, kind], time, payload, time - 5)
-        writer.finish()
-    return path
+    channels: dict[tuple[str, str], Channel] = {}
+    rows = []
+    for topic, kind, time, data in said:
+        channel = channels.setdefault((topic, kind), replace(standard_channel(kind), topic=topic))
+        rows.append((channel, time, data, time - 5))
+    return write_mcap(path, rows, chunk_size=chunk_size)
 
 
 def ranges_of(n: int) -> np.ndarray:

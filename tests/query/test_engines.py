@@ -19,7 +19,6 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from mcap.writer import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import hybridlog as hl
@@ -30,8 +29,10 @@ from hybridlog.query.predicate.to_mask import mask_of_objects
 from hybridlog.query.query import Query
 from hybridlog.query.rows import Rows
 from hybridlog_storage.errors import DatabaseError, TimeError
+from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from hybridlog_storage.settings import EMBEDDED, NONE
+from tests.independent import write_mcap
 
 SECOND = 10**9
 BASE = 1_700_000_000 * SECOND
@@ -137,30 +138,27 @@ def _write(path: Path, seed: int, count: int) -> list[Sent]:
     types = get_typestore(Stores.ROS2_HUMBLE)
     types.register(get_types_from_msg(DEFINITION, "demo/msg/Thing"))
     sent: list[Sent] = []
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start("ros2")
-        ros = writer.register_schema("demo/msg/Thing", "ros2msg", FULL_DEFINITION.encode())
-        plain = writer.register_schema("State", "jsonschema", b"{}")
-        things = [writer.register_channel(t, "cdr", ros) for t in ("/thing", "/other")]
-        state = writer.register_channel("/state", "json", plain, {"mark": str(seed)})
-        for seq in range(count):
-            # Ties in log time, and times that go back.
-            log_time = BASE + rng.randrange(40) * SECOND // 4 + (seed % 2)
-            publish, stamp = log_time - rng.randrange(SECOND), log_time - rng.randrange(9) * SECOND
-            kind = rng.randrange(3)
-            if kind < 2:
-                message = _ros_message(types, rng, stamp)
-                raw = bytes(types.serialize_cdr(message, "demo/msg/Thing"))
-                topic, channel, fields = ("/thing", "/other")[kind], things[kind], _as_dict(message)
-            else:
-                fields = _json_message(rng)
-                raw = json.dumps(fields).encode()
-                topic, channel = "/state", state
-            writer.add_message(channel, log_time, raw, publish)
-            own = stamp if kind < 2 else None
-            sent.append(Sent("", topic, log_time, publish, own, seq, fields, raw))
-        writer.finish()  # type: ignore[no-untyped-call]
+    ros = Schema("demo/msg/Thing", "ros2msg", FULL_DEFINITION.encode())
+    channels = {topic: Channel(topic, "cdr", ros) for topic in ("/thing", "/other")}
+    channels["/state"] = Channel(
+        "/state", "json", Schema("State", "jsonschema", b"{}"), {"mark": str(seed)}
+    )
+    for seq in range(count):
+        # Ties in log time, and times that go back.
+        log_time = BASE + rng.randrange(40) * SECOND // 4 + (seed % 2)
+        publish, stamp = log_time - rng.randrange(SECOND), log_time - rng.randrange(9) * SECOND
+        kind = rng.randrange(3)
+        if kind < 2:
+            message = _ros_message(types, rng, stamp)
+            raw = bytes(types.serialize_cdr(message, "demo/msg/Thing"))
+            fields = _as_dict(message)
+        else:
+            fields = _json_message(rng)
+            raw = json.dumps(fields).encode()
+        own = stamp if kind < 2 else None
+        topic = [*channels][kind]
+        sent.append(Sent("", topic, log_time, publish, own, seq, fields, raw))
+    write_mcap(path, [(channels[m.topic], m.log_time, m.raw, m.publish_time) for m in sent])
     return sent
 
 

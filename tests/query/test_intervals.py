@@ -17,13 +17,14 @@ import pyarrow as pa
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from mcap.writer import Writer
 
 import hybridlog as hl
 from hybridlog.query.intervals import Interval, Intervals, changing, holding
 from hybridlog.query.rows_differ import rows_differ
 from hybridlog_storage.errors import TimeError, UsageError, WhereError
+from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests.independent import write_mcap
 
 pytestmark = pytest.mark.mongo
 
@@ -215,21 +216,12 @@ log = st.lists(
 
 
 def write_log(path: Path, said: list[tuple[int, str, dict[str, Any]]], mark: int) -> list[Said]:
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        schema = writer.register_schema("State", "jsonschema", b"{}")
-        # The mark makes equal logs different ones.
-        metadata = {"mark": str(mark)}
-        channels: dict[str, int] = {}
-        for topic in ("/state", "/other"):
-            channels[topic] = writer.register_channel(topic, "json", schema, metadata)
-        found = []
-        for second, topic, value in said:
-            time = BASE + second * SECOND
-            writer.add_message(channels[topic], time, json.dumps(value).encode(), time)
-            found.append(Said(time, topic, value))
-        writer.finish()  # type: ignore[no-untyped-call]
+    # The mark makes equal logs different ones.
+    about = {"mark": str(mark)}
+    channels = {topic: Channel(topic, "json", None, about) for topic in ("/state", "/other")}
+    found = [Said(BASE + second * SECOND, topic, value) for second, topic, value in said]
+    rows = [(channels[one.topic], one.time, json.dumps(one.value).encode()) for one in found]
+    write_mcap(path, rows)
     return found
 
 
@@ -379,21 +371,6 @@ def test_nothing_found_is_no_error(plain: hl.Store) -> None:
     assert len(query.during(none.intervals()).intervals()) == 0
 
 
-def test_containing_keeps_to_what_is_asked(plain: hl.Store) -> None:
-    state = plain.topic("/state")
-    windows = state.windows("100ms", "100ms")
-    assert len(windows.containing(state)) == 10
-    assert len(windows.containing(state.where("s == 1"))) == 5
-    assert len(windows.containing(state.between("+2s", "+4s"))) == 2
-    assert len(windows.containing(state.during(windows).reverse())) == 10
-    assert len(windows.containing(state.during(state.where("s == 1").windows("1s", "1ns")))) == 10
-    assert len(windows.containing(plain.topic("/other"))) == 0
-    assert len(state.windows("5s", "5s").containing(state.where("s == 1"))) == 10
-    for wrong in (state.limit(1), state.every(2)):
-        with pytest.raises(UsageError, match="cannot be combined"):
-            windows.containing(wrong)
-
-
 def test_the_cost_is_counted_and_no_payload_is_read(plain: hl.Store) -> None:
     query = plain.topic("/state").where("s == 1")
     for _ in range(2):
@@ -415,6 +392,9 @@ def test_wrong_questions_say_what_is_wrong(plain: hl.Store) -> None:
             wrong.intervals()
         with pytest.raises(UsageError, match="cannot be combined"):
             wrong.changes("s")
+    for wrong in (state.limit(1), state.every(2)):
+        with pytest.raises(UsageError, match="cannot be combined"):
+            state.windows("100ms").containing(wrong)
     with pytest.raises(UsageError, match="name one of /other, /state"):
         plain.all_topics().intervals()
     with pytest.raises(UsageError, match="cannot use the publish clock"):

@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from mcap.writer import Writer
 
 import hybridlog as hl
 from hybridlog.cli.answers import write_answer
@@ -22,6 +21,7 @@ from hybridlog.query.query import Query
 from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.messages import REDUCED, Batch, Channel, Schema, left_channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests.independent import write_mcap
 from tests.limits import Limit
 
 SECOND = 10**9
@@ -151,24 +151,15 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("log") / "log.mcap"
     messages = sent()
     random.Random(7).shuffle(messages)
-    with path.open("wb") as file:
-        writer = Writer(file, chunk_size=1000)
-        writer.start()
-        schemas = {
-            "cdr": writer.register_schema("p/msg/T", "ros2msg", b"string data"),
-            "ros1": writer.register_schema("p/T", "ros1msg", b"string data"),
-        }
-        channels = [
-            writer.register_channel(one.topic, one.encoding, schemas[one.encoding], one.metadata)
-            for one in SENDERS
-        ]
-        for message in messages:
-            number = int(message.text.split()[0])
-            writer.add_message(
-                channels[number], message.time, message.text.encode(), message.time - 5
-            )
-        writer.finish()
-    return path
+    schemas = {
+        "cdr": Schema("p/msg/T", "ros2msg", b"string data"),
+        "ros1": Schema("p/T", "ros1msg", b"string data"),
+    }
+    channels = [Channel(s.topic, s.encoding, schemas[s.encoding], s.metadata) for s in SENDERS]
+    rows = [
+        (channels[int(m.text.split()[0])], m.time, m.text.encode(), m.time - 5) for m in messages
+    ]
+    return write_mcap(path, rows, chunk_size=1000)
 
 
 @pytest.fixture(scope="module")

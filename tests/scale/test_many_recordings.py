@@ -11,14 +11,16 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from mcap.writer import Writer
 
 import hybridlog as hl
 from hybridlog.sql import plan
 from hybridlog_storage.catalog import CATALOG
+from hybridlog_storage.messages import Channel
 from tests.calls import Calls
 from tests.copies import bring
 from tests.imports import ROOT
+from tests.independent import write_mcap
+from tests.many_topics import FLOAT
 from tests.scale.cost import Cost, cost_of
 
 pytestmark = pytest.mark.mongo("embedded")
@@ -31,16 +33,13 @@ MESSAGES = 12
 
 def write_day(path: Path, day: int) -> None:
     """A log of one day: a few messages of two topics."""
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start(profile="ros1")
-        schema = writer.register_schema("std_msgs/Float32", "ros1msg", b"float32 data\n")
-        topics = [writer.register_channel(name, "ros1", schema) for name in ("/pose", "/imu")]
-        for number in range(MESSAGES):
-            time = START + day * DAY + number * 10**9
-            for channel, value in zip(topics, (number, 100 * day + number), strict=True):
-                writer.add_message(channel, time, struct.pack("<f", value), time)
-        writer.finish()
+    channels = [(Channel("/pose", "ros1", FLOAT), 0), (Channel("/imu", "ros1", FLOAT), 100 * day)]
+    said = [
+        (channel, START + day * DAY + number * 10**9, struct.pack("<f", more + number))
+        for number in range(MESSAGES)
+        for channel, more in channels
+    ]
+    write_mcap(path, said)
 
 
 def fill(path: Path, count: int) -> None:

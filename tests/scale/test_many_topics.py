@@ -8,13 +8,15 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-from mcap.writer import Writer
 
 import hybridlog as hl
 from hybridlog.query.answers import statistics
 from hybridlog.query.rows import Rows
+from hybridlog_storage.messages import Channel
 from tests import places
 from tests.calls import Calls
+from tests.independent import write_mcap
+from tests.many_topics import FLOAT
 from tests.scale.cost import cost_of
 
 START = 1_577_836_800 * 10**9
@@ -28,16 +30,12 @@ def stores(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Path]:
     found = {}
     for count in (FEW, MANY):
         log = tmp_path_factory.mktemp("topics") / "log.mcap"
-        with log.open("wb") as file:
-            writer = Writer(file)
-            writer.start(profile="ros1")
-            schema = writer.register_schema("std_msgs/Float32", "ros1msg", b"float32 data\n")
-            topics = [writer.register_channel(f"/s{n}", "ros1", schema) for n in range(count)]
-            for number in range(MESSAGES * count):
-                time = START + number * 10**6
-                payload = struct.pack("<f", number // count)
-                writer.add_message(topics[number % count], time, payload, time)
-            writer.finish()
+        topics = [Channel(f"/s{n}", "ros1", FLOAT) for n in range(count)]
+        said = [
+            (topics[n % count], START + n * 10**6, struct.pack("<f", n // count))
+            for n in range(MESSAGES * count)
+        ]
+        write_mcap(log, said)
         found[count] = log.parent / "store"
         with hl.open(found[count], create=True) as store:
             store.record(log, name="log")

@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mcap.writer import Writer
 
 import hybridlog as hl
 from hybridlog.columns.tables import Tables
 from hybridlog.columns.topic_table import TopicTable
 from hybridlog_storage.errors import PayloadError
 from hybridlog_storage.messages import Channel, Schema
+from tests.independent import write_mcap
 
 SECOND = 1_000_000_000
 BASE = 1_700_000_000 * SECOND
@@ -110,20 +110,20 @@ def write_log(
     schemas: Mapping[str, tuple[str, Schema]] | None = None,
 ) -> Path:
     """A log of messages (log time, topic, payload); each topic has two publishers."""
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        channels = {}
-        for topic in sorted({topic for _, topic, _ in said}):
-            encoding, schema = (schemas or {}).get(topic, ("ros1", STATE))
-            known = writer.register_schema(schema.name, schema.encoding, schema.data)
-            for place in range(2):
-                about = {"publisher": str(place)}
-                channels[topic, place] = writer.register_channel(topic, encoding, known, about)
-        for place, (time, topic, data) in enumerate(said):
-            writer.add_message(channels[topic, place % 2], time, data, time + 7)
-        writer.finish()  # type: ignore[no-untyped-call]
-    return path
+    channels = {
+        (topic, place): Channel(
+            topic, *(schemas or {}).get(topic, ("ros1", STATE)), {"publisher": str(place)}
+        )
+        for topic in {topic for _, topic, _ in said}
+        for place in range(2)
+    }
+    return write_mcap(
+        path,
+        [
+            (channels[topic, n % 2], time, data, time + 7)
+            for n, (time, topic, data) in enumerate(said)
+        ],
+    )
 
 
 def channel(topic: str, schema: Schema = STATE) -> Channel:

@@ -13,7 +13,6 @@ from urllib.parse import urlencode
 
 import pytest
 from click.testing import CliRunner
-from mcap.writer import Writer
 
 import hybridlog as hl
 from hybridlog.cli import fetch
@@ -21,8 +20,10 @@ from hybridlog.drawing.tree import MAX_SHOWN
 from hybridlog.view.loopback import Admission
 from hybridlog.view.routes import ask, export
 from hybridlog.view.server import make_app
+from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
+from tests.independent import write_mcap
 from tests.limits import Limit
 
 from .conftest import PORT, TOKEN, printed_by
@@ -216,17 +217,13 @@ DAMAGED = "x-1"
 def odd(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
     """A store of odd names, one of which lost some."""
     place = tmp_path_factory.mktemp("odd")
-    with (place / "odd.mcap").open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        large = writer.register_channel("/large", "raw", 0)
-        spaced = writer.register_channel("/a b", "json", 0)
-        star = writer.register_channel("*", "json", 0)
-        for n in range(60):
-            writer.add_message(large, n * S, bytes(500_000), n * S)
-            for channel in (spaced, star):
-                writer.add_message(channel, n * S + 1, b'{"n": %d, "odd.name": 1}' % n, n * S)
-        writer.finish()
+    large = Channel("/large", "raw", None)
+    others = [Channel(name, "json", None) for name in ("/a b", "*")]
+    said = []
+    for n in range(60):
+        said.append((large, n * S, bytes(500_000)))
+        said += [(one, n * S + 1, b'{"n": %d, "odd.name": 1}' % n, n * S) for one in others]
+    write_mcap(place / "odd.mcap", said)
     with hl.open(place / "store", create=True) as store:
         for name in ("x [1]", "x [1]", "x-1"):
             settings = SegmentSettings(segment_size=1)  # a chunk each
