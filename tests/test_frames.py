@@ -186,59 +186,6 @@ def test_rows_that_stop_being_equal() -> None:
     assert [cell.tolist() for cell in frame["c"]] == [[1, 2], [1, 2], [1, 2.5], [7], []]
 
 
-def test_columns_missing_in_some_chunks() -> None:
-    chunks: tuple[tuple[list[int], dict[str, Column]], ...] = (
-        ([1, 2], {"i": Scalars(np.array([2**62 + 1, 5])), "s": strings("a", "b")}),
-        ([3], {"f": Scalars(np.array([1.5], "f4")), "t": Scalars(times(7), "time")}),
-        (
-            [4, 5],
-            {
-                "b": Scalars(np.array([True, False])),
-                "a": arrays("i4", [1, 2], [3, 4], width=2),
-                "v": arrays("i4", [], [3]),
-                "l": Arrays(strings("p", "q"), times(0, 1, 2)),
-                "d": Scalars(times(9, 10), "duration"),
-            },
-        ),
-        ([6], {}),
-    )
-    table = built(*chunks)
-    table.validate(full=True)
-    assert nanoseconds(table).to_pydict() == {
-        "log_time": [1, 2, 3, 4, 5, 6],
-        "i": [2**62 + 1, 5, None, None, None, None],
-        "s": ["a", "b", None, None, None, None],
-        "f": [None, None, 1.5, None, None, None],
-        "t": [None, None, 7, None, None, None],
-        "b": [None, None, None, True, False, None],
-        "a": [None, None, None, [1, 2], [3, 4], None],
-        "v": [None, None, None, [], [3], None],
-        "l": [None, None, None, ["p"], ["q"], None],
-        "d": [None, None, None, 9, 10, None],
-    }
-    frame = frame_of(built(*chunks))
-    assert {name: int(n) for name, n in frame.isna().sum().items()} == {
-        name: 6 - n
-        for name, n in {
-            "i": 2,
-            "s": 2,
-            "f": 1,
-            "t": 1,
-            "b": 2,
-            "a": 2,
-            "v": 2,
-            "l": 2,
-            "d": 2,
-        }.items()
-    }
-    assert str(frame["f"].dtype) == "Float32"
-    assert str(frame["i"].dtype) == "Int64"
-    assert str(frame["b"].dtype) == "boolean"
-    assert frame["i"].iloc[0] == 2**62 + 1
-    assert frame["a"].iloc[0] is None
-    assert frame["a"].iloc[3].tolist() == [1, 2]
-
-
 def test_types_that_change() -> None:
     table = built(
         (

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import struct
 from typing import Any
 
 import numpy as np
@@ -13,10 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hybridlog.columns.left_rows import reduced
 from hybridlog.schema.codec import Codec, Decoded, columns_of
 from hybridlog.schema.codecs import codec_for
-from hybridlog_storage.messages import REDUCED, Batch, Channel, Schema, left_channel
+from hybridlog_storage.messages import Batch, Channel, Schema
 
 JSON = codec_for(Channel("/t", "json", None))
 
@@ -164,18 +162,3 @@ def test_protobuf_presence_maps_and_extremes() -> None:
     assert second["l"][1]["m"]["m"]["u"] == 2
     assert first["_id_"] == -1
     assert arrow_of(codec, [], {"u", "m.s"}).type.field("u").type == pa.uint64()
-
-
-def test_reduced_messages_have_what_the_index_has() -> None:
-    channel = Channel(
-        "/t", "ros1", Schema("p/T", "ros1msg", b"float32[] r\nint32 n\nstring s\ntime t")
-    )
-    payload = struct.pack("<I100fiI1sII", 100, *range(100), 7, 1, b"x", 5, 6)
-    codec = codec_for(left_channel(channel, REDUCED))
-    decoded = decoded_of(codec, [reduced(codec_for(channel), payload), b"short"])
-    assert decoded.rows.tolist() == [0]
-    assert [u.rows.tolist() for u in decoded.unreadable] == [[1]]
-    (row,) = decoded.arrow().to_pylist()
-    assert row["r"] is None
-    assert decoded.records.statistic("r", "max").to_pylist() == [99.0]  # type: ignore[union-attr]
-    assert (row["n"], row["s"], row["t"].value) == (7, "x", 5 * 10**9 + 6)

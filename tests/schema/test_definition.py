@@ -410,11 +410,6 @@ def test_definitions_that_are_refused(text, reason):
     assert reason in str(caught.value)
 
 
-def test_defaults_are_no_ros1():
-    with pytest.raises(DefinitionError, match="line 1 is not a field"):
-        parse("uint8 a 7\n", "ros1msg")
-
-
 def test_no_definition_and_foreign_encodings():
     with pytest.raises(DefinitionError, match="no definition in the source"):
         parse("", "")

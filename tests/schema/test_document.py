@@ -12,7 +12,7 @@ from bson.int64 import Int64
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hybridlog.schema.column import Arrays, Column, Records, Scalars, Strings, take, top_level_names
+from hybridlog.schema.column import Arrays, Column, Records, Scalars, Strings, take
 from hybridlog.schema.document import Bodies, TooLarge, bodies
 from tests.limits import Limit
 
@@ -178,28 +178,6 @@ def test_a_body_does_not_depend_on_the_batch(data: st.DataObject) -> None:
         assert together[i :: len(rows)] == [together[i]] * 20
 
 
-def test_rows_of_one_layout_are_one_group() -> None:
-    kind = (
-        "message",
-        {
-            "header": ("message", {"stamp": ("number", "i8"), "frame_id": ("string",)}),
-            "covariance": ("list", ("number", "f8")),
-            "names": ("list", ("string",)),
-            "points": ("list", ("message", {"x": ("number", "f4"), "tags": ("list", ("string",))})),
-        },
-    )
-    row = {
-        "header": {"stamp": 5, "frame_id": b"odom"},
-        "covariance": DOUBLES[:4],
-        "names": [b"left", b"", b"right_wheel"],
-        "points": [{"x": 0.5, "tags": [b"a"]}, {"x": -0.0, "tags": [b"b"]}],
-    }
-    check(kind, [row] * 200)
-    records = column_of(kind, [row] * 200)
-    assert isinstance(records, Records)
-    assert [len(g.rows) for g in bodies(records, array_limit=LIMIT)] == [200]
-
-
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_numbers_at_their_limits(dtype: str) -> None:
     kind = ("message", {"v": ("number", dtype), "l": ("list", ("number", dtype))})
@@ -235,16 +213,6 @@ def test_keys_of_long_lists(limit: int, regular: bool) -> None:
         for row, body in zip(rows, made(records, array_limit=limit), strict=True):
             listed = [reference(kind, v) for v in row["l"]]
             assert document_of(body) == bson.encode({"l": listed})
-
-
-def test_names_that_the_index_uses_itself() -> None:
-    assert top_level_names(["_id", "x", "_meta"]) == ["_id_", "x", "_meta_"]
-    assert top_level_names(["_id", "_id_"]) == ["_id__", "_id_"]
-    one = Scalars(np.array([1], np.int32))
-    inner = Records({"_id": one}, 1)
-    assert document_of(made(Records({"_id": one, "m": inner}, 1))[0]) == bson.encode(
-        {"_id_": 1, "m": {"_id": 1}}
-    )
 
 
 def test_too_large_rows_are_named_and_the_others_are_made() -> None:
