@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 
-import hybridlog as hl
 from hybridlog.cli.render import Column, print_table
 from hybridlog.formats.answer import Answer
 from hybridlog.formats.jsonl import write_json
@@ -64,19 +63,6 @@ def test_long_answers_are_printed_some_rows_at_a_time(
         texts = [json.dumps(value) for value in values]
         write_json(Answer(lines=[[line] for one in texts for line in (one, iter(one))]), target)
         assert json.loads(target.getvalue()) == [one for one in values for _ in range(2)]
-
-
-def test_fetch_near_events(store: Path) -> None:
-    near = ("fetch", "-t", "**", "-r", "robot", "--where", "rosout: level >= 2")
-    with hl.open(store, mongo="none") as opened:
-        robot = opened.recordings("robot").all_topics()
-        for words, within in (
-            (("--within", "0.1s"), "0.1s"),
-            (("--before", "300ms"), ("300ms", "0s")),
-            (("--before", "0.1s", "--after", "200ms"), ("0.1s", "200ms")),
-        ):
-            count = robot.where("rosout: level >= 2", within).count()
-            assert run(*near, *words, "--count", "-q", store=store).out == f"{count}\n" != "0\n"
 
 
 @pytest.mark.parametrize(

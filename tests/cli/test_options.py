@@ -19,19 +19,7 @@ CHANNEL = Channel("/n", "json", None, {})
 ABOUT_TOPICS = {"fetch", "intervals", "stats", "align"}
 
 
-def test_topics_are_arguments_or_options(store: Path) -> None:
-    chosen = ("-r", "robot", "--json")
-    for words in (
-        ("intervals", "--where", "ranges.min < 5"),
-        ("intervals", "--gaps"),
-        ("stats", "--fields", "ranges.min"),
-        ("stats", "--rate"),
-    ):
-        found = answer(*words, "scan", *chosen, store=store).json
-        assert found == answer(*words, "-t", "scan", *chosen, store=store).json
-    assert answer("fetch", "scan", "odom", "--count", "-r", "robot", store=store).out == (
-        answer("fetch", "-t", "scan", "-t", "odom", "--count", "-r", "robot", store=store).out
-    )
+def test_a_topic_is_named(store: Path) -> None:
     for command in ABOUT_TOPICS:
         assert command in GROUPS["Ask"]
         more = ("--to", "scan") if command == "align" else ()

@@ -166,13 +166,6 @@ def test_parquet_has_no_statistics_of_floats() -> None:
     }
 
 
-@pytest.mark.parametrize("writer", [write_parquet, write_arrow, write_csv, write_npz])
-def test_two_columns_of_one_name(writer: object) -> None:
-    twice = pa.Table.from_arrays([pa.array([1]), pa.array([2])], names=["a", "a"])
-    with pytest.raises(UsageError, match="two columns"):
-        written(writer, twice)
-
-
 @pytest.mark.parametrize(("writer", "read"), WRITERS)
 def test_no_rows_and_no_pieces(writer: object, read: object) -> None:
     assert read(written(writer, table(0))).schema.equals(table(0).schema)  # type: ignore[operator]

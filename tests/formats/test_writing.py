@@ -67,13 +67,6 @@ def write(name: str, target: object, messages: int = 300, error: type | None = N
 
 
 @pytest.mark.parametrize("name", WRITERS)
-def test_only_the_target_is_left(name: str, tmp_path: Path) -> None:
-    target = tmp_path / "out"
-    write(name, target)
-    assert list(tmp_path.iterdir()) == [target]
-
-
-@pytest.mark.parametrize("name", WRITERS)
 def test_an_exception_in_the_answer_aborts(name: str, tmp_path: Path) -> None:
     target = tmp_path / "out"
     if name in FILES:

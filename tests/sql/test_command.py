@@ -195,26 +195,6 @@ def test_losses_are_told(root: Path, tmp_path: Path) -> None:
         assert (json.loads(done.stdout)["count_star()"], done.stderr) in {(LARGE, ""), (1000, "")}
 
 
-def test_a_choice_of_recordings_and_a_time(root: Path) -> None:
-    count = "select count(*) as n, min(t) - 1700000000000000000 as first from large"
-    for scope, rows, first in (
-        ("-r second", 40, 3600 * SECOND),
-        ("--tag site=hall", LARGE, 0),
-        ("--between 2023-11-14T23:00 now --has /Large", 40, 3600 * SECOND),
-        ("--between +100ms +200ms -r first", 100, 100_000_100),
-        ("--older-than 1d --type test/Text", 40, 3600 * SECOND),
-    ):
-        done = run(root, count, *scope.split(" "))
-        assert json.loads(done.stdout) == {"n": rows, "first": first}, scope
-    for scope, problem in (
-        (["--last", "1d"], "There is no recording with messages from"),
-        (["-r", "third"], "third"),
-        (["--last", "90y", "--between", "start", "end"], "--last and --between exclude each other"),
-    ):
-        with pytest.raises(HybridlogError, match=problem):
-            run(root, count, *scope)
-
-
 def test_completion(store: hl.Store) -> None:
     connection = store.sql_engine.connect()
 

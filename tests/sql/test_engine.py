@@ -266,20 +266,6 @@ def test_a_query_is_parsed_once(own: hl.Store, monkeypatch: pytest.MonkeyPatch) 
         own.sql(f"{query} and angle > 1")
 
 
-def test_tables_with_arrays_answer_alike(own: hl.Store) -> None:
-    query = "select ranges, echo.far from scan where angle < 100 order by t"
-    before = own.sql(query).to_arrow()
-    (found,) = own.index.arrays("scan")
-    assert found.recordings == ["first"]
-    own.refresh()
-    answer = own.sql(query)
-    assert answer.to_arrow().equals(before)
-    assert answer.counts.payload_bytes == answer.counts.chunks == 0
-    few = own.sql("select max(ranges[1]) from scan where angle = 7")
-    assert few.rows() == [(14.0,)]
-    assert few.counts.chunks == 0
-
-
 def test_fields_that_no_definition_fixes(tmp_path: Path) -> None:
     """Keys of a map of protobuf, and of JSON; types come from the messages."""
     cases = Path(__file__).parents[1] / "cases"

@@ -25,30 +25,6 @@ def uses(parser: duckdb.DuckDBPyConnection, query: str, path: tuple[str, ...] = 
 @pytest.mark.parametrize(
     "query",
     [
-        "select t from scan",
-        "select echo.kind from scan where echo.kind > 2",
-        "select s.echo.kind as far from scan s order by far",
-        "select echo.kind k, count(*) from scan group by all having count(*) > 1 order by k",
-        "select a.echo.kind from scan a asof join odom b on a.t >= b.t where b.pose.x > 1",
-        "with z as (select echo.kind as k from scan) select k, z.k from z",
-        "select t from scan where exists (select 1 from odom o where o.t = scan.t)",
-        "select sum(echo.kind) over (partition by recording order by t) from scan",
-        "select list_transform(ranges, lambda x: x + 1) from scan",
-        "select t from scan cross join range(3)",
-        "select ECHO.Kind from SCAN",
-        "select t from scan union all by name select t from odom",
-        "select unnest([1, 2]) from scan",
-        "select case when echo.kind = 1 then t end from scan qualify row_number() over () = 1",
-        "select t from scan join odom using (t)",
-    ],
-)
-def test_unused(parser: duckdb.DuckDBPyConnection, query: str) -> None:
-    assert not uses(parser, query)
-
-
-@pytest.mark.parametrize(
-    "query",
-    [
         "select * from scan",
         "from scan",
         "select scan.* from scan",

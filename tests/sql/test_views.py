@@ -205,20 +205,6 @@ def test_names(store: hl.Store) -> None:
     assert shown == {*views.values(), "scan", "recordings", "topics", "losses", "marks"}
 
 
-def test_tables_about_the_store(store: hl.Store) -> None:
-    found = store.sql(
-        "select recording, tags['site'], status, messages, first_t from recordings order by first_t"
-    ).rows()
-    entries = store.recordings()
-    assert found == [
-        (e.name, e.tags.get("site"), e.status, e.messages, e.span[0] if e.span else None)
-        for e in entries
-    ]
-    assert store.sql("select * from losses").rows() == []
-    messages = store.sql("select topic, sum(messages) from topics group by all").rows()
-    assert dict(messages) == {topic: store.topic(topic).count() for topic in store.topics()}
-
-
 def test_forms_of_an_answer(store: hl.Store) -> None:
     query = "select recording, i8, f64, name, header.stamp from large order by t, seq"
     table = store.sql(query).to_arrow()
