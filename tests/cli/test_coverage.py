@@ -62,21 +62,6 @@ def test_times_behind_what_is_left_are_known_to_be_lost(damaged: Path) -> None:
     assert "Nothing was recorded between" in done.err
 
 
-def test_what_was_lost_may_have_been_current_at_a_time(damaged: Path) -> None:
-    def at(second: float, topic: str, recording: str, code: int = 0) -> str:
-        time = str(BEGIN_NS + int(second * SECOND_NS))
-        args = ("-t", topic, "-r", recording, "--at", time, "--fields", "topic")
-        return run("fetch", *args, store=damaged, code=code).err
-
-    assert "part is not complete" in at(3.5, "/late", "part", code=2)
-    assert "gone is not complete" in at(3.5, "/kept", "gone", code=2)
-    places.folder(damaged, "gone").rename(damaged / "gone")
-    assert "not complete" not in at(2, "/kept", "part")
-    places.logs_of(damaged, "part", "/kept")[0][0].unlink()
-    assert "part is not complete" in at(0.5, "/kept", "part", code=2)
-    assert "part is not complete" not in at(1.5, "/kept", "part")
-
-
 def test_relative_times_mean_what_they_meant(damaged: Path) -> None:
     places.logs_of(damaged, "part", "/kept")[0][0].unlink()
     for begin, is_whole in (("+0s", False), ("+0.5s", True)):

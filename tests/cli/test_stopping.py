@@ -10,15 +10,15 @@ import time
 from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
-from urllib.parse import quote
 
 import pytest
+from pymongo import MongoClient
 
 from hybridlog.cli.signals import SIGNALS
-from hybridlog_storage.mongo.mongod import find_mongod
 from tests import places
 from tests.calls import Calls
 from tests.independent import read_bag
+from tests.servers.mongods import Mongod
 from tests.waiting import wait_for
 
 from .running import (
@@ -31,7 +31,7 @@ from .running import (
 
 pytestmark = pytest.mark.mongo
 
-Server = tuple[str, subprocess.Popen[bytes]]
+Server = tuple[str, Mongod]
 
 # The strongest compression makes the robot's images take seconds.
 SLOW = ("--level", "19", "--again")
@@ -252,32 +252,18 @@ def test_a_directory_of_tables_is_complete_or_absent(store: Path, tmp_path: Path
 
 
 @pytest.fixture
-def server(
-    tmp_path_factory: pytest.TempPathFactory,
-) -> Iterator[Server]:
-    """The URI of a mongod of one's own, and its process."""
-    directory = tmp_path_factory.mktemp("db")
-    socket = directory / "s.sock"
-    (directory / "data").mkdir()
-    process = subprocess.Popen(
-        [
-            *(str(find_mongod()), "--dbpath", str(directory / "data"), "--nounixsocket"),
-            *("--bind_ip", str(socket), "--logpath", str(directory / "log")),
-            *("--wiredTigerCacheSizeGB", "0.25"),
-        ],
-        stdout=subprocess.DEVNULL,
-    )
-    try:
-        wait_for(lambda: socket.exists() or process.poll() is not None)
-        yield f"mongodb://{quote(str(socket), safe='')}/logs?serverSelectionTimeoutMS=2000", process
-    finally:
-        process.kill()
-        process.wait()
+def server(tmp_path: Path) -> Iterator[Server]:
+    """The URI of a mongod of one's own, and it."""
+    with Mongod(tmp_path / "db") as server:
+        uri = f"mongodb://{server.address}/logs?directConnection=true"
+        with MongoClient(uri, serverSelectionTimeoutMS=30_000) as client:
+            client.admin.command("ping")
+        yield f"{uri}&serverSelectionTimeoutMS=2000", server
 
 
 @pytest.mark.mongo("embedded")
 def test_a_mongodb_of_ones_own_that_goes_away(server: Server, logs: Path, tmp_path: Path) -> None:
-    uri, process = server
+    uri, mongod = server
     store = tmp_path / "s"
     with started(
         *("record", logs / "robot.bag", "--store", store, "--mongo", uri, *SLOW),
@@ -285,7 +271,7 @@ def test_a_mongodb_of_ones_own_that_goes_away(server: Server, logs: Path, tmp_pa
     ) as recording:
         wait_for(lambda: recording.poll() is not None or open_bytes(store) > 100_000)
         assert recording.poll() is None
-        process.kill()
+        mongod.kill()
         # Recording goes on without the index; the exit code says that it is missing.
         assert recording.wait(120) == 6
     text = (tmp_path / "out").read_text()

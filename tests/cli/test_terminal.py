@@ -193,17 +193,6 @@ def test_an_answer_is_a_table_when_it_fits(store: Path) -> None:
     assert any(line.startswith("20 messages, ") for line in lines[-2:])
 
 
-def test_a_long_table_has_one_heading_and_one_width(store: Path) -> None:
-    query = "select case when i < 99 then 'wide' else 'a' end as a, i from range(20000) t(i)"
-    code, shown = on_terminal("sql", query, "-F", "table", "-n", "20000", "--store", store)
-    assert code == 0
-    first, *lines = plain(shown).splitlines()
-    assert first.split() == ["a", "i"]
-    assert len(lines) == 20_000
-    place = first.index("i")
-    assert all(line[place - 2 : place] == "  " and line[place].isdigit() for line in lines)
-
-
 def test_an_answer_is_a_block_a_message_when_it_does_not(store: Path) -> None:
     code, shown = on_terminal("fetch", "-t", "scan", "-r", "robot", "-n", "2", "--store", store)
     assert code == 0
