@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from msgspec import convert, to_builtins
+from msgspec import to_builtins
 from msgspec.json import Decoder, encode
 
 from hybridlog_storage.cache import Cache
@@ -549,14 +549,8 @@ _NAMES_OF: Final = Decoder(tuple[str, str])
 
 def _read(decoder: Decoder[_T], body: bytes | None) -> _T | None:
     """The value of a cell; None if it is of another kind."""
-    if not body:
-        return None
-    try:
-        return decoder.decode(body)
-    except (ValueError, RecursionError):  # a name may not be UTF-8
-        with suppress(ValueError, RecursionError):
-            found: _T = convert(json.loads(body), decoder.type)
-            return found
+    with suppress(ValueError, RecursionError):
+        return decoder.decode(body or b"")
     return None
 
 

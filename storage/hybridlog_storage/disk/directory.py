@@ -154,13 +154,14 @@ class Listing:
 class StoreDirectory:
     """A store's directory; with `read_only` it behaves as if this user could not write it.
 
-    With `is_remote` it stands for a place in a bucket, see `remote.store`.
+    With `is_remote` it stands for a place in a bucket, see `remote.store`. People call it `place`;
+    another process opens it by its `address`.
     """
 
     is_remote: ClassVar[bool] = False
 
     def __init__(self, path: Path, *, read_only: bool = False) -> None:
-        self.path = path
+        self.path, self.place, self.address = path, str(path), str(path.absolute())
         self.manifests: Manifests = DiskManifests(path)
         self.read_only = read_only
         self.settings = read_settings(path)
@@ -180,7 +181,7 @@ class StoreDirectory:
         """
         if path.exists() and not path.is_dir():
             raise StoreError(f"{path} is a file; a store is a directory. Choose another name.")
-        try:
+        with durability.explained(path, "making the store"):
             if not (path / SETTINGS).exists():
                 path.mkdir(parents=True, exist_ok=True)
                 # Of several processes, one creates the store and the others open it.
@@ -195,8 +196,6 @@ class StoreDirectory:
                     pass
                 else:
                     files.sync_folder(path)
-        except OSError as error:
-            raise durability.explain(error, path, "making the store") from error
         return store
 
     @staticmethod
@@ -238,10 +237,8 @@ class StoreDirectory:
         """Change settings of the store."""
         with self.manifests.creating():
             settings = structs.replace(read_settings(self.path), **changes)
-            try:
+            with durability.explained(self.path, "writing settings of"):
                 write_settings(self.path, settings)
-            except OSError as error:
-                raise durability.explain(error, self.path, "writing settings of") from error
             self.settings = settings
 
     @property
@@ -294,16 +291,6 @@ class StoreDirectory:
     def _look_of(self, recording: str) -> str:
         """The look of one recording; empty if there is none."""
         return self.looks([recording]).get(recording, "")
-
-    @property
-    def address(self) -> str:
-        """The address by which another process opens it."""
-        return str(self.path.absolute())
-
-    @property
-    def place(self) -> str:
-        """The store's place, for people."""
-        return str(self.path)
 
     @property
     def when_empty(self) -> str:
@@ -416,10 +403,8 @@ class StoreDirectory:
 
     def make_folder(self, recording: str) -> None:
         """Make the folder of a recording that begins, within `manifests.creating`."""
-        try:
+        with durability.explained(self.path, "starting a recording in"):
             files.make_folder(self.recording(recording))
-        except OSError as error:
-            raise durability.explain(error, self.path, "starting a recording in") from error
 
     @contextmanager
     def retaining(self) -> Iterator[bool]:
@@ -536,10 +521,8 @@ def gone(name: str) -> TopicError:
 
 
 def _is_at(fd: int, path: Path) -> bool:
-    try:
+    with durability.explained(path, "locking"):
         return files.is_at(fd, path)
-    except OSError as error:
-        raise durability.explain(error, path, "locking") from error
 
 
 def _folder_look(recording: str, folders: int) -> str:

@@ -10,7 +10,8 @@ never meets a half-made one.
 from __future__ import annotations
 
 import errno
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -36,6 +37,15 @@ def explain(error: OSError, path: Path, doing: str) -> HybridlogError:
             "Check the owner and the mount of the store, or choose another with --store."
         )
     return StoreError(f"Error while {doing} {path}: {error.strerror or error}.")
+
+
+@contextmanager
+def explained(path: Path, doing: str) -> Iterator[None]:
+    """Raise operating system errors of a block as hybridlog errors."""
+    try:
+        yield
+    except OSError as error:
+        raise explain(error, path, doing) from error
 
 
 def write_all(fd: int, parts: Sequence[Buffer]) -> int:
@@ -69,7 +79,5 @@ def publish(temporary: Path, final: Path) -> None:
 
 def write_new(final: Path, content: bytes) -> None:
     """Write a small file atomically."""
-    try:
+    with explained(final, "writing"):
         files.write_file(final, content)
-    except OSError as error:
-        raise explain(error, final, "writing") from error
