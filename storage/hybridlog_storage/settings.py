@@ -240,12 +240,11 @@ def _password() -> str | None:
         return None
     try:
         # The user chose this path: symlinks are followed.
-        fd = os.open(Path(named).expanduser(), os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-        try:
-            about = os.fstat(fd)
-            content = os.read(fd, _PASSWORD_LIMIT + 1) if stat.S_ISREG(about.st_mode) else b""
-        finally:
-            os.close(fd)
+        with os.fdopen(
+            os.open(Path(named).expanduser(), os.O_RDONLY | os.O_NONBLOCK), "rb"
+        ) as file:
+            about = os.fstat(file.fileno())
+            content = file.read(_PASSWORD_LIMIT + 1) if stat.S_ISREG(about.st_mode) else b""
     except (OSError, RuntimeError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         raise UsageError(

@@ -141,8 +141,7 @@ class AppendFile:
         """
         self._stage = self._hasher = None
         self.position = position
-        flags = fcntl.fcntl(self._fd, fcntl.F_GETFL)
-        fcntl.fcntl(self._fd, fcntl.F_SETFL, flags & ~DIRECT)
+        self._leave_direct()
         os.lseek(self._fd, position, os.SEEK_SET)
         files.system.truncate(self._fd, position)
 
@@ -151,11 +150,7 @@ class AppendFile:
         assert self._stage is None
         assert position + len(data) <= self.position
         self._hasher = None
-        pieces = [memoryview(data)]
-        while pieces:
-            done = files.system.pwritev(self._fd, pieces, position)
-            position += done
-            pieces = left_over(pieces, done)
+        self._write([memoryview(data)], position)
 
     def trim(self) -> None:
         """Set the file's exact length."""
@@ -199,20 +194,19 @@ class AppendFile:
             try:
                 done = files.system.pwritev(self._fd, pieces, position)
             except OSError as error:
-                if error.errno not in _REFUSED:
-                    raise
                 # Some file systems take the flag and refuse the write. Blocks stay whole,
                 # so nothing else changes.
-                self._give_up_direct(error)
+                if error.errno not in _REFUSED or not self._leave_direct():
+                    raise
                 continue
             position += done
             pieces = left_over(pieces, done)
 
-    def _give_up_direct(self, error: OSError) -> None:
+    def _leave_direct(self) -> bool:
+        """Write by way of the page cache from now on; False if that is so already."""
         flags = fcntl.fcntl(self._fd, fcntl.F_GETFL)
-        if not flags & DIRECT:
-            raise error
         fcntl.fcntl(self._fd, fcntl.F_SETFL, flags & ~DIRECT)
+        return bool(flags & DIRECT)
 
 
 def _is_own(content: NDArray[np.uint8]) -> bool:
