@@ -329,7 +329,7 @@ class DiskManifests(Manifests):
 
     def _create(self, manifest: Manifest) -> None:
         data, path = encode(manifest), self.path(manifest.id)
-        if _exists(path):
+        if os.path.lexists(path):
             raise RecordingExistsError(f"There is a recording {manifest.id} already.")
         folder = self._recordings / manifest.id
         with durability.explained(path, "writing"):
@@ -363,7 +363,7 @@ class DiskManifests(Manifests):
             try:
                 stack.enter_context(_locked(folder / MANIFEST_LOCK))
             except FileNotFoundError:
-                if not _exists(self.path(recording)):
+                if not os.path.lexists(self.path(recording)):
                     raise RecordingGoneError(f"There is no recording {recording!r}.") from None
                 self._make_lock(folder)  # copies of a store may leave out what is empty
                 stack.enter_context(_locked(folder / MANIFEST_LOCK))
@@ -475,7 +475,18 @@ def _locked(path: Path, wait_s: float | None = None) -> Iterator[None]:
     while True:
         fd = _opened(path, os.O_RDWR)
         try:
-            _lock(fd, path, end)
+            try:
+                files.lock(fd, max(end - time.monotonic(), 0))
+            except BlockingIOError:
+                message = f"Another process has held {path} for {WAIT_S:.0f} s; end it."
+                raise HeldError(message, is_recording=False) from None
+            except OSError as error:
+                if error.errno not in _NO_LOCKS:
+                    raise
+                raise StoreError(
+                    f"The file system of {path.parent} has no locks (flock), so the store can "
+                    "only be read there. Copy it to another one to change it."
+                ) from error
             if files.is_at(fd, path):
                 yield
                 return
@@ -508,24 +519,3 @@ def _odd(path: Path) -> str:
                     "of the store, then run `hybridlog verify --repair`."
                 )
     return ""
-
-
-def _lock(fd: int, path: Path, end: float) -> None:
-    try:
-        files.lock(fd, max(end - time.monotonic(), 0))
-    except BlockingIOError:
-        message = f"Another process has held {path} for {WAIT_S:.0f} s; end it."
-        raise HeldError(message, is_recording=False) from None
-    except OSError as error:
-        if error.errno not in _NO_LOCKS:
-            raise
-        raise StoreError(
-            f"The file system of {path.parent} has no locks (flock), so the store can only be "
-            "read there. Copy it to another one to change it."
-        ) from error
-
-
-def _exists(path: Path) -> bool:
-    with suppress(FileNotFoundError):
-        return files.status(path) is not None
-    return False

@@ -190,11 +190,8 @@ class StoreDirectory:
                     cls._make(path, settings)
             store = cls(path)
             for folder in (MANIFESTS, _RECORDINGS):
-                try:
+                with suppress(FileExistsError):
                     files.make_folder(path / folder)
-                except FileExistsError:
-                    pass
-                else:
                     files.sync_folder(path)
         return store
 

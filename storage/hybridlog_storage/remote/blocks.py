@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Final, Self
 
 from hybridlog_storage.checksum import crc32
-from hybridlog_storage.disk.files import user_directory
+from hybridlog_storage.disk import files
 from hybridlog_storage.errors import ObjectChangedError, ResourceError
 from hybridlog_storage.remote.bucket import Bucket, Object
 
@@ -123,7 +123,7 @@ class BlockCache:
 
     def __init__(self, path: Path | None = None, most: int = MAX_CACHED) -> None:
         if path is None:
-            path = user_directory("XDG_CACHE_HOME", ".cache", "blocks of buckets") / "buckets"
+            path = files.user_directory("XDG_CACHE_HOME", ".cache", "blocks of buckets") / "buckets"
         self.path = path
         self._most = most
         self._since_check = _CHECK_EVERY
@@ -173,19 +173,14 @@ class BlockCache:
             if self._since_check < min(_CHECK_EVERY, self._most):
                 return
             self._since_check = 0
-        found = []
-        with suppress(OSError), os.scandir(self.path) as entries:
-            for entry in entries:
-                with suppress(OSError):
-                    about = entry.stat(follow_symlinks=False)
-                    found.append((about.st_mtime_ns, about.st_blocks * 512, entry.path))
-        left = sum(taken for _, taken, _ in found)
-        for _, taken, path in sorted(found):
-            if left <= self._most:
-                return
-            with suppress(OSError):
-                os.unlink(path)  # noqa: PTH108 - as the listing has it
-            left -= taken
+        with suppress(OSError):
+            there = files.names(self.path).items()
+            found = sorted((one.st_mtime_ns, one.st_blocks * 512, name) for name, one in there)
+            left = sum(taken for _, taken, _ in found)
+            for _, taken, name in found:
+                if left > self._most:
+                    (self.path / name).unlink(missing_ok=True)
+                    left -= taken
 
 
 def inode_of(about: Object) -> int:
