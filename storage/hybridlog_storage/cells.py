@@ -138,7 +138,8 @@ class Cells:
         with suppress(*_ERRORS):
             if self._path is not None and not self._writes:
                 content = files.read_file(self._path, _MAX_COPIED)
-            made.deserialize(content)
+            if content:  # it takes an empty one for a lack of memory
+                made.deserialize(content)
             if self._is_ours(made):
                 return made
         made.close()
