@@ -155,10 +155,13 @@ class StoreDirectory:
     """A store's directory; with `read_only` it behaves as if this user could not write it.
 
     With `is_remote` it stands for a place in a bucket, see `remote.store`. People call it `place`;
-    another process opens it by its `address`.
+    another process opens it by its `address`. `cells` are those of its catalog, None for those in
+    its file; `when_empty` is the sentence for a store without recordings.
     """
 
     is_remote: ClassVar[bool] = False
+    cells: Cells | None = None
+    when_empty = "The store is empty: `hybridlog record FILE` fills it."
 
     def __init__(self, path: Path, *, read_only: bool = False) -> None:
         self.path, self.place, self.address = path, str(path), str(path.absolute())
@@ -288,15 +291,6 @@ class StoreDirectory:
     def _look_of(self, recording: str) -> str:
         """The look of one recording; empty if there is none."""
         return self.looks([recording]).get(recording, "")
-
-    @property
-    def when_empty(self) -> str:
-        """The sentence for a store without recordings."""
-        return "The store is empty: `hybridlog record FILE` fills it."
-
-    def catalog_cells(self) -> Cells | None:
-        """The cells of the catalog; None for those in its file here."""
-        return None
 
     @contextmanager
     def at_hand(

@@ -23,7 +23,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Final
+from typing import Annotated, Any, ClassVar, Final, cast
 
 from msgspec import Meta, MsgspecError, json
 from msgspec.structs import replace
@@ -325,8 +325,7 @@ class BucketStore(Source):
             about = self.cells.tables().get(inner[1], {}).get(inner[2])
         if about is None or about.name in self.bucket.lost:
             problem = "there is no such object" if about is None else LOST
-            place = "/".join([self.address, *inner])
-            raise FileNotFoundError(errno.ENOENT, problem, place)
+            raise FileNotFoundError(errno.ENOENT, problem, "/".join([self.address, *inner]))
         return self.cache.open(self.bucket, about)
 
     def names(self, inner: tuple[str, ...]) -> tuple[int, dict[str, os.stat_result]]:
@@ -335,8 +334,7 @@ class BucketStore(Source):
         if inner == (TABLES,):
             return self.number, dict.fromkeys(found, _stat(_FOLDER, 0, 0))
         if len(inner) != 2 or inner[0] != TABLES or inner[1] not in found:
-            place = "/".join([self.address, *inner])
-            raise FileNotFoundError(errno.ENOENT, "there is no such folder", place)
+            raise FileNotFoundError(errno.ENOENT, "there is no such folder", inner[-1])
         entries = found[inner[1]].items()
         return self.number, {name: _stat(_FILE, inode_of(o), o.size) for name, o in entries}
 
@@ -400,10 +398,9 @@ def mount(address: str) -> BucketStore:
     """The store in a bucket."""
     path = Path(address)
     with _mounting:
-        found = files.mounted.get(path)
-        if not isinstance(found, BucketStore):
-            found = files.mounted[path] = BucketStore(Bucket(address))
-        return found
+        if path not in files.mounted:
+            files.mounted[path] = BucketStore(Bucket(address))
+        return cast("BucketStore", files.mounted[path])
 
 
 def objects_of(manifest: Manifest) -> Iterator[Object]:
@@ -420,7 +417,9 @@ class RemoteDirectory(StoreDirectory):
     def __init__(self, address: str, *, read_only: bool = False) -> None:
         self.source = mount(address)
         self.place = self.address = address
-        self.bucket, self.path, self.read_only = self.source.bucket, Path(address), read_only
+        self.cells, self.bucket = self.source.cells, self.source.bucket
+        self.path, self.read_only = Path(address), read_only
+        self.when_empty = f"The store is empty: `hybridlog copy {address}` fills it from a disk."
         # No server that a bucket names is asked.
         self.settings = replace(self._read_settings()[1], mongo=NONE)
         self.manifests: BucketManifests = self.source.manifests
@@ -451,11 +450,6 @@ class RemoteDirectory(StoreDirectory):
         return cls(address)
 
     @property
-    def when_empty(self) -> str:
-        """The sentence for a store without recordings."""
-        return f"The store is empty: `hybridlog copy {self.place}` fills it from one on a disk."
-
-    @property
     def is_writable(self) -> bool:
         """False: nothing is mended, or noted for others, without being asked to."""
         return False
@@ -483,10 +477,6 @@ class RemoteDirectory(StoreDirectory):
     def make_folder(self, recording: str) -> None:
         """Raise: nothing is recorded into a bucket."""
         self.check_writable()
-
-    def catalog_cells(self) -> Cells:
-        """The cells of the catalog, from its object."""
-        return self.source.cells
 
     def changed(self) -> tuple[int, bool]:
         """A number that changes with what is seen of the store, and True."""
@@ -568,13 +558,8 @@ class RemoteDirectory(StoreDirectory):
     def writing(
         self, recording: str, name: str = "", *, wait_s: float = 0.0, records: bool = False
     ) -> Iterator[None]:
-        """Nothing is locked: a change is made of the newest manifest, and made again.
-
-        Nothing can be recorded here: `records` raises `StoreError`.
-        """
+        """Nothing is locked: a change is made of the newest manifest, and made again."""
         self.check_changes()
-        if records:
-            self.check_writable()
         if not self.has(recording):
             raise gone(name or recording)
         yield
