@@ -242,13 +242,6 @@ class RecordingEntry:
             if (held := self.held.get(str(span[0]))) is None or not wanted.isdisjoint(held)
         ]
 
-    def to_document(self) -> dict[str, Any]:
-        """The entry as a mapping of plain values."""
-        found: dict[str, Any] = to_builtins(replace(self, flushed={}))
-        del found["flushed"]
-        spans, rows = [[*span] for span in self.spans], [[*one] for one in self.rows]
-        return {**found, "spans": spans, "rows": rows}
-
 
 def channel_totals(
     table: ChunkTable, decoded: Mapping[int, ChannelStats] | None, silent: Container[int] = ()
@@ -360,7 +353,7 @@ class Catalog:
                 if self._cells.read(_SCHEMA, digest) is None:
                     yield put(_SCHEMA, digest, _schema_body(schema))
             yield put(_TOPICS, summary.topics, topics_to_json(described.topics).encode())
-            yield put(_ENTRY, entry.id, _body([described.files, entry.to_document()]))
+            yield put(_ENTRY, entry.id, _body([described.files, to_builtins(replace(entry, flushed={}))]))
             yield put(_SUMMARY, entry.id, _summary_body(summary))
             index, _, damage = self._index(entry.id)
             if index:  # until it is compared with the index

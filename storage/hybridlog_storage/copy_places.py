@@ -32,7 +32,6 @@ from hybridlog_storage.manifests import DiskManifests
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
-    from contextlib import AbstractContextManager
 
     from hybridlog_storage.manifests import Manifests
 
@@ -131,13 +130,14 @@ class Place(ABC):
     manifests: Manifests
     mends: ClassVar[bool] = True
 
-    @abstractmethod
-    def working(self, recording: str) -> AbstractContextManager[None]:
+    @contextmanager
+    def working(self, recording: str) -> Iterator[None]:
         """Copy into a recording; where there are locks, `HeldError` if another process does."""
+        yield
 
-    @abstractmethod
     def sees(self, name: str) -> bool:
         """True if a file that another store has made in `manifests` is here, too."""
+        return False
 
     @abstractmethod
     def sizes(self, recording: str) -> dict[str, int]:

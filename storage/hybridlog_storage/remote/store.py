@@ -343,15 +343,6 @@ class BucketStore(Source):
         """Changes with what was seen of the store."""
         return self.manifests.number + len(self.bucket.lost)
 
-    @contextmanager
-    def working(self, recording: str) -> Iterator[None]:
-        """As of `Place`; here several may, since all of them write the same."""
-        yield
-
-    def sees(self, name: str) -> bool:
-        """As of `Place`."""
-        return False
-
     def sizes(self, recording: str) -> dict[str, int]:
         """As of `Place`; 1,000 a request."""
         folder = f"{RECORDINGS}/{recording}/"
