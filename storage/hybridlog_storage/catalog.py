@@ -345,6 +345,7 @@ class Catalog:
             self._remove_recordings_file()
         self._tables.drop("table", entry.id)
         self._topics[summary.topics] = tuple(described.topics)
+        plain = to_builtins(replace(entry, flushed={}))
         schemas = {c.schema for c in described.channels.values() if c.schema is not None}
         known = {schema_hash(schema): schema for schema in schemas}
 
@@ -353,7 +354,7 @@ class Catalog:
                 if self._cells.read(_SCHEMA, digest) is None:
                     yield put(_SCHEMA, digest, _schema_body(schema))
             yield put(_TOPICS, summary.topics, topics_to_json(described.topics).encode())
-            yield put(_ENTRY, entry.id, _body([described.files, to_builtins(replace(entry, flushed={}))]))
+            yield put(_ENTRY, entry.id, _body([described.files, plain]))
             yield put(_SUMMARY, entry.id, _summary_body(summary))
             index, _, damage = self._index(entry.id)
             if index:  # until it is compared with the index
