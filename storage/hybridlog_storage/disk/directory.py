@@ -20,12 +20,10 @@ import os
 import re
 import secrets
 import stat
-import sys
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
-from itertools import takewhile
 from pathlib import Path
 from typing import Any, ClassVar, Final, NamedTuple
 
@@ -63,7 +61,7 @@ _BESIDE: Final = _OF_MANIFEST | {WRITER_LOCK}
 _TICK_NS: Final = 50_000_000
 _POLL_S = 0.02
 _RECORDER_WAIT_S = 0.5  # a reader's look at a lock must not pass for a recorder
-_MAX_HOLDER = 256  # bytes of the line in a lock
+_HOLDER = 32  # bytes of the line in a lock
 
 
 class ListedFile(NamedTuple):
@@ -437,7 +435,9 @@ class StoreDirectory:
                 if not _is_at(fd, path):
                     raise gone(name or recording)
                 if is_mine:
-                    _say_holder(fd, records=records)
+                    line = b"%d %d" % (os.getpid(), records)
+                    with suppress(OSError):  # a full disk must not keep it from being removed
+                        files.system.pwritev(fd, [memoryview(line.ljust(_HOLDER))], 0)
                     try:
                         yield
                     finally:
@@ -485,25 +485,12 @@ class StoreDirectory:
         return holder is not None and holder.is_recording
 
 
-def _say_holder(fd: int, *, records: bool) -> None:
-    """Write into a lock who holds it. Of arguments only words: options may hold passwords."""
-    program = Path(sys.argv[0] if sys.argv else "")
-    name = program.parent.name if program.name == "__main__.py" else program.name
-    name = "python" if name in {"", "-c"} else name
-    words = takewhile(lambda word: not word.startswith("-"), sys.argv[1:])
-    command = " ".join([name, *(words if name == "hybridlog" else ())]).encode("ascii", "replace")
-    line = f"{os.getpid()} {int(records)} ".encode() + command
-    with suppress(OSError):  # a full disk must not keep a recording from being removed
-        files.system.pwritev(fd, [memoryview(line[:_MAX_HOLDER].ljust(_MAX_HOLDER))], 0)
-
-
 def _read_holder(fd: int) -> Holder:
     """The last holder of a lock, from its line; the store may come from another user."""
-    line = os.pread(fd, _MAX_HOLDER, 0).decode("ascii", "replace").strip()
-    found = re.fullmatch(r"(\d+) ([01]) (.*)", line)
-    if found is None or not line.isprintable():
+    found = re.fullmatch(rb"([0-9]{1,19}) ([01]) *", os.pread(fd, _HOLDER, 0))
+    if found is None:
         return Holder("another process", is_recording=False)
-    return Holder(f"process {found[1]} ({found[3]})", is_recording=found[2] == "1")
+    return Holder(f"process {int(found[1])}", is_recording=found[2] == b"1")
 
 
 def gone(name: str) -> TopicError:
