@@ -257,10 +257,9 @@ class DiskManifests(Manifests):
         """Names of folders in `recordings` that have no manifest, sorted, and what they hold."""
         found = self._names(self._recordings)  # before the manifests, which come later
         manifests = {*self._names(self._folder)}
-        for name in sorted(found):
-            if f"{name}{_SUFFIX}" not in manifests:
-                with suppress(OSError):  # it goes at this moment, or is none
-                    yield name, {*files.names(self._recordings / name)}
+        for name in sorted(name for name in found if f"{name}{_SUFFIX}" not in manifests):
+            with suppress(OSError):  # it goes at this moment, or is none
+                yield name, {*files.names(self._recordings / name)}
 
     def _names(self, folder: Path) -> list[str]:
         try:
