@@ -246,8 +246,8 @@ class Directory(Source):
         sent.count(at, False)
         os.lseek(fd, at, os.SEEK_SET)
         for piece in sent.pieces(at):
-            durability.write_all(fd, [piece])
-        durability.sync_file(fd)
+            files.write_all(fd, [piece])
+        files.system.sync(fd)
         return digest_of(read(fd, 0, sent.size)) == sent.digest
 
     def drop(self, name: str) -> None:
@@ -262,7 +262,7 @@ class Directory(Source):
             with _file(path) as fd:
                 if digest_of(read(fd, 0, sent.size)) != sent.digest:
                     return False
-                durability.sync_file(fd)
+                files.system.sync(fd)
             files.sync_folder(path.parent)
         except FileNotFoundError:
             return False

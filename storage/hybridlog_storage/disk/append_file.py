@@ -25,7 +25,6 @@ from blake3 import blake3
 
 from hybridlog_storage.buffers import buffers
 from hybridlog_storage.disk import files
-from hybridlog_storage.disk.durability import left_over, sync_file, write_all
 from hybridlog_storage.messages import Buffer
 
 if TYPE_CHECKING:
@@ -106,7 +105,7 @@ class AppendFile:
 
     def _append(self, parts: Sequence[Buffer]) -> None:
         if self._stage is None:
-            self.position += write_all(self._fd, parts)
+            self.position += files.write_all(self._fd, parts)
             return
         pieces: list[NDArray[np.uint8]] = []
         for part in filter(len, parts):
@@ -168,7 +167,7 @@ class AppendFile:
 
     def sync(self) -> None:
         """Return once everything appended is on the disk."""
-        sync_file(self._fd)
+        files.system.sync(self._fd)
 
     def close(self) -> None:
         """Close the file as it is."""
@@ -200,7 +199,7 @@ class AppendFile:
                     raise
                 continue
             position += done
-            pieces = left_over(pieces, done)
+            pieces = files.left_over(pieces, done)
 
     def _leave_direct(self) -> bool:
         """Write by way of the page cache from now on; False if that is so already."""

@@ -10,16 +10,12 @@ never meets a half-made one.
 from __future__ import annotations
 
 import errno
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import NO_SPACE, DiskFullError, HybridlogError, StoreError, exhausted
-
-if TYPE_CHECKING:
-    from hybridlog_storage.messages import Buffer
 
 
 def explain(error: OSError, path: Path, doing: str) -> HybridlogError:
@@ -46,29 +42,6 @@ def explained(path: Path, doing: str) -> Iterator[None]:
         yield
     except OSError as error:
         raise explain(error, path, doing) from error
-
-
-def write_all(fd: int, parts: Sequence[Buffer]) -> int:
-    """Write all parts at the file's position; return the number of bytes."""
-    views = [memoryview(part).cast("B") for part in parts if len(part)]
-    total = sum(len(view) for view in views)
-    while views:
-        views = left_over(views, files.system.writev(fd, views[:512]))
-    return total
-
-
-def left_over(views: Sequence[memoryview], done: int) -> list[memoryview]:
-    """The views without their first bytes."""
-    for index, view in enumerate(views):
-        if done < len(view):
-            return [view[done:], *views[index + 1 :]]
-        done -= len(view)
-    return []
-
-
-def sync_file(fd: int) -> None:
-    """Return once everything written to the file is on the disk."""
-    files.system.sync(fd)
 
 
 def publish(temporary: Path, final: Path) -> None:

@@ -25,9 +25,12 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, Final, cast
+from typing import TYPE_CHECKING, Any, Final, cast
 
 from hybridlog_storage.errors import StoreError
+
+if TYPE_CHECKING:
+    from hybridlog_storage.messages import Buffer
 
 _STORE = "hybridlog.toml"
 _LEVELS = 5  # of folders in a store
@@ -98,17 +101,14 @@ def folder(path: Path) -> Iterator[int]:
     try:
         fd = os.open(path, _FOLDER | os.O_NOFOLLOW)
     except OSError as error:  # ELOOP in some systems
-        if error.errno not in {errno.ENOTDIR, errno.ELOOP} or _is_in_store(path):
+        is_in_store = any(os.path.lexists(outer / _STORE) for outer in path.parents[:_LEVELS])
+        if error.errno not in {errno.ENOTDIR, errno.ELOOP} or is_in_store:
             raise
         fd = os.open(path, _FOLDER)
     try:
         yield fd
     finally:
         os.close(fd)
-
-
-def _is_in_store(path: Path) -> bool:
-    return any(os.path.lexists(outer / _STORE) for outer in path.parents[:_LEVELS])
 
 
 def open_file(path: Path, flags: int, mode: int = 0o666) -> int:
@@ -145,6 +145,24 @@ def _content(fd: int, most: int, path: Path | str) -> bytes:
         os.close(fd)
 
 
+def write_all(fd: int, parts: Sequence[Buffer]) -> int:
+    """Write all parts at the file's position; return the number of bytes."""
+    views = [memoryview(part).cast("B") for part in parts if len(part)]
+    total = sum(len(view) for view in views)
+    while views:
+        views = left_over(views, system.writev(fd, views[:512]))
+    return total
+
+
+def left_over(views: Sequence[memoryview], done: int) -> list[memoryview]:
+    """The views without their first bytes."""
+    for index, view in enumerate(views):
+        if done < len(view):
+            return [view[done:], *views[index + 1 :]]
+        done -= len(view)
+    return []
+
+
 def write_file(
     path: Path,
     content: bytes,
@@ -162,9 +180,7 @@ def write_file(
     fd = open_file(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
     try:
         try:
-            left = memoryview(content)
-            while left:
-                left = left[system.writev(fd, [left]) :]
+            write_all(fd, [content])
             if modified is not None:
                 os.utime(fd, ns=(modified, modified))
             if sync:
@@ -227,7 +243,14 @@ def changed_names(
     with folder(path) as fd:
         about = os.fstat(fd)
         now = about.st_ino, about.st_mtime_ns
-        return now, None if now == before else _names_in(fd)
+        if now == before:
+            return now, None
+        entries = {}
+        with os.scandir(fd) as listed:
+            for entry in listed:
+                with suppress(FileNotFoundError):
+                    entries[entry.name] = entry.stat(follow_symlinks=False)
+        return now, entries
 
 
 def is_fetched(fd: int) -> bool:
@@ -270,16 +293,6 @@ def identity(fd: Any) -> tuple[int, ...]:
 def duplicate(fd: Any) -> int:
     """As `os.dup`."""
     return cast("int", fd.again()) if is_fetched(fd) else os.dup(fd)
-
-
-def _names_in(fd: int) -> dict[str, os.stat_result]:
-    """The status of each entry of an open folder, by name."""
-    found: dict[str, os.stat_result] = {}
-    with os.scandir(fd) as entries:
-        for entry in entries:
-            with suppress(FileNotFoundError):
-                found[entry.name] = entry.stat(follow_symlinks=False)
-    return found
 
 
 def most_open(most: int) -> int:

@@ -40,18 +40,13 @@ _MARK: Final = struct.Struct("<II")
 class CachedFile(int):
     """A handle of the cached file of an object, which fetches what is read."""
 
-    _cache: BlockCache
-    _bucket: Bucket
-    _about: Object
-    _lock: threading.Lock
-    _proved: set[int]
-
-    def __new__(cls, fd: int, cache: BlockCache, bucket: Bucket, about: Object) -> Self:
+    def __new__(cls, fd: int, *_: object) -> Self:
         """A handle that takes over an open file."""
-        made = super().__new__(cls, fd)
-        made._cache, made._bucket, made._about = cache, bucket, about
-        made._lock, made._proved = threading.Lock(), set()
-        return made
+        return super().__new__(cls, fd)
+
+    def __init__(self, _: int, cache: BlockCache, bucket: Bucket, about: Object) -> None:
+        self._cache, self._bucket, self._about = cache, bucket, about
+        self._lock, self._proved = threading.Lock(), set[int]()
 
     def identity(self) -> tuple[int, ...]:
         """A value that no other object has, nor this one after a change."""
@@ -110,9 +105,8 @@ class CachedFile(int):
 
     def _is_there(self, sums: int, number: int) -> bool:
         mark = os.pread(sums, _MARK.size, number * _MARK.size)
-        if len(mark) < _MARK.size or mark == bytes(_MARK.size):
-            return False
-        return mark == _MARK.pack(1, crc32(os.pread(self, BLOCK, number * BLOCK)))
+        is_known = mark[:1] == b"\1"
+        return is_known and mark == _MARK.pack(1, crc32(os.pread(self, BLOCK, number * BLOCK)))
 
 
 class BlockCache:
