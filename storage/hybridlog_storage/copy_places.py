@@ -122,8 +122,7 @@ class Sending:
 class Place(ABC):
     """A store that recordings are copied to; `address` is what people call it.
 
-    With `mends`, each copy looks for lost files, and makes a lost manifest again: not on a server,
-    where each look takes a while.
+    With `mends`, each copy looks for lost files: not on a server, where each look takes a while.
     """
 
     address: str
