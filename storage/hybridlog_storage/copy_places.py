@@ -24,7 +24,6 @@ from hybridlog_storage.disk.directory import (
 )
 from hybridlog_storage.errors import (
     StoreError,
-    TopicError,
     unreadable,
 )
 from hybridlog_storage.manifest import digest_of, hasher
@@ -194,16 +193,7 @@ class Directory(Source):
     @contextmanager
     def working(self, recording: str) -> Iterator[None]:
         """As of `Place`; nobody else writes the recording meanwhile."""
-        directory, path = StoreDirectory(self._path), self._path / RECORDINGS / recording
-        with ExitStack() as held:
-            while True:
-                with durability.explained(path, "copying into"):
-                    files.make_folders(path)
-                    files.sync_folder(self._path)
-                    files.sync_folder(path.parent)
-                with suppress(TopicError):  # it was removed meanwhile
-                    held.enter_context(directory.writing(recording, wait_s=LOCK_WAIT_S))
-                    break
+        with StoreDirectory(self._path).writing(recording, wait_s=LOCK_WAIT_S, makes=True):
             yield
 
     def sees(self, name: str) -> bool:

@@ -50,7 +50,7 @@ def test_what_is_no_place_for_a_store(tmp_path: Path) -> None:
 
 
 def made(store: StoreDirectory, name: str = "r") -> Path:
-    store.make_folder(name)
+    files.make_folders(store.recording(name))
     return store.recording(name)
 
 

@@ -390,11 +390,6 @@ class StoreDirectory:
         """Directory of the embedded MongoDB."""
         return self.path / "mongod"
 
-    def make_folder(self, recording: str) -> None:
-        """Make the folder of a recording that begins, within `manifests.creating`."""
-        with durability.explained(self.path, "starting a recording in"):
-            files.make_folder(self.recording(recording))
-
     @contextmanager
     def retaining(self) -> Iterator[bool]:
         """Lock out other passes of retention; yields False if another process makes one."""
@@ -410,20 +405,30 @@ class StoreDirectory:
 
     @contextmanager
     def writing(
-        self, recording: str, name: str = "", *, wait_s: float = 0.0, records: bool = False
+        self,
+        recording: str,
+        name: str = "",
+        *,
+        wait_s: float = 0.0,
+        records: bool = False,
+        makes: bool = False,
     ) -> Iterator[None]:
         """Lock a recording for writing, else `HeldError`; `TopicError` if it is gone.
 
         `wait_s` is for another command that holds it. A recorder may hold it for hours, so it is
-        not waited for.
+        not waited for. With `makes` it is a new one: its folder is made.
         """
         begun, path = time.monotonic(), self.recording(recording) / LOCK
         while True:
             try:
                 fd = files.open_file(path, os.O_RDWR | os.O_CREAT)
             except FileNotFoundError as error:
-                if not self._makes_folder(recording):
+                if not makes and recording not in self.looks([recording]):
                     raise gone(name or recording) from error
+                with durability.explained(path.parent, "making"):  # copies leave out empty ones
+                    files.make_folders(path.parent)
+                    files.sync_folder(self.path)
+                    files.sync_folder(self.recordings)
                 continue
             except OSError as error:
                 raise durability.explain(error, path, "locking") from error
@@ -432,7 +437,11 @@ class StoreDirectory:
                 with suppress(BlockingIOError):
                     fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
                     is_mine = True
-                if not _is_at(fd, path):
+                with durability.explained(path, "locking"):
+                    is_there = files.is_at(fd, path)
+                if not is_there and makes:
+                    continue
+                if not is_there:
                     raise gone(name or recording)
                 if is_mine:
                     line = b"%d %d" % (os.getpid(), records)
@@ -456,14 +465,6 @@ class StoreDirectory:
                     is_recording=holder.is_recording,
                 )
             pause(_POLL_S)
-
-    def _makes_folder(self, recording: str) -> bool:
-        """True if a recording's folder is there by now; copies of a store leave out empty ones."""
-        if recording not in self.looks([recording]):
-            return False
-        with suppress(FileExistsError):
-            self.make_folder(recording)
-        return True
 
     def holder(self, recording: str) -> Holder | None:
         """The process that holds a recording's lock at this moment."""
@@ -496,11 +497,6 @@ def _read_holder(fd: int) -> Holder:
 def gone(name: str) -> TopicError:
     """The error for a recording that was removed meanwhile."""
     return TopicError(f"Recording {name!r} is no longer in the store.")
-
-
-def _is_at(fd: int, path: Path) -> bool:
-    with durability.explained(path, "locking"):
-        return files.is_at(fd, path)
 
 
 def _folder_look(recording: str, folders: int) -> str:

@@ -465,10 +465,6 @@ class RemoteDirectory(StoreDirectory):
         self.bucket.replace(SETTINGS, settings_text(new), version)
         self.settings = replace(new, mongo=NONE)
 
-    def make_folder(self, recording: str) -> None:
-        """Raise: nothing is recorded into a bucket."""
-        self.check_writable()
-
     def changed(self) -> tuple[int, bool]:
         """A number that changes with what is seen of the store, and True."""
         self.manifests.look()
@@ -547,10 +543,18 @@ class RemoteDirectory(StoreDirectory):
 
     @contextmanager
     def writing(
-        self, recording: str, name: str = "", *, wait_s: float = 0.0, records: bool = False
+        self,
+        recording: str,
+        name: str = "",
+        *,
+        wait_s: float = 0.0,
+        records: bool = False,
+        makes: bool = False,
     ) -> Iterator[None]:
         """Nothing is locked: a change is made of the newest manifest, and made again."""
         self.check_changes()
+        if makes:
+            self.check_writable()
         if not self.has(recording):
             raise gone(name or recording)
         yield
