@@ -180,7 +180,7 @@ def _target(to: str | Path, options: CopyOptions, store: Store) -> Iterator[Targ
     """The place that recordings of a store are copied to."""
     from hybridlog.follow.follower import make_tables
     from hybridlog.maintenance.copying import Target
-    from hybridlog_storage.copy_places import BucketStore, Directory
+    from hybridlog_storage.copy_places import Directory
 
     source, address = store.directory, address_of(to)
     if str(to).startswith("ssh://"):
@@ -197,8 +197,10 @@ def _target(to: str | Path, options: CopyOptions, store: Store) -> Iterator[Targ
         if source.place == address:
             raise UsageError(f"{address} is this very store: there is nothing to copy.")
         target = RemoteDirectory.create_in(address)
-        place = BucketStore(target.bucket, target.manifests)
-        found = Target(place, lambda name: free_name_in(target.manifests.each(target.ids()), name))
+        found = Target(
+            target.source,
+            lambda name: free_name_in(target.manifests.each(target.ids()), name),
+        )
         try:
             yield found
         finally:

@@ -34,6 +34,7 @@ from hybridlog.entries import (
 from hybridlog.maintenance.opening import StoreFiles
 from hybridlog.maintenance.report import RepairReport
 from hybridlog_storage.catalog import CATALOG, Catalog, RecordingEntry
+from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.errors import CatalogError, ManifestError, SegmentError
 from hybridlog_storage.manifest import File, Loss, Manifest, Note, Part, Source, new_id, with_rows
@@ -80,7 +81,7 @@ class Made:
     def __init__(self, directory: StoreDirectory, name: str = "run", segments: int = 4) -> None:
         self.directory = directory
         self.id = new_id(name)
-        directory.make_folder(self.id)
+        files.make_folders(directory.recording(self.id))
         self.path = directory.recording(self.id)
         self.said = {
             "id": self.id,
@@ -451,7 +452,7 @@ def test_chunks_that_cannot_be_read_are_lost_by_topic(made: Made) -> None:
 
 
 def test_nothing_says_what_recording_it_is(directory: StoreDirectory) -> None:
-    directory.make_folder("x")
+    files.make_folders(directory.recording("x"))
     places.segment(directory.path, "x").write_bytes(b"nothing")
     with closing(Catalog(Path("/nowhere"), "x", in_memory=True)) as catalog:
         with pytest.raises(ManifestError, match="x has no manifest"):

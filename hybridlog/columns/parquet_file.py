@@ -19,7 +19,7 @@ from hybridlog.columns.column_file import ReusedBytes, leaves
 from hybridlog.columns.layout import ABOUT, About, Section
 from hybridlog.schema.arrow_types import is_bytes
 from hybridlog_storage.checksum import crc32
-from hybridlog_storage.disk import durability, files
+from hybridlog_storage.disk import files
 from hybridlog_storage.manifest import hasher
 
 if TYPE_CHECKING:
@@ -178,7 +178,7 @@ class _Sink:
 
     def _flush(self) -> None:
         data = bytes(self._waiting)
-        durability.write_all(self._fd, [data])
+        files.write_all(self._fd, [data])
         self._digest.update(data)
         self._waiting.clear()
 

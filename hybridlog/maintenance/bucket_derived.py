@@ -41,7 +41,7 @@ def bring_derived(source: Shared, target: RemoteDirectory, recordings: Collectio
             known[recording] = entry, _bring_tables(source, target, entry)
     cells = target.source.cells
     for _ in range(_TRIES if known else 0):
-        target.seen.look(now=True)
+        target.manifests.look(now=True)
         catalog = open_catalog(target)
         for recording, (entry, tables) in known.items():
             with suppress(StoreError):  # who asks for it there is told what is wrong

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from hybridlog.wording import counted
 from hybridlog_storage import copy
-from hybridlog_storage.copy_places import RECORDINGS, BucketStore, Directory, RefusedError
+from hybridlog_storage.copy_places import RECORDINGS, Directory, RefusedError
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import gone
 from hybridlog_storage.errors import (
@@ -26,7 +26,6 @@ from hybridlog_storage.errors import (
     StoreError,
     UsageError,
 )
-from hybridlog_storage.remote.bucket import Bucket
 
 if TYPE_CHECKING:
     from hybridlog.maintenance.report import Progress
@@ -126,7 +125,9 @@ class Copying:
     @staticmethod
     def _source_of(directory: StoreDirectory) -> Source:
         if directory.is_remote:
-            return BucketStore(Bucket(directory.place))
+            from hybridlog_storage.remote.store import mount
+
+            return mount(directory.place)
         return Directory(directory.path)
 
     def _is_same(self) -> bool:

@@ -56,7 +56,7 @@ def open_catalog(directory: StoreDirectory) -> Catalog:
         directory.path,
         directory.settings.store_id,
         in_memory=not directory.is_writable,
-        cells=directory.catalog_cells(),
+        cells=directory.cells,
     )
 
 

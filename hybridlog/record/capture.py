@@ -252,8 +252,7 @@ class Capture:
     def _begin(self, create: Callable[[Manifest], None], manifest: Manifest) -> RecordingEntry:
         """Create and lock the recording's folder, then its manifest."""
         recording = manifest.id
-        self._directory.make_folder(recording)
-        lock = self._directory.writing(recording, wait_s=LOCK_WAIT_S, records=True)
+        lock = self._directory.writing(recording, wait_s=LOCK_WAIT_S, records=True, makes=True)
         self._held.enter_context(lock)
         create(manifest)
         return put_entry(self._directory, self.catalog, recording, is_open=True)

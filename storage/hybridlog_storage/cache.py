@@ -26,25 +26,6 @@ class Cache:
         self._size = 0
         self._lock = threading.Lock()
 
-    def get(self, kind: Kind, *key: Hashable) -> Any:
-        """A value; None if it is not there."""
-        with self._lock:
-            if (kind, *key) not in self._values:
-                return None
-            self._values.move_to_end((kind, *key))
-            return self._values[kind, *key][0]
-
-    def put(self, kind: Kind, *key: Hashable, value: object, size: int) -> None:
-        """Keep a value of `size` bytes in place of an older one; nothing if it is too large."""
-        with self._lock:
-            self._remove((kind, *key))
-            if size > self.max_bytes:
-                return
-            self._values[kind, *key] = value, size
-            self._size += size
-            while self._size > self.max_bytes:
-                self._remove(next(iter(self._values)))
-
     def made(
         self,
         kind: Kind,
@@ -52,12 +33,22 @@ class Cache:
         make: Callable[[], Value],
         size_of: Callable[[Value], int],
     ) -> Value:
-        """A value that is made where it is not there."""
-        found = self.get(kind, *key)
-        if found is None:
-            found = make()
-            self.put(kind, *key, value=found, size=size_of(found))
-        return cast("Value", found)
+        """A value that is made where it is not there; one that is too large is not kept."""
+        name = (kind, *key)
+        with self._lock:
+            if name in self._values:
+                self._values.move_to_end(name)
+                return cast("Value", self._values[name][0])
+        found = make()
+        with self._lock:
+            self._remove(name)
+            self._values[name] = found, size_of(found)
+            self._size += self._values[name][1]
+            if self._values[name][1] > self.max_bytes:
+                self._remove(name)
+            while self._size > self.max_bytes:
+                self._remove(next(iter(self._values)))
+        return found
 
     def drop(self, kind: Kind, *begin: Hashable) -> None:
         """Forget the values of a kind, or those whose keys begin so."""

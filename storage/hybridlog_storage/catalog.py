@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from msgspec import convert, to_builtins
+from msgspec import to_builtins
 from msgspec.json import Decoder, encode
 
 from hybridlog_storage.cache import Cache
@@ -242,13 +242,6 @@ class RecordingEntry:
             if (held := self.held.get(str(span[0]))) is None or not wanted.isdisjoint(held)
         ]
 
-    def to_document(self) -> dict[str, Any]:
-        """The entry as a mapping of plain values."""
-        found: dict[str, Any] = to_builtins(replace(self, flushed={}))
-        del found["flushed"]
-        spans, rows = [[*span] for span in self.spans], [[*one] for one in self.rows]
-        return {**found, "spans": spans, "rows": rows}
-
 
 def channel_totals(
     table: ChunkTable, decoded: Mapping[int, ChannelStats] | None, silent: Container[int] = ()
@@ -352,6 +345,7 @@ class Catalog:
             self._remove_recordings_file()
         self._tables.drop("table", entry.id)
         self._topics[summary.topics] = tuple(described.topics)
+        plain = to_builtins(replace(entry, flushed={}))
         schemas = {c.schema for c in described.channels.values() if c.schema is not None}
         known = {schema_hash(schema): schema for schema in schemas}
 
@@ -360,7 +354,7 @@ class Catalog:
                 if self._cells.read(_SCHEMA, digest) is None:
                     yield put(_SCHEMA, digest, _schema_body(schema))
             yield put(_TOPICS, summary.topics, topics_to_json(described.topics).encode())
-            yield put(_ENTRY, entry.id, _body([described.files, entry.to_document()]))
+            yield put(_ENTRY, entry.id, _body([described.files, plain]))
             yield put(_SUMMARY, entry.id, _summary_body(summary))
             index, _, damage = self._index(entry.id)
             if index:  # until it is compared with the index
@@ -549,14 +543,8 @@ _NAMES_OF: Final = Decoder(tuple[str, str])
 
 def _read(decoder: Decoder[_T], body: bytes | None) -> _T | None:
     """The value of a cell; None if it is of another kind."""
-    if not body:
-        return None
-    try:
-        return decoder.decode(body)
-    except (ValueError, RecursionError):  # a name may not be UTF-8
-        with suppress(ValueError, RecursionError):
-            found: _T = convert(json.loads(body), decoder.type)
-            return found
+    with suppress(ValueError, RecursionError):
+        return decoder.decode(body or b"")
     return None
 
 

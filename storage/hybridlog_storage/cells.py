@@ -13,7 +13,7 @@ import os
 import sqlite3
 import stat
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from threading import RLock
 from typing import Any, Final, TypeVar
@@ -110,7 +110,7 @@ class Cells:
                     files.remove_tree(place)
         with suppress(FileExistsError):
             os.close(files.open_file(self._path, os.O_RDWR | os.O_CREAT | os.O_EXCL))
-        opened = _connected(_address(self._path, "rw"))
+        opened = _connected(f"file:{quote(os.fsencode(self._path.absolute()))}?mode=rw")
         try:
             if not self._is_ours(opened):
                 with _transaction(opened, _READ_S):
@@ -136,13 +136,10 @@ class Cells:
         """A database in memory with the cells of the file or content; empty if it is unreadable."""
         made = _connected()
         with suppress(*_ERRORS):
-            if content:
+            if self._path is not None and not self._writes:
+                content = files.read_file(self._path, _MAX_COPIED)
+            if content:  # it takes an empty one for a lack of memory
                 made.deserialize(content)
-            elif self._path is not None and not self._writes:
-                about = files.status(self._path)
-                if stat.S_ISREG(about.st_mode) and about.st_size <= _MAX_COPIED:
-                    with closing(_connected(_address(self._path, "ro&immutable=1"))) as source:
-                        source.backup(made)
             if self._is_ours(made):
                 return made
         made.close()
@@ -226,10 +223,6 @@ def _transaction(opened: sqlite3.Connection, wait_s: float) -> Iterator[None]:
     finally:
         with suppress(sqlite3.Error):
             opened.execute(f"PRAGMA busy_timeout = {int(_READ_S * 1000)}")
-
-
-def _address(path: Path, mode: str) -> str:
-    return f"file:{quote(os.fsencode(path.absolute()))}?mode={mode}"
 
 
 def _connected(address: str = ":memory:") -> sqlite3.Connection:

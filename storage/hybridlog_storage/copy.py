@@ -7,20 +7,20 @@ the status; what people said of the recording there stays (`merging`).
 from __future__ import annotations
 
 import time
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from hybridlog_storage.copy_places import RECORDINGS, RefusedError, Sending
 from hybridlog_storage.disk.directory import ListedFile, listed_files
-from hybridlog_storage.errors import ManifestError, RecordingExistsError, StoreError
+from hybridlog_storage.errors import RecordingExistsError, StoreError
 from hybridlog_storage.manifest import Manifest, replace
 from hybridlog_storage.manifests import MANIFEST_LOCK, WRITER_LOCK
 from hybridlog_storage.merging import check_origin, merged, wanted
 from hybridlog_storage.stopping import pause, safe_point
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Mapping
+    from collections.abc import Callable, Mapping
     from contextlib import AbstractContextManager
 
     from hybridlog_storage.copy_places import Place, Source
@@ -107,15 +107,14 @@ class _Copy:
         self._due = 0.0  # time from which more may be sent
         self._new: set[str] = set()  # paths of files that the manifest there did not list
         self._proved: dict[str, str] = {}  # digests by path
-        self._damaged: Collection[int] = ()  # numbers of logs that have lost rows there
+        self._is_there = False  # its manifest
 
     def known(self) -> Copied | None:
         """The result if there is nothing to copy, found without a lock; None if there is."""
-        here, target, there = self._here, self._target, None
+        here, target = self._here, self._target
         if self._must_prove:
             return None
-        with suppress(ManifestError):  # it may be made again
-            there = target.manifests.find(here.id)
+        there = target.manifests.find(here.id)
         check_origin(here, there)
         if there is None or there.status == "unproven" or self._wanted(there):
             return None
@@ -136,14 +135,12 @@ class _Copy:
             sizes = target.sizes(here.id)
             there = self._find(sizes)
             check_origin(here, there)
-            self._damaged = self._find_damaged(there, sizes)
-            believed = self._believed(there)
-            logs = self._wanted(believed)
+            logs = self._wanted(there)
             if logs and self._how.prepare is not None:
                 here, self._others = stack.enter_context(self._how.prepare(here, logs))
                 logs = [here.logs[log.number] for log in logs]
-            copied = Copied(here, there is None, lacking=_lacking(here, believed))
-            self._bring(here, believed, logs, sizes, copied)
+            copied = Copied(here, there is None, lacking=_lacking(here, there))
+            self._bring(here, there, logs, sizes, copied)
             copied.manifest = self._publish(here, there, {log.number for log in logs})
             self._clear(there, copied.manifest, sizes)
             if self._how.proved is not None:
@@ -153,62 +150,24 @@ class _Copy:
     def _wanted(self, there: Manifest | None) -> list[File]:
         return wanted(self._here, there, awaited=self._how.prepare is None)
 
-    def _believed(self, there: Manifest | None) -> Manifest | None:
-        """The manifest there without the logs that are to come again."""
-        files = () if there is None else there.files
-        left = tuple(file for file in files if file.number not in self._damaged)
-        return there and replace(there, files=left)
-
-    def _find_damaged(self, there: Manifest | None, sizes: Mapping[str, int]) -> set[int]:
-        """Numbers of logs that are here, and are gone there with rows that are not here."""
-        if there is None:
-            return set()
-        gone = {n for n, log in there.logs.items() if not log.is_here}
-        gone &= {n for n, log in self._here.logs.items() if log.is_here}
-        return {
-            number
-            for one in {*listed_files(there)} - {*listed_files(self._here)}
-            if (number := int(one.path[:6])) in gone
-            and (self._must_prove or sizes.get(one.path) != one.bytes)
-            and not self._is_whole(one, sizes)
-        }
-
     def _is_whole(self, file: ListedFile, sizes: Mapping[str, int]) -> bool:
         reads = file.path not in self._new
         is_there = sizes.get(file.path) == file.bytes
         return is_there and self._target.is_whole(self._sending(file), reads=reads)
 
     def _find(self, sizes: Mapping[str, int]) -> Manifest | None:
-        """The manifest there; one that is lost or damaged is made again."""
-        here, target = self._here, self._target
-        try:
-            there = target.manifests.find(here.id)
-            is_begun = WRITER_LOCK in sizes and MANIFEST_LOCK not in sizes  # by a stopped copy
-            if there is not None or is_begun:
-                return there
-            old = target.manifests.old(here.id) if target.mends else None
-            if not (MANIFEST_LOCK in sizes or old is not None or self._more(sizes)):
-                return None
-        except ManifestError as error:
-            if not target.mends:
-                raise RefusedError(
-                    f"{here.name} is not copied. {target.address}: {error}"
-                ) from error
-
-        def make(old: Manifest | None) -> Manifest:
-            if old is not None and old.created == here.created:
-                return old
-            if more := self._more(sizes):
-                raise RefusedError(
-                    f"{here.name} in {target.address} has lost its manifest, and has payloads "
-                    f"that are not here, in {', '.join(more)}. It stays as it is."
-                )
-            return replace(here, name=self._how.named(here.name), files=())
-
-        if target.mends:
-            return target.manifests.restore(here.id, make)
-        make(None)
-        return None
+        """The manifest there, or of one that was lost, the one before."""
+        here, manifests = self._here, self._target.manifests
+        there = manifests.find(here.id)
+        self._is_there = there is not None
+        there = there or manifests.old(here.id)
+        is_begun = WRITER_LOCK in sizes and MANIFEST_LOCK not in sizes  # by a stopped copy
+        if there is None and not is_begun and (more := self._more(sizes)):
+            raise RefusedError(
+                f"{here.name} in {self._target.address} has lost its manifest, and has payloads "
+                f"that are not here, in {', '.join(more)}. It stays as it is."
+            )
+        return there
 
     def _more(self, sizes: Mapping[str, int]) -> list[str]:
         """Logs there that are larger than those of their numbers here."""
@@ -272,15 +231,16 @@ class _Copy:
     def _publish(self, here: Manifest, there: Manifest | None, brought: set[int]) -> Manifest:
         manifests = self._target.manifests
         self._check_files()
-        if there is None:
+        if not self._is_there:
             try:
                 with manifests.creating() as create:
-                    made = replace(here, name=self._how.named(here.name))
+                    made = merged(here, there, brought)
+                    made = replace(made, name=self._how.named(made.name))
                     create(made)
                 return made
             except RecordingExistsError:
                 pass  # another process was faster
-        return manifests.change(here.id, lambda now: merged(here, self._believed(now), brought))
+        return manifests.change(here.id, lambda now: merged(here, now, brought))
 
     def _check_files(self) -> None:
         """Raise if files are no longer there: a removal that ends takes them along."""

@@ -1,8 +1,8 @@
-"""Places that recordings are copied to and from: the directory of a store, and a bucket.
+"""Places that recordings are copied to and from, and the first one: the directory of a store.
 
 A place makes a file visible under its name only when all of it has arrived and is proved: its
 bytes were read back, or the server has told their checksum. In a directory it grows beside, as
-`.DIGEST.part`, where the next copy goes on. A server is a place in `sftp`.
+`.DIGEST.part`, where the next copy goes on. Others are in `remote.store` and `sftp`.
 """
 
 from __future__ import annotations
@@ -23,27 +23,22 @@ from hybridlog_storage.disk.directory import (
     StoreDirectory,
 )
 from hybridlog_storage.errors import (
-    ObjectChangedError,
     StoreError,
-    TopicError,
     unreadable,
 )
 from hybridlog_storage.manifest import digest_of, hasher
-from hybridlog_storage.manifests import BucketManifests, DiskManifests
+from hybridlog_storage.manifests import DiskManifests
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
-    from contextlib import AbstractContextManager
 
     from hybridlog_storage.manifests import Manifests
-    from hybridlog_storage.remote.bucket import Bucket, Object
 
 RECORDINGS: Final = "recordings"
 MANIFESTS: Final = "manifests"
 MARK: Final = ".copying-"
 """Prefix of small files in `manifests` that live for a moment."""
 _PIECE: Final = 1 << 20
-_FETCHED: Final = 8 << 20  # bytes that a bucket is asked for
 
 
 class RefusedError(StoreError):
@@ -126,21 +121,21 @@ class Sending:
 class Place(ABC):
     """A store that recordings are copied to; `address` is what people call it.
 
-    With `mends`, each copy looks for lost files, and makes a lost manifest again: not on a server,
-    where each look takes a while.
+    With `mends`, each copy looks for lost files: not on a server, where each look takes a while.
     """
 
     address: str
     manifests: Manifests
     mends: ClassVar[bool] = True
 
-    @abstractmethod
-    def working(self, recording: str) -> AbstractContextManager[None]:
+    @contextmanager
+    def working(self, recording: str) -> Iterator[None]:
         """Copy into a recording; where there are locks, `HeldError` if another process does."""
+        yield
 
-    @abstractmethod
     def sees(self, name: str) -> bool:
         """True if a file that another store has made in `manifests` is here, too."""
+        return False
 
     @abstractmethod
     def sizes(self, recording: str) -> dict[str, int]:
@@ -198,18 +193,7 @@ class Directory(Source):
     @contextmanager
     def working(self, recording: str) -> Iterator[None]:
         """As of `Place`; nobody else writes the recording meanwhile."""
-        directory, path = StoreDirectory(self._path), self._path / RECORDINGS / recording
-        with ExitStack() as held:
-            while True:
-                try:
-                    files.make_folders(path)
-                    files.sync_folder(self._path)
-                    files.sync_folder(path.parent)
-                except OSError as error:
-                    raise durability.explain(error, path, "copying into") from error
-                with suppress(TopicError):  # it was removed meanwhile
-                    held.enter_context(directory.writing(recording, wait_s=LOCK_WAIT_S))
-                    break
+        with StoreDirectory(self._path).writing(recording, wait_s=LOCK_WAIT_S, makes=True):
             yield
 
     def sees(self, name: str) -> bool:
@@ -232,7 +216,7 @@ class Directory(Source):
     def send(self, sent: Sending) -> None:
         """As of `Place`; goes on behind the last byte that is there."""
         final, part = self._path / sent.name, self._path / sent.part
-        try:
+        with durability.explained(final, "copying into"):
             fd = files.open_file(part, os.O_RDWR | os.O_CREAT)
             try:
                 about = os.fstat(fd)
@@ -244,8 +228,6 @@ class Directory(Source):
             finally:
                 os.close(fd)
             durability.publish(part, final)
-        except OSError as error:
-            raise durability.explain(error, final, "copying into") from error
 
     def _grown(self, fd: int, at: int, sent: Sending) -> bool:
         """Write a file from a byte on; True if it is on the disk, with its digest."""
@@ -253,8 +235,8 @@ class Directory(Source):
         sent.count(at, False)
         os.lseek(fd, at, os.SEEK_SET)
         for piece in sent.pieces(at):
-            durability.write_all(fd, [piece])
-        durability.sync_file(fd)
+            files.write_all(fd, [piece])
+        files.system.sync(fd)
         return digest_of(read(fd, 0, sent.size)) == sent.digest
 
     def drop(self, name: str) -> None:
@@ -269,7 +251,7 @@ class Directory(Source):
             with _file(path) as fd:
                 if digest_of(read(fd, 0, sent.size)) != sent.digest:
                     return False
-                durability.sync_file(fd)
+                files.system.sync(fd)
             files.sync_folder(path.parent)
         except FileNotFoundError:
             return False
@@ -304,71 +286,13 @@ class Directory(Source):
     def marked(self) -> Iterator[str]:
         """Make a small file in `manifests`, for a moment; gives its name."""
         path = self._path / MANIFESTS / f"{MARK}{secrets.token_hex(8)}"
-        try:
+        with durability.explained(path, "copying from"):
             os.close(files.open_file(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL))
-        except OSError as error:
-            raise durability.explain(error, path, "copying from") from error
         try:
             yield path.name
         finally:
             with suppress(OSError):
                 files.unlink(path)
-
-
-class BucketStore(Source):
-    """A store in a bucket; without `manifests`, each of them is asked for."""
-
-    def __init__(self, bucket: Bucket, manifests: Manifests | None = None) -> None:
-        self.address = bucket.address
-        self.manifests = manifests or BucketManifests(bucket)
-        self._bucket = bucket
-        self._found: dict[str, Object] = {}
-
-    @contextmanager
-    def working(self, recording: str) -> Iterator[None]:
-        """As of `Place`; here several may, since all of them write the same."""
-        yield
-
-    def sees(self, name: str) -> bool:
-        """As of `Place`."""
-        return False
-
-    def sizes(self, recording: str) -> dict[str, int]:
-        """As of `Place`; 1,000 a request."""
-        folder = f"{RECORDINGS}/{recording}/"
-        found = {one.name: one for one in self._bucket.objects(folder)}
-        self._found |= found
-        return {name.removeprefix(folder): one.size for name, one in found.items()}
-
-    def send(self, sent: Sending) -> None:
-        """As of `Place`; from its first byte on."""
-        self._found[sent.name] = self._bucket.put(sent.name, sent.size, sent.checked())
-        if not self.is_whole(sent):
-            raise sent.not_arrived(self)
-
-    def drop(self, name: str) -> None:
-        """As of `Place`."""
-        self._bucket.delete([name])
-
-    def is_whole(self, sent: Sending, *, reads: bool = False) -> bool:
-        """As of `Place`: by the checksum of the server, or it is read."""
-        with suppress(RefusedError):  # what is damaged here may be whole there
-            if not reads and self._found[sent.name].has_md5_of(sent.again()):
-                return True
-        with suppress(RefusedError):
-            return digest_of(self.pieces(sent.name, 0, sent.size)) == sent.digest
-        return False
-
-    def pieces(self, name: str, at: int, size: int) -> Iterator[bytes]:
-        """As of `Source`."""
-        where = f"{self.address}/{name}"
-        for begin in range(at, size, _FETCHED):
-            try:
-                yield self._bucket.read(name, begin, min(begin + _FETCHED, size), size)
-            except FileNotFoundError as error:
-                raise RefusedError(f"{where} cannot be copied: {error.strerror}.") from error
-            except ObjectChangedError as error:
-                raise RefusedError(f"{where} is damaged: it has not {size} bytes.") from error
 
 
 @contextmanager

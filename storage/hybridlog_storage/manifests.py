@@ -32,7 +32,6 @@ from hybridlog_storage.errors import (
     HeldError,
     ManifestError,
     ObjectChangedError,
-    ObjectExistsError,
     RecordingExistsError,
     RecordingGoneError,
     StoreError,
@@ -43,8 +42,6 @@ from hybridlog_storage.manifest import MAX_BYTES, Manifest, decode, encode, is_i
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
     from pathlib import Path
-
-    from hybridlog_storage.remote.bucket import Bucket
 
 WAIT_S: Final = 30.0
 """Longest wait of a change for others, which take milliseconds."""
@@ -61,8 +58,9 @@ MANIFEST_OLD: Final = "manifest.old"
 
 
 class Manifests(ABC):
-    """The manifests of a store, in a directory or in a bucket."""
+    """The manifests of a store, in a directory or in a bucket; `place` is what people call it."""
 
+    place: str
     cure: ClassVar[str] = "`hybridlog verify --repair` makes it again."
 
     @abstractmethod
@@ -73,19 +71,12 @@ class Manifests(ABC):
         """Ids of recordings that have lost their manifest, sorted; of none by default."""
         return []
 
-    def clear(self) -> None:
+    def clear(self) -> None:  # noqa: B027 - a bucket has nothing of that
         """Remove what is left of beginnings and removals of processes that were killed."""
-        for one in self.ids():
-            try:
-                self.find(one)
-            except RecordingGoneError:
-                self.remove(one)
-            except ManifestError:
-                continue  # it is told where it is asked about
 
     def read(self, recording: str) -> Manifest:
         """The newest manifest of a recording; `RecordingGoneError` if there is none."""
-        return _present(self._read(recording)[0])
+        return _present(self._seen(recording)[0])
 
     def find(self, recording: str) -> Manifest | None:
         """The newest manifest of a recording; None if there is no such recording.
@@ -93,7 +84,7 @@ class Manifests(ABC):
         One that is being removed raises `RecordingGoneError`.
         """
         try:
-            found, _ = self._read(recording)
+            found, _ = self._seen(recording)
         except RecordingGoneError:
             return None
         return _present(found)
@@ -176,6 +167,10 @@ class Manifests(ABC):
                 else:
                     return new
 
+    def _seen(self, recording: str) -> tuple[Manifest, str]:
+        """The same as `_read`; in a bucket, as it was at the last look."""
+        return self._read(recording)
+
     def _read(self, recording: str) -> tuple[Manifest, str]:
         """The manifest, also of a removed recording, and its version in a bucket."""
         if not is_id(recording):
@@ -188,7 +183,7 @@ class Manifests(ABC):
             return _decoded(recording, data), version
         except ValueError as error:
             raise ManifestError(
-                f"The manifest of {recording} is damaged: {error}. {self.cure}"
+                f"The manifest of {recording} in {self.place} is damaged: {error}. {self.cure}"
             ) from error
 
     @abstractmethod
@@ -229,7 +224,7 @@ class DiskManifests(Manifests):
     """The manifests of a store in a directory."""
 
     def __init__(self, path: Path) -> None:
-        self._folder = path / MANIFESTS
+        self.place, self._folder = str(path), path / MANIFESTS
         self._listed: tuple[set[str], list[str]] = set(), []
         self._recordings = path / _RECORDINGS
 
@@ -239,8 +234,8 @@ class DiskManifests(Manifests):
         come = [name for name in names if name not in before]
         gone = before.difference(names) if len(before) + len(come) > len(names) else set()
         if come or gone:
-            left = {*_ids(gone)}
-            ids = sorted([*(one for one in ids if one not in left), *_ids(come)])
+            left = {*ids_of(gone)}
+            ids = sorted([*(one for one in ids if one not in left), *ids_of(come)])
             self._listed = (before - gone).union(come), ids
         return [*ids]
 
@@ -250,21 +245,21 @@ class DiskManifests(Manifests):
         Those with nothing but locks are left out: a recording begins, or was removed. So are
         those of copies that have not ended, which have no `manifest.lock` yet.
         """
-        return [name for name in sorted(self._others()) if name[0] != "." and self._holds(name)]
+        return [
+            name
+            for name, found in self._others()
+            if name[0] != "."
+            and not found <= _LOCKS
+            and (MANIFEST_LOCK in found or not is_id(name))
+        ]
 
-    def _others(self) -> set[str]:
-        """Names in `recordings` of what has no manifest."""
+    def _others(self) -> Iterator[tuple[str, set[str]]]:
+        """Names of folders in `recordings` that have no manifest, sorted, and what they hold."""
         found = self._names(self._recordings)  # before the manifests, which come later
         manifests = {*self._names(self._folder)}
-        return {name for name in found if f"{name}{_SUFFIX}" not in manifests}
-
-    def _holds(self, recording: str) -> bool:
-        """True for a folder with more than locks."""
-        try:
-            found = files.names(self._recordings / recording).keys()
-            return not found <= _LOCKS and (MANIFEST_LOCK in found or not is_id(recording))
-        except (FileNotFoundError, NotADirectoryError):  # or a link
-            return False
+        for name in sorted(name for name in found if f"{name}{_SUFFIX}" not in manifests):
+            with suppress(OSError):  # it goes at this moment, or is none
+                yield name, {*files.names(self._recordings / name)}
 
     def _names(self, folder: Path) -> list[str]:
         try:
@@ -295,35 +290,26 @@ class DiskManifests(Manifests):
         """
         if not (self._left() or self._bare()):
             return
-        with suppress(HeldError), self._all_locked(wait_s=0):
-            try:
-                for path, lock in self._left():
-                    with suppress(FileNotFoundError, HeldError), _locked(lock, 0):
-                        files.unlink(path)
-                for folder in self._bare():
-                    with ExitStack() as held, suppress(FileNotFoundError, HeldError):
-                        if WRITER_LOCK in files.names(folder):  # a copy may begin there
-                            held.enter_context(_locked(folder / WRITER_LOCK, 0))
-                        files.remove_tree(folder)
-            except OSError as error:
-                raise durability.explain(error, self._folder, "clearing") from error
+        explained = durability.explained(self._folder, "clearing")
+        with suppress(HeldError), explained, self._all_locked(wait_s=0):
+            for path, lock in self._left():
+                with suppress(FileNotFoundError, HeldError), _locked(lock, 0):
+                    files.unlink(path)
+            for folder in self._bare():
+                with ExitStack() as held, suppress(FileNotFoundError, HeldError):
+                    if WRITER_LOCK in files.names(folder):  # a copy may begin there
+                        held.enter_context(_locked(folder / WRITER_LOCK, 0))
+                    files.remove_tree(folder)
 
     def _left(self) -> list[tuple[Path, Path]]:
         """Manifests that are being written, or were when their writers died, and their locks."""
-        names = (one for one in self._names(self._folder) if one.endswith(_NEW))
-        ids = {one: one.removeprefix(".").removesuffix(_NEW) for one in names}
-        locks = {one: self._recordings / of / MANIFEST_LOCK for one, of in ids.items()}
-        return [(self._folder / one, lock) for one, lock in locks.items()]
+        names = [one for one in self._names(self._folder) if one.endswith(_NEW)]
+        folders = [self._recordings / one[1 : -len(_NEW)] for one in names]
+        return [(self._folder / n, f / MANIFEST_LOCK) for n, f in zip(names, folders, strict=True)]
 
     def _bare(self) -> list[Path]:
         """Folders without a manifest that hold only locks."""
-        folders = [self._recordings / name for name in self._others() if is_id(name)]
-        return [folder for folder in folders if self._is_bare(folder)]
-
-    def _is_bare(self, folder: Path) -> bool:
-        with suppress(OSError):
-            return files.names(folder).keys() <= _LOCKS
-        return False
+        return [self._recordings / n for n, held in self._others() if is_id(n) and held <= _LOCKS]
 
     @contextmanager
     def creating(self) -> Iterator[Callable[[Manifest], None]]:
@@ -333,28 +319,24 @@ class DiskManifests(Manifests):
 
     @contextmanager
     def _all_locked(self, wait_s: float | None = None) -> Iterator[None]:
-        try:
+        with durability.explained(self._folder, "making"):
             files.make_folders(self._folder)
             files.sync_folder(self._folder.parent)
-        except OSError as error:
-            raise durability.explain(error, self._folder, "making") from error
         _make_file(self._folder / _ALL)
         with _locked(self._folder / _ALL, wait_s):
             yield
 
     def _create(self, manifest: Manifest) -> None:
         data, path = encode(manifest), self.path(manifest.id)
-        if _exists(path):
+        if os.path.lexists(path):
             raise RecordingExistsError(f"There is a recording {manifest.id} already.")
         folder = self._recordings / manifest.id
-        try:
+        with durability.explained(path, "writing"):
             self._make_lock(folder)
             with _locked(folder / MANIFEST_LOCK):
                 self._write(path, data)
             with files.folder(self._recordings) as fd:
                 os.utime(fd)  # from which readers see that a recording has come
-        except OSError as error:
-            raise durability.explain(error, path, "writing") from error
 
     def _make_lock(self, folder: Path) -> None:
         files.make_folders(folder)
@@ -380,7 +362,7 @@ class DiskManifests(Manifests):
             try:
                 stack.enter_context(_locked(folder / MANIFEST_LOCK))
             except FileNotFoundError:
-                if not _exists(self.path(recording)):
+                if not os.path.lexists(self.path(recording)):
                     raise RecordingGoneError(f"There is no recording {recording!r}.") from None
                 self._make_lock(folder)  # copies of a store may leave out what is empty
                 stack.enter_context(_locked(folder / MANIFEST_LOCK))
@@ -389,10 +371,8 @@ class DiskManifests(Manifests):
     def _replace(self, recording: str, data: bytes, version: str) -> None:
         path = self.path(recording)
         _keep_old(path, self._recordings / recording)
-        try:
+        with durability.explained(path, "writing"):
             self._write(path, data)
-        except OSError as error:
-            raise durability.explain(error, path, "writing") from error
 
     def _write(self, path: Path, data: bytes) -> None:
         """Write a manifest whose lock is held; a power cut never leaves a part of it."""
@@ -444,67 +424,10 @@ class DiskManifests(Manifests):
             with suppress(RecordingGoneError):
                 if says_so and self._read(recording)[0].status != "removed":
                     return
-            try:
+            with durability.explained(self._folder, "deleting"):
                 self._drop(recording)
                 files.sync_folder(self._folder)
                 files.remove_tree(self._recordings / recording)
-            except OSError as error:
-                raise durability.explain(error, self._folder, "deleting") from error
-
-
-class BucketManifests(Manifests):
-    """The manifests of a store in a bucket."""
-
-    cure = "`hybridlog copy` from a store that has it brings it back."
-
-    def __init__(self, bucket: Bucket) -> None:
-        self._bucket = bucket
-
-    def ids(self) -> list[str]:
-        """Ids of all recordings that have a manifest, sorted; 1,000 a request."""
-        return self.ids_of(one.name for one in self._bucket.objects(f"{MANIFESTS}/"))
-
-    @staticmethod
-    def ids_of(names: Iterable[str]) -> list[str]:
-        """Ids of the recordings whose manifests are among objects, by their names."""
-        return _ids(one.removeprefix(f"{MANIFESTS}/") for one in names)
-
-    @staticmethod
-    def name_of(recording: str) -> str:
-        """Name of the object of a manifest."""
-        return f"{MANIFESTS}/{recording}{_SUFFIX}"
-
-    def _noted(self, recording: str, data: bytes, version: str) -> None:
-        """Called with each manifest that was read or written, and its version."""
-
-    def _create(self, manifest: Manifest) -> None:
-        data = encode(manifest)
-        try:
-            version = self._bucket.create(self.name_of(manifest.id), data)
-        except ObjectExistsError:
-            raise RecordingExistsError(f"There is a recording {manifest.id} already.") from None
-        self._noted(manifest.id, data, version)
-
-    def _get(self, recording: str) -> tuple[bytes, str]:
-        about, data = self._bucket.read_whole(self.name_of(recording), MAX_BYTES)
-        self._noted(recording, data, about.version)
-        return data, about.version
-
-    def _replace(self, recording: str, data: bytes, version: str) -> None:
-        self._noted(recording, data, self._bucket.replace(self.name_of(recording), data, version))
-
-    def _drop(self, recording: str) -> None:
-        self._bucket.delete([self.name_of(recording)])
-
-    def _delete_files(self, recording: str) -> None:
-        names = [one.name for one in self._bucket.objects(f"{_RECORDINGS}/{recording}/")]
-        self._bucket.delete(names)
-
-    def _forget(self, recording: str, *, says_so: bool) -> None:
-        # Servers have no condition for deletions: between these two it could be created anew.
-        with suppress(RecordingGoneError):
-            if self._read(recording)[0].status == "removed":
-                self._drop(recording)
 
 
 def manifests_at(folder: Path) -> Manifests:
@@ -524,7 +447,8 @@ def _keep_old(path: Path, folder: Path) -> None:
         files.unlink(new)  # a change that was killed has kept this one already
 
 
-def _ids(names: Iterable[str]) -> list[str]:
+def ids_of(names: Iterable[str]) -> list[str]:
+    """Ids of the recordings whose manifests have these names, sorted."""
     ids = (name.removesuffix(_SUFFIX) for name in names if name.endswith(_SUFFIX))
     return sorted(filter(is_id, ids))
 
@@ -550,7 +474,18 @@ def _locked(path: Path, wait_s: float | None = None) -> Iterator[None]:
     while True:
         fd = _opened(path, os.O_RDWR)
         try:
-            _lock(fd, path, end)
+            try:
+                files.lock(fd, max(end - time.monotonic(), 0))
+            except BlockingIOError:
+                message = f"Another process has held {path} for {WAIT_S:.0f} s; end it."
+                raise HeldError(message, is_recording=False) from None
+            except OSError as error:
+                if error.errno not in _NO_LOCKS:
+                    raise
+                raise StoreError(
+                    f"The file system of {path.parent} has no locks (flock), so the store can "
+                    "only be read there. Copy it to another one to change it."
+                ) from error
             if files.is_at(fd, path):
                 yield
                 return
@@ -583,24 +518,3 @@ def _odd(path: Path) -> str:
                     "of the store, then run `hybridlog verify --repair`."
                 )
     return ""
-
-
-def _lock(fd: int, path: Path, end: float) -> None:
-    try:
-        files.lock(fd, max(end - time.monotonic(), 0))
-    except BlockingIOError:
-        message = f"Another process has held {path} for {WAIT_S:.0f} s; end it."
-        raise HeldError(message, is_recording=False) from None
-    except OSError as error:
-        if error.errno not in _NO_LOCKS:
-            raise
-        raise StoreError(
-            f"The file system of {path.parent} has no locks (flock), so the store can only be "
-            "read there. Copy it to another one to change it."
-        ) from error
-
-
-def _exists(path: Path) -> bool:
-    with suppress(FileNotFoundError):
-        return files.status(path) is not None
-    return False

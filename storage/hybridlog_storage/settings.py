@@ -12,7 +12,6 @@ import os
 import re
 import stat
 import tomllib
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Final, TypeGuard
 from urllib.parse import SplitResult, quote
@@ -63,7 +62,7 @@ class StoreSettings(Struct, frozen=True):
     store_id: Annotated[str, Meta(min_length=1)]
     mongo: str | None = None
     arrays: tuple[str, ...] = ()
-    cache_mb: int | None = None
+    cache_mb: Annotated[int, Meta(ge=MIN_CACHE_MB, le=MAX_CACHE_MB)] | None = None
     retention: dict[str, Any] = {}
     remote: dict[str, Any] | None = None
 
@@ -71,29 +70,45 @@ class StoreSettings(Struct, frozen=True):
 def read_settings(path: Path) -> StoreSettings:
     """Read the settings of a store."""
     file = path / NAME
-    return _settings(path, file, _read(path, file))
+    try:
+        return settings_of(files.read_file(file, MAX_SETTINGS), str(path))
+    except FileNotFoundError:
+        reason = "there is no such directory" if not path.exists() else f"it has no {NAME}"
+        raise StoreError(
+            f"{path} is not a hybridlog store: {reason}. `hybridlog record FILE --store {path}` "
+            "makes one; --store or HYBRIDLOG_STORE says where to look."
+        ) from None
+    except NotADirectoryError:
+        raise StoreError(f"{path} is a file; a store is a directory.") from None
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise StoreError(
+                f"{file} is a symlink, and none inside a store is followed. Put the file itself "
+                "there."
+            ) from error
+        raise unreadable(error, file) from error
 
 
 def settings_of(content: bytes, store: str) -> StoreSettings:
-    """The settings in the content of the file; errors as of `read_settings`."""
-    file = Path(f"{store}/{NAME}")
-    return _settings(store, file, _parsed(content, file))
-
-
-def _settings(path: Path | str, file: Path, values: Mapping[str, object]) -> StoreSettings:
+    """The settings in the content of the file of a store."""
+    file = f"{store}/{NAME}"
+    if len(content) > MAX_SETTINGS:
+        raise StoreError(f"{file} is too large to be settings.")
+    try:
+        values = tomllib.loads(content.decode())
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise StoreError(f"{file} is damaged: {error}. Restore it or correct it.") from error
     version = values.get("format")
     if type(version) is not int or version < 1:
         raise StoreError(f"{file} names no format version; it should say `format = {FORMAT}`.")
     if version != FORMAT:
         raise StoreError(
-            f"The store {path} is of format {version}, and this hybridlog knows format {FORMAT}. "
+            f"The store {store} is of format {version}, and this hybridlog knows format {FORMAT}. "
             "Use the hybridlog that wrote it."
         )
     try:
         found = convert(values, StoreSettings)
-        if found.cache_mb is not None:
-            checked_cache_mb(found.cache_mb, "cache_mb")
-    except (ValidationError, UsageError) as error:
+    except ValidationError as error:
         raise StoreError(f"{file} is malformed: {error}") from error
     return replace(found, mongo=_stored_uri(file, found.mongo))
 
@@ -200,7 +215,7 @@ def _is_secret(option: str) -> bool:
     return "password" in name or "passphrase" in name or "token" in value
 
 
-def _stored_uri(file: Path, mongo: str | None) -> str | None:
+def _stored_uri(file: str, mongo: str | None) -> str | None:
     if not is_uri(mongo):
         return None if mongo == EMBEDDED else mongo
     try:
@@ -225,12 +240,11 @@ def _password() -> str | None:
         return None
     try:
         # The user chose this path: symlinks are followed.
-        fd = os.open(Path(named).expanduser(), os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-        try:
-            about = os.fstat(fd)
-            content = os.read(fd, _PASSWORD_LIMIT + 1) if stat.S_ISREG(about.st_mode) else b""
-        finally:
-            os.close(fd)
+        with os.fdopen(
+            os.open(Path(named).expanduser(), os.O_RDONLY | os.O_NONBLOCK), "rb"
+        ) as file:
+            about = os.fstat(file.fileno())
+            content = file.read(_PASSWORD_LIMIT + 1) if stat.S_ISREG(about.st_mode) else b""
     except (OSError, RuntimeError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         raise UsageError(
@@ -251,37 +265,6 @@ def _password() -> str | None:
             "line with the password."
         )
     return password
-
-
-def _read(path: Path, file: Path) -> dict[str, object]:
-    """The parsed file."""
-    try:
-        content = files.read_file(file, MAX_SETTINGS)
-    except FileNotFoundError:
-        reason = "there is no such directory" if not path.exists() else f"it has no {NAME}"
-        raise StoreError(
-            f"{path} is not a hybridlog store: {reason}. `hybridlog record FILE --store {path}` "
-            "makes one; --store or HYBRIDLOG_STORE says where to look."
-        ) from None
-    except NotADirectoryError:
-        raise StoreError(f"{path} is a file; a store is a directory.") from None
-    except OSError as error:
-        if error.errno == errno.ELOOP:
-            raise StoreError(
-                f"{file} is a symlink, and none inside a store is followed. Put the file itself "
-                "there."
-            ) from error
-        raise unreadable(error, file) from error
-    return _parsed(content, file)
-
-
-def _parsed(content: bytes, file: Path) -> dict[str, object]:
-    if len(content) > MAX_SETTINGS:
-        raise StoreError(f"{file} is too large to be settings.")
-    try:
-        return tomllib.loads(content.decode())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise StoreError(f"{file} is damaged: {error}. Restore it or correct it.") from error
 
 
 def _as_toml(value: object) -> str:

@@ -354,7 +354,7 @@ class _ServerManifests(Manifests):
     """The manifests of a store on a server."""
 
     def __init__(self, server: Server) -> None:
-        self._server = server
+        self.place, self._server = server.address, server
 
     def ids(self) -> list[str]:
         """Ids of all recordings that have a manifest, sorted."""

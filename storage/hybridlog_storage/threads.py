@@ -8,8 +8,8 @@ still writes. A fork never leaves a lock held in the child by a thread of the pa
 from __future__ import annotations
 
 import os
-import threading
 from collections.abc import Callable
+from concurrent import futures
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeVar
 
@@ -21,33 +21,21 @@ class Threads(ThreadPoolExecutor):
 
     def __init__(self, count: int, name: str) -> None:
         super().__init__(count, thread_name_prefix=name)
-        self._left = 0
-        self._idle = threading.Condition()
+        self._left: set[Future[Any]] = set()
 
     def submit(self, fn: Callable[..., _T], /, *args: Any, **kwargs: Any) -> Future[_T]:
         """Run a function on a thread of the pool."""
-        with self._idle:
-            self._left += 1
-        try:
-            future = super().submit(fn, *args, **kwargs)
-        except BaseException:
-            self._has_ended()
-            raise
-        future.add_done_callback(self._has_ended)
+        future = super().submit(fn, *args, **kwargs)
+        self._left.add(future)
+        future.add_done_callback(self._left.discard)
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:  # noqa: FBT001, FBT002 - as it is there
         """Stop accepting tasks and wait for all, or with `cancel_futures` for the running ones."""
         super().shutdown(wait=False, cancel_futures=cancel_futures)
         if wait:
-            with self._idle:
-                self._idle.wait_for(lambda: not self._left)
+            futures.wait(self._left.copy())
             super().shutdown(wait=True)
-
-    def _has_ended(self, _: object = None) -> None:
-        with self._idle:
-            self._left -= 1
-            self._idle.notify_all()
 
 
 def processors() -> int:

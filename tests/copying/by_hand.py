@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from blake3 import blake3
 
-from hybridlog_storage.copy_places import BucketStore, Directory, Place, Source
+from hybridlog_storage.copy_places import Directory, Place, Source
 from hybridlog_storage.disk.directory import listed_files
 from hybridlog_storage.manifest import (
     Channel,
@@ -26,6 +26,7 @@ from hybridlog_storage.manifest import (
     with_rows,
 )
 from hybridlog_storage.remote.bucket import Bucket
+from hybridlog_storage.remote.store import BucketStore
 from hybridlog_storage.settings import StoreSettings, write_settings
 from hybridlog_storage.sftp import Server
 from tests.copying.server import Sshd
@@ -136,10 +137,16 @@ class Store:
     def write(self, name: str, content: bytes) -> None:
         if self.bucket is not None:
             self.bucket.put(name, len(content), [content])
+            self.look()
             return
         assert self.folder is not None
         (self.folder / name).parent.mkdir(parents=True, exist_ok=True)
         (self.folder / name).write_bytes(content)
+
+    def look(self) -> None:
+        """See what another process has changed in the bucket."""
+        assert isinstance(self.place, BucketStore)
+        self.place.manifests.look(now=True)
 
     def read(self, name: str) -> bytes:
         if self.bucket is not None:
@@ -150,6 +157,7 @@ class Store:
     def delete(self, name: str) -> None:
         if self.bucket is not None:
             self.bucket.delete([name])
+            self.look()
             return
         assert self.folder is not None
         (self.folder / name).unlink()

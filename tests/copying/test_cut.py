@@ -8,10 +8,9 @@ from collections.abc import Callable
 import pytest
 
 from hybridlog_storage.copy import copy
-from hybridlog_storage.copy_places import BucketStore
 from hybridlog_storage.errors import HybridlogError
-from hybridlog_storage.manifests import BucketManifests
 from hybridlog_storage.remote.bucket import Bucket
+from hybridlog_storage.remote.store import BucketStore
 from tests.copying.by_hand import RECORDING, TOTAL, Makes, Store, recording
 from tests.copying.server import Sshd
 from tests.copying.test_any_place import edited
@@ -127,7 +126,7 @@ def test_requests_to_a_bucket(make: Makes, proxy: Proxy) -> None:
     copy(source.source, BucketStore(Bucket(target.bucket.address)), RECORDING)
     assert len(proxy.requests) <= 3
     proxy.reset()
-    BucketManifests(Bucket(target.bucket.address)).change(RECORDING, edited)
+    BucketStore(Bucket(target.bucket.address)).manifests.change(RECORDING, edited)
     assert len(proxy.requests) <= 4
 
 
@@ -146,6 +145,6 @@ def test_a_server_without_conditions_is_refused_before_the_first_write(
     proxy.without_conditions = True
     before = target.manifests().read(RECORDING)
     with pytest.raises(HybridlogError, match="ignores conditions"):
-        BucketManifests(Bucket(target.bucket.address)).change(RECORDING, edited)
+        BucketStore(Bucket(target.bucket.address)).manifests.change(RECORDING, edited)
     assert target.manifests().read(RECORDING) == before
     assert [name for name in target.names() if "probe" in name] == []

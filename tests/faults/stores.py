@@ -11,7 +11,7 @@ import sqlite3
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -277,7 +277,7 @@ def number_of(topic: str, payload: bytes) -> int | None:
 
 
 def _comparable(entry: RecordingEntry) -> dict[str, Any]:
-    found = entry.to_document()
+    found = asdict(replace(entry, flushed={}))
     # Drawn or taken anew for each recording, and what follows from them.
     for name in ("id", "created", "digests", "stored_bytes"):
         del found[name]

@@ -185,7 +185,7 @@ def test_a_killed_recording_is_not_said_to_go_on(tmp_path: Path) -> None:
         before = hl.open(path)
         wait_for(lambda: before.summaries()[0].messages)
         assert [entry.status for entry in before.recordings()] == ["open"]
-        with pytest.raises(HeldError, match=f"is being written by process {killed.pid} "):
+        with pytest.raises(HeldError, match=f"is being written by process {killed.pid}"):
             before.remove("load")
         killed.kill()
     with before:

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from hybridlog_storage.manifests import BucketManifests, DiskManifests, Manifests
+from hybridlog_storage.manifests import DiskManifests, Manifests
 from hybridlog_storage.remote.bucket import Bucket
+from hybridlog_storage.remote.store import BucketStore
 from tests.remote.conftest import address, moto, proxy, running_proxy
 
 __all__ = ["address", "moto", "proxy", "running_proxy"]
@@ -18,4 +19,4 @@ def manifests(request: pytest.FixtureRequest, tmp_path: Path) -> Manifests:
     """Of an empty store."""
     if request.param == "disk":
         return DiskManifests(tmp_path)
-    return BucketManifests(Bucket(request.getfixturevalue("address")))
+    return BucketStore(Bucket(request.getfixturevalue("address"))).manifests

@@ -8,8 +8,9 @@ import pytest
 
 from hybridlog_storage.errors import ManifestError, RecordingGoneError, StoreError
 from hybridlog_storage.manifest import Manifest, Note, encode, new_id, replace
-from hybridlog_storage.manifests import BucketManifests, DiskManifests, Manifests
+from hybridlog_storage.manifests import DiskManifests, Manifests
 from hybridlog_storage.remote.bucket import Bucket
+from hybridlog_storage.remote.store import BucketManifests, BucketStore
 from tests.calls import Calls
 from tests.remote.server import Proxy
 
@@ -30,6 +31,7 @@ def spoil(manifests: Manifests, one: Manifest, data: bytes | None) -> None:
     manifests._drop(one.id)
     if data is not None:
         manifests._bucket.create(f"manifests/{one.id}.json", data)
+    manifests.look(now=True)
 
 
 def test_a_recording_begins_once(manifests: Manifests) -> None:
@@ -204,7 +206,7 @@ def test_of_changes_at_once_none_is_lost(manifests: Manifests) -> None:
 
 
 def test_an_edit_in_a_bucket_takes_two_requests(address: str, proxy: Proxy) -> None:
-    manifests = BucketManifests(Bucket(address))
+    manifests = BucketStore(Bucket(address)).manifests
     one = begun()
     manifests.create(one)
     manifests.change(one.id, lambda now: replace(now, name="first"))  # tries the server once
@@ -217,7 +219,7 @@ def test_an_edit_in_a_bucket_takes_two_requests(address: str, proxy: Proxy) -> N
 
 
 def test_a_change_whose_answer_is_lost_is_made_once(address: str, proxy: Proxy) -> None:
-    manifests = BucketManifests(Bucket(address))
+    manifests = BucketStore(Bucket(address)).manifests
     one = begun()
     manifests.create(one)
     for number in range(1, 4):

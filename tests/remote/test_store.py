@@ -26,7 +26,7 @@ from hybridlog_storage.errors import (
 from hybridlog_storage.remote import address_of
 from hybridlog_storage.remote.blocks import BLOCK, BlockCache
 from hybridlog_storage.remote.bucket import Bucket
-from hybridlog_storage.remote.store import RemoteDirectory
+from hybridlog_storage.remote.store import RemoteDirectory, objects_of
 from tests.cli.within import answer
 from tests.copies import bring
 from tests.damage import flip
@@ -202,7 +202,7 @@ def test_marks_pins_and_rules(here: Path, address: str, proxy: Proxy) -> None:
         listed = {
             one.name
             for recording in directory.ids()
-            for one in directory.source.files_of(directory.manifests.read(recording)).values()
+            for one in objects_of(directory.manifests.read(recording))
         }
         assert {one.name for one in directory.bucket.objects("recordings")} == listed
 
@@ -439,7 +439,7 @@ def test_hostile_catalogs(published: str, proxy: Proxy) -> None:
             assert listed(bad) == 0
         for body in (b"", b"x", manifest[:-9] + b"0" * 9, manifest.replace(b"run", b"fun")):
             cells.write(lambda body=body: [put("manifest", recording, body)], 0)  # type: ignore[misc]
-            directory.seen._known.clear()
+            directory.manifests._known.clear()
             assert directory.manifests.read(recording).id == recording
 
 

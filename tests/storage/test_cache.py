@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hybridlog_storage.cache import Cache
+from hybridlog_storage.cache import Cache, Kind
 
 
 def test_those_that_were_not_asked_for_longest_go_first() -> None:
@@ -25,16 +25,15 @@ def test_those_that_were_not_asked_for_longest_go_first() -> None:
     assert made == [1, 2, 3, 4, 2, 5, 5]
 
 
-def test_another_value_takes_the_place_of_the_one_before_and_a_kind_is_dropped() -> None:
-    cache = Cache(100)
-    cache.put("chunk", 1, value="a", size=60)
-    cache.put("chunk", 1, value="b", size=70)
-    assert cache.get("chunk", 1) == "b"
-    cache.put("density", 1, value="c", size=30)
-    assert (cache.get("chunk", 1), cache.get("density", 1)) == ("b", "c")
+def test_a_kind_is_dropped() -> None:
+    cache, made = Cache(100), list[int]()
+
+    def get(kind: Kind, size: int) -> None:
+        cache.made(kind, 1, make=lambda: made.append(size), size_of=lambda _: size)
+
+    get("chunk", 70)
+    get("times", 30)
     cache.drop("chunk")
-    assert (cache.get("chunk", 1), cache.get("density", 1)) == (None, "c")
-    cache.put("matches", 1, value="d", size=70)  # there is room for it
-    assert cache.get("density", 1) == "c"
-    cache.put("matches", 1, value="e", size=101)  # there is none: the old one holds no more
-    assert cache.get("matches", 1) is None
+    for kind, size in (("times", 30), ("chunk", 70), ("times", 30), ("chunk", 70)):
+        get(kind, size)  # type: ignore[arg-type]
+    assert made == [70, 30, 70]

@@ -25,7 +25,6 @@ from blake3 import blake3
 
 from hybridlog_storage.buffers import buffers
 from hybridlog_storage.disk import files
-from hybridlog_storage.disk.durability import left_over, sync_file, write_all
 from hybridlog_storage.messages import Buffer
 
 if TYPE_CHECKING:
@@ -106,7 +105,7 @@ class AppendFile:
 
     def _append(self, parts: Sequence[Buffer]) -> None:
         if self._stage is None:
-            self.position += write_all(self._fd, parts)
+            self.position += files.write_all(self._fd, parts)
             return
         pieces: list[NDArray[np.uint8]] = []
         for part in filter(len, parts):
@@ -141,8 +140,7 @@ class AppendFile:
         """
         self._stage = self._hasher = None
         self.position = position
-        flags = fcntl.fcntl(self._fd, fcntl.F_GETFL)
-        fcntl.fcntl(self._fd, fcntl.F_SETFL, flags & ~DIRECT)
+        self._leave_direct()
         os.lseek(self._fd, position, os.SEEK_SET)
         files.system.truncate(self._fd, position)
 
@@ -151,11 +149,7 @@ class AppendFile:
         assert self._stage is None
         assert position + len(data) <= self.position
         self._hasher = None
-        pieces = [memoryview(data)]
-        while pieces:
-            done = files.system.pwritev(self._fd, pieces, position)
-            position += done
-            pieces = left_over(pieces, done)
+        self._write([memoryview(data)], position)
 
     def trim(self) -> None:
         """Set the file's exact length."""
@@ -173,7 +167,7 @@ class AppendFile:
 
     def sync(self) -> None:
         """Return once everything appended is on the disk."""
-        sync_file(self._fd)
+        files.system.sync(self._fd)
 
     def close(self) -> None:
         """Close the file as it is."""
@@ -199,20 +193,19 @@ class AppendFile:
             try:
                 done = files.system.pwritev(self._fd, pieces, position)
             except OSError as error:
-                if error.errno not in _REFUSED:
-                    raise
                 # Some file systems take the flag and refuse the write. Blocks stay whole,
                 # so nothing else changes.
-                self._give_up_direct(error)
+                if error.errno not in _REFUSED or not self._leave_direct():
+                    raise
                 continue
             position += done
-            pieces = left_over(pieces, done)
+            pieces = files.left_over(pieces, done)
 
-    def _give_up_direct(self, error: OSError) -> None:
+    def _leave_direct(self) -> bool:
+        """Write by way of the page cache from now on; False if that is so already."""
         flags = fcntl.fcntl(self._fd, fcntl.F_GETFL)
-        if not flags & DIRECT:
-            raise error
         fcntl.fcntl(self._fd, fcntl.F_SETFL, flags & ~DIRECT)
+        return bool(flags & DIRECT)
 
 
 def _is_own(content: NDArray[np.uint8]) -> bool:

@@ -20,12 +20,10 @@ import os
 import re
 import secrets
 import stat
-import sys
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
-from itertools import takewhile
 from pathlib import Path
 from typing import Any, ClassVar, Final, NamedTuple
 
@@ -63,7 +61,7 @@ _BESIDE: Final = _OF_MANIFEST | {WRITER_LOCK}
 _TICK_NS: Final = 50_000_000
 _POLL_S = 0.02
 _RECORDER_WAIT_S = 0.5  # a reader's look at a lock must not pass for a recorder
-_MAX_HOLDER = 256  # bytes of the line in a lock
+_HOLDER = 32  # bytes of the line in a lock
 
 
 class ListedFile(NamedTuple):
@@ -154,13 +152,17 @@ class Listing:
 class StoreDirectory:
     """A store's directory; with `read_only` it behaves as if this user could not write it.
 
-    With `is_remote` it stands for a place in a bucket, see `remote.store`.
+    With `is_remote` it stands for a place in a bucket, see `remote.store`. People call it `place`;
+    another process opens it by its `address`. `cells` are those of its catalog, None for those in
+    its file; `when_empty` is the sentence for a store without recordings.
     """
 
     is_remote: ClassVar[bool] = False
+    cells: Cells | None = None
+    when_empty = "The store is empty: `hybridlog record FILE` fills it."
 
     def __init__(self, path: Path, *, read_only: bool = False) -> None:
-        self.path = path
+        self.path, self.place, self.address = path, str(path), str(path.absolute())
         self.manifests: Manifests = DiskManifests(path)
         self.read_only = read_only
         self.settings = read_settings(path)
@@ -180,7 +182,7 @@ class StoreDirectory:
         """
         if path.exists() and not path.is_dir():
             raise StoreError(f"{path} is a file; a store is a directory. Choose another name.")
-        try:
+        with durability.explained(path, "making the store"):
             if not (path / SETTINGS).exists():
                 path.mkdir(parents=True, exist_ok=True)
                 # Of several processes, one creates the store and the others open it.
@@ -189,14 +191,9 @@ class StoreDirectory:
                     cls._make(path, settings)
             store = cls(path)
             for folder in (MANIFESTS, _RECORDINGS):
-                try:
+                with suppress(FileExistsError):
                     files.make_folder(path / folder)
-                except FileExistsError:
-                    pass
-                else:
                     files.sync_folder(path)
-        except OSError as error:
-            raise durability.explain(error, path, "making the store") from error
         return store
 
     @staticmethod
@@ -238,10 +235,8 @@ class StoreDirectory:
         """Change settings of the store."""
         with self.manifests.creating():
             settings = structs.replace(read_settings(self.path), **changes)
-            try:
+            with durability.explained(self.path, "writing settings of"):
                 write_settings(self.path, settings)
-            except OSError as error:
-                raise durability.explain(error, self.path, "writing settings of") from error
             self.settings = settings
 
     @property
@@ -294,25 +289,6 @@ class StoreDirectory:
     def _look_of(self, recording: str) -> str:
         """The look of one recording; empty if there is none."""
         return self.looks([recording]).get(recording, "")
-
-    @property
-    def address(self) -> str:
-        """The address by which another process opens it."""
-        return str(self.path.absolute())
-
-    @property
-    def place(self) -> str:
-        """The store's place, for people."""
-        return str(self.path)
-
-    @property
-    def when_empty(self) -> str:
-        """The sentence for a store without recordings."""
-        return "The store is empty: `hybridlog record FILE` fills it."
-
-    def catalog_cells(self) -> Cells | None:
-        """The cells of the catalog; None for those in its file here."""
-        return None
 
     @contextmanager
     def at_hand(
@@ -414,13 +390,6 @@ class StoreDirectory:
         """Directory of the embedded MongoDB."""
         return self.path / "mongod"
 
-    def make_folder(self, recording: str) -> None:
-        """Make the folder of a recording that begins, within `manifests.creating`."""
-        try:
-            files.make_folder(self.recording(recording))
-        except OSError as error:
-            raise durability.explain(error, self.path, "starting a recording in") from error
-
     @contextmanager
     def retaining(self) -> Iterator[bool]:
         """Lock out other passes of retention; yields False if another process makes one."""
@@ -436,20 +405,30 @@ class StoreDirectory:
 
     @contextmanager
     def writing(
-        self, recording: str, name: str = "", *, wait_s: float = 0.0, records: bool = False
+        self,
+        recording: str,
+        name: str = "",
+        *,
+        wait_s: float = 0.0,
+        records: bool = False,
+        makes: bool = False,
     ) -> Iterator[None]:
         """Lock a recording for writing, else `HeldError`; `TopicError` if it is gone.
 
         `wait_s` is for another command that holds it. A recorder may hold it for hours, so it is
-        not waited for.
+        not waited for. With `makes` it is a new one: its folder is made.
         """
         begun, path = time.monotonic(), self.recording(recording) / LOCK
         while True:
             try:
                 fd = files.open_file(path, os.O_RDWR | os.O_CREAT)
             except FileNotFoundError as error:
-                if not self._makes_folder(recording):
+                if not makes and recording not in self.looks([recording]):
                     raise gone(name or recording) from error
+                with durability.explained(path.parent, "making"):  # copies leave out empty ones
+                    files.make_folders(path.parent)
+                    files.sync_folder(self.path)
+                    files.sync_folder(self.recordings)
                 continue
             except OSError as error:
                 raise durability.explain(error, path, "locking") from error
@@ -458,10 +437,16 @@ class StoreDirectory:
                 with suppress(BlockingIOError):
                     fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
                     is_mine = True
-                if not _is_at(fd, path):
+                with durability.explained(path, "locking"):
+                    is_there = files.is_at(fd, path)
+                if not is_there and makes:
+                    continue
+                if not is_there:
                     raise gone(name or recording)
                 if is_mine:
-                    _say_holder(fd, records=records)
+                    line = b"%d %d" % (os.getpid(), records)
+                    with suppress(OSError):  # a full disk must not keep it from being removed
+                        files.system.pwritev(fd, [memoryview(line.ljust(_HOLDER))], 0)
                     try:
                         yield
                     finally:
@@ -480,14 +465,6 @@ class StoreDirectory:
                     is_recording=holder.is_recording,
                 )
             pause(_POLL_S)
-
-    def _makes_folder(self, recording: str) -> bool:
-        """True if a recording's folder is there by now; copies of a store leave out empty ones."""
-        if recording not in self.looks([recording]):
-            return False
-        with suppress(FileExistsError):
-            self.make_folder(recording)
-        return True
 
     def holder(self, recording: str) -> Holder | None:
         """The process that holds a recording's lock at this moment."""
@@ -509,37 +486,17 @@ class StoreDirectory:
         return holder is not None and holder.is_recording
 
 
-def _say_holder(fd: int, *, records: bool) -> None:
-    """Write into a lock who holds it. Of arguments only words: options may hold passwords."""
-    program = Path(sys.argv[0] if sys.argv else "")
-    name = program.parent.name if program.name == "__main__.py" else program.name
-    name = "python" if name in {"", "-c"} else name
-    words = takewhile(lambda word: not word.startswith("-"), sys.argv[1:])
-    command = " ".join([name, *(words if name == "hybridlog" else ())]).encode("ascii", "replace")
-    line = f"{os.getpid()} {int(records)} ".encode() + command
-    with suppress(OSError):  # a full disk must not keep a recording from being removed
-        files.system.pwritev(fd, [memoryview(line[:_MAX_HOLDER].ljust(_MAX_HOLDER))], 0)
-
-
 def _read_holder(fd: int) -> Holder:
     """The last holder of a lock, from its line; the store may come from another user."""
-    line = os.pread(fd, _MAX_HOLDER, 0).decode("ascii", "replace").strip()
-    found = re.fullmatch(r"(\d+) ([01]) (.*)", line)
-    if found is None or not line.isprintable():
+    found = re.fullmatch(rb"([0-9]{1,19}) ([01]) *", os.pread(fd, _HOLDER, 0))
+    if found is None:
         return Holder("another process", is_recording=False)
-    return Holder(f"process {found[1]} ({found[3]})", is_recording=found[2] == "1")
+    return Holder(f"process {int(found[1])}", is_recording=found[2] == b"1")
 
 
 def gone(name: str) -> TopicError:
     """The error for a recording that was removed meanwhile."""
     return TopicError(f"Recording {name!r} is no longer in the store.")
-
-
-def _is_at(fd: int, path: Path) -> bool:
-    try:
-        return files.is_at(fd, path)
-    except OSError as error:
-        raise durability.explain(error, path, "locking") from error
 
 
 def _folder_look(recording: str, folders: int) -> str:

@@ -10,15 +10,12 @@ never meets a half-made one.
 from __future__ import annotations
 
 import errno
-from collections.abc import Sequence
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import NO_SPACE, DiskFullError, HybridlogError, StoreError, exhausted
-
-if TYPE_CHECKING:
-    from hybridlog_storage.messages import Buffer
 
 
 def explain(error: OSError, path: Path, doing: str) -> HybridlogError:
@@ -38,27 +35,13 @@ def explain(error: OSError, path: Path, doing: str) -> HybridlogError:
     return StoreError(f"Error while {doing} {path}: {error.strerror or error}.")
 
 
-def write_all(fd: int, parts: Sequence[Buffer]) -> int:
-    """Write all parts at the file's position; return the number of bytes."""
-    views = [memoryview(part).cast("B") for part in parts if len(part)]
-    total = sum(len(view) for view in views)
-    while views:
-        views = left_over(views, files.system.writev(fd, views[:512]))
-    return total
-
-
-def left_over(views: Sequence[memoryview], done: int) -> list[memoryview]:
-    """The views without their first bytes."""
-    for index, view in enumerate(views):
-        if done < len(view):
-            return [view[done:], *views[index + 1 :]]
-        done -= len(view)
-    return []
-
-
-def sync_file(fd: int) -> None:
-    """Return once everything written to the file is on the disk."""
-    files.system.sync(fd)
+@contextmanager
+def explained(path: Path, doing: str) -> Iterator[None]:
+    """Raise operating system errors of a block as hybridlog errors."""
+    try:
+        yield
+    except OSError as error:
+        raise explain(error, path, doing) from error
 
 
 def publish(temporary: Path, final: Path) -> None:
@@ -69,7 +52,5 @@ def publish(temporary: Path, final: Path) -> None:
 
 def write_new(final: Path, content: bytes) -> None:
     """Write a small file atomically."""
-    try:
+    with explained(final, "writing"):
         files.write_file(final, content)
-    except OSError as error:
-        raise explain(error, final, "writing") from error

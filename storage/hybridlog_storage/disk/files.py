@@ -25,9 +25,12 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, Final, Protocol, cast
+from typing import TYPE_CHECKING, Any, Final, cast
 
 from hybridlog_storage.errors import StoreError
+
+if TYPE_CHECKING:
+    from hybridlog_storage.messages import Buffer
 
 _STORE = "hybridlog.toml"
 _LEVELS = 5  # of folders in a store
@@ -38,33 +41,8 @@ Identity = tuple[int, int]
 """Inode of a folder, and time of its last change, ns."""
 
 
-class Mounted(Protocol):
-    """A store that is no directory, to which the functions here lead."""
-
-    manifests: Any
-
-    def names(self, inner: tuple[str, ...]) -> tuple[int, dict[str, os.stat_result]]:
-        """The status of each entry of a folder, and a number that changes with them."""
-
-    def open(self, inner: tuple[str, ...]) -> int:
-        """A handle for reading a file."""
-
-
-class Fetched(Protocol):
-    """A handle of a file whose content is fetched when it is read."""
-
-    def fetch(self, ranges: Iterable[tuple[int, int]]) -> None:
-        """Make ranges of bytes readable."""
-
-    def again(self) -> int:
-        """Another handle of the same file."""
-
-    def identity(self) -> tuple[int, ...]:
-        """A value that no other file has, nor this one after a change."""
-
-
-mounted: Final[dict[Path, Mounted]] = {}
-"""Stores that are no directories, by their paths."""
+mounted: Final[dict[Path, Any]] = {}
+"""Stores in buckets, as of `remote.store.BucketStore`, by their paths."""
 
 
 class System:
@@ -123,7 +101,8 @@ def folder(path: Path) -> Iterator[int]:
     try:
         fd = os.open(path, _FOLDER | os.O_NOFOLLOW)
     except OSError as error:  # ELOOP in some systems
-        if error.errno not in {errno.ENOTDIR, errno.ELOOP} or _is_in_store(path):
+        is_in_store = any(os.path.lexists(outer / _STORE) for outer in path.parents[:_LEVELS])
+        if error.errno not in {errno.ENOTDIR, errno.ELOOP} or is_in_store:
             raise
         fd = os.open(path, _FOLDER)
     try:
@@ -132,14 +111,10 @@ def folder(path: Path) -> Iterator[int]:
         os.close(fd)
 
 
-def _is_in_store(path: Path) -> bool:
-    return any(os.path.lexists(outer / _STORE) for outer in path.parents[:_LEVELS])
-
-
 def open_file(path: Path, flags: int, mode: int = 0o666) -> int:
     """Open a file of a store; no symlink is followed, and no pipe is waited for."""
     if not flags & _WRITES and (found := _mounted(path)) is not None:
-        return found[0].open(found[1])
+        return cast("int", found[0].open(found[1]))
     with folder(path.parent) as fd:
         return system.open(path.name, flags | os.O_NOFOLLOW | os.O_NONBLOCK, mode, folder=fd)
 
@@ -170,6 +145,24 @@ def _content(fd: int, most: int, path: Path | str) -> bytes:
         os.close(fd)
 
 
+def write_all(fd: int, parts: Sequence[Buffer]) -> int:
+    """Write all parts at the file's position; return the number of bytes."""
+    views = [memoryview(part).cast("B") for part in parts if len(part)]
+    total = sum(len(view) for view in views)
+    while views:
+        views = left_over(views, system.writev(fd, views[:512]))
+    return total
+
+
+def left_over(views: Sequence[memoryview], done: int) -> list[memoryview]:
+    """The views without their first bytes."""
+    for index, view in enumerate(views):
+        if done < len(view):
+            return [view[done:], *views[index + 1 :]]
+        done -= len(view)
+    return []
+
+
 def write_file(
     path: Path,
     content: bytes,
@@ -187,9 +180,7 @@ def write_file(
     fd = open_file(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
     try:
         try:
-            left = memoryview(content)
-            while left:
-                left = left[system.writev(fd, [left]) :]
+            write_all(fd, [content])
             if modified is not None:
                 os.utime(fd, ns=(modified, modified))
             if sync:
@@ -235,10 +226,7 @@ def status(path: Path) -> os.stat_result:
 
 def names(path: Path) -> dict[str, os.stat_result]:
     """The status of each entry of a folder, by name."""
-    if (found := _mounted(path)) is not None:
-        return found[0].names(found[1])[1]
-    with folder(path) as fd:
-        return names_in(fd)
+    return changed_names(path, None)[1] or {}
 
 
 def changed_names(
@@ -255,7 +243,14 @@ def changed_names(
     with folder(path) as fd:
         about = os.fstat(fd)
         now = about.st_ino, about.st_mtime_ns
-        return now, None if now == before else names_in(fd)
+        if now == before:
+            return now, None
+        entries = {}
+        with os.scandir(fd) as listed:
+            for entry in listed:
+                with suppress(FileNotFoundError):
+                    entries[entry.name] = entry.stat(follow_symlinks=False)
+        return now, entries
 
 
 def is_fetched(fd: int) -> bool:
@@ -266,20 +261,18 @@ def is_fetched(fd: int) -> bool:
 def fetch(fd: int, ranges: Iterable[tuple[int, int]]) -> None:
     """Announce that some ranges of a file will be read, so that a bucket is asked once."""
     if is_fetched(fd):
-        cast("Fetched", fd).fetch(ranges)
+        cast("Any", fd).fetch(ranges)
 
 
 def pread(fd: int, size: int, offset: int) -> bytes:
     """As `os.pread`."""
-    if is_fetched(fd):
-        cast("Fetched", fd).fetch([(offset, offset + size)])
+    fetch(fd, [(offset, offset + size)])
     return os.pread(fd, size, offset)
 
 
 def preadv(fd: int, buffers: Sequence[memoryview], offset: int) -> int:
     """As `os.preadv`."""
-    if is_fetched(fd):
-        cast("Fetched", fd).fetch([(offset, offset + sum(map(len, buffers)))])
+    fetch(fd, [(offset, offset + sum(map(len, buffers)))])
     return os.preadv(fd, buffers, offset)
 
 
@@ -290,27 +283,16 @@ def is_at(fd: int, path: Path) -> bool:
     return False
 
 
-def identity(fd: int) -> tuple[int, ...]:
+def identity(fd: Any) -> tuple[int, ...]:
     """A value that no other file has, nor this one after a change."""
-    if is_fetched(fd):
-        return cast("Fetched", fd).identity()
     about = os.fstat(fd)
-    return about.st_ino, about.st_size, about.st_mtime_ns
+    now = about.st_ino, about.st_size, about.st_mtime_ns
+    return cast("tuple[int, ...]", fd.identity()) if is_fetched(fd) else now
 
 
-def duplicate(fd: int) -> int:
+def duplicate(fd: Any) -> int:
     """As `os.dup`."""
-    return cast("Fetched", fd).again() if is_fetched(fd) else os.dup(fd)
-
-
-def names_in(fd: int) -> dict[str, os.stat_result]:
-    """The status of each entry of an open folder, by name."""
-    found: dict[str, os.stat_result] = {}
-    with os.scandir(fd) as entries:
-        for entry in entries:
-            with suppress(FileNotFoundError):
-                found[entry.name] = entry.stat(follow_symlinks=False)
-    return found
+    return cast("int", fd.again()) if is_fetched(fd) else os.dup(fd)
 
 
 def most_open(most: int) -> int:
@@ -380,7 +362,7 @@ def _remove(parent: int, name: str) -> None:
         system.rmdir(name, folder=parent)
 
 
-def _mounted(path: Path) -> tuple[Mounted, tuple[str, ...]] | None:
+def _mounted(path: Path) -> tuple[Any, tuple[str, ...]] | None:
     """The store that is no directory and has a path, and the names on the way in it."""
     if mounted:
         for outer in (path, *path.parents):

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Final, Self
 
 from hybridlog_storage.checksum import crc32
-from hybridlog_storage.disk.files import user_directory
+from hybridlog_storage.disk import files
 from hybridlog_storage.errors import ObjectChangedError, ResourceError
 from hybridlog_storage.remote.bucket import Bucket, Object
 
@@ -40,18 +40,13 @@ _MARK: Final = struct.Struct("<II")
 class CachedFile(int):
     """A handle of the cached file of an object, which fetches what is read."""
 
-    _cache: BlockCache
-    _bucket: Bucket
-    _about: Object
-    _lock: threading.Lock
-    _proved: set[int]
-
-    def __new__(cls, fd: int, cache: BlockCache, bucket: Bucket, about: Object) -> Self:
+    def __new__(cls, fd: int, *_: object) -> Self:
         """A handle that takes over an open file."""
-        made = super().__new__(cls, fd)
-        made._cache, made._bucket, made._about = cache, bucket, about
-        made._lock, made._proved = threading.Lock(), set()
-        return made
+        return super().__new__(cls, fd)
+
+    def __init__(self, _: int, cache: BlockCache, bucket: Bucket, about: Object) -> None:
+        self._cache, self._bucket, self._about = cache, bucket, about
+        self._lock, self._proved = threading.Lock(), set[int]()
 
     def identity(self) -> tuple[int, ...]:
         """A value that no other object has, nor this one after a change."""
@@ -110,9 +105,8 @@ class CachedFile(int):
 
     def _is_there(self, sums: int, number: int) -> bool:
         mark = os.pread(sums, _MARK.size, number * _MARK.size)
-        if len(mark) < _MARK.size or mark == bytes(_MARK.size):
-            return False
-        return mark == _MARK.pack(1, crc32(os.pread(self, BLOCK, number * BLOCK)))
+        is_known = mark[:1] == b"\1"
+        return is_known and mark == _MARK.pack(1, crc32(os.pread(self, BLOCK, number * BLOCK)))
 
 
 class BlockCache:
@@ -123,7 +117,7 @@ class BlockCache:
 
     def __init__(self, path: Path | None = None, most: int = MAX_CACHED) -> None:
         if path is None:
-            path = user_directory("XDG_CACHE_HOME", ".cache", "blocks of buckets") / "buckets"
+            path = files.user_directory("XDG_CACHE_HOME", ".cache", "blocks of buckets") / "buckets"
         self.path = path
         self._most = most
         self._since_check = _CHECK_EVERY
@@ -173,19 +167,14 @@ class BlockCache:
             if self._since_check < min(_CHECK_EVERY, self._most):
                 return
             self._since_check = 0
-        found = []
-        with suppress(OSError), os.scandir(self.path) as entries:
-            for entry in entries:
-                with suppress(OSError):
-                    about = entry.stat(follow_symlinks=False)
-                    found.append((about.st_mtime_ns, about.st_blocks * 512, entry.path))
-        left = sum(taken for _, taken, _ in found)
-        for _, taken, path in sorted(found):
-            if left <= self._most:
-                return
-            with suppress(OSError):
-                os.unlink(path)  # noqa: PTH108 - as the listing has it
-            left -= taken
+        with suppress(OSError):
+            there = files.names(self.path).items()
+            found = sorted((one.st_mtime_ns, one.st_blocks * 512, name) for name, one in there)
+            left = sum(taken for _, taken, _ in found)
+            for _, taken, name in found:
+                if left > self._most:
+                    (self.path / name).unlink(missing_ok=True)
+                    left -= taken
 
 
 def inode_of(about: Object) -> int:

@@ -19,11 +19,11 @@ import tempfile
 import threading
 import time
 import zlib
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Final
+from typing import Annotated, Any, ClassVar, Final, cast
 
 from msgspec import Meta, MsgspecError, json
 from msgspec.structs import replace
@@ -31,7 +31,14 @@ from msgspec.structs import replace
 from hybridlog_storage import manifest as truth
 from hybridlog_storage.cells import Cells, drop, put
 from hybridlog_storage.checksum import crc32
-from hybridlog_storage.copy_places import RECORDINGS, BucketStore, Directory, Sending
+from hybridlog_storage.copy_places import (
+    MANIFESTS,
+    RECORDINGS,
+    Directory,
+    RefusedError,
+    Sending,
+    Source,
+)
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import (
     Listing,
@@ -44,11 +51,19 @@ from hybridlog_storage.errors import (
     ManifestError,
     ObjectChangedError,
     ObjectExistsError,
+    RecordingExistsError,
     RecordingGoneError,
     StoreError,
 )
-from hybridlog_storage.manifest import Manifest, decode, with_rows
-from hybridlog_storage.manifests import BucketManifests
+from hybridlog_storage.manifest import (
+    MAX_BYTES,
+    Manifest,
+    decode,
+    digest_of,
+    encode,
+    with_rows,
+)
+from hybridlog_storage.manifests import Manifests, ids_of
 from hybridlog_storage.remote.blocks import LOST, BlockCache, inode_of
 from hybridlog_storage.remote.bucket import Bucket, Object
 from hybridlog_storage.settings import MAX_SETTINGS, NONE, StoreSettings, settings_of, settings_text
@@ -63,6 +78,7 @@ _MANIFEST: Final = "manifest"
 _TABLES: Final = "tables"
 """Kinds of cells, by recording: its manifest with its version, and the objects of its tables."""
 _FEW: Final = 4  # manifests that are read one by one, even if there is a newer catalog
+_FETCHED: Final = 8 << 20  # bytes that a copy asks for at once
 _MAX_CATALOG: Final = 1 << 30  # bytes, packed and unpacked
 _PART: Final = r"(?!\.\.?(?:/|$))[^/\x00]{1,255}"
 _Row = tuple[
@@ -150,18 +166,19 @@ class CatalogCells(Cells):
                 self.save()
 
 
-class SeenManifests(BucketManifests):
+class BucketManifests(Manifests):
     """The manifests of a bucket as they were at the last look; a change asks for the newest.
 
     `objects` are by id; `number` counts what others have changed at a look, and what came or went
     here.
     """
 
+    cure = "If it is deleted, `hybridlog copy` from a store that has it brings it back."
+
     def __init__(self, bucket: Bucket, cells: CatalogCells) -> None:
-        super().__init__(bucket)
         self.objects: dict[str, Object] = {}
         self.number = 0
-        self._cells = cells
+        self.place, self._bucket, self._cells = bucket.address, bucket, cells
         self._known: dict[str, tuple[Manifest, str]] = {}
         self._look_at = 0.0
         self._lock = threading.RLock()
@@ -171,9 +188,9 @@ class SeenManifests(BucketManifests):
         with self._lock:
             if self.number and not now and time.monotonic() < self._look_at:
                 return
-            found = {one.name: one for one in self._bucket.objects("manifests/")}
-            before = self.objects
-            self.objects = {one: found[self.name_of(one)] for one in self.ids_of(found)}
+            found = {one.name: one for one in self._bucket.objects(f"{MANIFESTS}/")}
+            ids = ids_of(name.removeprefix(f"{MANIFESTS}/") for name in found)
+            before, self.objects = self.objects, {one: found[_name_of(one)] for one in ids}
             changed = {
                 one
                 for one in before.keys() | self.objects.keys()
@@ -191,6 +208,7 @@ class SeenManifests(BucketManifests):
 
     def ids(self) -> list[str]:
         """Ids of all recordings, sorted; also of those being removed."""
+        self.look()
         return sorted(self.objects)
 
     def without(self) -> list[str]:
@@ -203,15 +221,20 @@ class SeenManifests(BucketManifests):
     ) -> Manifest:
         """Remove a recording with all its objects, and those of others whose removal was cut."""
         removed = super().remove(recording, check)
-        self.clear()
+        for one in self.ids():
+            try:
+                self.find(one)
+            except RecordingGoneError:
+                super().remove(one)
+            except ManifestError:
+                continue  # it is told where it is asked about
         return removed
 
-    def _read(self, recording: str) -> tuple[Manifest, str]:
+    def _seen(self, recording: str) -> tuple[Manifest, str]:
         with self._lock:
-            version = _version(self.objects.get(recording))
             known = self._known.get(recording) or self._catalogued(recording)
-            if known is None or known[1] != version:
-                known = super()._read(recording)
+            if known is None or known[1] != _version(self.objects.get(recording)):
+                known = self._read(recording)
             self._known[recording] = known
             return known
 
@@ -228,76 +251,81 @@ class SeenManifests(BucketManifests):
                 return manifest, version.decode()
         return None
 
-    @contextmanager
-    def _alone(self, recording: str) -> Iterator[None]:
-        self._doubt(recording)  # a change is decided from the newest one
-        yield
-
-    def _doubt(self, recording: str) -> None:
-        with self._lock:
-            if recording in self.objects:
-                self.objects[recording] = Object(self.name_of(recording), 0, "")
-
-    def _replace(self, recording: str, data: bytes, version: str) -> None:
-        self._doubt(recording)
-        super()._replace(recording, data, version)
-        self._cells.has_changes = True
+    def _get(self, recording: str) -> tuple[bytes, str]:
+        about, data = self._bucket.read_whole(_name_of(recording), MAX_BYTES)
+        self._note(recording, data, about.version)
+        return data, about.version
 
     def _create(self, manifest: Manifest) -> None:
-        super()._create(manifest)
-        self._cells.has_changes = True
+        data = encode(manifest)
+        try:
+            version = self._bucket.create(_name_of(manifest.id), data)
+        except ObjectExistsError:
+            raise RecordingExistsError(f"There is a recording {manifest.id} already.") from None
+        self._note(manifest.id, data, version, is_change=True)
 
-    def _delete_files(self, recording: str) -> None:
-        super()._delete_files(recording)
-        self._cells.put_tables(recording)
+    def _replace(self, recording: str, data: bytes, version: str) -> None:
+        version = self._bucket.replace(_name_of(recording), data, version)
+        self._note(recording, data, version, is_change=True)
 
-    def _forget(self, recording: str, *, says_so: bool) -> None:
-        self._doubt(recording)
-        super()._forget(recording, says_so=says_so)
+    def _note(self, recording: str, data: bytes, version: str, *, is_change: bool = False) -> None:
         with self._lock:
-            self._cells.has_changes = True
-            known = self._known.pop(recording, None)
-            if known is None or known[0].status == "removed":  # it was not created anew
-                self.objects.pop(recording, None)
-                self.number += 1
-                self._cells.write(lambda: [drop(_MANIFEST, recording)])
-
-    def _noted(self, recording: str, data: bytes, version: str) -> None:
-        with self._lock:
+            self._cells.has_changes |= is_change
             self.number += recording not in self.objects
-            self.objects[recording] = Object(self.name_of(recording), len(data), version)
+            self.objects[recording] = Object(_name_of(recording), len(data), version)
             self._known.pop(recording, None)
             cell = put(_MANIFEST, recording, version.encode() + b"\n" + data)
             self._cells.write(lambda: [cell])
 
+    def _drop(self, recording: str) -> None:
+        self._bucket.delete([_name_of(recording)])
 
-class BucketFiles:
-    """A store in a bucket, by the paths of its files; see `files.mounted`.
+    def _delete_files(self, recording: str) -> None:
+        names = [one.name for one in self._bucket.objects(f"{RECORDINGS}/{recording}/")]
+        self._bucket.delete(names)
+        self._cells.put_tables(recording)
 
-    `path` stands for it among paths; `cells` are those of its catalog.
+    def _forget(self, recording: str, *, says_so: bool) -> None:
+        # Servers have no condition for deletions: between these two it could be created anew.
+        with suppress(RecordingGoneError):
+            if self._read(recording)[0].status != "removed":
+                return
+            self._drop(recording)
+        with self._lock:
+            self._cells.has_changes = True
+            self._known.pop(recording, None)
+            self.objects.pop(recording, None)
+            self.number += 1
+            self._cells.write(lambda: [drop(_MANIFEST, recording)])
+
+
+class BucketStore(Source):
+    """A store in a bucket; one for all who use it in this process, by its path: `files.mounted`.
+
+    `cells` are those of its catalog.
     """
 
-    def __init__(self, bucket: Bucket, cache: BlockCache) -> None:
-        self.bucket = bucket
-        self.path = Path(bucket.address)
-        self.cache = cache
-        self.cells = CatalogCells(bucket, cache)
-        self.manifests = SeenManifests(bucket, self.cells)
-        self._files: dict[str, tuple[Manifest, dict[str, Object]]] = {}
+    manifests: BucketManifests
+
+    def __init__(self, bucket: Bucket) -> None:
+        self.bucket, self.address = bucket, bucket.address
+        self.cache = BlockCache()
+        self.cells = CatalogCells(bucket, self.cache)
+        self.manifests = BucketManifests(bucket, self.cells)
+        self._found: dict[str, Object] = {}
 
     def open(self, inner: tuple[str, ...]) -> int:
         """A handle for reading a file that a manifest or the catalog lists."""
-        listed: Mapping[str, Object] = {}
-        if len(inner) > 2 and inner[0] == RECORDINGS:
+        about = None
+        if len(inner) == 3 and inner[0] == RECORDINGS:
             with suppress(RecordingGoneError):
-                listed = self.files_of(self.manifests.read(inner[1]))
+                listed = objects_of(self.manifests.read(inner[1]))
+                about = next((one for one in listed if one.name == "/".join(inner)), None)
         elif len(inner) == 3 and inner[0] == TABLES:
-            listed = self.cells.tables().get(inner[1], {})
-        about = listed.get(inner[-1] if inner[0] == TABLES else "/".join(inner[2:]))
+            about = self.cells.tables().get(inner[1], {}).get(inner[2])
         if about is None or about.name in self.bucket.lost:
             problem = "there is no such object" if about is None else LOST
-            place = "/".join([self.bucket.address, *inner])
-            raise FileNotFoundError(errno.ENOENT, problem, place)
+            raise FileNotFoundError(errno.ENOENT, problem, "/".join([self.address, *inner]))
         return self.cache.open(self.bucket, about)
 
     def names(self, inner: tuple[str, ...]) -> tuple[int, dict[str, os.stat_result]]:
@@ -306,8 +334,7 @@ class BucketFiles:
         if inner == (TABLES,):
             return self.number, dict.fromkeys(found, _stat(_FOLDER, 0, 0))
         if len(inner) != 2 or inner[0] != TABLES or inner[1] not in found:
-            place = "/".join([self.bucket.address, *inner])
-            raise FileNotFoundError(errno.ENOENT, "there is no such folder", place)
+            raise FileNotFoundError(errno.ENOENT, "there is no such folder", inner[-1])
         entries = found[inner[1]].items()
         return self.number, {name: _stat(_FILE, inode_of(o), o.size) for name, o in entries}
 
@@ -316,30 +343,61 @@ class BucketFiles:
         """Changes with what was seen of the store."""
         return self.manifests.number + len(self.bucket.lost)
 
-    def files_of(self, manifest: Manifest) -> dict[str, Object]:
-        """The objects of the files that a manifest lists, by path below the recording."""
-        known = self._files.get(manifest.id)
-        if known is None or known[0] is not manifest:
-            place = f"{RECORDINGS}/{manifest.id}"
-            found = {
-                one.path: Object(f"{place}/{one.path}", one.bytes, one.digest)
-                for one in listed_files(manifest)
-            }
-            known = self._files[manifest.id] = manifest, found
-        return known[1]
+    def sizes(self, recording: str) -> dict[str, int]:
+        """As of `Place`; 1,000 a request."""
+        folder = f"{RECORDINGS}/{recording}/"
+        found = {one.name: one for one in self.bucket.objects(folder)}
+        self._found |= found
+        return {name.removeprefix(folder): one.size for name, one in found.items()}
+
+    def send(self, sent: Sending) -> None:
+        """As of `Place`; from its first byte on."""
+        self._found[sent.name] = self.bucket.put(sent.name, sent.size, sent.checked())
+        if not self.is_whole(sent):
+            raise sent.not_arrived(self)
+
+    def drop(self, name: str) -> None:
+        """As of `Place`."""
+        self.bucket.delete([name])
+
+    def is_whole(self, sent: Sending, *, reads: bool = False) -> bool:
+        """As of `Place`: by the checksum of the server, or it is read."""
+        with suppress(RefusedError):  # what is damaged here may be whole there
+            if not reads and self._found[sent.name].has_md5_of(sent.again()):
+                return True
+        with suppress(RefusedError):
+            return digest_of(self.pieces(sent.name, 0, sent.size)) == sent.digest
+        return False
+
+    def pieces(self, name: str, at: int, size: int) -> Iterator[bytes]:
+        """As of `Source`."""
+        where = f"{self.address}/{name}"
+        for begin in range(at, size, _FETCHED):
+            try:
+                yield self.bucket.read(name, begin, min(begin + _FETCHED, size), size)
+            except FileNotFoundError as error:
+                self.manifests.look(now=True)  # it may have expired meanwhile
+                raise RefusedError(f"{where} cannot be copied: {error.strerror}.") from error
+            except ObjectChangedError as error:
+                raise RefusedError(f"{where} is damaged: it has not {size} bytes.") from error
 
 
 _mounting = threading.Lock()
 
 
-def mount(address: str) -> BucketFiles:
-    """The files of a store in a bucket; one for all who use it in this process."""
+def mount(address: str) -> BucketStore:
+    """The store in a bucket."""
     path = Path(address)
     with _mounting:
-        found = files.mounted.get(path)
-        if not isinstance(found, BucketFiles):
-            found = files.mounted[path] = BucketFiles(Bucket(address), BlockCache())
-        return found
+        if path not in files.mounted:
+            files.mounted[path] = BucketStore(Bucket(address))
+        return cast("BucketStore", files.mounted[path])
+
+
+def objects_of(manifest: Manifest) -> Iterator[Object]:
+    """The objects of the files that a manifest lists."""
+    place = f"{RECORDINGS}/{manifest.id}"
+    return (Object(f"{place}/{o.path}", o.bytes, o.digest) for o in listed_files(manifest))
 
 
 class RemoteDirectory(StoreDirectory):
@@ -349,11 +407,14 @@ class RemoteDirectory(StoreDirectory):
 
     def __init__(self, address: str, *, read_only: bool = False) -> None:
         self.source = mount(address)
-        self.path, self.read_only = self.source.path, read_only
+        self.place = self.address = address
+        self.cells, self.bucket = self.source.cells, self.source.bucket
+        self.path, self.read_only = Path(address), read_only
+        self.when_empty = f"The store is empty: `hybridlog copy {address}` fills it from a disk."
         # No server that a bucket names is asked.
         self.settings = replace(self._read_settings()[1], mongo=NONE)
-        self.manifests = self.seen = self.source.manifests
-        self.seen.look(now=True)
+        self.manifests: BucketManifests = self.source.manifests
+        self.manifests.look(now=True)
 
     def _read_settings(self) -> tuple[str, StoreSettings]:
         """The version of the object with the settings, and these."""
@@ -380,23 +441,6 @@ class RemoteDirectory(StoreDirectory):
         return cls(address)
 
     @property
-    def bucket(self) -> Bucket:
-        """Its objects."""
-        return self.source.bucket
-
-    @property
-    def address(self) -> str:
-        """The address by which another process opens it."""
-        return self.bucket.address
-
-    place = address
-
-    @property
-    def when_empty(self) -> str:
-        """The sentence for a store without recordings."""
-        return f"The store is empty: `hybridlog copy {self.place}` fills it from one on a disk."
-
-    @property
     def is_writable(self) -> bool:
         """False: nothing is mended, or noted for others, without being asked to."""
         return False
@@ -421,25 +465,17 @@ class RemoteDirectory(StoreDirectory):
         self.bucket.replace(SETTINGS, settings_text(new), version)
         self.settings = replace(new, mongo=NONE)
 
-    def make_folder(self, recording: str) -> None:
-        """Raise: nothing is recorded into a bucket."""
-        self.check_writable()
-
-    def catalog_cells(self) -> Cells:
-        """The cells of the catalog, from its object."""
-        return self.source.cells
-
     def changed(self) -> tuple[int, bool]:
         """A number that changes with what is seen of the store, and True."""
-        self.seen.look()
+        self.manifests.look()
         return self.source.number, True
 
     def looks(self, ids: Sequence[str]) -> dict[str, str]:
         """The look of each recording, by id: the version of its manifest, and what was lost."""
-        return {one: self._look_of(one) for one in ids if one in self.seen.objects}
+        return {one: self._look_of(one) for one in ids if one in self.manifests.objects}
 
     def _look_of(self, recording: str) -> str:
-        about = self.seen.objects.get(recording)
+        about = self.manifests.objects.get(recording)
         if about is None:
             return ""
         lost = sorted(self._lost(recording))
@@ -453,7 +489,7 @@ class RemoteDirectory(StoreDirectory):
 
     def has(self, recording: str) -> bool:
         """True if there is a manifest of a recording."""
-        return recording in self.seen.objects
+        return recording in self.manifests.objects
 
     def look_closely(self, recording: str | None = None) -> bool:
         """Compare files with their objects; True if some are missing.
@@ -465,7 +501,7 @@ class RemoteDirectory(StoreDirectory):
         lost = {one for one in self.bucket.lost if not one.startswith(place)}
         for one in self.ids() if recording is None else [recording]:
             with suppress(StoreError):  # it is named where it is asked about
-                for about in self.source.files_of(self.manifests.read(one)).values():
+                for about in objects_of(self.manifests.read(one)):
                     is_lost = there.get(about.name) != about.size
                     if is_lost:
                         lost.add(about.name)
@@ -480,7 +516,10 @@ class RemoteDirectory(StoreDirectory):
         look, lost = self._look_of(recording), sorted(self._lost(recording))
         manifest = self.manifests.find(recording)
         if manifest is None:
-            raise ManifestError(f"{recording} has no manifest. {BucketManifests.cure}")
+            raise ManifestError(
+                f"{recording} has no manifest. `hybridlog copy` from a store that has it brings "
+                "it back."
+            )
         sealed = {n: one.name for n, one in sorted(manifest.logs.items()) if one.is_here}
         sealed = {number: name for number, name in sealed.items() if name not in lost}
         files = (one for own in manifest.rows.values() for one in own)
@@ -504,14 +543,17 @@ class RemoteDirectory(StoreDirectory):
 
     @contextmanager
     def writing(
-        self, recording: str, name: str = "", *, wait_s: float = 0.0, records: bool = False
+        self,
+        recording: str,
+        name: str = "",
+        *,
+        wait_s: float = 0.0,
+        records: bool = False,
+        makes: bool = False,
     ) -> Iterator[None]:
-        """Nothing is locked: a change is made of the newest manifest, and made again.
-
-        Nothing can be recorded here: `records` raises `StoreError`.
-        """
+        """Nothing is locked: a change is made of the newest manifest, and made again."""
         self.check_changes()
-        if records:
+        if makes:
             self.check_writable()
         if not self.has(recording):
             raise gone(name or recording)
@@ -527,7 +569,6 @@ class RemoteDirectory(StoreDirectory):
         """As of a directory: a hidden one on the disk, of which all that is new becomes objects."""
         before = self.manifests.read(recording)
         listed = {one.path: one for one in listed_files(before)}
-        there = BucketStore(self.bucket, self.manifests)
         # Others may do the same, so all that is made here has names of its own.
         version = 1 + secrets.randbelow(9 * 10**8)
         with tempfile.TemporaryDirectory(prefix="hybridlog-") as place:
@@ -536,14 +577,14 @@ class RemoteDirectory(StoreDirectory):
             disk = Directory(here.path)
             for number in segments:
                 if number in before.logs and before.logs[number].is_here:
-                    disk.send(Sending(there, recording, *listed[before.logs[number].name]))
+                    disk.send(Sending(self.source, recording, *listed[before.logs[number].name]))
             yield here, version
             after = here.manifests.read(recording)
             made = {one.path: one for one in listed_files(after)}
             new = made.keys() - listed.keys()
             try:
                 for path in new:
-                    there.send(Sending(disk, recording, *made[path]))
+                    self.source.send(Sending(disk, recording, *made[path]))
                 self.manifests.change(recording, partial(_brought, before, after, check))
             except BaseException:
                 with suppress(BucketError):
@@ -575,6 +616,10 @@ def _objects(body: bytes) -> list[Object]:
 
 def _version(about: Object | None) -> str:
     return "" if about is None else about.version
+
+
+def _name_of(recording: str) -> str:
+    return f"{MANIFESTS}/{recording}.json"
 
 
 def _stat(mode: int, inode: int, size: int) -> os.stat_result:
