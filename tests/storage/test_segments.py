@@ -273,47 +273,8 @@ def test_a_segment_has_no_more_chunks_than_a_summary_should(tmp_path: Path, limi
     paths = writer.close()
     assert [data for path in paths for _, _, data in messages_in(path)] == payloads
     chunks = [len(summary_of(path, number).chunks) for number, path in enumerate(paths)]
-    # Those that wait together are written together, eight of them at most.
     assert sum(chunks) == 200
     assert all(10 <= count < 10 + AT_WORK for count in chunks[:-1])
-
-
-def test_chunks_that_wait_are_written_together(tmp_path: Path, calls: Calls) -> None:
-    go_on = threading.Event()
-    together: list[int] = []
-
-    def noted(_: None, __: SegmentFile, own: Sequence[object]) -> None:
-        together.append(len(own))
-
-    calls.change(SegmentFile, "append_chunks", noted)
-    calls(SegmentFile, "append_chunks", lambda *_: go_on.wait(60) or pytest.fail("waited in vain"))
-    setup = SegmentSettings(chunk_size=100_000, compression="none", segment_size=1_000_000)
-    chunks: list[StoredChunk] = []
-    writer = recorder(tmp_path, chunks, setup, on_written=done)
-    payloads = [bytes([n]) * 100_000 for n in range(35)]
-    for n, payload in enumerate(payloads):
-        writer.append(loose([(0, payload, n, n, n)]), CHANNELS)
-    writer.append(loose([(1, b"last", 99, 99, 99)]), CHANNELS)
-    while not all(future.done() for future in writer._packed):
-        time.sleep(0.01)
-    go_on.set()
-    paths = writer.close()
-    # Alone only those that were there first; and segments end as if each had come by itself.
-    assert sum(together) == 36
-    assert len(together) <= 6
-    assert max(together) in {9, 10}
-    assert [chunk.segment for chunk in chunks] == [n // 10 for n in range(36)]
-    found = [m for path in paths for m in messages_in(path)]
-    assert found == [
-        *((CHANNELS[0].topic, n, payload) for n, payload in enumerate(payloads)),
-        (CHANNELS[1].topic, 99, b"last"),
-    ]
-    for chunk in chunks:
-        data = paths[chunk.segment].read_bytes()
-        assert data[chunk.offset] == Opcode.CHUNK
-        assert int.from_bytes(data[chunk.offset + 1 : chunk.offset + 9], "little") == (
-            chunk.length - 9
-        )
 
 
 def test_no_chunk_follows_one_that_failed(tmp_path: Path, calls: Calls) -> None:
@@ -323,7 +284,7 @@ def test_no_chunk_follows_one_that_failed(tmp_path: Path, calls: Calls) -> None:
         failing.wait()
         raise DiskFullError("There is no room.")
 
-    calls(SegmentFile, "append_chunks", full)
+    calls(SegmentFile, "append_chunk", full)
     writer = recorder(tmp_path, setup=SegmentSettings(chunk_size=100_000), on_written=done)
     for _ in range(50):
         writer.append(loose([(0, bytes(100_000), 0, 0, 0)]), CHANNELS)

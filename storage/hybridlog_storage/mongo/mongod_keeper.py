@@ -26,8 +26,6 @@ from pathlib import Path
 
 LOG_LIMIT = 10 << 20
 """Bytes of log after which it is emptied."""
-OPEN_FILES = 64_000
-"""Limit of mongod's open files: about two for each collection."""
 END_LIMIT_S = 30.0
 """Seconds for an orderly end of mongod."""
 POLL_S = 0.25
@@ -103,15 +101,11 @@ def _die_with(keeper: int) -> Callable[[], None] | None:
 
 
 def _raise_limits() -> None:
-    """Undo the starter's limit of memory, and allow many open files."""
-    hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
-    resource.setrlimit(resource.RLIMIT_DATA, (hard, hard))
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    unlimited = resource.RLIM_INFINITY
-    wanted = OPEN_FILES if hard == unlimited else min(OPEN_FILES, hard)
-    if soft not in {unlimited, wanted} and soft < wanted:
+    """Undo the starter's limits of memory and of open files: each collection takes about two."""
+    for limit in (resource.RLIMIT_DATA, resource.RLIMIT_NOFILE):
+        hard = resource.getrlimit(limit)[1]
         with contextlib.suppress(OSError, ValueError):
-            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+            resource.setrlimit(limit, (hard, hard))
 
 
 def _wait(

@@ -34,7 +34,6 @@ from hybridlog_storage.segments.attachments import Attachment
 from hybridlog_storage.segments.chunk import PackedChunk
 from hybridlog_storage.segments.chunk_table import ChunkTable, TableBuilder
 from hybridlog_storage.segments.segment_format import (
-    ARRIVAL_HEAD,
     CHUNK_TABLE_OPCODE,
     FORMAT_VERSION,
     LOSSES_METADATA,
@@ -267,31 +266,17 @@ class SegmentFile:
         self._metadata_indexes += metadata
         self._attachment_indexes += attachments
 
-    def end_behind(self, chunk: PackedChunk, at: int) -> int:
-        """Byte of the file where a chunk ends that is appended when the file has `at` bytes."""
-        trailer = sum(map(len, chunk.indexes.values())) + ARRIVAL_HEAD + len(chunk.arrivals)
-        padding = self._padding(chunk.data, at, len(chunk.head))
-        return at + len(padding) + len(chunk.head) + len(chunk.data) + trailer
-
-    def append_chunks(self, chunks: Sequence[PackedChunk]) -> None:
-        """Append chunks with their message indexes and arrival numbers in one write."""
-        parts: list[Buffer] = []
-        places: list[tuple[int, int]] = []
-        at = self.position
-        for chunk in chunks:
-            padding = self._padding(chunk.data, at, len(chunk.head))
-            offset = at + len(padding)
-            arrivals = arrival_record(offset, chunk.head_crc, chunk.indexes_crc, chunk.arrivals)
-            trailer = sum(map(len, chunk.indexes.values())) + len(arrivals)
-            parts += [padding, chunk.head, chunk.data, *chunk.indexes.values(), arrivals]
-            at = offset + len(chunk.head) + len(chunk.data) + trailer
-            places.append((offset, trailer))
-        self._append(parts)
-        for chunk, (offset, trailer) in zip(chunks, places, strict=True):
-            sizes = {channel: len(data) for channel, data in chunk.indexes.items()}
-            head = chunk_head_of(chunk.head)
-            assert head is not None
-            self.note_chunk(offset, trailer, head, sizes, chunk.parts)
+    def append_chunk(self, chunk: PackedChunk) -> None:
+        """Append a chunk with its message indexes and arrival numbers in one write."""
+        padding = self._padding(chunk.data, len(chunk.head))
+        offset = self.position + len(padding)
+        arrivals = arrival_record(offset, chunk.head_crc, chunk.indexes_crc, chunk.arrivals)
+        indexes = chunk.indexes.values()
+        self._append([padding, chunk.head, chunk.data, *indexes, arrivals])
+        head = chunk_head_of(chunk.head)
+        assert head is not None
+        sizes = {channel: len(data) for channel, data in chunk.indexes.items()}
+        self.note_chunk(offset, sum(sizes.values()) + len(arrivals), head, sizes, chunk.parts)
 
     def note_chunk(
         self,
@@ -398,12 +383,12 @@ class SegmentFile:
         with suppress(OSError):
             self._file.finish(sync=False)
 
-    def _padding(self, content: Buffer, at: int, head: int) -> bytes:
+    def _padding(self, content: Buffer, head: int) -> bytes:
         """Padding before a chunk record so that its content starts at a block."""
-        if not self._file.room_before(content, at + head):
+        at, least = self.position + head, RECORD_HEAD.size
+        if not self._file.room_before(content, at):
             return b""
-        least = RECORD_HEAD.size
-        return padding_record(least + self._file.room_before(content, at + least + head))
+        return padding_record(least + self._file.room_before(content, at + least))
 
     def _append(self, parts: Sequence[Buffer]) -> None:
         with self._explained("writing"):

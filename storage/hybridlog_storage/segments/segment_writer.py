@@ -46,7 +46,6 @@ _LATCHED = -2
 _MAX_SPAN = 3600 * 10**9  # ns
 _SMALL_SPANS = 256  # times the usual span, for a chunk that is still small
 _SYNC_STRIDE = 32 << 20  # bytes
-_WRITTEN_AT_ONCE = 16 << 20  # bytes, at most, and one chunk
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,7 +175,6 @@ class RecordingWriter:
         self._make_room = make_room
         large, own = self.settings.large_payload, self.settings.own_payload
         self._division = Division(own, large, is_named)
-        self._packed: deque[Future[PackedChunk]] = deque()  # in file order
         self._storing: deque[Future[None]] = deque()
         self._extras: list[Metadata | Attachment] = []  # not in a segment yet
         self._broken: BaseException | None = None
@@ -368,7 +366,6 @@ class RecordingWriter:
         chunk = self._clusters.pop(key)
         self._closed_bytes += chunk.size
         packed = self._pool.submit(self._pack, chunk)
-        self._packed.append(packed)
         self._storing.append(self._disk.submit(self._store, packed))
         self._limit_queue(limit=AT_WORK)
 
@@ -397,50 +394,14 @@ class RecordingWriter:
     # The methods below run on the writing thread only.
 
     def _store(self, packed: Future[PackedChunk]) -> None:
-        """Write a packed chunk and the packed ones that follow it; nothing after a failure."""
+        """Write a chunk, once it is packed; nothing after a failure."""
         if self._broken is not None:
             return  # the next append raises it
-        if not self._packed or packed is not self._packed[0]:
-            return  # it was written together with an earlier one
         try:
-            self._write()
+            self._write(packed.result())
         except BaseException as error:
             self._broken = error
             raise
-
-    def _next_chunks(self) -> list[tuple[SegmentFile, PackedChunk]]:
-        """The first chunk, once it is packed, and the packed chunks behind it.
-
-        After each blocking call this thread waits for the interpreter lock. So many waiting
-        chunks are written at once; the files are the same either way.
-        """
-        group = self._open_group()
-        chunk = self._packed[0].result()
-        topic, key = self._place_of(chunk)
-        segment = group.segment(key)
-        self._define(segment, [c for c in chunk.indexes if c not in segment.channels])
-        chunks: list[tuple[SegmentFile, PackedChunk]] = []
-        ends: dict[SegmentFile, int] = {}
-        size, left = 0, self.settings.segment_size - group.position
-        while True:
-            if topic is not None:
-                self._division.note(topic, chunk, key)
-            chunks.append((segment, chunk))
-            size += len(chunk.data)
-            before = ends.get(segment, segment.position)
-            ends[segment] = segment.end_behind(chunk, before)
-            left -= ends[segment] - before
-            if size >= _WRITTEN_AT_ONCE or left <= 0 or len(chunks) == len(self._packed):
-                return chunks
-            following = self._packed[len(chunks)]
-            if not following.done() or following.exception() is not None:
-                return chunks
-            chunk = following.result()
-            topic, key = self._place_of(chunk)
-            found = group.segments.get(key)
-            if found is None or not chunk.indexes.keys() <= found.channels.keys():
-                return chunks
-            segment = found
 
     def _place_of(self, chunk: PackedChunk) -> tuple[str | None, Key]:
         """The topic of a chunk of one channel, and its segment; no topic in the first one."""
@@ -473,29 +434,25 @@ class RecordingWriter:
             for number, channel in channels
         )
 
-    def _write(self) -> None:
-        chunks = self._with_room(self._next_chunks)
-        by_segment: dict[SegmentFile, list[PackedChunk]] = {}
-        for segment, chunk in chunks:
-            by_segment.setdefault(segment, []).append(chunk)
-        done: set[int] = set()  # by the identity of the chunk
-        try:
-            for segment, own in by_segment.items():
-                self._with_room(partial(segment.append_chunks, own))
-                done.update(map(id, own))
-                if self.settings.sync == "chunk":
-                    segment.sync()
-        finally:  # on a full disk, what is in the other segments counts
-            for _, chunk in chunks:
-                if id(chunk) in done:
-                    self._publish(chunk)
-        for _ in chunks:
-            self._packed.popleft()
+    def _write(self, chunk: PackedChunk) -> None:
+        topic, key = self._place_of(chunk)
+        segment = self._with_room(partial(self._append, chunk, key))
+        if topic is not None:
+            self._division.note(topic, chunk, key)
+        self._publish(chunk)
+        if self.settings.sync == "chunk":
+            segment.sync()
         group = self._open_group()
         if self.settings.sync == "seal" and not group.first.direct:
             self._sync_behind(group)
         if group.is_full(self.settings.segment_size, self.settings.segment_span_s):
             self._seal()
+
+    def _append(self, chunk: PackedChunk, key: Key) -> SegmentFile:
+        segment = self._open_group().segment(key)
+        self._define(segment, [c for c in chunk.indexes if c not in segment.channels])
+        segment.append_chunk(chunk)
+        return segment
 
     def _with_room(self, do: Callable[[], _Done]) -> _Done:
         """Do what changes nothing when it fails, again when there is room for it."""
