@@ -71,9 +71,8 @@ class ChunkIndexer:
             batch = placed.batch.take(rows)
             found = _Results(placed.number[rows])
             tables: list[NDArray[np.uint8]] = []
-            for group in bodies_of(codec, batch):
+            for group in bodies_of(codec, batch, found.surplus):
                 found.unreadable[group.rows] = group.error is not None
-                found.surplus[group.surplus] = True
                 if group.stamps is not None:
                     found.stamped[group.rows] = True
                     found.stamps[group.rows] = group.stamps

@@ -506,7 +506,7 @@ def sample(directory: Path) -> tuple[bytes, list[StoredChunk]]:
     writer = recorder(directory, chunks, SegmentSettings(chunk_size=1024))
     rows = [(2 * (n % 2), bytes([n]) * (20 + n), 50 * n % 400, 50 * n, n) for n in range(20)]
     writer.append(batch_of(rows[:12]), CHANNELS)
-    content = FilePart(io.BytesIO(b"attached"), 0, 8)
+    content = FilePart(lambda at, size: b"attached"[at : at + size], 0, 8)
     writer.add_extra(Attachment(2, 1, "a.txt", "text/plain", content))
     writer.append(batch_of([(1, bytes(1500), 77, 78, 1)]), CHANNELS)
     writer.add_extra(Metadata("source", {"k": "v"}))

@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
     from hybridlog_storage.messages import Buffer
 
+MAGIC = b"\x89MCAP0\r\n"
+"""First and last eight bytes of an MCAP file."""
 RECORD_HEAD = struct.Struct("<BQ")
 """Opcode and length of the content, at the start of every record."""
 
@@ -377,6 +379,18 @@ _IN_SUMMARY = frozenset(
 def is_in_summary(opcode: int) -> bool:
     """True for a kind of record that a summary may have."""
     return opcode in _IN_SUMMARY or opcode > LAST_KNOWN
+
+
+_FOOTER = struct.Struct("<BQQQI")  # head, start of the summary and of its offsets, checksum
+TAIL = _FOOTER.size + len(MAGIC)
+"""Bytes of the footer and the magic behind it."""
+
+
+def footer_of(tail: Buffer) -> tuple[int, int, int] | None:
+    """Starts of the summary and of its offsets, and its checksum; None without a footer."""
+    opcode, length, *found = _FOOTER.unpack_from(tail)
+    is_footer = (opcode, length, bytes(tail[_FOOTER.size :])) == (Opcode.FOOTER, 20, MAGIC)
+    return (found[0], found[1], found[2]) if is_footer else None
 
 
 def parse_summary(data: Buffer, *, skipped: int = 0) -> tuple[Summary, dict[int, Buffer]]:

@@ -395,23 +395,21 @@ class Database:
 def _options(parsed: Mapping[str, Any], timeout_s: float) -> dict[str, object]:
     """The options of a connection, beside those in its parsed URI."""
     given = {option.lower(): value for option, value in parsed["options"].items()}
-    # Members other than the primary may lack documents that the index is said to have.
-    options: dict[str, object] = {
+    is_set = len(parsed["nodelist"]) > 1 or "replicaset" in given or parsed["fqdn"]
+    defaults = {
+        "wtimeoutMS": int(_REPLICATION_S * 1000),
+        "serverSelectionTimeoutMS": int((timeout_s + (_ELECTION_S if is_set else 0)) * 1000),
+        "connectTimeoutMS": int(timeout_s * 1000),
+    }
+    return {
         "appname": "hybridlog",
+        # Members other than the primary may lack documents that the index is said to have.
         "readPreference": "primary",
         "readConcernLevel": "majority",
+        # A name is one of the server's.
+        "w": given["w"] if isinstance(given.get("w"), str) else "majority",
+        **{name: value for name, value in defaults.items() if name.lower() not in given},
     }
-    if not isinstance(given.get("w"), str):  # a name is one of the server's
-        options["w"] = "majority"
-    if "wtimeoutms" not in given:
-        options["wtimeoutMS"] = int(_REPLICATION_S * 1000)
-    if "serverselectiontimeoutms" not in given:
-        is_set = len(parsed["nodelist"]) > 1 or "replicaset" in given or parsed["fqdn"]
-        wait_s = timeout_s + (_ELECTION_S if is_set else 0)
-        options["serverSelectionTimeoutMS"] = int(wait_s * 1000)
-    if "connecttimeoutms" not in given:
-        options["connectTimeoutMS"] = int(timeout_s * 1000)
-    return options
 
 
 def without_secrets(uri: str) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final, NamedTuple, Self
 
 import numpy as np
@@ -145,48 +146,27 @@ class _Tail:
     """The `_meta` element and the document's end, and the positions of their values."""
 
     def __init__(self, origin: Origin, error: str | None) -> None:
+        from bson import Int64, encode
+
+        topic, said = (text.encode("utf-8", "replace") for text in (origin.topic, error or ""))
+        times = ("t", "pub") if origin.has_publish_time else ("t",)
+        meta = {
+            "inserted_at": datetime.fromtimestamp(0, UTC),
+            **dict.fromkeys(times, Int64(0)),
+            "rec": origin.key,
+            "topic": topic.decode(),
+            "seq": Int64(0),
+            "ref": {"seg": 0, **dict.fromkeys(("chunk", "off", "len"), Int64(0))},
+            **({} if error is None else {"error": said[:1000].decode(errors="ignore")}),
+        }
+        data = encode({"_meta": meta})[4:]
+        self.template = np.frombuffer(data, np.uint8)
         self.at: dict[str, int] = {}
-        body = bytearray()
-
-        def number(name: str, kind: int, size: int) -> None:
-            body.extend(bytes([kind]) + name.encode() + b"\x00")
-            self.at[name] = len(body)
-            body.extend(bytes(size))
-
-        def text(name: str, value: str) -> None:
-            data = value.encode("utf-8", "replace")
-            body.extend(b"\x02" + name.encode() + b"\x00")
-            body.extend(struct.pack("<i", len(data) + 1) + data + b"\x00")
-
-        def document(name: str) -> int:
-            body.extend(b"\x03" + name.encode() + b"\x00")
-            start = len(body)
-            body.extend(bytes(4))
-            return start
-
-        def end(start: int) -> None:
-            body.append(0)
-            struct.pack_into("<i", body, start, len(body) - start)
-
-        meta = document("_meta")
-        number("inserted_at", 0x09, 8)
-        number("t", 0x12, 8)
-        if origin.has_publish_time:
-            number("pub", 0x12, 8)
-        text("rec", origin.key)
-        text("topic", origin.topic)
-        number("seq", 0x12, 8)
-        ref = document("ref")
-        number("seg", 0x10, 4)
-        number("chunk", 0x12, 8)
-        number("off", 0x12, 8)
-        number("len", 0x12, 8)
-        end(ref)
-        if error is not None:
-            text("error", error[:1000])
-        end(meta)
-        body.append(0)
-        self.template = np.frombuffer(bytes(body), np.uint8)
+        at = 0
+        for name in ("inserted_at", *times, "topic", "seq", "ref", "seg", "chunk", "off", "len"):
+            at = self.at[name] = data.index(b"%s\0" % name.encode(), at) + len(name) + 1
+            if name == "topic":  # whatever its name contains
+                at += 4 + len(topic)
 
 
 def _column(out: NDArray[np.uint8], offset: int, dtype: str) -> NDArray[np.int64]:

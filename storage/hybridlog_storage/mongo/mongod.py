@@ -40,7 +40,7 @@ from pathlib import Path
 from typing import Self
 from urllib.parse import quote
 
-from hybridlog_storage.disk import files
+from hybridlog_storage.disk import durability, files
 from hybridlog_storage.errors import (
     DatabaseError,
     DiskFullError,
@@ -48,7 +48,6 @@ from hybridlog_storage.errors import (
     MissingDependencyError,
     StoreError,
     UsageError,
-    exhausted,
 )
 from hybridlog_storage.settings import MIN_CACHE_MB
 
@@ -147,9 +146,11 @@ class EmbeddedMongod:
                 if self._users is None:
                     self._users = self._enter()
                 return self._find_or_launch(self._users)
-            except HybridlogError:
+            except (HybridlogError, OSError) as error:
                 if entered:
                     self._leave()
+                if isinstance(error, OSError):
+                    raise _directory_error(self._directory, error) from error
                 raise
 
     def publish(self, wait_s: float) -> str:
@@ -183,27 +184,24 @@ class EmbeddedMongod:
 
     def _enter(self) -> int:
         """Lock `users.lock`; wait for a mongod that is being ended."""
-        try:
-            self._directory = _own_directory(self._given)
-        except OSError as error:
-            raise _directory_error(self._directory, error) from error
+        self._directory = _own_directory(self._given)
         descriptor = self._open("users.lock")
         deadline = time.monotonic() + START_LIMIT_S
         while not _try_lock(descriptor, fcntl.LOCK_SH):
             if time.monotonic() > deadline:
                 os.close(descriptor)
-                raise DatabaseError(
-                    f"The mongod of {self._directory} is being ended, but keeps running. "
-                    f"See {self.log}, and end its processes by hand."
-                )
+                raise self._hangs("did not end")
             time.sleep(0.01)
         return descriptor
 
-    def _open(self, name: str) -> int:
-        try:
-            return files.open_file(self._directory / name, os.O_RDWR | os.O_CREAT, 0o600)
-        except OSError as error:
-            raise _directory_error(self._directory, error) from error
+    def _hangs(self, how: str) -> DatabaseError:
+        return DatabaseError(
+            f"The mongod of {self._directory} {how} within {START_LIMIT_S:.0f} s. See {self.log}, "
+            "and end that process by hand if it hangs."
+        )
+
+    def _open(self, name: str, flags: int = 0) -> int:
+        return files.open_file(self._directory / name, os.O_RDWR | os.O_CREAT | flags, 0o600)
 
     def _find_or_launch(self, users: int) -> str:
         """The URI of a running mongod; `users` is the open and locked `users.lock`."""
@@ -222,10 +220,7 @@ class EmbeddedMongod:
             finally:
                 os.close(keeper)
             if time.monotonic() - began > START_LIMIT_S:
-                raise DatabaseError(
-                    f"The mongod of {self._directory} did not answer within {START_LIMIT_S:.0f} s. "
-                    f"See {self.log}; end that process if it hangs."
-                )
+                raise self._hangs("did not answer")
             time.sleep(0.01)
 
     def _launch(self, path: str, keeper: int, *, has_started: bool) -> None:
@@ -233,30 +228,22 @@ class EmbeddedMongod:
 
         `has_started`: one was started already, and has ended.
         """
-        try:
-            program = find_mongod()
-            _refuse_odd_files(self._directory)
+        program = find_mongod()
+        _refuse_odd_files(self._directory)
+        _make_folder(self.data)
+        has_data, log = bool(files.names(self.data)), self._last_run()
+        if has_data and self.damage is None and _is_damage(log):
+            files.remove_tree(self.data)
             _make_folder(self.data)
-            has_data, log = bool(files.names(self.data)), self._last_run()
-            if has_data and self.damage is None and _is_damage(log):
-                files.remove_tree(self.data)
-                _make_folder(self.data)
-                self.damage = "; ".join(_telling_lines(log))
-            elif has_started:
-                raise self._failure(log)
-            self._spawn(program, path, keeper)
-        except OSError as error:
-            raise _directory_error(self._directory, error) from error
+            self.damage = "; ".join(_telling_lines(log))
+        elif has_started:
+            raise self._failure(log)
+        self._spawn(program, path, keeper)
 
     def _spawn(self, program: Path, path: str, keeper: int) -> None:
-        if not sys.executable:
-            raise DatabaseError(
-                f"This Python does not know its own executable, so it cannot start the keeper of "
-                f"mongod. {_OTHER_WAYS}"
-            )
         script = str(Path(__file__).with_name("mongod_keeper.py"))
         own = [script, str(keeper), str(self._linger_s), path]
-        log = files.open_file(self.log, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o600)
+        log = self._open(self.log.name, os.O_APPEND)
         try:
             subprocess.run(  # noqa: S603 - our own script and interpreter
                 [sys.executable, "-I", "-S", *own, *self._command(program, path)],
@@ -399,13 +386,9 @@ def _own_directory(given: Path) -> Path:
 
 
 def _make_folder(path: Path) -> None:
-    """Create a private folder unless it exists; replace a plain file of its name."""
+    """Create a private folder unless it exists."""
     with contextlib.suppress(FileExistsError):
         files.make_folder(path, 0o700)
-        return
-    if stat.S_ISREG(files.status(path).st_mode):
-        files.unlink(path)
-        _make_folder(path)
 
 
 def _refuse_odd_files(directory: Path) -> None:
@@ -425,18 +408,9 @@ def _odd_file(path: Path, directory: Path) -> StoreError:
 
 
 def _directory_error(directory: Path, error: OSError) -> HybridlogError:
-    if error.errno in {errno.ENOSPC, errno.EDQUOT}:
-        return DiskFullError(f"No space left for the index in {directory}: {error.strerror}.")
-    short = exhausted(error.errno, f"starting the index in {directory}")
-    if short is not None:
-        return short
     if error.errno in {errno.ELOOP, errno.ENOTDIR, errno.EISDIR}:
         return _odd_file(Path(directory, error.filename or ""), directory)
-    return StoreError(
-        f"{directory} cannot be used for the index: {error.strerror} ({error.filename}). The "
-        f"embedded MongoDB needs a directory that it can write, even to read; copy the store, or "
-        f"use a server with --mongo URI."
-    )
+    return durability.explain(error, directory, "starting the index in")
 
 
 def _answers(path: str) -> bool:

@@ -28,7 +28,7 @@ from hybridlog_storage.disk.append_file import AppendFile
 from hybridlog_storage.errors import HybridlogError, StoreError
 from hybridlog_storage.manifest import Channel as ListedChannel
 from hybridlog_storage.manifest import File, Part
-from hybridlog_storage.mcap.mcap_content import RECORD_HEAD, ChunkHead, chunk_head_of
+from hybridlog_storage.mcap.mcap_content import MAGIC, RECORD_HEAD, ChunkHead, chunk_head_of
 from hybridlog_storage.messages import EXPIRED_IDS, schema_hash
 from hybridlog_storage.segments.attachments import Attachment
 from hybridlog_storage.segments.chunk import PackedChunk
@@ -37,7 +37,6 @@ from hybridlog_storage.segments.segment_format import (
     CHUNK_TABLE_OPCODE,
     FORMAT_VERSION,
     LOSSES_METADATA,
-    MAGIC,
     RECORDING_METADATA,
     START,
     arrival_record,
@@ -270,13 +269,13 @@ class SegmentFile:
         """Append a chunk with its message indexes and arrival numbers in one write."""
         padding = self._padding(chunk.data, len(chunk.head))
         offset = self.position + len(padding)
-        arrivals = arrival_record(offset, chunk.head_crc, chunk.indexes_crc, chunk.arrivals)
-        indexes = chunk.indexes.values()
-        self._append([padding, chunk.head, chunk.data, *indexes, arrivals])
+        indexes = b"".join(chunk.indexes.values())
+        arrivals = arrival_record(offset, crc32(chunk.head), crc32(indexes), chunk.arrivals)
+        self._append([padding, chunk.head, chunk.data, indexes, arrivals])
         head = chunk_head_of(chunk.head)
         assert head is not None
         sizes = {channel: len(data) for channel, data in chunk.indexes.items()}
-        self.note_chunk(offset, sum(sizes.values()) + len(arrivals), head, sizes, chunk.parts)
+        self.note_chunk(offset, len(indexes) + len(arrivals), head, sizes, chunk.parts)
 
     def note_chunk(
         self,

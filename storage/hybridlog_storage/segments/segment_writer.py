@@ -160,8 +160,7 @@ class RecordingWriter:
         self._known: dict[Channel, _Known] = {}
         self._schema_ids: dict[Schema, int] = {}
         self._clusters: dict[int, OpenChunk] = {}
-        self._latched: set[int] = set()  # ids of channels whose messages lie apart
-        self._movable: set[int] = set()  # ids of channels that need not be in the first segment
+        self._keys: dict[int, Key | None] = {}  # by channel id; None where the division decides
         self._compressor = Compressor(self.settings.compression, self.settings.level)
         # One processor is left to who brings messages that cannot wait.
         packers = _PACKERS if on_written is None else min(_PACKERS, max(processors() - 1, 1))
@@ -319,11 +318,9 @@ class RecordingWriter:
         is_latched = self._is_latched(channel)
         is_alone = mean >= self.settings.large_payload or self._division.is_named(channel.topic)
         cluster = channel_id if is_alone else _SHARED
+        self._keys[channel_id] = None if is_alone and not is_latched else FIRST
         if is_latched and self._latched_apart:
-            cluster = _LATCHED
-            self._latched.add(channel_id)
-        elif is_alone and not is_latched:
-            self._movable.add(channel_id)
+            cluster, self._keys[channel_id] = _LATCHED, LATCHED
         known = self._known[channel] = _Known(channel_id, schema_id, cluster)
         if channel.is_indexed and self._no_index(channel.topic):
             channel = replace(channel, is_indexed=False)
@@ -403,15 +400,11 @@ class RecordingWriter:
             self._broken = error
             raise
 
-    def _place_of(self, chunk: PackedChunk) -> tuple[str | None, Key]:
-        """The topic of a chunk of one channel, and its segment; no topic in the first one."""
+    def _key_of(self, chunk: PackedChunk) -> Key:
+        """The segment of a chunk in its group."""
         number = next(iter(chunk.indexes))
-        if number in self._latched:
-            return None, LATCHED
-        if number not in self._movable:
-            return None, FIRST
-        topic = self.channels[number].topic
-        return topic, self._division.key(topic, chunk)
+        key = self._keys[number]
+        return self._division.key(self.channels[number].topic, chunk) if key is None else key
 
     def _add(self, record: Metadata | Attachment) -> None:
         group = self._open_group()
@@ -435,10 +428,7 @@ class RecordingWriter:
         )
 
     def _write(self, chunk: PackedChunk) -> None:
-        topic, key = self._place_of(chunk)
-        segment = self._with_room(partial(self._append, chunk, key))
-        if topic is not None:
-            self._division.note(topic, chunk, key)
+        segment = self._with_room(partial(self._append, chunk, self._key_of(chunk)))
         self._publish(chunk)
         if self.settings.sync == "chunk":
             segment.sync()
