@@ -176,7 +176,7 @@ class IndexAccess:
                 except ConnectionLostError as error:
                     if not was_connected and not isinstance(error, ConnectionBrokenError):
                         raise
-                return self._connect(brings=brings)
+                    return self._connect(brings=brings)
             except BaseException as error:
                 self.disconnect()
                 if isinstance(error, HybridlogError):
@@ -231,8 +231,6 @@ class IndexAccess:
     @property
     def place(self) -> str:
         """Description of the index's location; does not contact MongoDB."""
-        if self.connected is not None:
-            return f"database {self.connected.name} at {self.connected.address}"
         uri = self._named
         if uri == EMBEDDED:
             return "the MongoDB that comes with hybridlog"

@@ -45,7 +45,6 @@ from hybridlog_storage.segments.segment_format import (
     index_offsets,
     json_metadata,
     metadata_record,
-    padding_record,
     record_bytes,
     schema_record,
 )
@@ -267,11 +266,10 @@ class SegmentFile:
 
     def append_chunk(self, chunk: PackedChunk) -> None:
         """Append a chunk with its message indexes and arrival numbers in one write."""
-        padding = self._padding(chunk.data, len(chunk.head))
-        offset = self.position + len(padding)
+        offset = self.position
         indexes = b"".join(chunk.indexes.values())
         arrivals = arrival_record(offset, crc32(chunk.head), crc32(indexes), chunk.arrivals)
-        self._append([padding, chunk.head, chunk.data, indexes, arrivals])
+        self._append([chunk.head, chunk.data, indexes, arrivals])
         head = chunk_head_of(chunk.head)
         assert head is not None
         sizes = {channel: len(data) for channel, data in chunk.indexes.items()}
@@ -381,13 +379,6 @@ class SegmentFile:
         """Close without sealing; the next opening of the store recovers the file."""
         with suppress(OSError):
             self._file.finish(sync=False)
-
-    def _padding(self, content: Buffer, head: int) -> bytes:
-        """Padding before a chunk record so that its content starts at a block."""
-        at, least = self.position + head, RECORD_HEAD.size
-        if not self._file.room_before(content, at):
-            return b""
-        return padding_record(least + self._file.room_before(content, at + least))
 
     def _append(self, parts: Sequence[Buffer]) -> None:
         with self._explained("writing"):

@@ -54,8 +54,6 @@ NO_INDEX: Final = "hybridlog.no_index"
 
 ARRIVAL_OPCODE: Final = 0x90
 """Record of the application range of opcodes: the arrival numbers of the chunk before it."""
-PADDING_OPCODE: Final = 0x91
-"""Record of zeros, so that the content of the chunk behind it starts at a block."""
 CHUNK_TABLE_OPCODE: Final = 0x92
 """Record of the summary: the chunk table, see `chunk_table`."""
 DAMAGED_OPCODE: Final = 0x93
@@ -189,12 +187,6 @@ def chunk_head(
             struct.pack("<Q", compressed_size),
         )
     )
-
-
-def padding_record(size: int) -> bytes:
-    """A padding record of `size` bytes, including its head."""
-    length = size - RECORD_HEAD.size
-    return RECORD_HEAD.pack(PADDING_OPCODE, length) + bytes(length)
 
 
 def damaged_head(size: int) -> bytes:

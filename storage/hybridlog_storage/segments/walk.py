@@ -32,7 +32,6 @@ from hybridlog_storage.segments.segment_format import (
     DAMAGED_OPCODE,
     INDEX_HEAD,
     LOSSES_METADATA,
-    PADDING_OPCODE,
     RECORDING_METADATA,
     START,
     Trailer,
@@ -54,7 +53,6 @@ if TYPE_CHECKING:
 _WINDOW: Final = 4096  # bytes read at once around the heads of records
 _SEARCHED: Final = 1 << 20  # bytes searched at once for the next record
 _MAX_RECORD: Final = 1 << 28  # bytes of what is read into memory as a whole
-_MAX_PADDING: Final = 2 * _WINDOW  # bytes
 _UNKNOWN: Final = np.iinfo(np.int64)  # publish times stand in the messages only
 
 
@@ -156,7 +154,7 @@ class Walk:
             error = _TornError if self._is_room(at) else SegmentError
             raise error("no record starts here")
         is_large = opcode in {Opcode.ATTACHMENT, DAMAGED_OPCODE}
-        if opcode in {Opcode.METADATA, PADDING_OPCODE} or is_large:
+        if opcode == Opcode.METADATA or is_large:
             if not is_large and end - at > _MAX_RECORD:
                 raise SegmentError("the record is too large")
             if end > self._reader.size:
@@ -166,11 +164,9 @@ class Walk:
             elif opcode == Opcode.ATTACHMENT:
                 found = self._reader.attachment_at(at, end - at)
                 self.attachments.append(found.index(at, end - at))
-            elif opcode == DAMAGED_OPCODE:
+            else:
                 why = "it was damaged when the recording was recovered"
                 self._damaged.append(Damage(at, end - at, why))
-            elif end - at > _MAX_PADDING or any(self._reader.read(at, end - at)[HEAD:]):
-                raise SegmentError("padding has other bytes than zeros")
             return end
         if opcode in {Opcode.MESSAGE_INDEX, ARRIVAL_OPCODE}:
             raise SegmentError("it belongs to no chunk")
