@@ -17,7 +17,7 @@ from hybridlog.schema.column import STAMP
 from hybridlog.schema.index_bodies import bodies_of
 from hybridlog_storage.catalog import ChannelStats
 from hybridlog_storage.messages import Channel
-from hybridlog_storage.mongo.index_documents import DocumentAssembler, Origin, Placed
+from hybridlog_storage.mongo.index_documents import DocumentAssembler, Placed
 from hybridlog_storage.ordering import run_starts
 from hybridlog_storage.segments.chunk import StoredChunk
 
@@ -101,8 +101,8 @@ class ChunkIndexer:
             codec = codec_for(channel)
             paths = codec.paths()
             stamped = any(one.path == STAMP and one.type == "time" for one in paths)
-            origin = Origin(self._key, channel.topic, channel.has_publish_time)
-            part = self._parts[channel_id] = codec, DocumentAssembler(origin), stamped
+            assembler = DocumentAssembler(self._key, channel)
+            part = self._parts[channel_id] = codec, assembler, stamped
         return part
 
 

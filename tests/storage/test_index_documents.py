@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
@@ -13,17 +14,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from hybridlog_storage.messages import Batch
+from hybridlog_storage.messages import Batch, Channel
 from hybridlog_storage.mongo.index_documents import (
     DocumentAssembler,
-    Origin,
     Placed,
     key_bound,
 )
 from hybridlog_storage.segments.chunk import StoredChunk
 
 TIMES = st.integers(0, 2**63 - 1)
-ORIGIN = Origin("fedcba9876543210", "/a topic/ä", has_publish_time=True)
+KEY = "fedcba9876543210"
+CHANNEL = Channel("/a topic/ä", "x", None)
 
 
 def chunk_of(
@@ -70,7 +71,7 @@ def assembled(chunk: StoredChunk, error: str | None = None) -> NDArray[np.uint8]
     """Documents without fields, of all messages."""
     rows = np.arange(len(chunk.batch))
     nothing = np.empty((len(rows), 0), np.uint8)
-    return DocumentAssembler(ORIGIN).assemble(Placed.of([chunk]), rows, nothing, error)
+    return DocumentAssembler(KEY, CHANNEL).assemble(Placed.of([chunk]), rows, nothing, error)
 
 
 def body_of(values: list[dict[str, Any]]) -> NDArray[np.uint8]:
@@ -86,10 +87,10 @@ def body_of(values: list[dict[str, Any]]) -> NDArray[np.uint8]:
 )
 def test_documents_say_what_the_chunk_says(rows: list[tuple[int, int, int]], publish: bool) -> None:
     chunk = chunk_of([r[0] for r in rows], [r[1] for r in rows], [r[2] for r in rows])
-    origin = Origin("fedcba9876543210", "/a topic/ä", has_publish_time=publish)
+    channel = replace(CHANNEL, has_publish_time=publish)
     chosen = np.arange(0, len(rows), 2)
     body = body_of([{"number": i, "text": "abc"} for i in range(len(chosen))])
-    made = documents(DocumentAssembler(origin).assemble(Placed.of([chunk]), chosen, body))
+    made = documents(DocumentAssembler(KEY, channel).assemble(Placed.of([chunk]), chosen, body))
     assert len(made) == len(chosen)
     for number, (row, document) in enumerate(zip(chosen.tolist(), made, strict=True)):
         time, seq, length = rows[row]
@@ -124,7 +125,7 @@ def test_bounds_outside_of_all_times(time: int) -> None:
 
 
 def test_errors_replace_the_fields() -> None:
-    assembler = DocumentAssembler(ORIGIN)
+    assembler = DocumentAssembler(KEY, CHANNEL)
     chunk = chunk_of([1, 2, 3])
     none = np.empty((3, 0), np.uint8)
     for error in ("short", "ü" * 3000, "\udc80 half", "short"):

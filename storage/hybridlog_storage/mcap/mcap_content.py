@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 from io import BytesIO
-from typing import TYPE_CHECKING, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 from mcap import records
@@ -399,8 +399,12 @@ def parse_summary(data: Buffer, *, skipped: int = 0) -> tuple[Summary, dict[int,
     With the summary comes the content of the last record of each kind that MCAP does not know.
     """
     view, at = memoryview(data), 0
-    found = Summary()
-    others: dict[int, Buffer] = {}
+    found, others = Summary(), dict[int, Buffer]()
+    lists: dict[type, list[Any]] = {
+        records.ChunkIndex: found.chunk_indexes,
+        records.AttachmentIndex: found.attachment_indexes,
+        records.MetadataIndex: found.metadata_indexes,
+    }
     while at < len(view):
         if at + RECORD_HEAD.size > len(view):
             raise SegmentError("it ends in the middle of a record")
@@ -417,12 +421,8 @@ def parse_summary(data: Buffer, *, skipped: int = 0) -> tuple[Summary, dict[int,
             found.schemas[record.id] = record
         elif isinstance(record, records.Channel):
             found.channels[record.id] = record
-        elif isinstance(record, records.ChunkIndex):
-            found.chunk_indexes.append(record)
-        elif isinstance(record, records.AttachmentIndex):
-            found.attachment_indexes.append(record)
-        elif isinstance(record, records.MetadataIndex):
-            found.metadata_indexes.append(record)
         elif isinstance(record, records.Statistics):
             found.statistics = record
+        elif type(record) in lists:
+            lists[type(record)].append(record)
     return found, others

@@ -218,17 +218,16 @@ class SegmentFile:
 
     def define(self, channels: Iterable[tuple[int, int, Channel]]) -> None:
         """Write channels (id, id of the schema, channel) as a chunk, schemas on first use."""
-        records: list[bytes] = []
-        schemas: dict[int, Schema] = {}
         defined = [*channels]
-        for channel_id, schema_id, channel in defined:
-            if schema_id and channel.schema is not None:
-                if schema_id not in self.schemas and schema_id not in schemas:
-                    records.append(record_bytes(schema_record(schema_id, channel.schema)))
-                schemas[schema_id] = channel.schema
-            records.append(record_bytes(channel_record(channel_id, schema_id, channel)))
+        schemas = {number: one.schema for _, number, one in defined if one.schema is not None}
+        records: list[McapRecord] = [
+            schema_record(number, schema)
+            for number, schema in schemas.items()
+            if number not in self.schemas
+        ]
+        records += [channel_record(*one) for one in defined]
         if records:
-            self._append([definitions_chunk(b"".join(records), self.position)])
+            self._append([definitions_chunk(_joined(records), self.position)])
         self.schemas |= schemas
         self.channels |= {number: (schema, channel) for number, schema, channel in defined}
 

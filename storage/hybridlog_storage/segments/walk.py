@@ -150,12 +150,8 @@ class Walk:
             return at
         if opcode == Opcode.CHUNK:
             return self._take_chunk(at, end)
-        if opcode == 0:
-            error = _TornError if self._is_room(at) else SegmentError
-            raise error("no record starts here")
-        is_large = opcode in {Opcode.ATTACHMENT, DAMAGED_OPCODE}
-        if opcode == Opcode.METADATA or is_large:
-            if not is_large and end - at > _MAX_RECORD:
+        if opcode in {Opcode.METADATA, Opcode.ATTACHMENT, DAMAGED_OPCODE}:
+            if opcode == Opcode.METADATA and end - at > _MAX_RECORD:
                 raise SegmentError("the record is too large")
             if end > self._reader.size:
                 raise _TornError("the file ends in the middle of a record")
@@ -168,9 +164,10 @@ class Walk:
                 why = "it was damaged when the recording was recovered"
                 self._damaged.append(Damage(at, end - at, why))
             return end
-        if opcode in {Opcode.MESSAGE_INDEX, ARRIVAL_OPCODE}:
-            raise SegmentError("it belongs to no chunk")
-        raise SegmentError(f"a record of kind {opcode}")
+        why = "it belongs to no chunk"
+        if opcode not in {Opcode.MESSAGE_INDEX, ARRIVAL_OPCODE}:
+            why = f"a record of kind {opcode}" if opcode else "no record starts here"
+        raise (_TornError if opcode == 0 and self._is_room(at) else SegmentError)(why)
 
     def _take_metadata(self, at: int, end: int) -> None:
         try:
