@@ -399,7 +399,8 @@ def parse_summary(data: Buffer, *, skipped: int = 0) -> tuple[Summary, dict[int,
     With the summary comes the content of the last record of each kind that MCAP does not know.
     """
     view, at = memoryview(data), 0
-    found, others = Summary(), dict[int, Buffer]()
+    found = Summary()
+    others: dict[int, Buffer] = {}
     lists: dict[type, list[Any]] = {
         records.ChunkIndex: found.chunk_indexes,
         records.AttachmentIndex: found.attachment_indexes,
