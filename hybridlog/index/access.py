@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import platform
-import re
 import threading
 import time
 from collections.abc import Callable
@@ -23,7 +22,14 @@ from hybridlog_storage.errors import (
     StoreError,
     WithoutMongoError,
 )
-from hybridlog_storage.settings import EMBEDDED, MIN_CACHE_MB, NAME, NONE, with_password
+from hybridlog_storage.settings import (
+    EMBEDDED,
+    MIN_CACHE_MB,
+    NAME,
+    NONE,
+    with_password,
+    without_password,
+)
 
 if TYPE_CHECKING:
     from hybridlog.follow.follower import IndexTarget
@@ -217,7 +223,7 @@ class IndexAccess:
         name = self.connect().name
         if self._mongod is not None:
             return IndexAddress(self._mongod.publish(wait_s), name)
-        return IndexAddress(re.sub(r"//([^:/@]*):[^/]*@", r"//\1@", self._uri or ""), name)
+        return IndexAddress(without_password(self._uri or ""), name)
 
     @property
     def _named(self) -> str:

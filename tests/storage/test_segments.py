@@ -375,23 +375,6 @@ def test_a_segment_cut_in_its_summary_is_what_it_was(tmp_path: Path, missing: in
     assert problems(recovered.path) == []
 
 
-def test_a_segment_that_was_left_open_is_recovered_without_its_last_chunk(tmp_path: Path) -> None:
-    batches = [[(1, os.urandom(300_000), 10 * n, 10 * n, n)] for n in range(4)]
-    (path,), chunks = write(tmp_path, batches, SegmentSettings(chunk_size=1 << 19))
-    whole = path.read_bytes()
-    last = chunks[-1]
-    path.unlink()
-    # Killed while the last chunk was being written: before it, in its head, or in its middle.
-    for cut in (last.offset, last.offset + 2, last.offset + last.length // 2):
-        recovered = recovered_of(tmp_path, whole[:cut])
-        assert recovered.path is not None
-        with recovered.path.open("rb") as file:
-            found = [message.data for _, _, message in make_reader(file).iter_messages()]
-        assert found == [rows[0][1] for rows in batches[:-1]]
-        assert problems(recovered.path) == []
-        recovered.path.unlink()
-
-
 @pytest.mark.parametrize("span", [0, -1, 1 << 62])
 def test_a_chunk_lasts_longer_than_no_time(span: int) -> None:
     with pytest.raises(UsageError, match="a chunk must last"):
