@@ -102,13 +102,6 @@ class RecordingTotals:
     chunks: int = 0
 
 
-@dataclass(slots=True)
-class _Known:
-    channel_id: int
-    schema_id: int
-    cluster: int
-
-
 class RecordingWriter:
     """Writes the batches of one recording into segments.
 
@@ -157,7 +150,7 @@ class RecordingWriter:
         self._last_times: dict[int, int] = {}  # in the files, by channel id
         self._directory = directory
         self._recording = recording
-        self._known: dict[Channel, _Known] = {}
+        self._known: dict[Channel, tuple[int, int]] = {}  # its id, and its cluster
         self._schema_ids: dict[Schema, int] = {}
         self._clusters: dict[int, OpenChunk] = {}
         self._keys: dict[int, Key | None] = {}  # by channel id; None where the division decides
@@ -201,10 +194,9 @@ class RecordingWriter:
         ids, cluster = np.zeros((2, present[-1] + 1), np.int32)
         for index in present:
             channel = channels[index]
-            known = self._known.get(channel) or self._meet(
-                channel, float(sizes[index] / counts[index])
-            )
-            ids[index], cluster[index] = known.channel_id, known.cluster
+            known = self._known.get(channel)
+            mean = float(sizes[index] / counts[index])
+            ids[index], cluster[index] = known or self._meet(channel, mean)
         loose = batch if isinstance(batch, LooseBatch) else LooseBatch.of(batch)
         own = replace(loose, channel=ids[batch.channel])
         clusters = sorted({int(cluster[index]) for index in present})
@@ -287,13 +279,11 @@ class RecordingWriter:
 
     def written_of(self, channel: Channel) -> int:
         """Number of messages of a channel in the files."""
-        known = self._known.get(channel)
-        return 0 if known is None else self.written[known.channel_id]
+        return self.written[self._known.get(channel, (0, 0))[0]]
 
     def last_time_of(self, channel: Channel) -> int | None:
         """Log time of the last message of a channel in the files, ns; None without any."""
-        known = self._known.get(channel)
-        return None if known is None else self._last_times.get(known.channel_id)
+        return self._last_times.get(self._known.get(channel, (0, 0))[0])
 
     def abort(self) -> None:
         """Stop at once; sealed segments and flushed chunks stay."""
@@ -307,13 +297,12 @@ class RecordingWriter:
         self._pool.shutdown(wait=True, cancel_futures=True)
         self._disk.shutdown(wait=True, cancel_futures=True)
 
-    def _meet(self, channel: Channel, mean: float) -> _Known:
-        """Register a new channel: its ids and, from its mean payload size, its cluster."""
+    def _meet(self, channel: Channel, mean: float) -> tuple[int, int]:
+        """Register a new channel: its id and, from its mean payload size, its cluster."""
         if len(self._known) >= MAX_CHANNELS:
             raise StoreError(f"more than {MAX_CHANNELS} channels in one recording")
-        schema_id = 0
         if channel.schema is not None:
-            schema_id = self._schema_ids.setdefault(channel.schema, len(self._schema_ids) + 1)
+            self._schema_ids.setdefault(channel.schema, len(self._schema_ids) + 1)
         channel_id = len(self._known) + 1
         is_latched = self._is_latched(channel)
         is_alone = mean >= self.settings.large_payload or self._division.is_named(channel.topic)
@@ -321,7 +310,7 @@ class RecordingWriter:
         self._keys[channel_id] = None if is_alone and not is_latched else FIRST
         if is_latched and self._latched_apart:
             cluster, self._keys[channel_id] = _LATCHED, LATCHED
-        known = self._known[channel] = _Known(channel_id, schema_id, cluster)
+        known = self._known[channel] = channel_id, cluster
         if channel.is_indexed and self._no_index(channel.topic):
             channel = replace(channel, is_indexed=False)
         self.channels[channel_id] = channel
