@@ -133,7 +133,7 @@ def _wait(
             is_published = 0 < about.st_mtime - time.time() < PUBLISHED_S
             if is_published or _has_clients(socket):
                 used = now
-            if now - used >= linger_s:
+            elif now - used >= linger_s:
                 # It stays locked: new users wait until mongod and this process have ended,
                 # and then start a new one.
                 return False
