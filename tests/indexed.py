@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 import hybridlog as hl
 from hybridlog.schema.codec import Codec
@@ -25,13 +26,15 @@ def documents_of(store: hl.Store, *topics: str) -> list[dict[str, Any]]:
     return sorted(found, key=lambda one: bytes(one["_id"]))
 
 
-def groups_of(codec: Codec, *payloads: bytes) -> list[BodyGroup]:
+def groups_of(
+    codec: Codec, *payloads: bytes, surplus: NDArray[np.bool_] | None = None
+) -> list[BodyGroup]:
     """The bodies of documents of payloads."""
     length = np.array([len(payload) for payload in payloads], np.int64)
     none = np.zeros(len(payloads), np.int64)
     places = b"".join(payloads), np.cumsum(length) - length, length
     batch = Batch(*places, none.astype(np.int32), none, none, none.astype(np.uint32))
-    return [*bodies_of(codec, batch)]
+    return [*bodies_of(codec, batch, surplus)]
 
 
 def index_fields(codec: Codec, payload: bytes) -> dict[str, object]:

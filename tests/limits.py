@@ -47,7 +47,6 @@ PLACES = {
     "ros2_pause_s": "hybridlog.live.sources.ros2.source._PAUSE_S",
     "shown_bytes": "hybridlog.message._MAX_SHOWN",
     "min_threaded_bytes": "hybridlog.query.chunk_scan._MIN_THREADED_BYTES",
-    "index_ranges": "hybridlog.query.index_reader._MAX_RANGES",
     "latched_held": "hybridlog.query.latching.MAX_HELD",
     "sampled_periods": "hybridlog.query.periods._SAMPLED",
     "planner_group_growth": "hybridlog.query.planner._GROUP_GROWTH",

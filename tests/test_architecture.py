@@ -37,7 +37,7 @@ ALLOWED = {
         "hybridlog.schema.index_bodies",
         "hybridlog.schema.objects",
         "hybridlog_storage.mongo.database",
-        "hybridlog_storage.mongo.mongod",
+        "hybridlog_storage.mongo.index_documents",
     ),
     "click": ("hybridlog.cli",),
     "duckdb": ("hybridlog.sql.source",),
@@ -131,7 +131,6 @@ ALLOWED = {
         "hybridlog.formats.log_set",
         "hybridlog.formats.spool",
         "hybridlog_storage.segments.compression",
-        "hybridlog_storage.segments.segment_format",
     ),
 }
 

@@ -1114,7 +1114,7 @@ def test_the_specification_names_what_there_is() -> None:
         assert f"`{getattr(segment_format, f'{name}_METADATA')}`" in text
     for name in (segment_format.NO_PUBLISH_TIME, segment_format.PROFILE):
         assert f"`{name}`" in text
-    for name in ("ARRIVAL_OPCODE", "PADDING_OPCODE", "CHUNK_TABLE_OPCODE", "DAMAGED_OPCODE"):
+    for name in ("ARRIVAL_OPCODE", "CHUNK_TABLE_OPCODE", "DAMAGED_OPCODE"):
         assert re.search(f"opcode,? {getattr(segment_format, name):#x}", text)
     assert FORMAT == segment_format.FORMAT_VERSION
     assert f"Format {FORMAT}. No version of hybridlog has been released yet" in text

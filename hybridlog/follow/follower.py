@@ -284,9 +284,7 @@ class Follower:
         """
         if self._target.database is not None:
             with suppress(HybridlogError):
-                state, key = IndexState(self._target.database), self._entry.key
-                state.clear_everywhere([key])
-                state.remove([key])
+                IndexState(self._target.database).forget([self._entry.key])
 
     def follow(self) -> None:
         """Read what was flushed since the last time.
@@ -466,7 +464,7 @@ class Follower:
                 self._sender.send(wait=True)
                 self._sender.messages = 0
                 state = IndexState(self._sender.database)
-                state.clear_everywhere([self._entry.key])
+                state.forget([self._entry.key])
                 state.begin(self._entry)
 
     # The database.

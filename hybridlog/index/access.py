@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import platform
-import re
 import threading
 import time
 from collections.abc import Callable
@@ -23,7 +22,14 @@ from hybridlog_storage.errors import (
     StoreError,
     WithoutMongoError,
 )
-from hybridlog_storage.settings import EMBEDDED, MIN_CACHE_MB, NAME, NONE, with_password
+from hybridlog_storage.settings import (
+    EMBEDDED,
+    MIN_CACHE_MB,
+    NAME,
+    NONE,
+    with_password,
+    without_password,
+)
 
 if TYPE_CHECKING:
     from hybridlog.follow.follower import IndexTarget
@@ -176,7 +182,7 @@ class IndexAccess:
                 except ConnectionLostError as error:
                     if not was_connected and not isinstance(error, ConnectionBrokenError):
                         raise
-                return self._connect(brings=brings)
+                    return self._connect(brings=brings)
             except BaseException as error:
                 self.disconnect()
                 if isinstance(error, HybridlogError):
@@ -217,7 +223,7 @@ class IndexAccess:
         name = self.connect().name
         if self._mongod is not None:
             return IndexAddress(self._mongod.publish(wait_s), name)
-        return IndexAddress(re.sub(r"//([^:/@]*):[^/]*@", r"//\1@", self._uri or ""), name)
+        return IndexAddress(without_password(self._uri or ""), name)
 
     @property
     def _named(self) -> str:
@@ -231,8 +237,6 @@ class IndexAccess:
     @property
     def place(self) -> str:
         """Description of the index's location; does not contact MongoDB."""
-        if self.connected is not None:
-            return f"database {self.connected.name} at {self.connected.address}"
         uri = self._named
         if uri == EMBEDDED:
             return "the MongoDB that comes with hybridlog"

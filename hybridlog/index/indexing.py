@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from hybridlog.schema.codec import Codec, no_rows, stamps_of
+from hybridlog.schema.codec import Codec, stamps_of
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.column import STAMP
 from hybridlog.schema.index_bodies import bodies_of
 from hybridlog_storage.catalog import ChannelStats
 from hybridlog_storage.messages import Channel
-from hybridlog_storage.mongo.index_documents import DocumentAssembler, Origin, Placed
+from hybridlog_storage.mongo.index_documents import DocumentAssembler, Placed
 from hybridlog_storage.ordering import run_starts
 from hybridlog_storage.segments.chunk import StoredChunk
 
@@ -71,22 +71,20 @@ class ChunkIndexer:
             batch = placed.batch.take(rows)
             found = _Results(placed.number[rows])
             tables: list[NDArray[np.uint8]] = []
-            for group in bodies_of(codec, batch):
-                if group.error is not None:
-                    found.unreadable.append(group.rows)
-                found.surplus.append(group.surplus)
+            for group in bodies_of(codec, batch, found.surplus):
+                found.unreadable[group.rows] = group.error is not None
                 if group.stamps is not None:
-                    found.stamped.append(group.rows)
-                    found.stamps.append(group.stamps)
+                    found.stamped[group.rows] = True
+                    found.stamps[group.rows] = group.stamps
                 if is_indexed:
                     row = rows[group.rows]
                     tables.append(assembler.assemble(placed, row, group.body, group.error))
             if stamped:
-                left = np.setdiff1d(np.arange(len(batch)), np.concatenate(found.stamped))
+                left = np.flatnonzero(~found.stamped)
                 if len(left):
                     own, values = stamps_of(codec, batch.take(left))
-                    found.stamped.append(left[own])
-                    found.stamps.append(values)
+                    found.stamped[left[own]] = True
+                    found.stamps[left[own]] = values
             for place, of_chunk in found.by_chunk(batch.log_time):
                 decoded[place][channel_id] = of_chunk
             if tables:
@@ -103,8 +101,8 @@ class ChunkIndexer:
             codec = codec_for(channel)
             paths = codec.paths()
             stamped = any(one.path == STAMP and one.type == "time" for one in paths)
-            origin = Origin(self._key, channel.topic, channel.has_publish_time)
-            part = self._parts[channel_id] = codec, DocumentAssembler(origin), stamped
+            assembler = DocumentAssembler(self._key, channel)
+            part = self._parts[channel_id] = codec, assembler, stamped
         return part
 
 
@@ -127,55 +125,33 @@ class _Results:
         number: intp[n], index of each message's chunk; ascending.
 
     Attributes:
-        unreadable: Rows of messages that cannot be read.
-        surplus: Rows of those with bytes left over.
-        stamped: Rows of those with a header stamp.
-        stamps: The stamps.
+        unreadable: bool[n], messages that cannot be read.
+        surplus: bool[n], those with bytes left over.
+        stamped: bool[n], those with a header stamp.
+        stamps: int64[n], the stamps.
     """
 
     def __init__(self, number: NDArray[np.intp]) -> None:
         self._number = number
-        self.unreadable = [no_rows()]
-        self.surplus = [no_rows()]
-        self.stamped = [no_rows()]
-        self.stamps = [no_rows().astype(np.int64)]
+        self.unreadable, self.surplus, self.stamped = np.zeros((3, len(number)), np.bool_)
+        self.stamps = np.zeros(len(number), np.int64)
 
     def by_chunk(self, log_time: NDArray[np.int64]) -> Iterator[tuple[int, ChannelStats]]:
         """The chunks with messages, and the results of each."""
-        size = int(self._number[-1]) + 1
-        rows, stamps = np.concatenate(self.stamped), np.concatenate(self.stamps)
-        number, is_set = self._number[rows], stamps != 0
-        skew = (log_time[rows] - stamps)[is_set]
-
-        def count(of: NDArray[np.intp]) -> list[int]:
-            return [*map(int, np.bincount(of, minlength=size))]
-
-        counts = zip(
-            count(self._number[np.concatenate(self.unreadable)]),
-            count(self._number[np.concatenate(self.surplus)]),
-            count(number),
-            count(number[~is_set]),
-            np.bincount(number[is_set], skew, size).tolist(),  # integers could overflow
-            strict=True,
-        )
-        found = [
-            ChannelStats(unreadable=a, surplus=b, stamped=c, unset=d, skew_sum=e)
-            for a, b, c, d, e in counts
-        ]
-        for place, least, greatest in _bounds(number, stamps):
-            found[place].first_stamp, found[place].last_stamp = least, greatest
-        for place, least, greatest in _bounds(number[is_set], skew):
-            found[place].skew_min, found[place].skew_max = least, greatest
-        for place in np.unique(self._number).tolist():
-            yield place, found[place]
-
-
-def _bounds(number: NDArray[np.intp], values: NDArray[np.int64]) -> Iterator[tuple[int, int, int]]:
-    """Least and greatest value of each number."""
-    if not len(number):
-        return
-    order = np.argsort(number, kind="stable")
-    number, values = number[order], values[order]
-    begins = run_starts(number)
-    least, greatest = np.minimum.reduceat(values, begins), np.maximum.reduceat(values, begins)
-    yield from zip(number[begins].tolist(), least.tolist(), greatest.tolist(), strict=True)
+        begins = run_starts(self._number).tolist()
+        for begin, end in zip(begins, [*begins[1:], len(log_time)], strict=True):
+            rows = begin + np.flatnonzero(self.stamped[begin:end])
+            stamps = self.stamps[rows]
+            skew = (log_time[rows] - stamps)[stamps != 0]
+            found = ChannelStats(
+                unreadable=int(self.unreadable[begin:end].sum()),
+                surplus=int(self.surplus[begin:end].sum()),
+                stamped=len(stamps),
+                unset=len(stamps) - len(skew),
+                skew_sum=float(skew.sum(dtype=np.float64)),  # integers could overflow
+            )
+            if len(stamps):
+                found.first_stamp, found.last_stamp = int(stamps.min()), int(stamps.max())
+            if len(skew):
+                found.skew_min, found.skew_max = int(skew.min()), int(skew.max())
+            yield int(self._number[begin]), found

@@ -95,8 +95,7 @@ class StoreIndex:
         present = {one[-16:] for one in (*directory.ids(), *directory.manifests.without())}
         gone = {*known} - present
         if gone:
-            state.clear_everywhere(gone)
-            state.remove(gone)
+            state.forget(gone)
             report.removed += sorted(gone)
         if directory.is_writable:
             tables.remove_orphans(directory, present)

@@ -237,10 +237,9 @@ def _index_bytes(
                 count[entry.id, channel.topic] += channel.stats.messages
     found: dict[tuple[str, str], int] = {}
     for collection, counts in documents.items():
-        stats = database.stats(collection)
-        size = stats.storage_bytes + stats.index_bytes
+        number, size = database.size(collection)
         # Of other recordings, there may be more. After a crash, the count may be too small.
-        others = max(0, stats.documents - counts.total())
+        others = max(0, number - counts.total())
         shares = _divided(size, {**counts, ("", ""): others})
         found.update({key: shares[key] for key in counts})
     return found

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from hybridlog.schema.codec import columns_of, no_rows
+from hybridlog.schema.codec import columns_of
 from hybridlog.schema.column import Records, header_stamps
 from hybridlog.schema.document import TooLarge, bodies
 
@@ -33,26 +33,28 @@ class BodyGroup(NamedTuple):
         error: Reason why these payloads could not be read; the width is then 0.
         stamps: int64[k], header stamps, ns; None if there are none, or if they are not at
             hand.
-        surplus: intp[j], rows of these with bytes left over behind the message.
     """
 
     rows: NDArray[np.intp]
     body: NDArray[np.uint8]
     error: str | None
     stamps: NDArray[np.int64] | None = None
-    surplus: NDArray[np.intp] = no_rows()
 
 
-def bodies_of(codec: Codec, batch: Batch) -> Iterator[BodyGroup]:
+def bodies_of(
+    codec: Codec, batch: Batch, surplus: NDArray[np.bool_] | None = None
+) -> Iterator[BodyGroup]:
     """Make index bodies of messages of one channel, with or without payloads.
 
-    Each message is in exactly one group.
+    Each message is in exactly one group. `surplus`, bool[n], gets those with bytes left over.
     """
     if not codec.indexed:
         if len(batch):
             yield _without_fields(np.arange(len(batch)), None)
         return
     decoded = columns_of(codec, batch)
+    if surplus is not None:
+        surplus[decoded.surplus] = True
     if isinstance(decoded.records, Records):
         yield from _of_columns(decoded, decoded.records)
     else:
@@ -61,7 +63,7 @@ def bodies_of(codec: Codec, batch: Batch) -> Iterator[BodyGroup]:
             if isinstance(made, str):
                 yield _without_fields(rows, made)
             else:
-                yield BodyGroup(rows, made, None, None, _surplus_among(rows, decoded))
+                yield BodyGroup(rows, made, None)
     for bad in decoded.unreadable:
         yield _without_fields(bad.rows, bad.reason)
 
@@ -74,11 +76,7 @@ def _of_columns(decoded: Decoded, records: Records) -> Iterator[BodyGroup]:
             yield _without_fields(rows, f"its fields take more than {MAX_BYTES >> 20} MiB")
             continue
         own = None if stamps is None else stamps[group.rows]
-        yield BodyGroup(rows, group.body, None, own, _surplus_among(rows, decoded))
-
-
-def _surplus_among(rows: NDArray[np.intp], decoded: Decoded) -> NDArray[np.intp]:
-    return np.intersect1d(rows, decoded.surplus) if len(decoded.surplus) else no_rows()
+        yield BodyGroup(rows, group.body, None, own)
 
 
 def _without_fields(rows: NDArray[np.intp], error: str | None) -> BodyGroup:

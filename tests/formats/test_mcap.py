@@ -22,7 +22,7 @@ from mcap.writer import CompressionType, Writer
 import hybridlog as hl
 from hybridlog.formats.mcap.reader import McapSource
 from hybridlog.formats.reading import BATCH_BYTES, BATCH_MESSAGES, Damage
-from hybridlog_storage.mcap.mcap_scan import MAGIC
+from hybridlog_storage.mcap.mcap_content import MAGIC
 from hybridlog_storage.segments.segment_format import METADATA_CHECK
 from tests import places
 

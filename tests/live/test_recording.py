@@ -90,7 +90,7 @@ def test_while_the_disk_stands_still_the_budget_is_still_taken(
     store: hl.Store, calls: Calls, size: int
 ) -> None:
     go_on = threading.Event()
-    calls(SegmentFile, "append_chunks", lambda *_: go_on.wait(60) or pytest.fail("waited in vain"))
+    calls(SegmentFile, "append_chunk", lambda *_: go_on.wait(60) or pytest.fail("waited in vain"))
     budget, settings = 8 << 20, SegmentSettings(chunk_size=1 << 19)
     written: list[list[bytes]] = [[] for _ in range(5)]
     refused = [0] * 5

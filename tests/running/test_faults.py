@@ -12,12 +12,11 @@ import pytest
 
 import hybridlog as hl
 from hybridlog_storage.errors import HybridlogError, SegmentError
-from hybridlog_storage.mcap.mcap_content import RECORD_HEAD
+from hybridlog_storage.mcap.mcap_content import MAGIC, RECORD_HEAD
 from hybridlog_storage.segments.open_segment import OpenSegment
 from hybridlog_storage.segments.segment_format import (
     ARRIVAL_OPCODE,
     ARRIVALS,
-    MAGIC,
     arrival_record,
 )
 from tests.running.methods import LABEL, rows, sent

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import signal
 import subprocess
@@ -193,7 +194,7 @@ def test_extras_and_what_is_shown(tmp_path: Path) -> None:
         record = tmp_path / "calibration.yaml"
         record.write_bytes(b"fx: 500")
         with record.open("rb") as file:
-            part = FilePart(file, 0, 7)
+            part = FilePart(lambda at, size: os.pread(file.fileno(), size, at), 0, 7)
             writer = found.recording._capture.writer
             writer.add_extra(Attachment(START, START, record.name, "text/yaml", part))
             writer.add_extra(Metadata(name="robot", metadata={"name": "seven"}))

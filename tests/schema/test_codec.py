@@ -77,8 +77,9 @@ def test_objects_of_payloads_with_bytes_left_over(surplus: bytes) -> None:
         assert (found.s, found.n) == ("hi", 9)
     with pytest.raises(PayloadError, match="does not fit"):
         plain.decode(b"\x02\0\0\0\x07\x08\x01")
-    for group in groups_of(plain, b"\0\0\0\0\1\2", b"\0\0\0\0\1\2" + surplus):
-        assert group.surplus.tolist() == [1]
+    left = np.zeros(2, np.bool_)
+    groups_of(plain, b"\0\0\0\0\1\2", b"\0\0\0\0\1\2" + surplus, surplus=left)
+    assert left.tolist() == [False, True]
 
 
 def test_arrays_without_elements() -> None:

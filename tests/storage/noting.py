@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -35,16 +35,14 @@ class NotingWriter(RecordingWriter):
     def _create(self, group: int | None) -> SegmentFile:
         segment = super()._create(group)
 
-        def noted(own: Sequence[PackedChunk]) -> None:
-            before = segment.chunks
-            SegmentFile.append_chunks(segment, own)
-            rows = segment.table.build().chunks[["offset", "length", "trailer"]].tolist()[before:]
-            for number, packed in enumerate(own, before):
-                offset, length, trailer = rows[number - before]
-                batch, seq = self._held.pop(id(packed))[1].laid_out()
-                place = {"offset": offset, "length": length, "trailer": trailer}
-                about = {"segment": segment.number, "number": number}
-                self.chunks.append(StoredChunk(**about, **place, batch=batch, seq=seq))
+        def noted(packed: PackedChunk) -> None:
+            SegmentFile.append_chunk(segment, packed)
+            rows = segment.table.build().chunks[["offset", "length", "trailer"]].tolist()
+            offset, length, trailer = rows[-1]
+            batch, seq = self._held.pop(id(packed))[1].laid_out()
+            place = {"offset": offset, "length": length, "trailer": trailer}
+            about = {"segment": segment.number, "number": len(rows) - 1}
+            self.chunks.append(StoredChunk(**about, **place, batch=batch, seq=seq))
 
-        segment.append_chunks = noted  # type: ignore[method-assign]
+        segment.append_chunk = noted  # type: ignore[method-assign]
         return segment

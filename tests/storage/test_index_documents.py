@@ -9,15 +9,15 @@ import bson
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridlog_storage.messages import Batch
+from hybridlog_storage.messages import Batch, Channel
 from hybridlog_storage.mongo.index_documents import (
     DocumentAssembler,
-    Origin,
     Placed,
 )
 from hybridlog_storage.segments.chunk import StoredChunk
 
-ORIGIN = Origin("fedcba9876543210", "/a topic/ä", has_publish_time=True)
+KEY = "fedcba9876543210"
+CHANNEL = Channel("/a topic/ä", "x", None)
 
 
 def chunk_of(count: int) -> StoredChunk:
@@ -39,7 +39,7 @@ def documents(data: NDArray[np.uint8]) -> list[dict[str, Any]]:
 
 
 def test_errors_replace_the_fields() -> None:
-    assembler = DocumentAssembler(ORIGIN)
+    assembler = DocumentAssembler(KEY, CHANNEL)
     chunk = chunk_of(3)
     none = np.empty((3, 0), np.uint8)
     for error in ("short", "ü" * 3000, "\udc80 half", "short"):

@@ -91,6 +91,6 @@ def test_documents_of_what_is_no_recording_can_be_cleared(
     state: IndexState, database: Database, key: Any
 ) -> None:
     database.insert_raw("one", [bson.encode({"_id": b"x" * 24, "_meta": {"rec": key}})])
-    state.clear_everywhere([key])
+    state.forget([key])
     assert database.count("one", {"_id": b"x" * 24}) == 0
     assert left(database, ONE) == left(database, OTHER) == list(range(5))

@@ -21,8 +21,14 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
 from hybridlog_storage.errors import SegmentError
-from hybridlog_storage.mcap.mcap_content import ChunkContent, Damage, parse_content, read_record
-from hybridlog_storage.mcap.mcap_scan import MAGIC, Scan
+from hybridlog_storage.mcap.mcap_content import (
+    MAGIC,
+    ChunkContent,
+    Damage,
+    parse_content,
+    read_record,
+)
+from hybridlog_storage.mcap.mcap_scan import Scan
 from hybridlog_storage.segments.attachments import Attachment
 from tests.data import DATA, needs_data
 from tests.work import calls_in

@@ -22,7 +22,6 @@ from hybridlog_storage.errors import (
     DatabaseError,
     DiskFullError,
     MissingDependencyError,
-    ResourceError,
     StoreError,
     UsageError,
 )
@@ -327,7 +326,7 @@ def test_a_directory_that_cannot_be_written(runtime: Path) -> None:
     if user == 0:
         os.seteuid(65534)
     try:
-        with pytest.raises(StoreError, match="needs a directory that it can write"):
+        with pytest.raises(StoreError, match="Not allowed to write while starting the index"):
             EmbeddedMongod(store / "mongod").start()
     finally:
         os.seteuid(user)
@@ -350,11 +349,15 @@ def test_a_program_that_fails_at_once(directory: Path, monkeypatch: pytest.Monke
 @pytest.mark.parametrize(
     ("script", "error", "words"),
     [
-        ("echo '\"/d/x\": No space left on device' >&2; exit 1", DiskFullError, "free some"),
+        (
+            "echo '\"/d/x\": No space left on device' >&2; exit 1",
+            DiskFullError,
+            "No space left.*Remove the cause",
+        ),
         (
             "echo 'mongod: error while loading shared libraries: libcrypto.so.3' >&2; exit 127",
             DatabaseError,
-            "does not run on this machine",
+            "error while loading shared libraries: libcrypto.*--mongo URI",
         ),
         (
             """echo '{"s":"I","msg":"hello"}'; """
@@ -420,14 +423,14 @@ echo '{{"s":"F","msg":"oh","attr":{{"error":"WT_PANIC"}}}}'; kill -6 $$"""
 
 
 @pytest.mark.parametrize(
-    ("words", "end", "error", "told"),
+    ("words", "end", "error"),
     [
-        ("24: Too many open files", "exit 14", ResourceError, r"file handles.*ulimit -n"),
-        ("std::bad_alloc", "kill -6 $$", ResourceError, "out of memory"),
-        ("11: Resource temporarily unavailable", "kill -6 $$", ResourceError, "out of memory"),
-        ("No space left on device", "exit 14", DiskFullError, "free some"),
-        ("16: already being managed by another process", "exit 14", DatabaseError, "has .* open"),
-        ("Permission denied", "exit 100", DatabaseError, "somebody else"),
+        ("24: Too many open files", "exit 14", DatabaseError),
+        ("std::bad_alloc", "kill -6 $$", DatabaseError),
+        ("11: Resource temporarily unavailable", "kill -6 $$", DatabaseError),
+        ("No space left on device", "exit 14", DiskFullError),
+        ("16: already being managed by another process", "exit 14", DatabaseError),
+        ("Permission denied", "exit 100", DatabaseError),
     ],
 )
 def test_other_causes_leave_the_data_files_alone(
@@ -437,13 +440,12 @@ def test_other_causes_leave_the_data_files_alone(
     words: str,
     end: str,
     error: type[Exception],
-    told: str,
 ) -> None:
     starts = tmp_path / "starts"
     script = f"""echo x >> {starts}; echo '{{"s":"F","msg":"wiredtiger: {words}"}}'; {end}"""
     fake(script)
     data = marked(directory)
-    with pytest.raises(error, match=told):
+    with pytest.raises(error, match=f"wiredtiger: {words}.*Remove the cause"):
         EmbeddedMongod(directory, linger_s=LINGER_S).start()
     assert starts.read_text() == "x\n"
     assert (data / "WiredTiger.turtle").read_bytes() == b"old"
@@ -474,20 +476,14 @@ def test_damage_that_the_last_mongod_noticed_late(
         assert user.damage is None, "that run is over"
 
 
-@pytest.mark.parametrize("is_whole", [True, False])
-def test_a_file_for_a_folder(directory: Path, *, is_whole: bool) -> None:
-    if not is_whole:
-        directory.mkdir()
-    (directory if is_whole else directory / "data").write_text("x")
-    with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
-        assert ping(user.start())
-
-
-@pytest.mark.parametrize("name", ["users.lock", "mongod.log", "data/link"])
+@pytest.mark.parametrize("name", ["users.lock", "mongod.log", "data/link", "data"])
 def test_what_does_not_belong_there_is_named(directory: Path, tmp_path: Path, name: str) -> None:
     path = directory / name
     path.parent.mkdir(parents=True)
-    path.symlink_to(tmp_path) if name == "data/link" else path.mkdir()
+    if name == "data":
+        path.write_text("x")
+    else:
+        path.symlink_to(tmp_path) if name == "data/link" else path.mkdir()
     with pytest.raises(StoreError, match=r"does not belong there.*Remove .*mongod"):
         EmbeddedMongod(directory).start()
 

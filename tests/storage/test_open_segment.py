@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from io import BytesIO
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -49,10 +48,8 @@ class Written:
                 writer.add_extra(Metadata(name="calibration", metadata={"a": "b"}))
                 writer.add_extra(json_metadata(LOSSES_METADATA, {"rows": [LOSS]}))
             if chunk == 2:
-                content = b"content" * 100
-                writer.add_extra(
-                    Attachment(1, 2, "a.txt", "text/plain", FilePart(BytesIO(content), 0, 700))
-                )
+                content = FilePart(lambda at, size: (b"content" * 100)[at : at + size], 0, 700)
+                writer.add_extra(Attachment(1, 2, "a.txt", "text/plain", content))
         (path,) = writer.close()
         self.data = path.read_bytes()
         with SegmentReader(path, 0) as reader:

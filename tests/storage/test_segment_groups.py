@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import threading
-import time
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
@@ -299,34 +297,3 @@ def test_losses_that_found_no_room_come_in_the_end(
     made.writer.close_truncated([])
     with SegmentReader(made.folder / "000000.mcap", 0) as reader:
         assert {row["count"] for row in reader.summary().losses} == {16, 3}
-
-
-def test_what_came_into_other_segments_counts_on_a_full_disk(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    made = Recorded(tmp_path / "r", on_written=lambda: None)
-    made.write(0, 50)
-    made.write(1, 150)
-    real, go_on = SegmentFile.append_chunks, threading.Event()
-
-    def append(segment: SegmentFile, chunks: Any) -> Any:
-        go_on.wait(60)
-        if segment.number == 1:
-            raise DiskFullError("no room")
-        return real(segment, chunks)
-
-    monkeypatch.setattr(SegmentFile, "append_chunks", append)
-    for topic, size in ((0, 1100), (1, 1100), (0, 1100), (1, 1100)):
-        made.append([(topic, os.urandom(size), 0, 0, 0)])
-    while not all(future.done() for future in made.writer._packed):
-        time.sleep(0.01)
-    go_on.set()
-    with pytest.raises(DiskFullError):
-        made.writer.flush()
-    counts = Counter(int(n) for chunk in made.chunks for n in chunk.batch.channel)
-    assert [made.writer.written_of(TOPICS[one]) for one in (0, 1)] == [counts[1], counts[2]]
-    assert counts[1] > 1
-    made.writer.abort()
-    for path in made.folder.glob("*.open"):
-        recover_segment(path)
-    assert len(read_in(made.folder)) == counts.total()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import os
 import random
-import re
 import struct
 import threading
 import time
@@ -25,10 +24,9 @@ from mcap.records import Metadata
 from mcap.stream_reader import StreamReader
 
 from hybridlog_storage.checksum import crc32
-from hybridlog_storage.disk.append_file import BLOCK, AppendFile
+from hybridlog_storage.disk.append_file import BLOCK
 from hybridlog_storage.errors import DiskFullError, SegmentError, StoreError, UsageError
 from hybridlog_storage.manifest import replace
-from hybridlog_storage.mcap.mcap_content import MAX_CHUNK_HEAD, chunk_head_of
 from hybridlog_storage.messages import Batch, Channel, LooseBatch, Schema
 from hybridlog_storage.segments import open_chunk, segment_writer
 from hybridlog_storage.segments.attachments import Attachment
@@ -273,47 +271,8 @@ def test_a_segment_has_no_more_chunks_than_a_summary_should(tmp_path: Path, limi
     paths = writer.close()
     assert [data for path in paths for _, _, data in messages_in(path)] == payloads
     chunks = [len(summary_of(path, number).chunks) for number, path in enumerate(paths)]
-    # Those that wait together are written together, eight of them at most.
     assert sum(chunks) == 200
     assert all(10 <= count < 10 + AT_WORK for count in chunks[:-1])
-
-
-def test_chunks_that_wait_are_written_together(tmp_path: Path, calls: Calls) -> None:
-    go_on = threading.Event()
-    together: list[int] = []
-
-    def noted(_: None, __: SegmentFile, own: Sequence[object]) -> None:
-        together.append(len(own))
-
-    calls.change(SegmentFile, "append_chunks", noted)
-    calls(SegmentFile, "append_chunks", lambda *_: go_on.wait(60) or pytest.fail("waited in vain"))
-    setup = SegmentSettings(chunk_size=100_000, compression="none", segment_size=1_000_000)
-    chunks: list[StoredChunk] = []
-    writer = recorder(tmp_path, chunks, setup, on_written=done)
-    payloads = [bytes([n]) * 100_000 for n in range(35)]
-    for n, payload in enumerate(payloads):
-        writer.append(loose([(0, payload, n, n, n)]), CHANNELS)
-    writer.append(loose([(1, b"last", 99, 99, 99)]), CHANNELS)
-    while not all(future.done() for future in writer._packed):
-        time.sleep(0.01)
-    go_on.set()
-    paths = writer.close()
-    # Alone only those that were there first; and segments end as if each had come by itself.
-    assert sum(together) == 36
-    assert len(together) <= 6
-    assert max(together) in {9, 10}
-    assert [chunk.segment for chunk in chunks] == [n // 10 for n in range(36)]
-    found = [m for path in paths for m in messages_in(path)]
-    assert found == [
-        *((CHANNELS[0].topic, n, payload) for n, payload in enumerate(payloads)),
-        (CHANNELS[1].topic, 99, b"last"),
-    ]
-    for chunk in chunks:
-        data = paths[chunk.segment].read_bytes()
-        assert data[chunk.offset] == Opcode.CHUNK
-        assert int.from_bytes(data[chunk.offset + 1 : chunk.offset + 9], "little") == (
-            chunk.length - 9
-        )
 
 
 def test_no_chunk_follows_one_that_failed(tmp_path: Path, calls: Calls) -> None:
@@ -323,7 +282,7 @@ def test_no_chunk_follows_one_that_failed(tmp_path: Path, calls: Calls) -> None:
         failing.wait()
         raise DiskFullError("There is no room.")
 
-    calls(SegmentFile, "append_chunks", full)
+    calls(SegmentFile, "append_chunk", full)
     writer = recorder(tmp_path, setup=SegmentSettings(chunk_size=100_000), on_written=done)
     for _ in range(50):
         writer.append(loose([(0, bytes(100_000), 0, 0, 0)]), CHANNELS)
@@ -416,51 +375,6 @@ def test_a_segment_cut_in_its_summary_is_what_it_was(tmp_path: Path, missing: in
     assert problems(recovered.path) == []
 
 
-def test_large_content_that_is_not_compressed_starts_at_a_block(tmp_path: Path) -> None:
-    batches = [[(1, os.urandom(300_000), 10 * n, 10 * n, n)] for n in range(5)]
-    (path,), chunks = write(tmp_path, batches, SegmentSettings(chunk_size=1 << 19))
-    data = path.read_bytes()
-    found = [
-        (message.data, message.log_time)
-        for _, _, message in make_reader(io.BytesIO(data), validate_crcs=True).iter_messages()
-    ]
-    assert found == [(payload, time) for rows in batches for _, payload, time, _, _ in rows]
-    heads = [chunk_head_of(data[chunk.offset :][:MAX_CHUNK_HEAD]) for chunk in chunks]
-    places = [chunk.offset + head.start for chunk, head in zip(chunks, heads, strict=True) if head]
-    if AppendFile.create(tmp_path / "probe").direct:
-        assert [place % BLOCK for place in places] == [0] * 5
-    assert problems(path) == []
-    paddings = [
-        found.start()
-        for found in re.finditer(b"\x91", data)
-        if found.start() + 9 + int.from_bytes(data[found.start() + 1 :][:8], "little")
-        in {chunk.offset for chunk in chunks}
-    ]
-    for at in paddings:
-        for place in (at, at + 1, at + 9, at + 20):
-            damaged = bytearray(data)
-            damaged[place] ^= 4
-            path.write_bytes(damaged)
-            assert problems(path, blake3(data).hexdigest()), place
-
-
-def test_a_segment_that_was_left_open_is_recovered_with_its_padding(tmp_path: Path) -> None:
-    batches = [[(1, os.urandom(300_000), 10 * n, 10 * n, n)] for n in range(4)]
-    (path,), chunks = write(tmp_path, batches, SegmentSettings(chunk_size=1 << 19))
-    whole = path.read_bytes()
-    last = chunks[-1]
-    path.unlink()
-    # Killed while the last chunk was being written, in its padding, or in its middle.
-    for cut in (last.offset - 5, last.offset + 2, last.offset + last.length // 2):
-        recovered = recovered_of(tmp_path, whole[:cut])
-        assert recovered.path is not None
-        with recovered.path.open("rb") as file:
-            found = [message.data for _, _, message in make_reader(file).iter_messages()]
-        assert found == [rows[0][1] for rows in batches[:-1]]
-        assert problems(recovered.path) == []
-        recovered.path.unlink()
-
-
 @pytest.mark.parametrize("span", [0, -1, 1 << 62])
 def test_a_chunk_lasts_longer_than_no_time(span: int) -> None:
     with pytest.raises(UsageError, match="a chunk must last"):
@@ -545,7 +459,7 @@ def sample(directory: Path) -> tuple[bytes, list[StoredChunk]]:
     writer = recorder(directory, chunks, SegmentSettings(chunk_size=1024))
     rows = [(2 * (n % 2), bytes([n]) * (20 + n), 50 * n % 400, 50 * n, n) for n in range(20)]
     writer.append(batch_of(rows[:12]), CHANNELS)
-    content = FilePart(io.BytesIO(b"attached"), 0, 8)
+    content = FilePart(lambda at, size: b"attached"[at : at + size], 0, 8)
     writer.add_extra(Attachment(2, 1, "a.txt", "text/plain", content))
     writer.append(batch_of([(1, bytes(1500), 77, 78, 1)]), CHANNELS)
     writer.add_extra(Metadata("source", {"k": "v"}))

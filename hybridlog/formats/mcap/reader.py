@@ -21,8 +21,8 @@ from hybridlog.formats.reading import (
 from hybridlog.wording import listed
 from hybridlog_storage.errors import SourceError
 from hybridlog_storage.mcap import mcap_content
-from hybridlog_storage.mcap.mcap_content import ChunkContent
-from hybridlog_storage.mcap.mcap_scan import MAGIC, Item, Scan
+from hybridlog_storage.mcap.mcap_content import MAGIC, ChunkContent
+from hybridlog_storage.mcap.mcap_scan import Item, Scan
 from hybridlog_storage.messages import MAX_CHANNELS, Channel, Schema
 from hybridlog_storage.ordering import distinct
 from hybridlog_storage.segments.attachments import Attachment, FileHandle
@@ -124,7 +124,7 @@ class McapSource(Source):
             self.extras.append(item)
         elif isinstance(item, Attachment):
             self._handle = self._handle or FileHandle(self._file.fileno())
-            self.extras.append(replace(item, data=item.data.through(self._handle)))
+            self.extras.append(replace(item, data=item.data.through(self._handle.read)))
 
     def _content(self, content: ChunkContent, offset: int) -> Iterator[Batch]:
         """Yield the messages of one chunk or run, split where a definition changes."""

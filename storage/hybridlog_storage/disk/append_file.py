@@ -4,9 +4,7 @@ A recorder does not read its own output again. Copying it into the page cache co
 processor time, and stalls later writers when the kernel flushes the cache. Direct writes
 avoid both, but must start and end at whole blocks. So the bytes behind the last whole
 block also stay in memory; the next write repeats them, padded with zeros to a whole block.
-A file that was never closed may therefore end in up to a block of zeros. Large content
-that starts at a block, in memory and in the file, is written without a copy; all other
-content is staged.
+A file that was never closed may therefore end in up to a block of zeros.
 """
 
 from __future__ import annotations
@@ -18,7 +16,7 @@ import stat
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import numpy as np
 from blake3 import blake3
@@ -27,15 +25,11 @@ from hybridlog_storage.buffers import buffers
 from hybridlog_storage.disk import files
 from hybridlog_storage.messages import Buffer
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
 BLOCK = 4096
 """Bytes of a block; a multiple of every device's block size."""
 _STAGE = 1 << 20  # a recorder has up to 32 files open
 DIRECT: int = getattr(os, "O_DIRECT", 0)
 """Flag of direct writes, 0 if not supported."""
-_OWN = 1 << 18  # bytes from which content is not staged; pool buffers start at a block
 _REFUSED = {errno.EINVAL, errno.EOPNOTSUPP}
 
 
@@ -49,7 +43,6 @@ class AppendFile:
         self._hasher = None if position else blake3()  # of all that was appended
         self._stage = buffers.take(_STAGE) if direct else None
         self._filled = 0  # bytes in the stage
-        self._begun = 0  # staged bytes before this are being written
         self._written = 0  # byte of the file up to which whole blocks are written
 
     @classmethod
@@ -107,15 +100,8 @@ class AppendFile:
         if self._stage is None:
             self.position += files.write_all(self._fd, parts)
             return
-        pieces: list[NDArray[np.uint8]] = []
         for part in filter(len, parts):
             content = np.frombuffer(part, np.uint8)
-            if self.position % BLOCK == 0 and _is_own(content):
-                whole = len(content) - len(content) % BLOCK
-                pieces += [self._stage[self._begun : self._filled], content[:whole]]
-                self._begun = self._filled
-                self.position += whole
-                content = content[whole:]
             while len(content):
                 piece = content[: _STAGE - self._filled]
                 self._stage[self._filled : self._filled + len(piece)] = piece
@@ -123,15 +109,8 @@ class AppendFile:
                 self.position += len(piece)
                 content = content[len(piece) :]
                 if self._filled == _STAGE:
-                    self._put(pieces)
-                    pieces = []
-        self._put(pieces)
-
-    def room_before(self, content: Buffer, position: int) -> int:
-        """Bytes of padding that let large content be written without a copy; 0 where none helps."""
-        if self._stage is None or not _is_own(np.frombuffer(content, np.uint8)):
-            return 0
-        return -position % BLOCK
+                    self._put()
+        self._put()
 
     def cut(self, position: int) -> None:
         """Truncate the file at a position. Later writes go through the page cache; they are few.
@@ -175,18 +154,17 @@ class AppendFile:
             os.close(self._fd)
             self._fd = -1
 
-    def _put(self, pieces: list[NDArray[np.uint8]]) -> None:
-        """Write pieces and the staged bytes; stage the bytes behind the last block."""
+    def _put(self) -> None:
+        """Write the staged bytes; stage those behind the last block again."""
         assert self._stage is not None
         whole = self._filled - self._filled % BLOCK
         rest = self._filled - whole
         end = whole + BLOCK if rest else whole
         self._stage[self._filled : end] = 0
-        pieces.append(self._stage[self._begun : end])
-        self._write([piece.data for piece in pieces if len(piece)], self._written)
+        self._write([self._stage[:end].data] if end else [], self._written)
         self._written = self.position - rest
         self._stage[:rest] = self._stage[whole : self._filled].copy()
-        self._filled, self._begun = rest, 0
+        self._filled = rest
 
     def _write(self, pieces: list[memoryview], position: int) -> None:
         while pieces:
@@ -206,8 +184,3 @@ class AppendFile:
         flags = fcntl.fcntl(self._fd, fcntl.F_GETFL)
         fcntl.fcntl(self._fd, fcntl.F_SETFL, flags & ~DIRECT)
         return bool(flags & DIRECT)
-
-
-def _is_own(content: NDArray[np.uint8]) -> bool:
-    """True if content is aligned for a direct write without a copy."""
-    return len(content) >= _OWN and content.ctypes.data % BLOCK == 0

@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 from io import BytesIO
-from typing import TYPE_CHECKING, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 from mcap import records
@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
     from hybridlog_storage.messages import Buffer
 
+MAGIC = b"\x89MCAP0\r\n"
+"""First and last eight bytes of an MCAP file."""
 RECORD_HEAD = struct.Struct("<BQ")
 """Opcode and length of the content, at the start of every record."""
 
@@ -379,6 +381,18 @@ def is_in_summary(opcode: int) -> bool:
     return opcode in _IN_SUMMARY or opcode > LAST_KNOWN
 
 
+_FOOTER = struct.Struct("<BQQQI")  # head, start of the summary and of its offsets, checksum
+TAIL = _FOOTER.size + len(MAGIC)
+"""Bytes of the footer and the magic behind it."""
+
+
+def footer_of(tail: Buffer) -> tuple[int, int, int] | None:
+    """Starts of the summary and of its offsets, and its checksum; None without a footer."""
+    opcode, length, *found = _FOOTER.unpack_from(tail)
+    is_footer = (opcode, length, bytes(tail[_FOOTER.size :])) == (Opcode.FOOTER, 20, MAGIC)
+    return (found[0], found[1], found[2]) if is_footer else None
+
+
 def parse_summary(data: Buffer, *, skipped: int = 0) -> tuple[Summary, dict[int, Buffer]]:
     """Parse the records between the data of a file and its footer, but for the kind `skipped`.
 
@@ -387,6 +401,11 @@ def parse_summary(data: Buffer, *, skipped: int = 0) -> tuple[Summary, dict[int,
     view, at = memoryview(data), 0
     found = Summary()
     others: dict[int, Buffer] = {}
+    lists: dict[type, list[Any]] = {
+        records.ChunkIndex: found.chunk_indexes,
+        records.AttachmentIndex: found.attachment_indexes,
+        records.MetadataIndex: found.metadata_indexes,
+    }
     while at < len(view):
         if at + RECORD_HEAD.size > len(view):
             raise SegmentError("it ends in the middle of a record")
@@ -403,12 +422,8 @@ def parse_summary(data: Buffer, *, skipped: int = 0) -> tuple[Summary, dict[int,
             found.schemas[record.id] = record
         elif isinstance(record, records.Channel):
             found.channels[record.id] = record
-        elif isinstance(record, records.ChunkIndex):
-            found.chunk_indexes.append(record)
-        elif isinstance(record, records.AttachmentIndex):
-            found.attachment_indexes.append(record)
-        elif isinstance(record, records.MetadataIndex):
-            found.metadata_indexes.append(record)
         elif isinstance(record, records.Statistics):
             found.statistics = record
+        elif type(record) in lists:
+            lists[type(record)].append(record)
     return found, others

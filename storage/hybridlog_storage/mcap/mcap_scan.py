@@ -5,9 +5,7 @@ Behind damage it goes on where plausible records follow one another again.
 
 from __future__ import annotations
 
-import struct
 from contextlib import suppress
-from io import BytesIO
 from typing import TYPE_CHECKING, BinaryIO, Final, TypeAlias
 
 from mcap.opcode import Opcode
@@ -18,13 +16,16 @@ from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.lazy import lazy
 from hybridlog_storage.mcap.mcap_content import (
     LAST_KNOWN,
+    MAGIC,
     MAX_CHUNK_HEAD,
     MIN_RECORDS,
     RECORD_HEAD,
+    TAIL,
     ChunkContent,
     ChunkHead,
     Damage,
     chunk_head_of,
+    footer_of,
     is_in_summary,
     parse_content,
     parse_parts,
@@ -47,11 +48,6 @@ if TYPE_CHECKING:
 
     from mcap.summary import Summary
 
-MAGIC = b"\x89MCAP0\r\n"
-"""First and last eight bytes of an MCAP file."""
-
-_FOOTER: Final = struct.Struct("<BQQQI")  # head, start of the summary and of its offsets, checksum
-_TAIL: Final = _FOOTER.size + len(MAGIC)
 _DATA_END: Final = RECORD_HEAD.pack(Opcode.DATA_END, 4)
 _CODECS: Final = frozenset({"", "zstd", "lz4"})
 _WINDOW: Final = 1 << 20
@@ -104,16 +100,12 @@ class Scan:
         return memoryview(self._file.read(length))
 
     def _read_summary(self) -> None:
-        end = self._bytes.size - _TAIL
-        if end < len(MAGIC):
+        end = self._bytes.size - TAIL
+        tail = self._read(end, TAIL) if end >= len(MAGIC) else b""
+        footer = footer_of(tail) if len(tail) == TAIL else None
+        if footer is None or footer[0] < len(MAGIC) + HEAD + 4:
             return
-        tail = self._read(end, _TAIL)
-        if len(tail) < _TAIL:
-            return
-        opcode, length, start, _, crc = _FOOTER.unpack_from(tail)
-        is_footer = (opcode, length, bytes(tail[_FOOTER.size :])) == (Opcode.FOOTER, 20, MAGIC)
-        if not is_footer or start < len(MAGIC) + HEAD + 4:
-            return
+        start, _, crc = footer
         is_there = self._bytes.at(start - HEAD - 4, HEAD) == _DATA_END
         if self._parse_summary(start, end, crc) or is_there:
             self._stop = start
@@ -129,7 +121,7 @@ class Scan:
         """Read the summary, if it starts there."""
         if not 0 <= end - start <= _MAX_SUMMARY:
             return False
-        data = self._read(start, end - start + _FOOTER.size - 4)
+        data = self._read(start, end - start + TAIL - len(MAGIC) - 4)
         with suppress(SegmentError):
             if crc in {0, crc32(data)}:
                 self.summary = parse_summary(data[: end - start])[0]
@@ -262,7 +254,7 @@ class Scan:
             raise SegmentError(
                 f"it claims {chunk.size} bytes uncompressed, more than the limit of {self._limit}"
             )
-        part = FilePart(self._file, chunk.start, length)
+        part = FilePart(self._read, chunk.start, length)
         if not is_torn:
             if chunk.codec:
                 check_size(chunk.codec, chunk.size, length)
@@ -340,7 +332,7 @@ class Scan:
                     start, min(size, MAX_HEAD if opcode == Opcode.ATTACHMENT else size)
                 )
                 found: tuple[Item | None, int] = (
-                    parse_attachment(head, FilePart(self._file, start, size))
+                    parse_attachment(head, FilePart(self._read, start, size))
                     if opcode == Opcode.ATTACHMENT
                     else read_record(opcode, head)
                 )
@@ -479,8 +471,9 @@ def _is_other_record(content: memoryview) -> bool:
     first = int.from_bytes(content[14:22], "little")  # of a message, the publish time
     if len(content) == 6 + size and size % 16 == 0 and first < MAX_UNCOMPRESSED:
         return True  # a message index
+    part = FilePart(lambda at, size: content[at : at + size], 0, len(content))
     for parse in (
-        lambda: parse_attachment(content, FilePart(BytesIO(content), 0, len(content))),
+        lambda: parse_attachment(content, part),
         lambda: read_record(Opcode.METADATA, content),
     ):
         with suppress(SegmentError):

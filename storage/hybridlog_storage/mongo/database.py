@@ -15,7 +15,6 @@ from __future__ import annotations
 import contextlib
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
@@ -54,7 +53,7 @@ _ELECTION_S = 20.0  # seconds for a replica set to elect a primary; it takes abo
 _REPLICATION_S = 60.0  # seconds for a majority of its members to take over a write
 _DUPLICATE_KEY = 11000
 _NAMESPACE_EXISTS = 48
-_DISK_FULL = frozenset({14031})
+_DISK_FULL = 14031
 _WRONG_QUESTION = frozenset(
     {
         2,  # BadValue: unknown operators, $where without scripting
@@ -74,18 +73,6 @@ _WRITES = frozenset({"insert", "remove", "update"})
 _UNAUTHORIZED = 13
 _LOGIN_FAILED = 18
 _RESERVED_NAMES = frozenset({"admin", "local", "config"})
-
-
-@dataclass(frozen=True, slots=True)
-class CollectionStats:
-    """Size of a collection, bytes on the disk; all zero if it does not exist.
-
-    A clustered collection needs no indexes.
-    """
-
-    documents: int
-    storage_bytes: int
-    index_bytes: int
 
 
 class Database:
@@ -317,15 +304,6 @@ class Database:
             lambda: list(of.find(dict(filter or {}), shape, limit=limit)), question=True
         )
 
-    def find_one(
-        self,
-        collection: str,
-        filter: Mapping[str, object] | None = None,  # noqa: A002
-        projection: Mapping[str, object] | None = None,
-    ) -> Document | None:
-        """Find the first document, None if no document matches. Arguments as in `find`."""
-        return next(iter(self.find(collection, filter, projection, limit=1)), None)
-
     def count(
         self,
         collection: str,
@@ -408,36 +386,30 @@ class Database:
         self._again(lambda: of.drop_index(list(keys)))
         return True
 
-    def stats(self, collection: str) -> CollectionStats:
-        """Size of a collection."""
+    def size(self, collection: str) -> tuple[int, int]:
+        """Number of documents of a collection, and its bytes on the disk, with its indexes."""
         found = self._again(lambda: self._database.command("collStats", collection))
-        return CollectionStats(
-            documents=int(found.get("count", 0)),
-            storage_bytes=int(found.get("storageSize", 0)),
-            index_bytes=int(found.get("totalIndexSize", 0)),
-        )
+        return int(found.get("count", 0)), int(found.get("totalSize", 0))
 
 
 def _options(parsed: Mapping[str, Any], timeout_s: float) -> dict[str, object]:
     """The options of a connection, beside those in its parsed URI."""
     given = {option.lower(): value for option, value in parsed["options"].items()}
-    # Members other than the primary may lack documents that the index is said to have.
-    options: dict[str, object] = {
+    is_set = len(parsed["nodelist"]) > 1 or "replicaset" in given or parsed["fqdn"]
+    defaults = {
+        "wtimeoutMS": int(_REPLICATION_S * 1000),
+        "serverSelectionTimeoutMS": int((timeout_s + (_ELECTION_S if is_set else 0)) * 1000),
+        "connectTimeoutMS": int(timeout_s * 1000),
+    }
+    return {
         "appname": "hybridlog",
+        # Members other than the primary may lack documents that the index is said to have.
         "readPreference": "primary",
         "readConcernLevel": "majority",
+        # A name is one of the server's.
+        "w": given["w"] if isinstance(given.get("w"), str) else "majority",
+        **{name: value for name, value in defaults.items() if name.lower() not in given},
     }
-    if not isinstance(given.get("w"), str):  # a name is one of the server's
-        options["w"] = "majority"
-    if "wtimeoutms" not in given:
-        options["wtimeoutMS"] = int(_REPLICATION_S * 1000)
-    if "serverselectiontimeoutms" not in given:
-        is_set = len(parsed["nodelist"]) > 1 or "replicaset" in given or parsed["fqdn"]
-        wait_s = timeout_s + (_ELECTION_S if is_set else 0)
-        options["serverSelectionTimeoutMS"] = int(wait_s * 1000)
-    if "connecttimeoutms" not in given:
-        options["connectTimeoutMS"] = int(timeout_s * 1000)
-    return options
 
 
 def without_secrets(uri: str) -> str:
@@ -471,9 +443,10 @@ def _mapped(address: str, *, question: bool = False) -> Iterator[None]:
             f"or ask for less."
         ) from error
     except OperationFailure as error:
-        code = error.code or 0
-        text = _server_words(error.details) or str(error)
-        if question and _is_wrong_question(code, error.details):
+        code, said = error.code or 0, error.details or {}
+        text = str(said.get("errmsg", "")) or str(error)  # pymongo's own adds the whole reply
+        is_unnamed = str(said.get("codeName", "")).startswith(_UNNAMED_CODE)
+        if question and (code in _WRONG_QUESTION or is_unnamed):
             raise WhereError(f"MongoDB does not understand the predicate: {text}") from error
         raise _refused(address, code, text) from error
     except InvalidOperation as error:  # another thread has closed the client
@@ -502,26 +475,16 @@ def _unusable_file(address: str, error: OSError) -> UsageError:
 
 def _unreachable(address: str, text: str) -> str:
     """The reason why no connection can be made or kept, with its cure."""
-    if "CERTIFICATE_VERIFY_FAILED" in text:
-        reason = text.rpartition("certificate verify failed: ")[2].partition(" (_ssl")[0]
-        return (
-            f"MongoDB at {address} cannot be trusted: {reason}. Name the certificate of the "
-            "authority that signed its own in the URI: tlsCAFile=FILE."
-        )
-    if "SSL handshake failed" in text or "[SSL" in text:
-        return (
-            f"MongoDB at {address} does not answer with TLS. If it has none, leave tls=true out "
-            "of the URI."
-        )
-    is_closed = "connection closed" in text or "reset by peer" in text
-    tls = "; if it wants TLS, write tls=true into the URI" if is_closed else ""
+    text = text.partition(" (_ssl")[0]
+    is_tls = any(sign in text for sign in ("SSL", "connection closed", "reset by peer"))
+    tls = ", and that tls=true and tlsCAFile=FILE in the URI fit it" if is_tls else ""
     return (
         f"MongoDB at {address} does not answer: {text}. Check that it runs and can be reached{tls}."
     )
 
 
 def _refused(address: str, code: int, text: str) -> DatabaseError | DiskFullError:
-    if code in _DISK_FULL or "No space left on device" in text:
+    if code == _DISK_FULL or "No space left on device" in text:
         return DiskFullError(f"MongoDB at {address} has no space left: {text}")
     cure = f" {LOGIN_CURE}" if code == _LOGIN_FAILED else ""
     if code == _UNAUTHORIZED and "requires authentication" in text:
@@ -530,16 +493,6 @@ def _refused(address: str, code: int, text: str) -> DatabaseError | DiskFullErro
         text = text.partition(" to execute command")[0]
         cure = ": the user needs the role readWrite on this database, or read to ask only."
     return DatabaseError(f"MongoDB at {address} refuses (error {code}): {text}{cure}")
-
-
-def _is_wrong_question(code: int, details: Mapping[str, Any] | None) -> bool:
-    name = str((details or {}).get("codeName", ""))
-    return code in _WRONG_QUESTION or name.startswith(_UNNAMED_CODE)
-
-
-def _server_words(details: Mapping[str, Any] | None) -> str:
-    """The server's message; pymongo's own adds the whole reply."""
-    return str(details.get("errmsg", "")) if details else ""
 
 
 def _first_words(error: BaseException) -> str:

@@ -8,7 +8,7 @@ tiled, and each value that differs is a column.
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final, NamedTuple, Self
 
 import numpy as np
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from hybridlog_storage.messages import Batch
+    from hybridlog_storage.messages import Batch, Channel
     from hybridlog_storage.segments.chunk import StoredChunk
 
 KEY_BYTES: Final = 24
@@ -41,18 +41,6 @@ def between(begin: int | None = None, end: int | None = None) -> dict[str, objec
         return {}
     until = {} if end is None else {"$lt": key_bound(end)}
     return {"_id": {"$gte": key_bound(begin or 0), **until}}
-
-
-@dataclass(frozen=True, slots=True)
-class Origin:
-    """Values shared by all documents of one channel of one recording.
-
-    `key` is the first 64 bits of the recording's id, 16 hexadecimal digits.
-    """
-
-    key: str
-    topic: str
-    has_publish_time: bool
 
 
 class Placed(NamedTuple):
@@ -92,10 +80,14 @@ class Placed(NamedTuple):
 
 
 class DocumentAssembler:
-    """Assembles the index documents of one channel."""
+    """Assembles the index documents of one channel of one recording.
 
-    def __init__(self, origin: Origin) -> None:
-        self._origin = origin
+    `key` is the last 16 hexadecimal digits of the recording's id.
+    """
+
+    def __init__(self, key: str, channel: Channel) -> None:
+        self._key = key
+        self._channel = channel
         self._tails: dict[str | None, _Tail] = {}
 
     def assemble(
@@ -114,7 +106,7 @@ class DocumentAssembler:
         if tail is None:
             if len(self._tails) > 256:
                 self._tails.clear()
-            tail = self._tails[error] = _Tail(self._origin, error)
+            tail = self._tails[error] = _Tail(self._key, self._channel, error)
         count, fields = body.shape
         width = _HEAD_WIDTH + fields + len(tail.template)
         out = np.empty((count, width), np.uint8)
@@ -123,7 +115,7 @@ class DocumentAssembler:
         log_time = batch.log_time[rows]
         seq = placed.seq[rows]
         _column(out, _KEY_AT, ">i8")[:] = log_time
-        _column(out, _KEY_AT + 8, ">u8")[:] = int(self._origin.key, 16)
+        _column(out, _KEY_AT + 8, ">u8")[:] = int(self._key, 16)
         _column(out, _KEY_AT + 16, ">i8")[:] = seq
         out[:, _HEAD_WIDTH : _HEAD_WIDTH + fields] = body
         start = _HEAD_WIDTH + fields
@@ -144,49 +136,28 @@ class DocumentAssembler:
 class _Tail:
     """The `_meta` element and the document's end, and the positions of their values."""
 
-    def __init__(self, origin: Origin, error: str | None) -> None:
+    def __init__(self, key: str, channel: Channel, error: str | None) -> None:
+        from bson import Int64, encode
+
+        topic, said = (text.encode("utf-8", "replace") for text in (channel.topic, error or ""))
+        times = ("t", "pub") if channel.has_publish_time else ("t",)
+        meta = {
+            "inserted_at": datetime.fromtimestamp(0, UTC),
+            **dict.fromkeys(times, Int64(0)),
+            "rec": key,
+            "topic": topic.decode(),
+            "seq": Int64(0),
+            "ref": {"seg": 0, **dict.fromkeys(("chunk", "off", "len"), Int64(0))},
+            **({} if error is None else {"error": said[:1000].decode(errors="ignore")}),
+        }
+        data = encode({"_meta": meta})[4:]
+        self.template = np.frombuffer(data, np.uint8)
         self.at: dict[str, int] = {}
-        body = bytearray()
-
-        def number(name: str, kind: int, size: int) -> None:
-            body.extend(bytes([kind]) + name.encode() + b"\x00")
-            self.at[name] = len(body)
-            body.extend(bytes(size))
-
-        def text(name: str, value: str) -> None:
-            data = value.encode("utf-8", "replace")
-            body.extend(b"\x02" + name.encode() + b"\x00")
-            body.extend(struct.pack("<i", len(data) + 1) + data + b"\x00")
-
-        def document(name: str) -> int:
-            body.extend(b"\x03" + name.encode() + b"\x00")
-            start = len(body)
-            body.extend(bytes(4))
-            return start
-
-        def end(start: int) -> None:
-            body.append(0)
-            struct.pack_into("<i", body, start, len(body) - start)
-
-        meta = document("_meta")
-        number("inserted_at", 0x09, 8)
-        number("t", 0x12, 8)
-        if origin.has_publish_time:
-            number("pub", 0x12, 8)
-        text("rec", origin.key)
-        text("topic", origin.topic)
-        number("seq", 0x12, 8)
-        ref = document("ref")
-        number("seg", 0x10, 4)
-        number("chunk", 0x12, 8)
-        number("off", 0x12, 8)
-        number("len", 0x12, 8)
-        end(ref)
-        if error is not None:
-            text("error", error[:1000])
-        end(meta)
-        body.append(0)
-        self.template = np.frombuffer(bytes(body), np.uint8)
+        at = 0
+        for name in ("inserted_at", *times, "topic", "seq", "ref", "seg", "chunk", "off", "len"):
+            at = self.at[name] = data.index(b"%s\0" % name.encode(), at) + len(name) + 1
+            if name == "topic":  # whatever its name contains
+                at += 4 + len(topic)
 
 
 def _column(out: NDArray[np.uint8], offset: int, dtype: str) -> NDArray[np.int64]:

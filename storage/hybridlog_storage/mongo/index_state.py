@@ -115,13 +115,11 @@ class IndexState:
         for collection in collections:
             self._db.delete(collection, chosen)
 
-    def clear_everywhere(self, keys: Collection[object]) -> None:
-        """Remove all documents of recordings, looking through everything.
-
-        Keys may be other values of `_meta.rec`, of foreign documents.
-        """
+    def forget(self, keys: Collection[str]) -> None:
+        """Remove recordings and all their documents, looking through everything."""
         for collection in self.document_collections():
             self._db.delete(collection, {"_meta.rec": {"$in": list(keys)}})
+        self.remove(keys)
 
     def clear_all(self, but: Collection[str]) -> None:
         """Remove all recordings and their documents but some, which are given by their keys."""
@@ -139,10 +137,9 @@ class IndexState:
 
     def owner(self) -> Owner | None:
         """The store that owns the database; None without an owner."""
-        found = self._db.find_one(STORE, {"_id": "store"})
-        return (
-            None if found is None else Owner(*(str(found.get(name, "")) for name in Owner._fields))
-        )
+        for found in self._db.find(STORE, {"_id": "store"}):
+            return Owner(*(str(found.get(name, "")) for name in Owner._fields))
+        return None
 
     def claim(self, store: str, place: str) -> Owner:
         """Register the store that owns the database.

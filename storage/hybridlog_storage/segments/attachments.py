@@ -141,20 +141,12 @@ class FileHandle:
     """
 
     def __init__(self, fd: int) -> None:
-        self._at = 0
         self._fd = files.duplicate(fd)
 
     def __del__(self) -> None:
         if hasattr(self, "_fd"):
             os.close(self._fd)
 
-    def seek(self, offset: int) -> int:
-        """Set the position of the next read."""
-        self._at = offset
-        return offset
-
-    def read(self, size: int) -> bytes:
-        """The next bytes; fewer at the end."""
-        data = files.pread(self._fd, size, self._at)
-        self._at += len(data)
-        return data
+    def read(self, offset: int, size: int) -> bytes:
+        """Bytes of the file; fewer at its end."""
+        return files.pread(self._fd, size, offset)

@@ -31,9 +31,7 @@ class PackedChunk:
         size: Bytes of its content before compression.
         head: The chunk record up to the compressed content.
         data: The compressed content.
-        head_crc: CRC-32 of the head.
         indexes: Message index record of each channel, by channel id.
-        indexes_crc: CRC-32 of all of them, concatenated.
         arrivals: The arrival numbers, packed.
         parts: `PART`[c], statistics of each channel in the chunk.
     """
@@ -41,9 +39,7 @@ class PackedChunk:
     size: int
     head: bytes
     data: Buffer
-    head_crc: int
     indexes: dict[int, bytes]
-    indexes_crc: int
     arrivals: bytes
     parts: NDArray[np.void]
 
@@ -69,16 +65,11 @@ def pack(
     )
     starts = batch.offset - MESSAGE_HEAD.itemsize
     indexes = message_indexes(batch.channel, batch.log_time, starts, order)
-    indexes_crc = 0
-    for index in indexes.values():
-        indexes_crc = crc32(index, indexes_crc)
     return PackedChunk(
         size=len(batch.buffer),
         head=head,
         data=data,
-        head_crc=crc32(head),
         indexes=indexes,
-        indexes_crc=indexes_crc,
         arrivals=pack_arrivals(seq),
         parts=parts,
     )

@@ -16,8 +16,7 @@ from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.lazy import RowType
 from hybridlog_storage.messages import EXPIRED_IDS
 from hybridlog_storage.ordering import run_starts
-from hybridlog_storage.segments.compression import decompress
-from hybridlog_storage.segments.segment_format import checked_frame
+from hybridlog_storage.segments.compression import checked_frame, decompress
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -51,7 +50,6 @@ _DTYPES = (CHUNK, PART)
 _MAX_BYTES = 1 << 28
 _MAX_FILE = 1 << 62
 _MAX_CHANNEL = 65535
-_MAX_LIST_MESSAGES = 32  # messages
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -189,16 +187,6 @@ def parts_of(batch: Batch, order: NDArray[np.intp]) -> tuple[NDArray[np.void], i
     `batch` has a message at least, and channel ids; `order` is intp[n], rows by channel and, within
     one, by log time.
     """
-    first, last = order[0], order[-1]
-    if batch.channel[first] == batch.channel[last]:  # as in most chunks
-        few = len(order) <= _MAX_LIST_MESSAGES  # for few rows lists are faster
-        length = batch.length.tolist() if few else batch.length
-        publish = batch.publish_time.tolist() if few else batch.publish_time
-        times = int(batch.log_time[first]), int(batch.log_time[last])
-        spans = (min(publish), max(publish)) if few else (publish.min(), publish.max())
-        size = sum(length) if few else length.sum()
-        row = (int(batch.channel[first]), len(order), int(size), *times, *map(int, spans))
-        return np.array([row], PART), *times
     channel = batch.channel[order]
     starts = run_starts(channel)
     parts = np.empty(len(starts), PART)

@@ -7,8 +7,9 @@ compressed form; `Compressor` keeps to that, too.
 
 from __future__ import annotations
 
-import threading
-from typing import TYPE_CHECKING, Literal, Protocol, cast
+from functools import lru_cache
+from threading import get_ident
+from typing import TYPE_CHECKING, Literal, cast
 
 import lz4.frame
 import zstandard
@@ -16,7 +17,7 @@ import zstandard
 from hybridlog_storage.errors import SegmentError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
     from typing import IO
 
     from hybridlog_storage.messages import Buffer
@@ -43,8 +44,6 @@ _MAX_SHARE = 0.97  # of its size that a compressed chunk may have
 _WORTH_IT = 0.2
 _FAST = 1  # at this level of either codec.
 
-_per_thread = threading.local()
-
 
 def decompress(
     compression: str, data: Buffer, uncompressed_size: int, *, limit: int = MAX_UNCOMPRESSED
@@ -70,7 +69,7 @@ def decompress(
         )
     try:
         if compression == "zstd" and zstandard.frame_content_size(data) == uncompressed_size:
-            return _decompressor().decompress(data, allow_extra_data=False)
+            return _decompressor(get_ident()).decompress(data, allow_extra_data=False)
         return _joined(decompress_pieces(compression, data), uncompressed_size)
     except MemoryError as error:
         raise SegmentError(f"there is no memory for its {uncompressed_size} bytes") from error
@@ -109,24 +108,14 @@ def is_implausible(uncompressed_size: int, size: int) -> bool:
     return uncompressed_size > MAX_FREE and uncompressed_size > size * MAX_RATIO
 
 
-class Readable(Protocol):
-    """An open file that is read by position."""
-
-    def seek(self, offset: int, /) -> int:
-        """Set the position of the next read."""
-
-    def read(self, size: int, /) -> bytes:
-        """The next bytes; fewer at the end."""
-
-
 class FilePart:
-    """A part of a file that is read piece by piece; the position of `file` is moved.
+    """A part of a file that is read piece by piece.
 
-    All of its `size` bytes are in the file.
+    `read` takes an offset and a length. All of its `size` bytes are in the file.
     """
 
-    def __init__(self, file: Readable, start: int, size: int) -> None:
-        self._file = file
+    def __init__(self, read: Callable[[int, int], Buffer], start: int, size: int) -> None:
+        self._read = read
         self._start = start
         self._size = size
         self._at = 0
@@ -136,21 +125,20 @@ class FilePart:
 
     def again(self) -> FilePart:
         """The same part from its start."""
-        return FilePart(self._file, self._start, self._size)
+        return self.section(0, self._size)
 
     def section(self, start: int, size: int) -> FilePart:
         """Some of its bytes, as a part of the same file."""
-        return FilePart(self._file, self._start + start, size)
+        return FilePart(self._read, self._start + start, size)
 
-    def through(self, file: Readable) -> FilePart:
-        """The same part, read through another handle of the file."""
-        return FilePart(file, self._start, self._size)
+    def through(self, read: Callable[[int, int], Buffer]) -> FilePart:
+        """The same part, read in another way."""
+        return FilePart(read, self._start, self._size)
 
     def read(self, size: int = -1) -> bytes:
         """The next bytes: at most `size`, all without it; none at the end."""
         left = self._size - self._at
-        self._file.seek(self._start + self._at)
-        data = self._file.read(left if size < 0 else min(size, left))
+        data = bytes(self._read(self._start + self._at, left if size < 0 else min(size, left)))
         self._at += len(data)
         return data
 
@@ -172,12 +160,19 @@ def decompress_pieces(compression: str, data: Buffer | FilePart) -> Iterator[byt
         raise SegmentError(f"its {compression} data is damaged ({error})") from error
 
 
-def _decompressor() -> zstandard.ZstdDecompressor:
-    try:
-        found: zstandard.ZstdDecompressor = _per_thread.decompressor
-    except AttributeError:
-        found = _per_thread.decompressor = zstandard.ZstdDecompressor()
-    return found
+@lru_cache(maxsize=64)
+def _decompressor(_thread: int) -> zstandard.ZstdDecompressor:
+    return zstandard.ZstdDecompressor()  # which threads must not share
+
+
+@lru_cache(maxsize=64)
+def _compressor(_thread: int, level: int, *, check: bool) -> zstandard.ZstdCompressor:
+    return zstandard.ZstdCompressor(level=level, write_checksum=check)
+
+
+def checked_frame(data: Buffer) -> bytes:
+    """Data as one zstd frame with a checksum of its content."""
+    return _compressor(get_ident(), 1, check=True).compress(data)
 
 
 def _slices(data: Buffer | FilePart) -> Iterator[bytes | memoryview]:
@@ -192,7 +187,8 @@ def _slices(data: Buffer | FilePart) -> Iterator[bytes | memoryview]:
 def _zstd_pieces(data: Buffer | FilePart) -> Iterator[bytes]:
     # Of a file, a reader needs only `read`.
     source = cast("IO[bytes]", data) if isinstance(data, FilePart) else memoryview(data)
-    reader = _decompressor().stream_reader(source, read_across_frames=True, closefd=False)
+    whole = _decompressor(get_ident())
+    reader = whole.stream_reader(source, read_across_frames=True, closefd=False)
     while piece := reader.read(_PIECE):
         yield piece
 
@@ -220,24 +216,12 @@ class Compressor:
     chunk are tried first, and a chunk that gains less than 3 % is stored uncompressed. Thread safe;
     compression releases the interpreter lock.
 
-    The codec `none` stores everything as it is. The level is 1 to 22 for zstd (negative: faster), 0
-    to 16 for lz4; another one is a `ValueError`.
+    The codec `none` stores everything as it is. `level` is zstd's.
     """
 
-    def __init__(
-        self,
-        name: Literal["zstd", "lz4", "none"] = "zstd",
-        level: int = 1,
-    ) -> None:
-        if name not in {"zstd", "lz4", "none"}:
-            raise ValueError(f"compression {name!r} is not known; use zstd, lz4 or none")
-        if name == "zstd" and level > zstandard.MAX_COMPRESSION_LEVEL:
-            raise ValueError(f"zstd has levels up to {zstandard.MAX_COMPRESSION_LEVEL}")
-        if name == "lz4" and level > lz4.frame.COMPRESSIONLEVEL_MAX:
-            raise ValueError(f"lz4 has levels up to {lz4.frame.COMPRESSIONLEVEL_MAX}")
+    def __init__(self, name: Literal["zstd", "lz4", "none"] = "zstd", level: int = 1) -> None:
         self.name = name
         self.level = level
-        self._own = threading.local()  # threads must not share a ZstdCompressor
 
     def compress(self, data: Buffer, *, hurried: bool = False) -> tuple[str, Buffer]:
         """Compress a chunk if it gains enough: name of the codec and bytes, else empty and `data`.
@@ -270,8 +254,4 @@ class Compressor:
         if self.name == "lz4":
             packed: bytes = lz4.frame.compress(data, compression_level=level, store_size=True)
             return packed
-        compressors: dict[int, zstandard.ZstdCompressor] = self._own.__dict__.setdefault("by", {})
-        compressor = compressors.get(level)
-        if compressor is None:
-            compressor = compressors[level] = zstandard.ZstdCompressor(level=level)
-        return compressor.compress(data)
+        return _compressor(get_ident(), level, check=False).compress(data)

@@ -112,9 +112,6 @@ class GoneLog(SegmentReader):
                 return data[offset - place : offset - place + length]
         raise SegmentError(f"Byte {offset} of log {self.number} is gone: {self.path} has its rows.")
 
-    def grow(self) -> None:
-        """Nothing: it was sealed."""
-
     def digest(self, _: object = None) -> str:
         """BLAKE3 of the log, as the manifest had it."""
         return self.log.digest

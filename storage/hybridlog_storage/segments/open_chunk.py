@@ -67,7 +67,7 @@ def _joined(parts: list[Buffer], size: int) -> Buffer:
     """The parts in one buffer. Large ones are copied without the interpreter lock."""
     if size < _LARGE * len(parts):
         return b"".join(parts)
-    content = buffers.take(size)[:size]  # it costs fewer page faults, and begins at a block
+    content = buffers.take(size)[:size]  # it costs fewer page faults
     at = 0
     for part in parts:
         content[at : at + len(part)] = np.frombuffer(part, np.uint8)

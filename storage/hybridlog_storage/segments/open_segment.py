@@ -87,7 +87,7 @@ class OpenSegment:
         for chunk in walk.chunks[self._table.chunks :]:
             parts = chunk.parts
             times = int(parts["first"].min()), int(parts["last"].max())
-            self._table.chunk(chunk[:3], times, parts)
+            self._table.chunk((chunk.offset, chunk.head.length, chunk.trailer), times, parts)
         table = self._table.build(is_flushed=True)
         metadata = [one for one in walk.metadata if not one.name.startswith(OUR_NAMES)]
         self._flushed = Flushed(table, tuple(walk.attachments), metadata, self.reader)

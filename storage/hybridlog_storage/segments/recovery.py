@@ -15,9 +15,8 @@ from hybridlog_storage.disk import durability, files
 from hybridlog_storage.disk.append_file import BLOCK, AppendFile
 from hybridlog_storage.errors import SegmentError, StoreError
 from hybridlog_storage.manifest import hasher
-from hybridlog_storage.mcap.mcap_content import Damage, parse_content
+from hybridlog_storage.mcap.mcap_content import Damage
 from hybridlog_storage.messages import Schema
-from hybridlog_storage.segments.chunk_table import parts_of
 from hybridlog_storage.segments.segment_file import (
     OPEN_SUFFIX,
     Sealed,
@@ -25,16 +24,12 @@ from hybridlog_storage.segments.segment_file import (
     sealed_name,
 )
 from hybridlog_storage.segments.segment_format import (
-    ARRIVAL_HEAD,
-    INDEX_HEAD,
     START,
     damaged_head,
     group_of,
-    index_order,
-    trailer_of,
 )
-from hybridlog_storage.segments.segment_reader import SegmentReader, check_format, open_chunk
-from hybridlog_storage.segments.walk import Walk, WalkedChunk
+from hybridlog_storage.segments.segment_reader import SegmentReader, check_format
+from hybridlog_storage.segments.walk import Walk
 
 _PIECE = 4 << 20  # bytes read at once for a digest
 
@@ -107,7 +102,7 @@ class _Rest:
     def __init__(self, segment: SegmentFile, reader: SegmentReader) -> None:
         self._segment = segment
         self._reader = reader
-        self._walk = walk = Walk(reader)
+        self._walk = walk = Walk(reader, reads=True)
         walk.go_on()
         if walk.recording is not None:
             check_format(walk.recording, segment.path)
@@ -117,7 +112,9 @@ class _Rest:
             segment.schemas[number] = Schema(one.name, one.encoding, bytes(one.data))
         segment.channels |= walk.channels
         segment.note_extras(walk.metadata, walk.attachments)
-        self.messages = sum(map(self._take, walk.chunks))
+        for chunk in walk.chunks:
+            segment.note_chunk(chunk.offset, chunk.trailer, chunk.head, chunk.indexes, chunk.parts)
+        self.messages = sum(int(chunk.parts["messages"].sum()) for chunk in walk.chunks)
         self.cut_bytes = self._torn()
 
     @classmethod
@@ -149,29 +146,6 @@ class _Rest:
         rest = self._reader.size - end
         is_room = 0 <= rest < BLOCK and not any(self._reader.read(end, rest))
         return 0 if is_room or self._walk.is_complete else rest
-
-    def _take(self, chunk: WalkedChunk) -> int:
-        """Note a chunk if its content is whole; return how many messages it has."""
-        offset, length, trailer, _ = chunk
-        data = self._reader.read(offset, length + trailer)
-        try:
-            content, head = open_chunk(data[:length])
-            batch = parse_content(content).batch
-            behind = trailer_of(data[length:], offset)
-            behind.arrivals(len(batch))
-            parts, *span = parts_of(batch, index_order(batch.channel, batch.log_time))
-            if [head.first, head.last] != span:
-                raise SegmentError("its times are not those of its messages")
-        except SegmentError as error:
-            reason = f"a chunk is damaged: {error}"
-            self._damage.append(Damage(offset, length + trailer, reason))
-            return 0
-        indexes = {channel: INDEX_HEAD.size + rows.nbytes for channel, rows in behind.indexes or ()}
-        if not indexes:
-            size = trailer - ARRIVAL_HEAD - len(behind.packed)
-            self._damage.append(Damage(offset + length, size, "message indexes are damaged"))
-        self._segment.note_chunk(offset, trailer, head, indexes, parts)
-        return len(batch)
 
     def seal(
         self, recording: Mapping[str, object] | None, on_sealing: Callable[[Sealed], object]

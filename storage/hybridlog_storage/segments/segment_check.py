@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.segments.segment_reader import SegmentReader
@@ -63,13 +63,12 @@ def _unreadable(reader: SegmentReader, summary: SegmentSummary) -> Iterator[Segm
             topics = ", ".join(lost[:5]) + (f" and {len(lost) - 5} more" if lost[5:] else "")
             problem = f"chunk {place.number} is lost (messages: {topics}): {error}"
             yield SegmentDamage(place.offset, problem, place.number)
-    for attachment in summary.attachments:
+    reads: list[tuple[Callable[[Any], object], list[Any]]] = [
+        (reader.attachment, summary.attachments),
+        (reader.metadata, summary.metadata),
+    ]
+    for read, record in ((read, record) for read, records in reads for record in records):
         try:
-            reader.attachment(attachment)
-        except SegmentError as error:
-            yield SegmentDamage(attachment.offset, str(error))
-    for record in summary.metadata:
-        try:
-            reader.metadata(record)
+            read(record)
         except SegmentError as error:
             yield SegmentDamage(record.offset, str(error))

@@ -28,17 +28,15 @@ from hybridlog_storage.disk.append_file import AppendFile
 from hybridlog_storage.errors import HybridlogError, StoreError
 from hybridlog_storage.manifest import Channel as ListedChannel
 from hybridlog_storage.manifest import File, Part
-from hybridlog_storage.mcap.mcap_content import RECORD_HEAD, ChunkHead, chunk_head_of
+from hybridlog_storage.mcap.mcap_content import MAGIC, RECORD_HEAD, ChunkHead, chunk_head_of
 from hybridlog_storage.messages import EXPIRED_IDS, schema_hash
 from hybridlog_storage.segments.attachments import Attachment
 from hybridlog_storage.segments.chunk import PackedChunk
 from hybridlog_storage.segments.chunk_table import ChunkTable, TableBuilder
 from hybridlog_storage.segments.segment_format import (
-    ARRIVAL_HEAD,
     CHUNK_TABLE_OPCODE,
     FORMAT_VERSION,
     LOSSES_METADATA,
-    MAGIC,
     RECORDING_METADATA,
     START,
     arrival_record,
@@ -47,7 +45,6 @@ from hybridlog_storage.segments.segment_format import (
     index_offsets,
     json_metadata,
     metadata_record,
-    padding_record,
     record_bytes,
     schema_record,
 )
@@ -221,17 +218,16 @@ class SegmentFile:
 
     def define(self, channels: Iterable[tuple[int, int, Channel]]) -> None:
         """Write channels (id, id of the schema, channel) as a chunk, schemas on first use."""
-        records: list[bytes] = []
-        schemas: dict[int, Schema] = {}
         defined = [*channels]
-        for channel_id, schema_id, channel in defined:
-            if schema_id and channel.schema is not None:
-                if schema_id not in self.schemas and schema_id not in schemas:
-                    records.append(record_bytes(schema_record(schema_id, channel.schema)))
-                schemas[schema_id] = channel.schema
-            records.append(record_bytes(channel_record(channel_id, schema_id, channel)))
+        schemas = {number: one.schema for _, number, one in defined if one.schema is not None}
+        records: list[McapRecord] = [
+            schema_record(number, schema)
+            for number, schema in schemas.items()
+            if number not in self.schemas
+        ]
+        records += [channel_record(*one) for one in defined]
         if records:
-            self._append([definitions_chunk(b"".join(records), self.position)])
+            self._append([definitions_chunk(_joined(records), self.position)])
         self.schemas |= schemas
         self.channels |= {number: (schema, channel) for number, schema, channel in defined}
 
@@ -267,31 +263,16 @@ class SegmentFile:
         self._metadata_indexes += metadata
         self._attachment_indexes += attachments
 
-    def end_behind(self, chunk: PackedChunk, at: int) -> int:
-        """Byte of the file where a chunk ends that is appended when the file has `at` bytes."""
-        trailer = sum(map(len, chunk.indexes.values())) + ARRIVAL_HEAD + len(chunk.arrivals)
-        padding = self._padding(chunk.data, at, len(chunk.head))
-        return at + len(padding) + len(chunk.head) + len(chunk.data) + trailer
-
-    def append_chunks(self, chunks: Sequence[PackedChunk]) -> None:
-        """Append chunks with their message indexes and arrival numbers in one write."""
-        parts: list[Buffer] = []
-        places: list[tuple[int, int]] = []
-        at = self.position
-        for chunk in chunks:
-            padding = self._padding(chunk.data, at, len(chunk.head))
-            offset = at + len(padding)
-            arrivals = arrival_record(offset, chunk.head_crc, chunk.indexes_crc, chunk.arrivals)
-            trailer = sum(map(len, chunk.indexes.values())) + len(arrivals)
-            parts += [padding, chunk.head, chunk.data, *chunk.indexes.values(), arrivals]
-            at = offset + len(chunk.head) + len(chunk.data) + trailer
-            places.append((offset, trailer))
-        self._append(parts)
-        for chunk, (offset, trailer) in zip(chunks, places, strict=True):
-            sizes = {channel: len(data) for channel, data in chunk.indexes.items()}
-            head = chunk_head_of(chunk.head)
-            assert head is not None
-            self.note_chunk(offset, trailer, head, sizes, chunk.parts)
+    def append_chunk(self, chunk: PackedChunk) -> None:
+        """Append a chunk with its message indexes and arrival numbers in one write."""
+        offset = self.position
+        indexes = b"".join(chunk.indexes.values())
+        arrivals = arrival_record(offset, crc32(chunk.head), crc32(indexes), chunk.arrivals)
+        self._append([chunk.head, chunk.data, indexes, arrivals])
+        head = chunk_head_of(chunk.head)
+        assert head is not None
+        sizes = {channel: len(data) for channel, data in chunk.indexes.items()}
+        self.note_chunk(offset, len(indexes) + len(arrivals), head, sizes, chunk.parts)
 
     def note_chunk(
         self,
@@ -397,13 +378,6 @@ class SegmentFile:
         """Close without sealing; the next opening of the store recovers the file."""
         with suppress(OSError):
             self._file.finish(sync=False)
-
-    def _padding(self, content: Buffer, at: int, head: int) -> bytes:
-        """Padding before a chunk record so that its content starts at a block."""
-        if not self._file.room_before(content, at + head):
-            return b""
-        least = RECORD_HEAD.size
-        return padding_record(least + self._file.room_before(content, at + least + head))
 
     def _append(self, parts: Sequence[Buffer]) -> None:
         with self._explained("writing"):

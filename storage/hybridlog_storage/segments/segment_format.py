@@ -11,13 +11,11 @@ from __future__ import annotations
 
 import json
 import struct
-import threading
 from collections.abc import Mapping
 from itertools import accumulate
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
-import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import Channel as ChannelRecord
@@ -29,6 +27,7 @@ from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.lazy import RowType
 from hybridlog_storage.mcap.mcap_content import (
     CHUNK_HEAD,
+    MAGIC,
     MESSAGE_HEAD,
     RECORD_HEAD,
     batch_of,
@@ -37,12 +36,11 @@ from hybridlog_storage.mcap.mcap_content import (
 )
 from hybridlog_storage.messages import Batch, Buffer, Channel, Schema
 from hybridlog_storage.ordering import run_starts
-from hybridlog_storage.segments.compression import decompress
+from hybridlog_storage.segments.compression import checked_frame, decompress
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-MAGIC: Final = b"\x89MCAP0\r\n"
 PROFILE: Final = "hybridlog"
 LIBRARY: Final = "hybridlog"
 FORMAT_VERSION: Final = 4
@@ -56,8 +54,6 @@ NO_INDEX: Final = "hybridlog.no_index"
 
 ARRIVAL_OPCODE: Final = 0x90
 """Record of the application range of opcodes: the arrival numbers of the chunk before it."""
-PADDING_OPCODE: Final = 0x91
-"""Record of zeros, so that the content of the chunk behind it starts at a block."""
 CHUNK_TABLE_OPCODE: Final = 0x92
 """Record of the summary: the chunk table, see `chunk_table`."""
 DAMAGED_OPCODE: Final = 0x93
@@ -73,7 +69,6 @@ ARRIVAL_HEAD: Final = RECORD_HEAD.size + ARRIVALS.size
 
 _INDEX_ENTRY = RowType(("log_time", "<u8"), ("offset", "<u8"))
 _MAX_ARRIVALS = 1 << 27
-_per_thread = threading.local()
 
 
 def record_bytes(record: McapRecord) -> bytes:
@@ -194,12 +189,6 @@ def chunk_head(
     )
 
 
-def padding_record(size: int) -> bytes:
-    """A padding record of `size` bytes, including its head."""
-    length = size - RECORD_HEAD.size
-    return RECORD_HEAD.pack(PADDING_OPCODE, length) + bytes(length)
-
-
 def damaged_head(size: int) -> bytes:
     """The head of a record of `size` damaged bytes, including itself."""
     return RECORD_HEAD.pack(DAMAGED_OPCODE, size - RECORD_HEAD.size)
@@ -255,16 +244,6 @@ def definitions_chunk(content: bytes, offset: int) -> bytes:
     )
     arrivals = arrival_record(offset, crc32(head), 0, pack_arrivals(np.empty(0, np.int64)))
     return b"".join((head, packed, arrivals))
-
-
-def checked_frame(data: Buffer) -> bytes:
-    """Data as one zstd frame with a checksum of its content."""
-    compressor = getattr(_per_thread, "compressor", None)
-    if compressor is None:
-        compressor = zstandard.ZstdCompressor(level=1, write_checksum=True)
-        _per_thread.compressor = compressor
-    packed: bytes = compressor.compress(data)
-    return packed
 
 
 def pack_arrivals(seq: NDArray[np.int64]) -> bytes:

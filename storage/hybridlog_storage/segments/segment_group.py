@@ -64,19 +64,17 @@ class Division:
 
     def key(self, topic: str, chunk: PackedChunk) -> Key:
         """The segment for the next chunk of a topic that shares no chunks."""
+        messages = self._messages[topic] = self._messages[topic] + int(
+            chunk.parts["messages"].sum()
+        )
+        size = self._bytes[topic] = self._bytes[topic] + int(chunk.parts["payload_bytes"].sum())
         if topic in self._own or self.is_named(topic):
             return topic
-        if self._is_first and len(self._own) < _OTHERS:
-            messages, size = self._with(topic, chunk)
-            if messages > 1 and size >= self._own_payload * max(messages, _LEAST):
-                return topic
-        return SECOND
-
-    def note(self, topic: str, chunk: PackedChunk, key: Key) -> None:
-        """Note that a chunk goes to a segment."""
-        self._messages[topic], self._bytes[topic] = self._with(topic, chunk)
-        if key == topic and not self.is_named(topic):
+        is_large = messages > 1 and size >= self._own_payload * max(messages, _LEAST)
+        if self._is_first and len(self._own) < _OTHERS and is_large:
             self._own.add(topic)
+            return topic
+        return SECOND
 
     def begin(self) -> None:
         """Begin the next group."""
@@ -89,11 +87,6 @@ class Division:
         self._is_first = False
         self._messages.clear()
         self._bytes.clear()
-
-    def _with(self, topic: str, chunk: PackedChunk) -> tuple[int, int]:
-        parts = chunk.parts
-        messages = self._messages[topic] + int(parts["messages"].sum())
-        return messages, self._bytes[topic] + int(parts["payload_bytes"].sum())
 
 
 class SegmentGroup:

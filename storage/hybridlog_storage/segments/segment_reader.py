@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import stat
-import struct
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -25,10 +24,13 @@ from hybridlog_storage.disk import files
 from hybridlog_storage.errors import SegmentError, exhausted
 from hybridlog_storage.manifest import hasher
 from hybridlog_storage.mcap.mcap_content import (
+    MAGIC,
     MAX_CHUNK_HEAD,
     RECORD_HEAD,
+    TAIL,
     ChunkHead,
     chunk_head_of,
+    footer_of,
     parse_content,
     parse_summary,
 )
@@ -47,7 +49,6 @@ from hybridlog_storage.segments.segment_format import (
     CHUNK_TABLE_OPCODE,
     FORMAT_VERSION,
     LOSSES_METADATA,
-    MAGIC,
     OUR_NAMES,
     RECORDING_METADATA,
     channel_of,
@@ -65,8 +66,6 @@ if TYPE_CHECKING:
 
     from hybridlog_storage.messages import Batch
 
-_FOOTER = struct.Struct("<BQQQI")  # head, start of the summary and of its offsets, checksum
-_TAIL = _FOOTER.size + len(MAGIC)
 _MAX_SUMMARY = 1 << 30
 _PIECE = 4 << 20  # bytes read at once for a checksum
 _AHEAD = 64 << 20  # bytes that are announced at once; a multiple of the former
@@ -199,13 +198,11 @@ class SegmentReader:
 
     def _records(self) -> tuple[Summary, Buffer | None, int]:
         """The checked summary, the content of the chunk table, and where they start."""
-        if self.size < len(MAGIC) + _TAIL:
-            raise self._no_summary("it is too short")
-        tail = self.read(self.size - _TAIL, _TAIL)
-        opcode, length, start, offsets, crc = _FOOTER.unpack_from(tail)
-        if bytes(tail[_FOOTER.size :]) != MAGIC or opcode != Opcode.FOOTER or length != 20:
+        end = self.size - TAIL
+        footer = footer_of(self.read(end, TAIL)) if end >= len(MAGIC) else None
+        if footer is None:
             raise self._no_summary("its end is damaged or missing")
-        end = self.size - _TAIL
+        start, offsets, crc = footer
         if not len(MAGIC) <= start <= offsets <= end or end - start > _MAX_SUMMARY:
             raise self._no_summary("its footer is damaged")
         data = self.read(start, self.size - start)
@@ -213,7 +210,7 @@ class SegmentReader:
             raise self._no_summary("its checksum differs")
         try:
             # The chunk table says more than chunk indexes, and is faster to read.
-            found, others = parse_summary(data[: len(data) - _TAIL], skipped=Opcode.CHUNK_INDEX)
+            found, others = parse_summary(data[: len(data) - TAIL], skipped=Opcode.CHUNK_INDEX)
         except SegmentError as error:
             raise self._no_summary(error) from error
         return found, others.get(CHUNK_TABLE_OPCODE), start
@@ -287,7 +284,7 @@ class SegmentReader:
         start, size = offset + RECORD_HEAD.size, length - RECORD_HEAD.size
         head = self.read(start, max(min(size, MAX_HEAD), 0))
         found, used = parse_attachment(
-            head, FilePart(FileHandle(self._fd), start, size), needs_crc=True
+            head, FilePart(FileHandle(self._fd).read, start, size), needs_crc=True
         )
         if used != size:
             raise SegmentError("an attachment record is longer than its fields")

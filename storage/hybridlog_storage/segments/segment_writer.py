@@ -46,7 +46,6 @@ _LATCHED = -2
 _MAX_SPAN = 3600 * 10**9  # ns
 _SMALL_SPANS = 256  # times the usual span, for a chunk that is still small
 _SYNC_STRIDE = 32 << 20  # bytes
-_WRITTEN_AT_ONCE = 16 << 20  # bytes, at most, and one chunk
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,13 +102,6 @@ class RecordingTotals:
     chunks: int = 0
 
 
-@dataclass(slots=True)
-class _Known:
-    channel_id: int
-    schema_id: int
-    cluster: int
-
-
 class RecordingWriter:
     """Writes the batches of one recording into segments.
 
@@ -158,11 +150,10 @@ class RecordingWriter:
         self._last_times: dict[int, int] = {}  # in the files, by channel id
         self._directory = directory
         self._recording = recording
-        self._known: dict[Channel, _Known] = {}
+        self._known: dict[Channel, tuple[int, int]] = {}  # its id, and its cluster
         self._schema_ids: dict[Schema, int] = {}
         self._clusters: dict[int, OpenChunk] = {}
-        self._latched: set[int] = set()  # ids of channels whose messages lie apart
-        self._movable: set[int] = set()  # ids of channels that need not be in the first segment
+        self._keys: dict[int, Key | None] = {}  # by channel id; None where the division decides
         self._compressor = Compressor(self.settings.compression, self.settings.level)
         # One processor is left to who brings messages that cannot wait.
         packers = _PACKERS if on_written is None else min(_PACKERS, max(processors() - 1, 1))
@@ -176,7 +167,6 @@ class RecordingWriter:
         self._make_room = make_room
         large, own = self.settings.large_payload, self.settings.own_payload
         self._division = Division(own, large, is_named)
-        self._packed: deque[Future[PackedChunk]] = deque()  # in file order
         self._storing: deque[Future[None]] = deque()
         self._extras: list[Metadata | Attachment] = []  # not in a segment yet
         self._broken: BaseException | None = None
@@ -204,10 +194,9 @@ class RecordingWriter:
         ids, cluster = np.zeros((2, present[-1] + 1), np.int32)
         for index in present:
             channel = channels[index]
-            known = self._known.get(channel) or self._meet(
-                channel, float(sizes[index] / counts[index])
-            )
-            ids[index], cluster[index] = known.channel_id, known.cluster
+            known = self._known.get(channel)
+            mean = float(sizes[index] / counts[index])
+            ids[index], cluster[index] = known or self._meet(channel, mean)
         loose = batch if isinstance(batch, LooseBatch) else LooseBatch.of(batch)
         own = replace(loose, channel=ids[batch.channel])
         clusters = sorted({int(cluster[index]) for index in present})
@@ -290,13 +279,11 @@ class RecordingWriter:
 
     def written_of(self, channel: Channel) -> int:
         """Number of messages of a channel in the files."""
-        known = self._known.get(channel)
-        return 0 if known is None else self.written[known.channel_id]
+        return self.written[self._known.get(channel, (0, 0))[0]]
 
     def last_time_of(self, channel: Channel) -> int | None:
         """Log time of the last message of a channel in the files, ns; None without any."""
-        known = self._known.get(channel)
-        return None if known is None else self._last_times.get(known.channel_id)
+        return self._last_times.get(self._known.get(channel, (0, 0))[0])
 
     def abort(self) -> None:
         """Stop at once; sealed segments and flushed chunks stay."""
@@ -310,23 +297,20 @@ class RecordingWriter:
         self._pool.shutdown(wait=True, cancel_futures=True)
         self._disk.shutdown(wait=True, cancel_futures=True)
 
-    def _meet(self, channel: Channel, mean: float) -> _Known:
-        """Register a new channel: its ids and, from its mean payload size, its cluster."""
+    def _meet(self, channel: Channel, mean: float) -> tuple[int, int]:
+        """Register a new channel: its id and, from its mean payload size, its cluster."""
         if len(self._known) >= MAX_CHANNELS:
             raise StoreError(f"more than {MAX_CHANNELS} channels in one recording")
-        schema_id = 0
         if channel.schema is not None:
-            schema_id = self._schema_ids.setdefault(channel.schema, len(self._schema_ids) + 1)
+            self._schema_ids.setdefault(channel.schema, len(self._schema_ids) + 1)
         channel_id = len(self._known) + 1
         is_latched = self._is_latched(channel)
         is_alone = mean >= self.settings.large_payload or self._division.is_named(channel.topic)
         cluster = channel_id if is_alone else _SHARED
+        self._keys[channel_id] = None if is_alone and not is_latched else FIRST
         if is_latched and self._latched_apart:
-            cluster = _LATCHED
-            self._latched.add(channel_id)
-        elif is_alone and not is_latched:
-            self._movable.add(channel_id)
-        known = self._known[channel] = _Known(channel_id, schema_id, cluster)
+            cluster, self._keys[channel_id] = _LATCHED, LATCHED
+        known = self._known[channel] = channel_id, cluster
         if channel.is_indexed and self._no_index(channel.topic):
             channel = replace(channel, is_indexed=False)
         self.channels[channel_id] = channel
@@ -368,7 +352,6 @@ class RecordingWriter:
         chunk = self._clusters.pop(key)
         self._closed_bytes += chunk.size
         packed = self._pool.submit(self._pack, chunk)
-        self._packed.append(packed)
         self._storing.append(self._disk.submit(self._store, packed))
         self._limit_queue(limit=AT_WORK)
 
@@ -397,60 +380,20 @@ class RecordingWriter:
     # The methods below run on the writing thread only.
 
     def _store(self, packed: Future[PackedChunk]) -> None:
-        """Write a packed chunk and the packed ones that follow it; nothing after a failure."""
+        """Write a chunk, once it is packed; nothing after a failure."""
         if self._broken is not None:
             return  # the next append raises it
-        if not self._packed or packed is not self._packed[0]:
-            return  # it was written together with an earlier one
         try:
-            self._write()
+            self._write(packed.result())
         except BaseException as error:
             self._broken = error
             raise
 
-    def _next_chunks(self) -> list[tuple[SegmentFile, PackedChunk]]:
-        """The first chunk, once it is packed, and the packed chunks behind it.
-
-        After each blocking call this thread waits for the interpreter lock. So many waiting
-        chunks are written at once; the files are the same either way.
-        """
-        group = self._open_group()
-        chunk = self._packed[0].result()
-        topic, key = self._place_of(chunk)
-        segment = group.segment(key)
-        self._define(segment, [c for c in chunk.indexes if c not in segment.channels])
-        chunks: list[tuple[SegmentFile, PackedChunk]] = []
-        ends: dict[SegmentFile, int] = {}
-        size, left = 0, self.settings.segment_size - group.position
-        while True:
-            if topic is not None:
-                self._division.note(topic, chunk, key)
-            chunks.append((segment, chunk))
-            size += len(chunk.data)
-            before = ends.get(segment, segment.position)
-            ends[segment] = segment.end_behind(chunk, before)
-            left -= ends[segment] - before
-            if size >= _WRITTEN_AT_ONCE or left <= 0 or len(chunks) == len(self._packed):
-                return chunks
-            following = self._packed[len(chunks)]
-            if not following.done() or following.exception() is not None:
-                return chunks
-            chunk = following.result()
-            topic, key = self._place_of(chunk)
-            found = group.segments.get(key)
-            if found is None or not chunk.indexes.keys() <= found.channels.keys():
-                return chunks
-            segment = found
-
-    def _place_of(self, chunk: PackedChunk) -> tuple[str | None, Key]:
-        """The topic of a chunk of one channel, and its segment; no topic in the first one."""
+    def _key_of(self, chunk: PackedChunk) -> Key:
+        """The segment of a chunk in its group."""
         number = next(iter(chunk.indexes))
-        if number in self._latched:
-            return None, LATCHED
-        if number not in self._movable:
-            return None, FIRST
-        topic = self.channels[number].topic
-        return topic, self._division.key(topic, chunk)
+        key = self._keys[number]
+        return self._division.key(self.channels[number].topic, chunk) if key is None else key
 
     def _add(self, record: Metadata | Attachment) -> None:
         group = self._open_group()
@@ -473,29 +416,22 @@ class RecordingWriter:
             for number, channel in channels
         )
 
-    def _write(self) -> None:
-        chunks = self._with_room(self._next_chunks)
-        by_segment: dict[SegmentFile, list[PackedChunk]] = {}
-        for segment, chunk in chunks:
-            by_segment.setdefault(segment, []).append(chunk)
-        done: set[int] = set()  # by the identity of the chunk
-        try:
-            for segment, own in by_segment.items():
-                self._with_room(partial(segment.append_chunks, own))
-                done.update(map(id, own))
-                if self.settings.sync == "chunk":
-                    segment.sync()
-        finally:  # on a full disk, what is in the other segments counts
-            for _, chunk in chunks:
-                if id(chunk) in done:
-                    self._publish(chunk)
-        for _ in chunks:
-            self._packed.popleft()
+    def _write(self, chunk: PackedChunk) -> None:
+        segment = self._with_room(partial(self._append, chunk, self._key_of(chunk)))
+        self._publish(chunk)
+        if self.settings.sync == "chunk":
+            segment.sync()
         group = self._open_group()
         if self.settings.sync == "seal" and not group.first.direct:
             self._sync_behind(group)
         if group.is_full(self.settings.segment_size, self.settings.segment_span_s):
             self._seal()
+
+    def _append(self, chunk: PackedChunk, key: Key) -> SegmentFile:
+        segment = self._open_group().segment(key)
+        self._define(segment, [c for c in chunk.indexes if c not in segment.channels])
+        segment.append_chunk(chunk)
+        return segment
 
     def _with_room(self, do: Callable[[], _Done]) -> _Done:
         """Do what changes nothing when it fails, again when there is room for it."""

