@@ -244,9 +244,7 @@ class Follower:
 
     def _begin(self) -> None:
         entry, topics = self._entry, self._topics
-        self._tables = TableWriter(
-            self._directory.path, entry.id, entry.name, topics=topics, is_new=topics is None
-        )
+        self._tables = TableWriter(self._directory.path, entry.id, entry.name, topics)
         self._damage = self._catalog.damage(entry.id)
         self._segments: dict[int, _Segment] = {}
         self._ended: set[int] = set()

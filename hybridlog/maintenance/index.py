@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.follow.follower import bring
-from hybridlog.maintenance import tables
 from hybridlog_storage.disk.directory import LOCK_WAIT_S
 from hybridlog_storage.errors import HeldError, HybridlogError, SegmentError, TopicError
 from hybridlog_storage.mongo.index_state import IndexState
@@ -47,15 +46,13 @@ class StoreIndex:
         the index belongs to: what it does not have may be there.
         """
         directory, state = self.directory, IndexState(self.database)
-        tables.remove_unfinished(directory, snapshot)
         behind = [one for one in snapshot.summaries if one.indexed_by != index]
         known = state.of([one.key for one in behind]) if behind else {}
         is_other = state.count() - len(known) != len(snapshot) - len(behind)
         if is_other:
-            behind = snapshot.summaries
-        if is_other or tables.are_left(directory, snapshot):
-            known = state.of()
-            self._remove_orphans(known if removes else (), report)
+            behind, known = snapshot.summaries, state.of()
+            if removes:
+                self._remove_orphans(known, report)
         changed, current = set(), []
         for summary in behind:
             entry = entry_of(summary)
@@ -86,20 +83,17 @@ class StoreIndex:
         return bring(directory, catalog, entry, database, progress=self.progress, **options).chunks
 
     def _remove_orphans(self, known: Iterable[str], report: RepairReport) -> None:
-        """Remove recordings without a directory from the index and the tables.
+        """Remove recordings without a directory from the index.
 
         The directories are listed after the index, so they include recordings that have begun
         meanwhile.
         """
         directory, state = self.directory, IndexState(self.database)
-        present = {one[-16:] for one in (*directory.ids(), *directory.manifests.without())}
-        gone = {*known} - present
+        gone = {*known} - {one[-16:] for one in (*directory.ids(), *directory.manifests.without())}
         if gone:
             state.clear_everywhere(gone)
             state.remove(gone)
             report.removed += sorted(gone)
-        if directory.is_writable:
-            tables.remove_orphans(directory, present)
 
     def rebuild(self, entries: Iterable[RecordingEntry]) -> dict[str, HybridlogError]:
         """Rebuild the index of recordings from their segments; returns why some are unchanged.

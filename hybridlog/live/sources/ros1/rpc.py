@@ -65,41 +65,46 @@ async def call(network: Network, uri: str, method: str, *arguments: Any) -> obje
 
 async def _exchange(connected: socket.socket, request: bytes) -> bytes:
     """Sends a request, and returns the body of the answer."""
+    await asyncio.get_running_loop().sock_sendall(connected, request)
+    words, length, begun = await _head(connected)
+    if len(words) < 2 or not words[0].startswith(b"HTTP/"):
+        raise PeerError("it does not speak HTTP")
+    if words[1] != b"200":
+        raise PeerError(f"it answers {one_line(b' '.join(words[1:]))}")
+    return await _body(connected, begun, length, _MAX_ANSWER)
+
+
+async def _head(connected: socket.socket) -> tuple[list[bytes], int | None, bytearray]:
+    """The words of the first line of a call or answer, the length of its body, and its begin."""
     loop = asyncio.get_running_loop()
-    await loop.sock_sendall(connected, request)
     got = bytearray()
-    total: int | None = None
-    body = -1
-    while total is None or len(got) < total:
+    while (end := got.find(b"\r\n\r\n")) < 0:
+        data = await loop.sock_recv(connected, 64 << 10)
+        if not data or len(got) > _MAX_HTTP_HEADER:
+            raise PeerError("it does not speak HTTP")
+        got += data
+    first, *fields = bytes(got[:end]).split(b"\r\n")
+    return first.split(None, 2), _content_length(fields), got[end + 4 :]
+
+
+async def _body(connected: socket.socket, got: bytearray, length: int | None, most: int) -> bytes:
+    """The body of a call or answer; without a length, all that comes."""
+    loop = asyncio.get_running_loop()
+    while length is None or len(got) < length:
+        if max(length or 0, len(got)) > most:
+            raise PeerError(f"its answer is longer than {most >> 20} MiB")
         data = await loop.sock_recv(connected, 64 << 10)
         if not data:
-            break
+            if length is None:
+                break
+            raise PeerError("it closed in the middle of its answer")
         got += data
-        if body < 0:
-            body = got.find(b"\r\n\r\n")
-            if body < 0 and len(got) > _MAX_HTTP_HEADER:
-                raise PeerError("it answers with an endless header")
-            if body >= 0:
-                body += 4
-                length = _content_length(bytes(got[:body]))
-                total = None if length is None else body + length
-        if body >= 0 and max(total or 0, len(got)) > body + _MAX_ANSWER:
-            raise PeerError(f"its answer is longer than {_MAX_ANSWER >> 20} MiB")
-    if body < 0:
-        raise PeerError("it does not speak HTTP")
-    if total is not None and len(got) < total:
-        raise PeerError("it closed in the middle of its answer")
-    status = bytes(got[: got.find(b"\r\n")]).split(None, 2)
-    if len(status) < 2 or not status[0].startswith(b"HTTP/"):
-        raise PeerError("it does not speak HTTP")
-    if status[1] != b"200":
-        raise PeerError(f"it answers {one_line(b' '.join(status[1:]))}")
-    return bytes(got[body:total])
+    return bytes(got[:length])
 
 
-def _content_length(head: bytes) -> int | None:
-    """The content length in an HTTP header, None if it has none."""
-    for line in head.split(b"\r\n")[1:]:
+def _content_length(fields: list[bytes]) -> int | None:
+    """The content length in the lines of an HTTP header, None if it has none."""
+    for line in fields:
         name, _, value = line.partition(b":")
         if name.strip().lower() == b"content-length":
             value = value.strip()
@@ -199,31 +204,16 @@ class RpcServer:
         loop = asyncio.get_running_loop()
         with contextlib.suppress(OSError, PeerError):
             async with asyncio.timeout(PATIENCE_S):
-                values, method = _parsed(await self._request(client))
+                words, length, begun = await _head(client)
+                if words[:1] != [b"POST"] or length is None:
+                    return
+                values, method = _parsed(await _body(client, begun, length, _MAX_REQUEST))
                 body = self._result(method, values).encode()
                 head = (
                     "HTTP/1.0 200 OK\r\nContent-Type: text/xml\r\n"
                     f"Content-Length: {len(body)}\r\n\r\n"
                 )
                 await loop.sock_sendall(client, head.encode() + body)
-
-    async def _request(self, client: socket.socket) -> bytes:
-        loop = asyncio.get_running_loop()
-        got = bytearray()
-        while (end := got.find(b"\r\n\r\n")) < 0:
-            data = await loop.sock_recv(client, 64 << 10)
-            if not data or len(got) > _MAX_HTTP_HEADER:
-                raise PeerError("it does not speak HTTP")
-            got += data
-        length = _content_length(bytes(got[:end]))
-        if not got.startswith(b"POST ") or length is None or length > _MAX_REQUEST:
-            raise PeerError("its call is malformed")
-        while len(got) < end + 4 + length:
-            data = await loop.sock_recv(client, 64 << 10)
-            if not data:
-                raise PeerError("it closed in the middle of its call")
-            got += data
-        return bytes(got[end + 4 : end + 4 + length])
 
     def _result(self, method: str | None, values: tuple[object, ...]) -> str:
         known = self._methods.get(method or "")
