@@ -80,7 +80,8 @@ channel = text_channel()
 for number in range({MESSAGES}):
     live.write(channel, text(str(number)))
 deadline = time.monotonic() + 30
-while not live.lag == 0 == {MESSAGES} - live.stored[0] and time.monotonic() < deadline:
+capture = live.capture
+while time.monotonic() < deadline and (capture.lag or capture.writer.totals.messages < {MESSAGES}):
     time.sleep(0.02)
 time.sleep(2)  # twenty times what flushing takes
 os._exit(9)

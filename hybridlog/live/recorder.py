@@ -327,7 +327,7 @@ class Recorder:
         self._retention.stop()
         self._incidents.stop()
         if self._is_marked(self._target.id) or (
-            not (self.stopped_for_disk and self._target.is_empty)
+            not (self.stopped_for_disk and self._target.first_time is None)
             and (self._recorded_by_content or any(source.was_reached for source in self._sources))
         ):
             report = self._target.close()
@@ -378,20 +378,20 @@ class Recorder:
                 lost.update({cause.value: count for cause, count in one.lost.items()})
             shown = [one for one in self._topics.values() if one.tallies or one.is_present]
         topics = [one.look(elapsed, now_steady) for one in sorted(shown, key=attrgetter("topic"))]
-        stored, stored_bytes = self._target.stored
-        failure = self._target.index_failure
+        capture = self._target.capture
+        stored, failure = capture.writer.totals, capture.follower.state.failure
         state = RecorderState(
             self.name,
             now - self._started,
             topics,
             sum(topic.messages for topic in topics),
-            stored,
+            stored.messages,
             dict(lost),
             self._target.filled,
-            self._target.lag,
+            capture.lag,
             "" if failure is None else str(failure),
             shutil.disk_usage(self._directory.path).free,
-            stored_bytes,
+            stored.payload_bytes,
             self._stalled_s(now),
             incidents=self._incidents.count,
             let_go=None if self._ring is None else self._ring.messages,
@@ -407,8 +407,8 @@ class Recorder:
         return state
 
     def _stalled_s(self, now: float) -> float:
-        taken, written = self._target.progress
-        if taken <= written or written != self._written:
+        written = self._target.capture.writer.written.total()
+        if self._target.taken.total() <= written or written != self._written:
             self._written, self._written_at = written, now
         waited = now - self._written_at - self._options.flush_interval_s
         return waited if waited > _SLOW_WRITE_S else 0.0

@@ -90,7 +90,7 @@ class Ring:
         for number, log in sorted(now.logs.items(), reverse=True):
             came: Counter[Hashable] = Counter()
             for one, part in log.parts.items():
-                channel = self._recording.channels.get(one)
+                channel = self._recording.capture.writer.channels.get(one)
                 depth = 0 if channel is None else depth_of(channel)
                 if channel is not None and depth and part.messages:
                     publisher = publisher_of(channel)
