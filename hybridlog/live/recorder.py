@@ -22,7 +22,7 @@ from hybridlog.entries import text as as_text
 from hybridlog.entries import with_said
 from hybridlog.follow.child import RECOVERED, FollowerProcess, Task
 from hybridlog.live.clocks import CLOCK, MachineClock, SimulatedTime
-from hybridlog.live.incidents import Incidents, Moment
+from hybridlog.live.incidents import GROUPS, RULE, Incidents, Moment, Ring, Silence, SilenceWatch
 from hybridlog.live.memory import resident_bytes
 from hybridlog.live.policy import (
     SMALL_BYTES,
@@ -33,10 +33,7 @@ from hybridlog.live.policy import (
     first_fit,
 )
 from hybridlog.live.recording import LiveOptions, LiveRecording, follow_interval_s
-from hybridlog.live.ring import GROUPS, Ring
-from hybridlog.live.silence import RULE, Silence, SilenceWatch
-from hybridlog.live.state import RecorderState, StateFile
-from hybridlog.live.statistics import Tally, TopicCounts
+from hybridlog.live.state import RecorderState, StateFile, Tally, TopicCounts
 from hybridlog.maintenance.edit import remove_if
 from hybridlog.maintenance.keep import RetentionThread
 from hybridlog.maintenance.retention import Rules

@@ -390,8 +390,8 @@ def _serve() -> NoReturn:
     import hybridlog.columns.tables
     import hybridlog.formats.mcap.reader
     import hybridlog.maintenance.copying
+    import hybridlog.maintenance.derived
     import hybridlog.maintenance.edit
-    import hybridlog.maintenance.index
     import hybridlog.maintenance.repair
     import hybridlog.record.recorder
     import hybridlog.store

@@ -11,8 +11,8 @@ import pytest
 import hybridlog as hl
 from hybridlog.contract import Contract, TopicRules
 from hybridlog.contract.judge import broken
+from hybridlog.live.incidents import Silence, SilenceWatch
 from hybridlog.live.recorder import Recorder, RecorderOptions
-from hybridlog.live.silence import Silence, SilenceWatch
 from hybridlog.live.sources.replay import ReplaySource
 from hybridlog.record.marks import MARKS
 from tests.across.test_check import write_mcap
