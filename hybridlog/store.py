@@ -933,7 +933,7 @@ class Store:
     def _repair(
         self, names: Mapping[str, str] | None, progress: Progress | None
     ) -> tuple[list[Repaired], list[Finding]]:
-        from hybridlog.maintenance.repair import repair, repair_index
+        from hybridlog.maintenance.verify import repair, repair_index
 
         done, left = repair(self.directory, self.catalog, self.repairs, names)
         self.refresh()

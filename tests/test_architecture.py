@@ -78,10 +78,7 @@ ALLOWED = {
     ),
     "obstore": ("hybridlog_storage.remote.bucket",),
     "pandas": ("hybridlog.frames", "hybridlog.training.lerobot"),
-    "picows": (
-        "hybridlog.live.sources.foxglove.connection",
-        "hybridlog.live.sources.foxglove.session",
-    ),
+    "picows": ("hybridlog.live.sources.foxglove.connection",),
     "polars": ("hybridlog.frames.frame",),
     "pyarrow": (
         "hybridlog.across",

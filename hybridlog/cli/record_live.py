@@ -125,7 +125,7 @@ def _record(choices: RecordChoices) -> None:
 def recorder_options(choices: RecordChoices) -> RecorderOptions:
     """Options for the recorder from those of the command; patterns are checked."""
     from hybridlog.contract import Contract
-    from hybridlog.follow.triggers import Trigger
+    from hybridlog.follow.child import Trigger
     from hybridlog.live.memory import default_budget
     from hybridlog.live.policy import priority_rule, throttle_rule
     from hybridlog.live.recorder import RecorderOptions

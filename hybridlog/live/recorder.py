@@ -56,7 +56,7 @@ from hybridlog_storage.messages import REDUCED, Channel, left_channel
 
 if TYPE_CHECKING:
     from hybridlog.contract import Contract
-    from hybridlog.follow.triggers import Trigger
+    from hybridlog.follow.child import Trigger
     from hybridlog.live.sources.base import LiveSource, Sink
     from hybridlog.query.topics import TopicMatcher
     from hybridlog.record.recorder import RecordReport

@@ -392,7 +392,7 @@ def _serve() -> NoReturn:
     import hybridlog.maintenance.copying
     import hybridlog.maintenance.derived
     import hybridlog.maintenance.edit
-    import hybridlog.maintenance.repair
+    import hybridlog.maintenance.verify
     import hybridlog.record.recorder
     import hybridlog.store
     import tests.faults.logs

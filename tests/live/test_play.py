@@ -23,7 +23,7 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.contract import Contract, TopicRules
-from hybridlog.follow.triggers import Trigger
+from hybridlog.follow.child import Trigger
 from hybridlog.live import ring
 from hybridlog.live.recorder import Recorder, RecorderOptions
 from hybridlog.maintenance.edit import mark_now

@@ -12,7 +12,7 @@ import pytest
 import hybridlog as hl
 from hybridlog.entries import summary_by, summary_of, topic_types
 from hybridlog.follow import child
-from hybridlog.follow.triggers import Trigger
+from hybridlog.follow.child import Trigger
 from hybridlog.live import incidents
 from hybridlog.live import ring as ring_module
 from hybridlog.live.recorder import RecorderOptions

@@ -12,8 +12,12 @@ import pytest
 
 from hybridlog.live.sources.base import Cause, Loss
 from hybridlog.live.sources.ros2.overrides import read_overrides
-from hybridlog.live.sources.ros2.process import PYTHON_VARIABLE, candidates, environment_for
-from hybridlog.live.sources.ros2.source import Ros2Source
+from hybridlog.live.sources.ros2.source import (
+    PYTHON_VARIABLE,
+    Ros2Source,
+    candidates,
+    environment_for,
+)
 from hybridlog_storage.errors import MissingDependencyError, SourceError, UsageError
 from tests.limits import Limit
 from tests.live.sources.heard import Heard, must_return

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Final
 from hybridlog.live.sources.base import PeerError, ThreadedSource
 from hybridlog.live.sources.network import Endpoint, Network, endpoint_of
 from hybridlog.live.sources.ros1.graph import Graph, Master
-from hybridlog.live.sources.ros1.reader import Reader
 from hybridlog.live.sources.ros1.rpc import RpcServer, listen, methods, uri_of
+from hybridlog.live.sources.ros1.stream import Reader
 from hybridlog.live.sources.ros1.subscription import Context
 from hybridlog_storage.errors import UsageError
 

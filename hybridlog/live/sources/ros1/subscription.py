@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from hybridlog.live.sources.base import Sink
     from hybridlog.live.sources.network import Network
-    from hybridlog.live.sources.ros1.reader import Reader
+    from hybridlog.live.sources.ros1.stream import Reader
     from hybridlog_storage.messages import Channel
 
 
