@@ -461,23 +461,13 @@ def repair_index(
     *,
     progress: Progress | None = None,
 ) -> list[Repaired]:
-    """Index those of some recordings that are not completely indexed."""
-    known = IndexState(database).of([entry.key for entry in entries])
+    """Index recordings anew whose damaged chunks are readable again."""
     done = []
     for entry in entries:
-        indexed = known.get(entry.key)
-        if entry.status == "open":
-            continue
-        is_restored = _is_restored(directory, catalog, entry)
-        is_whole = indexed is not None and indexed.is_whole(entry) and entry.is_decoded
-        if is_whole and not is_restored:
-            continue
-        with suppress(HeldError, TopicError):
-            chunks = bring(
-                directory, catalog, entry, database, anew=is_restored, progress=progress
-            ).chunks
-            how = "damaged chunks are readable again" if is_restored else f"{chunks} chunks indexed"
-            done.append(Repaired(entry.name, "index", how))
+        if entry.status != "open" and _is_restored(directory, catalog, entry):
+            with suppress(HeldError, TopicError):
+                bring(directory, catalog, entry, database, anew=True, progress=progress)
+                done.append(Repaired(entry.name, "index", "damaged chunks are readable again"))
     return done
 
 
