@@ -196,7 +196,7 @@ def test_a_disk_that_has_room_for_little_more(
     channel = scan_channel()
     for number in range(5):
         robot.speaker.say(channel, scan(number, 400_000))
-    wait_for(lambda: robot.recorder._target._capture.writer.written.total() == 5)  # type: ignore[union-attr]
+    wait_for(lambda: robot.recorder._target.capture.writer.written.total() == 5)  # type: ignore[union-attr]
     pwritev = os.pwritev
 
     def full(fd: int, pieces: list[memoryview], position: int) -> int:

@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 
 from hybridlog.live.sources.base import Cause, Loss
-from hybridlog.live.sources.ros2.overrides import read_overrides
 from hybridlog.live.sources.ros2.source import (
     PYTHON_VARIABLE,
     Ros2Source,
     candidates,
     environment_for,
+    read_overrides,
 )
 from hybridlog_storage.errors import MissingDependencyError, SourceError, UsageError
 from tests.limits import Limit

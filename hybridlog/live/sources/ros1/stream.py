@@ -20,7 +20,6 @@ from collections import deque
 from typing import TYPE_CHECKING, Final
 
 from hybridlog.live.sources.base import Cause, Loss, one_line
-from hybridlog.live.sources.ros1.handshake import u32
 from hybridlog.live.sources.sequence_gaps import (
     SequenceGap,
     SequenceGapDetector,
@@ -32,6 +31,9 @@ if TYPE_CHECKING:
 
     from hybridlog.live.sources.base import Sink
     from hybridlog_storage.messages import Channel
+
+u32: Final[Callable[..., tuple[int]]] = struct.Struct("<I").unpack_from
+"""Reads the number at an offset of a buffer, as a tuple."""
 
 _BLOCK: Final = 256 << 10
 _LARGE: Final = 64 << 10
