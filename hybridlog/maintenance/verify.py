@@ -33,7 +33,7 @@ from hybridlog.follow.follower import bring, make_tables
 from hybridlog.index import consent
 from hybridlog.maintenance import tables
 from hybridlog.maintenance.opening import recover, recover_segments
-from hybridlog.maintenance.report import Repaired
+from hybridlog.maintenance.report import Repaired, reporter
 from hybridlog_storage.catalog import file_of
 from hybridlog_storage.disk.directory import LOCK, LOCK_WAIT_S
 from hybridlog_storage.errors import (
@@ -231,11 +231,7 @@ class _Check:
         total = sum(sizes.values())
         before = 0
         for number, name in sealed.items():
-
-            def tell(at: int, before: int = before) -> None:
-                if progress is not None and total:
-                    progress(self._name, min(before + at, total), total)
-
+            tell = reporter(progress if total else None, self._name, total, before)
             self._segment(inventory, number, name, tell)
             before += sizes.get(number, 0)
         self._files(inventory, left, is_held=holder is not None)
