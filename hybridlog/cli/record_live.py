@@ -158,6 +158,7 @@ def recorder_options(choices: RecordChoices) -> RecorderOptions:
         after_s=choices.after or 0.0,
         no_index=no_index,
         use_sim_time=choices.use_sim_time,
+        derives=not choices.no_derive,
         contract=None if choices.contract is None else Contract.read(choices.contract),
     )
 

@@ -42,6 +42,7 @@ from hybridlog.record.losses import Cause, Loss
 from hybridlog.record.marks import CLOCK_SET, CONTRACT
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.completion import completed
+from hybridlog.wording import size
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import (
     DiskFullError,
@@ -81,7 +82,8 @@ class RecorderOptions(LiveOptions):
 
     It stops after `max_bytes` of payloads, or when less than `reserve_bytes` are free. After
     `ring_s` messages go that no pin touches. What lies `before_s` (None: as long as the ring) and
-    `after_s` around a trigger or signal is marked and pinned.
+    `after_s` around a trigger or signal is marked and pinned. Unless it `derives`, tables and index
+    are left to a later command.
     """
 
     name: str = "live"
@@ -98,6 +100,7 @@ class RecorderOptions(LiveOptions):
     after_s: float = 0.0
     use_sim_time: bool = False
     contract: Contract | None = None
+    derives: bool = True
 
     def __post_init__(self) -> None:
         """Refuse limits that would stop the recorder at once, and a ring that holds too little."""
@@ -150,6 +153,10 @@ class Recorder:
         say: Callable[[str], None],
         clock: MachineClock | None = None,
     ) -> None:
+        if not (options.derives or Rules.of(store.directory.settings.retention).is_empty):
+            raise UsageError(
+                "The rules of this store delete what the follower has read: leave out --no-derive."
+            )
         self._clock = clock or MachineClock()
         self._sources = sources
         self._options = options
@@ -220,7 +227,7 @@ class Recorder:
             raise
 
     def _begin_to_follow(self, entry: RecordingEntry) -> FollowerProcess:
-        index, triggers = self._shared.index, self._options.triggers
+        index, options, triggers = self._shared.index, self._options, self._options.triggers
         task = Task(
             self._directory.address,
             index.wanted,
@@ -234,7 +241,7 @@ class Recorder:
             self._shared.catalog,
             task,
             triggers,
-            has_documents=index.is_wanted,
+            has_documents=index.is_wanted and options.derives,
             hit=lambda text, time: self.fire(text, self._passed(time)),
             say=self.say,
         )
@@ -265,7 +272,8 @@ class Recorder:
                 recording is removed.
         """
         try:
-            self._follower.start()
+            if self._options.derives:
+                self._follower.start()
             for source in self._sources:
                 source.start(self._sink)
         except BaseException:
@@ -545,7 +553,7 @@ class Recorder:
             else:
                 self._lose_for_room(recorded, received)
         except HybridlogError as error:
-            cause = _cause_of(error)
+            cause = Cause.DISK if isinstance(error, DiskFullError) else Cause.QUEUE
             self._refuse(cause, str(error))
             self._lose(recorded, cause, str(error), received)
 
@@ -755,11 +763,6 @@ class Recorder:
         self._incidents.note(new_random(), Moment(text, {"cause": CLOCK_SET, **tags}, at))
 
 
-def _cause_of(error: HybridlogError) -> Cause:
-    """The cause of the loss of a message that could not be written."""
-    return Cause.DISK if isinstance(error, DiskFullError) else Cause.QUEUE
-
-
 def make_room(store: Store, reserve_bytes: int) -> None:
     """Check that a disk has as much free space as the reserve, once the store's rules made room.
 
@@ -784,9 +787,4 @@ def check_room(free_bytes: int, reserve_bytes: int, coming_bytes: float = 0) -> 
     """
     if free_bytes < reserve_bytes + coming_bytes:
         lower = ", or lower --reserve" if reserve_bytes else ""
-        left = _megabytes(free_bytes)
-        raise DiskFullError(f"The disk has only {left} left: free some{lower}.")
-
-
-def _megabytes(count: float) -> str:
-    return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"
+        raise DiskFullError(f"The disk has only {size(free_bytes)} left: free some{lower}.")

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from hybridlog.maintenance.report import Progress
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
-    from hybridlog_storage.manifest import File, Manifest
+    from hybridlog_storage.manifest import Manifest
 
     Remove = Callable[[str, Callable[[Manifest], None]], None]
 
@@ -252,7 +252,12 @@ class Keeper:
                 lock = self._directory.writing(step.id, step.recording, wait_s=LOCK_WAIT_S)
                 held.enter_context(lock)
             if step.groups:
-                let_go(self._directory, step.id, partial(_of_groups, step.groups), check)
+                let_go(
+                    self._directory,
+                    step.id,
+                    lambda now: [file for file in now.files if file.group in step.groups],
+                    check,
+                )
                 done = Expired(freed=step.bytes)
             else:
                 at_hand = self._directory.at_hand(step.id, step.segments, check)
@@ -265,10 +270,6 @@ class Keeper:
                     done = expire(here, step.id, step.segments, check=check, version=version, **how)
             self._changed(step.id)
         return done
-
-
-def _of_groups(groups: Sequence[int], manifest: Manifest) -> list[File]:
-    return [file for file in manifest.files if file.group in groups]
 
 
 def _check(step: Step, rules: Rules, manifest: Manifest) -> None:

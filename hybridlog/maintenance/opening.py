@@ -189,7 +189,7 @@ class StoreFiles:
             return None
         if files != state_of(listing, manifest):
             return None
-        if _is_interrupted(manifest, listing):
+        if not manifest.is_ended or listing.open or listing.left_over(manifest):
             holder = directory.holder(recording)
             if holder is None or not (holder.is_recording or entry.status != "open"):
                 return None
@@ -274,12 +274,6 @@ def recover(directory: StoreDirectory, recording: str, report: RepairReport) -> 
 
     directory.manifests.change(recording, change)
     return True
-
-
-def _is_interrupted(manifest: Manifest, listing: Listing) -> bool:
-    """True if a recording goes on, or a process has left something to mend."""
-    is_ended = manifest.is_ended and not listing.open
-    return not is_ended or bool(listing.left_over(manifest))
 
 
 def recover_segments(

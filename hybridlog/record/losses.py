@@ -163,7 +163,7 @@ def losses_of(entry: RecordingEntry) -> list[dict[str, Any]]:
         losses.append(
             _uncounted(CRASH, "its last segment is read once the store can be written again")
         )
-    if was_cut_short(entry):
+    if "recovered" in {entry.status, entry.end.get("status")}:  # a crash ended it
         losses.append(_uncounted(CRASH, "what came after its last message was not stored"))
         damage = entry.end.get("damage", [])
         losses.extend(_uncounted("damaged segment", str(reason)) for reason in damage)
@@ -174,11 +174,6 @@ def _uncounted(cause: str, reason: str) -> dict[str, Any]:
     """A loss of an unknown number of messages."""
     row: dict[str, Any] = {"cause": cause, "file": "", "offset": None, "reason": reason}
     return row | {"count": None, "topic": None}
-
-
-def was_cut_short(entry: RecordingEntry) -> bool:
-    """True for a recording that a crash ended, whatever its status is."""
-    return "recovered" in {entry.status, entry.end.get("status")}
 
 
 def extent_of(entry: RecordingEntry) -> tuple[int, int]:

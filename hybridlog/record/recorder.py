@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -44,7 +45,6 @@ if TYPE_CHECKING:
     from hybridlog.snapshot import Snapshot
     from hybridlog_storage.catalog import Catalog
     from hybridlog_storage.disk.directory import StoreDirectory
-    from hybridlog_storage.summary import RecordingSummary
 
 _FOLLOW_S = 0.5  # between two looks of the follower
 _MAX_PARTS = 1000  # of a log, whose fingerprints the recording has
@@ -140,11 +140,6 @@ def record(
     from hybridlog.follow.follower import in_thread  # a live recorder loads none of it
 
     started = time.monotonic()
-
-    def refuse_known(snapshot: Snapshot) -> None:
-        if not options.again:
-            _refuse_known(snapshot.by_fingerprint, source, fingerprint)
-
     capture = Capture(
         directory,
         catalog,
@@ -161,7 +156,7 @@ def record(
         },
         settings=options.settings,
         no_index=options.no_index,
-        check=refuse_known,
+        check=None if options.again else partial(_refuse_known, source, fingerprint),
     )
     try:
         copy = _Copy(source, capture.writer, options)
@@ -331,9 +326,8 @@ def _identity(fingerprint: Fingerprint) -> dict[str, object]:
     return {"fingerprint": fingerprint.whole, **parts}
 
 
-def _refuse_known(
-    recorded: Mapping[str, RecordingSummary], source: Source, fingerprint: Fingerprint
-) -> None:
+def _refuse_known(source: Source, fingerprint: Fingerprint, snapshot: Snapshot) -> None:
+    recorded = snapshot.by_fingerprint
     known = recorded.get(fingerprint.whole)
     if known is None and len(fingerprint.parts) > 1:
         parts = [recorded.get(part) for part in fingerprint.parts]

@@ -225,8 +225,7 @@ def test_no_password_is_shown() -> None:
 def test_without_picows_the_message_says_how_to_install_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    for module in ("connection", "session"):
-        monkeypatch.delitem(sys.modules, f"hybridlog.live.sources.foxglove.{module}", False)
+    monkeypatch.delitem(sys.modules, "hybridlog.live.sources.foxglove.connection", False)
     monkeypatch.setitem(sys.modules, "picows", None)
     with pytest.raises(MissingDependencyError, match=r"pip install 'hybridlog\[foxglove\]'"):
         FoxgloveSource("ws://127.0.0.1:1").start(Heard())

@@ -148,7 +148,7 @@ class Middleware:
         handle = node.create_subscription(
             message,
             topic,
-            _nothing,
+            lambda _: None,  # never called: the node does not spin
             self._quality(profile),
             raw=True,
             event_callbacks=self._silent,
@@ -219,10 +219,6 @@ class Middleware:
                 for name, value in profile._asdict().items()
             }
         )
-
-
-def _nothing(_message: object) -> None:
-    """Never called: the node does not spin."""
 
 
 def _no_callbacks() -> Any:
