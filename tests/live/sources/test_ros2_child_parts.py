@@ -22,9 +22,14 @@ from hybridlog.live.sources.ros2.child.definitions import (
     Definitions,
     UnknownTypeError,
 )
-from hybridlog.live.sources.ros2.child.middleware import Offer
+from hybridlog.live.sources.ros2.child.middleware import (
+    VARIABLES,
+    Offer,
+    default_profile,
+    is_set_up,
+    profile,
+)
 from hybridlog.live.sources.ros2.child.outbox import Outbox
-from hybridlog.live.sources.ros2.child.profile import VARIABLES, default_profile, is_set_up, profile
 from hybridlog.live.sources.ros2.child.qos import Profile
 from hybridlog.live.sources.ros2.child.topics import Topics
 from hybridlog.live.sources.ros2.child.wire import MAX_PAYLOAD
