@@ -269,7 +269,7 @@ def recover(directory: StoreDirectory, recording: str, report: RepairReport) -> 
     adopt = unlisted(inventory)
 
     def change(now: Manifest) -> Manifest:
-        now = now if adopt is None else adopt(now)
+        now = adopt(now)
         return now if now.is_ended else ended({"status": "recovered"})(now)
 
     directory.manifests.change(recording, change)

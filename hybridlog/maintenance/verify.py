@@ -27,7 +27,6 @@ from hybridlog.entries import (
     steady_inventory,
     take_inventory,
     topic_of,
-    unlisted,
 )
 from hybridlog.follow.follower import bring, make_tables
 from hybridlog.index import consent
@@ -434,15 +433,17 @@ def _manifest(directory: StoreDirectory, report: RepairReport, recording: str) -
 
         made = manifests.restore(recording, make)
         return [Repaired(made.name, "manifest", "made again")]
-    if left := directory.listing(recording).left_over(manifest):
-        recover(directory, recording, report)
+    left = directory.listing(recording).left_over(manifest)
+    misfits = take_inventory(directory, recording).misfits
     done = [Repaired(manifest.name, file, "left over, and removed") for file in left]
-    inventory = take_inventory(directory, recording)
-    if (adopt := unlisted(inventory)) is None:
-        return done
-    manifests.change(recording, adopt)
-    names = [misfit.file for misfit in inventory.misfits if misfit.is_unlisted]
-    return done + [Repaired(inventory.name, file, "listed in the manifest") for file in names]
+    done += [
+        Repaired(manifest.name, misfit.file, "listed in the manifest")
+        for misfit in misfits
+        if misfit.is_unlisted
+    ]
+    if done:
+        recover(directory, recording, report)
+    return done
 
 
 def repair_index(
