@@ -45,18 +45,22 @@ class Moment(NamedTuple):
 
 
 class Incidents:
-    """Marks and pins on a thread of its own, and lets what is too old for a ring go.
+    """Marks and pins on a thread of its own, looks for silences, lets what a ring has too long go.
 
-    Nothing goes before the hits that came until then are pinned. What fails is tried again. Without
-    a clock, as of a simulation, log times are steady.
+    `now` returns the present as a steady time, ns. Nothing goes before the hits that came until
+    then are pinned. What fails is tried again. Without a clock, as of a simulation, log times are
+    steady.
     """
 
     def __init__(
         self,
         change: Callable[[Callable[[Manifest], Manifest]], Manifest],
+        *,
         clock: MachineClock | None,
         first: Callable[[], int | None],
         ring: Ring | None,
+        silence: SilenceWatch,
+        now: Callable[[], int],
         say: Callable[[str], None],
     ) -> None:
         self.count = 0
@@ -64,6 +68,8 @@ class Incidents:
         self._clock = clock
         self._first = first
         self._ring = ring
+        self._silence = silence
+        self._now = now
         self._say = say
         self._set_by = 0
         self._last: dict[str, tuple[str, int, int]] = {}  # id, begin and end of hits, by text
@@ -81,8 +87,9 @@ class Incidents:
         """Begin."""
         self._thread.start()
 
-    def stop(self) -> None:
-        """Pin what waits, and end."""
+    def stop(self, ended_at: int) -> None:
+        """End all silences when the recording ended, ns; pin what waits, and end."""
+        self._now = lambda: ended_at
         self._over.set()
         if self._thread.is_alive():
             self._thread.join()
@@ -158,10 +165,11 @@ class Incidents:
         return (one.begin, end) if self._clock is None else self._clock.log_times(one.begin, end)
 
     def _run(self) -> None:
-        is_over = False
+        every_s, is_over = min(_EVERY_S, self._silence.interval_s), False
         while not is_over:
-            is_over = self._over.wait(_EVERY_S)
+            is_over = self._over.wait(every_s)
             try:
+                self._silence.look(self._now(), is_end=is_over)
                 now = time.monotonic()
                 self._follow_clock()
                 due = self._ring.due(now) if self._ring is not None and not is_over else set()
@@ -288,11 +296,10 @@ class SilenceWatch:
     Its times are steady ones, so that a clock that is set is no silence.
     """
 
-    def __init__(self, contract: Contract | None, now: Callable[[], int], note: Note) -> None:
+    def __init__(self, contract: Contract | None, note: Note) -> None:
         rules = [] if contract is None else contract.topics.items()
         self._limits = {n: r.longest_gap for n, r in rules if r.longest_gap is not None}
         self._optional = {name for name, rule in rules if rule.optional}
-        self._now = now
         self._note = note
         self._last: dict[str, int] = {}
         self._begin: int | None = None
@@ -300,28 +307,10 @@ class SilenceWatch:
         self._noted: dict[str, str] = {}  # ids of marks, by topics that are silent
         self._over: list[Silence] = []
         self._lock = threading.Lock()
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
         self.breaches = 0
-        shortest = min(self._limits.values(), default=0) / 1e9
+        shortest = min(self._limits.values(), default=10**10) / 1e9
         # So that a silence is told within twice its limit.
         self.interval_s = max(min(shortest / 4, _MAX_INTERVAL_S), 1e-3)
-
-    def start(self) -> None:
-        """Look in a thread, if there are topics."""
-        if self._limits:
-            self._thread.start()
-
-    def stop(self, ended_at: int) -> None:
-        """End all silences when the recording ended, ns."""
-        self._ended.set()
-        if self._thread.is_alive():
-            self._thread.join()
-        self.look(ended_at, is_end=True)
-
-    def _run(self) -> None:
-        while not self._ended.wait(self.interval_s):
-            self.look(self._now())
 
     def take(self, topic: str, time: int) -> None:
         """A message was stored, at a time, ns."""

@@ -182,7 +182,7 @@ class Recorder:
         self._written = 0
         self._stored_bytes = 0
         self._newest = max(store.summaries(), key=attrgetter("created"), default=None)
-        self._silence = SilenceWatch(options.contract, self._now, self._note_silence)
+        self._silence = SilenceWatch(options.contract, self._note_silence)
         self._settled_at = 0.0
         self._ended_at: int | None = None
         self._simulated: SimulatedTime | None = None
@@ -206,10 +206,12 @@ class Recorder:
         )
         self._incidents = Incidents(
             partial(self._directory.manifests.change, self._target.id),
-            None if options.use_sim_time else self._clock,
-            lambda: self._target.first_time,
-            self._ring,
-            self.say,
+            clock=None if options.use_sim_time else self._clock,
+            first=lambda: self._target.first_time,
+            ring=self._ring,
+            silence=self._silence,
+            now=self._now,
+            say=self.say,
         )
         try:
             self._retention = RetentionThread(
@@ -282,7 +284,6 @@ class Recorder:
             self._says.remove()
             self._target.abort()
             raise
-        self._silence.start()
         now = self._clock.now()
         if self._simulated is None and self._newest is not None and self._newest.created > now:
             says = f"the clock of this machine says {format_time(now)}"
@@ -324,13 +325,12 @@ class Recorder:
         for source in self._sources:
             source.stop()
         self._over.set()
-        self._silence.stop(ended_at)
         if self._simulated is not None:
             self._simulated.close()
         self._follower.wait_s, self._follower.left = wait_s, left
         self._says.remove()
         self._retention.stop()
-        self._incidents.stop()
+        self._incidents.stop(ended_at)
         if self._is_marked(self._target.id) or (
             not (self.stopped_for_disk and self._target.first_time is None)
             and (self._recorded_by_content or any(source.was_reached for source in self._sources))

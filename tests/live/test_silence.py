@@ -130,7 +130,7 @@ class Watch(SilenceWatch):
     def __init__(self, **topics: TopicRules) -> None:
         self.begun: list[tuple[str, int, int]] = []
         self.over: list[tuple[str, int, int]] = []
-        super().__init__(Contract(topics), lambda: 0, self.note)
+        super().__init__(Contract(topics), self.note)
 
     def note(self, one: Silence, mark: str, is_over: bool) -> None:
         (self.over if is_over else self.begun).append((one.topic, one.begin, one.end))
