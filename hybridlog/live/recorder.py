@@ -180,7 +180,6 @@ class Recorder:
         self._started = time.monotonic()
         self._looked = self._written_at = self._started
         self._written = 0
-        self._stored_bytes = 0
         self._newest = max(store.summaries(), key=attrgetter("created"), default=None)
         self._silence = SilenceWatch(options.contract, self._note_silence)
         self._settled_at = 0.0
@@ -727,9 +726,8 @@ class Recorder:
             if self.is_full:
                 self._end("its manifest is full")
                 return
-        grown, self._stored_bytes = state.stored_bytes - self._stored_bytes, state.stored_bytes
-        # Messages in memory will be written, and as many new ones before the next check.
-        coming = state.filled * options.budget_bytes + grown
+        # Messages in memory will be written, and those of a second until the next check.
+        coming = state.filled * options.budget_bytes + state.bytes_per_s
         try:
             check_room(state.free_bytes, options.reserve_bytes, coming)
         except DiskFullError as error:

@@ -10,8 +10,8 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from operator import index as index_of
 from queue import Empty, SimpleQueue
@@ -412,7 +412,7 @@ class LiveRecording:
         flushed = reported = time.monotonic()
         interval = self._options.flush_interval_s
         tick = min(_TICK_S, interval / 10)
-        with suppress(BaseException), self._failing():
+        try:
             while True:
                 with suppress(Empty):
                     self._calls.get(timeout=tick)
@@ -431,6 +431,11 @@ class LiveRecording:
                 if now - reported >= interval / 4:
                     self._write_losses()
                     reported = now
+        except BaseException as error:
+            # The threads that write and close would wait forever.
+            with self._lock:
+                self.failure = self.failure or error
+                self._room.notify_all()
 
     def _most_open(self) -> int | None:
         """Bytes that open chunks may have: what they hold is missing in the budget."""
@@ -439,17 +444,6 @@ class LiveRecording:
             return 0  # or nothing would ever make room
         budget = self._options.budget_bytes
         return budget // 8 if self._unwritten > budget // 4 else None
-
-    @contextmanager
-    def _failing(self) -> Iterator[None]:
-        """Pass any error on to the threads that write and close, which would wait forever."""
-        try:
-            yield
-        except BaseException as error:
-            with self._lock:
-                self.failure = self.failure or error
-                self._room.notify_all()
-            raise
 
     def _write_losses(self, *, everything: bool = False) -> None:
         rows = self.ledger.take(everything=everything)
