@@ -63,7 +63,6 @@ ALLOWED = {
         "hybridlog.columns",
         "hybridlog.entries",
         "hybridlog.live.sources.ros1",
-        "hybridlog.live.sources.ros2.receiver",
         "hybridlog.live.state",
         "hybridlog.maintenance",
         "hybridlog.record.capture",

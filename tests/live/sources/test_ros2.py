@@ -164,7 +164,7 @@ BROKEN = [
     ('raw(EVENT, 3, b"\\xff\\xfe{")', "JSON"),
     ('raw(EVENT, 200000, b"[" * 200000)', "JSON"),
     ('raw(EVENT, 4, b"[ 1]")', "not an object"),
-    ('event(event="what")', "Invalid value 'what'"),
+    ('event(event="what")', "a malformed event: {'event': 'what'}"),
     ('event(event="gone", topic=5)', "topic"),
     ('channel(number="x")', "number"),
     ('channel(definition="\\ud800")', "not text"),
