@@ -268,8 +268,8 @@ def test_a_channel_may_have_no_schema(unnamed: dict[str, object]) -> None:
 @pytest.mark.parametrize(
     ("entry", "words"),
     [
-        (5, "not a JSON object"),
-        (None, "not a JSON object"),
+        (5, "'id'"),
+        (None, "'id'"),
         ({}, "'id'"),
         ({**channel(), "id": True}, "'id'"),
         ({**channel(), "id": -1}, "'id'"),
@@ -458,7 +458,7 @@ def test_a_channel_that_is_offered_and_never_sent_is_told(limit: Limit) -> None:
         (text({"op": 5}), "without an operation"),
         (text({"op": "advertise"}), "something else than a list of channels"),
         (text({"op": "unadvertise", "channelIds": 5}), "something else than a list of channels"),
-        (advertise(5, channel(2, "")), "without a topic"),
+        (advertise(5, channel(2, "")), "without number"),
         (text({"op": "status", "level": 2, "message": "\x1b[31mbad\nnews"}), "says: ?[31mbad news"),
         (message(4711, 0, b"x"), "unknown subscription"),
         (frame(Opcode.BINARY, b""), "empty binary message"),

@@ -39,7 +39,6 @@ from hybridlog.live.sources.foxglove.protocol import (
     Address,
     Offer,
     parse_channel,
-    parse_text,
 )
 from hybridlog.live.sources.network import Endpoint, Network, reason_of
 from hybridlog.live.sources.sequence_gaps import (
@@ -405,22 +404,27 @@ class Session(WSListener):
     def _text(self, data: bytes) -> None:
         """Handle a JSON message; operations that do not matter to a recorder are ignored."""
         try:
-            message = parse_text(data)
-        except PeerError as error:
-            self._say(str(error))
+            message = json.loads(data.decode())
+        except (ValueError, RecursionError) as error:
+            self._say(f"sent a message that is not JSON ({error}); it is ignored")
             return
-        match message["op"]:
-            case "advertise":
-                self._advertise(message.get("channels"))
-            case "unadvertise":
-                self._unadvertise(message.get("channelIds"))
-            case "status":
+        match message:
+            case {"op": "advertise", "channels": list(channels)}:
+                self._advertise(channels)
+            case {"op": "unadvertise", "channelIds": list(numbers)}:
+                for number in numbers:
+                    if type(number) is int and number in self._subscriptions:
+                        self._retire(number)
+            case {"op": "advertise" | "unadvertise" as operation}:
+                self._say(f"sent something else than a list of channels to {operation}")
+            case {"op": "status"}:
                 self._status(str(message.get("message")))
+            case {"op": str()}:
+                pass
+            case _:
+                self._say("sent a JSON message without an operation ('op'); it is ignored")
 
-    def _advertise(self, channels: object) -> None:
-        if not isinstance(channels, list):
-            self._say("advertises something else than a list of channels")
-            return
+    def _advertise(self, channels: list[object]) -> None:
         wanted: list[_Subscription] = []
         for entry in channels:
             try:
@@ -467,14 +471,6 @@ class Session(WSListener):
             detail = "the connection was down; messages of this time are unknown"
             self._sink.lost(Loss(topic, Cause.CONNECTION, None, since, time.time_ns(), detail))
         return subscription
-
-    def _unadvertise(self, channels: object) -> None:
-        if not isinstance(channels, list):
-            self._say("unadvertises something else than a list of channels")
-            return
-        for number in channels:
-            if type(number) is int and number in self._subscriptions:
-                self._retire(number)
 
     def _retire(self, channel_id: int) -> None:
         """Remove a channel. Late messages of it are still recorded."""
