@@ -17,7 +17,6 @@ from hybridlog.live.sources.network import endpoint_of
 from hybridlog.live.sources.ros1.rpc import RpcServer
 from hybridlog.live.sources.ros1.stream import Stream
 from hybridlog.live.sources.ros1.subscription import (
-    WireError,
     channel_of,
     decode_header,
     encode_header,
@@ -41,7 +40,7 @@ from tests.live.sources.ros1_peers import Collector, framed
     ],
 )
 def test_a_broken_header_is_named(body: bytes, words: str) -> None:
-    with pytest.raises(WireError, match=words):
+    with pytest.raises(PeerError, match=words):
         decode_header(body)
 
 
@@ -54,7 +53,7 @@ def test_any_bytes_are_a_header_or_an_error() -> None:
             body[draw.randrange(len(body))] = draw.randrange(256)
         try:
             fields = decode_header(bytes(body[: draw.randrange(len(body) + 1)]))
-        except WireError:
+        except PeerError:
             continue
         channel_of("/t", fields)
 

@@ -260,10 +260,6 @@ _Protocol = tuple[
 ]
 
 
-class WireError(Exception):
-    """A malformed connection header; the message names the fault."""
-
-
 def encode_header(fields: Mapping[str, str]) -> bytes:
     """A connection header with its length."""
     lines = [f"{key}={value}".encode() for key, value in fields.items()]
@@ -277,15 +273,15 @@ def decode_header(body: bytes) -> dict[str, str]:
     pos = 0
     while pos < len(body):
         if pos + 4 > len(body):
-            raise WireError(f"its header has {len(body) - pos} surplus bytes")
+            raise PeerError(f"its header has {len(body) - pos} surplus bytes")
         end = pos + 4 + u32(body, pos)[0]
         if end > len(body):
-            raise WireError(f"a field of its header exceeds it by {end - len(body)} bytes")
+            raise PeerError(f"a field of its header exceeds it by {end - len(body)} bytes")
         key, equals, value = body[pos + 4 : end].partition(b"=")
         if not equals:
-            raise WireError(f"a field of its header has no '=': {one_line(key)}")
+            raise PeerError(f"a field of its header has no '=': {one_line(key)}")
         if len(fields) == _MAX_FIELDS:
-            raise WireError(f"its header has more than {_MAX_FIELDS} fields")
+            raise PeerError(f"its header has more than {_MAX_FIELDS} fields")
         fields[key.decode(errors="replace").strip()] = value.decode(errors="replace")
         pos = end
     return fields
@@ -362,10 +358,7 @@ async def _exchange_headers(connected: socket.socket, caller: str, topic: str) -
     length = u32(await _exactly(connected, 4), 0)[0]
     if length > MAX_HEADER:
         raise PeerError(f"it announces a connection header of {length} bytes")
-    try:
-        fields = decode_header(await _exactly(connected, length))
-    except WireError as error:
-        raise PeerError(str(error)) from error
+    fields = decode_header(await _exactly(connected, length))
     if "error" in fields:
         raise PeerError(f"it refuses: {one_line(fields['error'])}")
     return fields
