@@ -203,26 +203,24 @@ class FollowerProcess:
                 told += 1
             if not control.poll(_POLL_S):
                 continue
-            kind, *values = control.recv()
-            self._has_told |= kind in {"read", "state"}
-            if kind == "hit":
-                text, times = values
-                for at in times:
-                    self._hit(text, at)
-            elif kind == "read":
-                self._task = self._task._replace(seen=values[0])
-                self.judged = values[0][1]
-            elif kind == "seen":
-                self._has_seen = True
-            elif kind == "state":
-                (self.state,) = values
-            elif kind == "say":
-                self._say(*values)
-            elif kind == "failed":
-                (self._why,) = values
-                return False
-            else:
-                return True
+            match control.recv():
+                case ("hit", text, times):
+                    for at in times:
+                        self._hit(text, at)
+                case ("read", seen):
+                    self._has_told, self.judged = True, seen[1]
+                    self._task = self._task._replace(seen=seen)
+                case ("seen",):
+                    self._has_seen = True
+                case ("state", state):
+                    self._has_told, self.state = True, state
+                case ("say", text):
+                    self._say(text)
+                case ("failed", why):
+                    self._why = why
+                    return False
+                case _:
+                    return True
         return False
 
 

@@ -216,7 +216,7 @@ def test_a_message_too_large_for_the_wire_is_refused(limit: Limit) -> None:
     with ours, theirs:
         outbox = Outbox(theirs)
         outbox.message(0, bytes(11), 1, 0, -1)
-        assert outbox.refused[0].count == 1
+        assert outbox.refused[0][0] == 1
 
 
 class FakeSubscription:
