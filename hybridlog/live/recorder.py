@@ -216,9 +216,10 @@ class Recorder:
             self._retention = RetentionThread(
                 store.directory,
                 partial(remove_if, store.shared),
-                self._target,
-                options.reserve_bytes,
-                self.say,
+                self._target.id,
+                sealed=lambda: self._target.sealed,
+                reserve=options.reserve_bytes,
+                say=self.say,
                 window=round((options.before_s or ring_s or 0) * 1e9),
                 judged=lambda: self._follower.judged,
             )

@@ -16,7 +16,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final
 
 from hybridlog.maintenance.expiry import Expired, expire, let_go
 from hybridlog.maintenance.retention import (
@@ -61,16 +61,6 @@ _SPARE_SHARE: Final = 64  # of the quota, at most
 _LEAST_SPARE: Final = 1 << 16
 
 
-class Own(Protocol):
-    """The recording that this process makes; it holds the lock of it."""
-
-    id: str
-
-    @property
-    def sealed(self) -> int:
-        """Number of segments sealed so far."""
-
-
 @dataclass(slots=True)
 class KeepReport:
     """The result of a pass.
@@ -91,7 +81,7 @@ class Keeper:
 
     Args:
         remove: Removes a whole recording, by its id, unless a check of its manifest raises.
-        own: The recording that this process makes; None if it makes none.
+        own: Id of the recording that this process makes, and so holds; None if it makes none.
         window: The newest of it that goes last, ns: a trigger may want it.
         judged: Returns the numbers of its segments that triggers have seen, None for all: the
             others go last.
@@ -103,7 +93,7 @@ class Keeper:
         self,
         directory: StoreDirectory,
         remove: Remove,
-        own: Own | None = None,
+        own: str | None = None,
         *,
         window: int = 0,
         judged: Callable[[], Collection[int] | None] = lambda: None,
@@ -195,7 +185,7 @@ class Keeper:
                 self._unproven.add(manifest.name)
                 continue
             failed = self._failed[manifest.id]
-            is_own = self._is_own(manifest.id)
+            is_own = manifest.id == self._own
             if is_own:
                 held = held_of(manifest, now, self._window, self._judged())
             else:
@@ -210,9 +200,6 @@ class Keeper:
             ):
                 left, held = [], replace(held, is_ended=False)
             yield replace(held, segments=left)
-
-    def _is_own(self, recording: str) -> bool:
-        return self._own is not None and recording == self._own.id
 
     def _do(self, step: Step, rules: Rules, found: KeepReport, how: Mapping[str, Any]) -> None:
         """Do a step, with the room of the spare file if there is no other; reports in `found`."""
@@ -246,7 +233,7 @@ class Keeper:
         if not step.segments and not step.groups:
             self._remove(step.id, check)
             return Expired(freed=step.bytes)
-        is_own = self._is_own(step.id)
+        is_own = step.id == self._own
         with ExitStack() as held:
             if not is_own:
                 lock = self._directory.writing(step.id, step.recording, wait_s=LOCK_WAIT_S)
@@ -339,6 +326,8 @@ class RetentionThread:
 
     Args:
         remove: Removes a whole recording, by its id, unless a check of its manifest raises.
+        own: Id of the recording that this process makes.
+        sealed: Returns the number of its segments that are sealed.
         reserve: Bytes that the recorder wants free at least, where rules may make room.
         say: Shows a line to the user, each text once.
         window: The newest of the recording that goes last, ns.
@@ -349,10 +338,11 @@ class RetentionThread:
         self,
         directory: StoreDirectory,
         remove: Remove,
-        own: Own,
+        own: str,
+        *,
+        sealed: Callable[[], int],
         reserve: int,
         say: Callable[[str], None],
-        *,
         window: int,
         judged: Callable[[], Collection[int] | None],
     ) -> None:
@@ -365,7 +355,7 @@ class RetentionThread:
             judged=judged,
             is_wanted=lambda: not self._over.is_set(),
         )
-        self._own = own
+        self._sealed = sealed
         self._reserve = self._wanted = reserve
         self._say = say
         self._over = threading.Event()
@@ -419,7 +409,7 @@ class RetentionThread:
         looked = last_pass = -_AGES_S
         sealed = 0
         while not self._over.wait(_TICK_S):
-            now, count, is_low = time.monotonic(), self._own.sealed, False
+            now, count, is_low = time.monotonic(), self._sealed(), False
             is_asked = self._asked > self._passes
             freed = 0
             try:
