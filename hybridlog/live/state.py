@@ -165,12 +165,11 @@ def _resolve(name: str, recorders: Mapping[str, str]) -> str:
     Raises:
         UsageError: No recorder matches, or several do.
     """
-    whole = [one for one, known in recorders.items() if name in {one, known}]
-    named = [one for one, known in recorders.items() if name and known.startswith(name)]
-    begun = [
-        one for one in recorders if name and name in {one[: len(name)], one[-16:][: len(name)]}
+    fitting = [one for one, known in recorders.items() if name in {one, known}] or [
+        one
+        for one, known in recorders.items()
+        if name and any(text.startswith(name) for text in (known, one, one[-16:]))
     ]
-    fitting = whole or named or begun
     if len(fitting) != 1:
         what = "is ambiguous" if fitting else "is no running recorder"
         known = ", ".join(recorders[one] for one in fitting or recorders)

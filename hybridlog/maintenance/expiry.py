@@ -320,18 +320,11 @@ def may_go(log: File) -> bool:
 
 
 def _remove(folder: Path, names: Collection[str]) -> None:
-    """Remove files, if they are there."""
-    failure: OSError | None = None
-    for name in names:
-        try:
-            files.unlink(folder / name)
-        except FileNotFoundError:
-            continue
-        except OSError as error:
-            failure = failure or error
+    """Remove files, if they are there; after an error, the next opening removes the others."""
     try:
-        if failure is not None:
-            raise failure
+        for name in names:
+            with suppress(FileNotFoundError):
+                files.unlink(folder / name)
         if names:
             files.sync_folder(folder)
     except OSError as error:

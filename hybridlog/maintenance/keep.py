@@ -206,26 +206,23 @@ class Keeper:
         if self._failed[step.id] and not step.segments:
             return  # planned before it was known: the next plan judges again
         check = partial(_check, step, rules)
-        try:
+        while True:
             try:
                 done = self._done(step, check, how)
+                break
             except DiskFullError:
                 if not use_spare(self._directory):
                     raise
-                done = self._done(step, check, how)
-        except DiskFullError:
-            raise
-        except ChangedError as error:  # the next plan judges again
-            found.problems.append(str(error))
-        except (StoreError, TopicError) as error:
-            found.problems.append(str(error))
-            self._failed[step.id].add(_WHOLE)
-        else:
-            found.freed_bytes += done.freed
-            for number, reason in done.damaged.items():
-                cure = "Its payloads stay until the file is restored from a copy"
-                found.problems.append(f"{reason}. {cure}")
-                self._failed[step.id].add(number)
+            except (StoreError, TopicError) as error:
+                found.problems.append(str(error))
+                if not isinstance(error, ChangedError):  # else the next plan judges again
+                    self._failed[step.id].add(_WHOLE)
+                return
+        found.freed_bytes += done.freed
+        for number, reason in done.damaged.items():
+            cure = "Its payloads stay until the file is restored from a copy"
+            found.problems.append(f"{reason}. {cure}")
+            self._failed[step.id].add(number)
 
     def _done(
         self, step: Step, check: Callable[[Manifest], None], how: Mapping[str, Any]
