@@ -347,7 +347,7 @@ def test_a_user_who_may_only_read_can_ask_everything(
             with pytest.raises(DatabaseError, match="may only read"):
                 change()
         recording = opened.start("more")
-        assert "may only read" in str(recording.capture.follower.state.failure)
+        assert "may only read" in str(recording.index_failure)
         recording.abort()
     # What the index lacks is answered by tables and messages, and is not written.
     shutil.move(store, tmp_path / "moved")

@@ -149,7 +149,7 @@ def test_a_live_recording_while_the_server_comes(tmp_path: Path, calls: Calls) -
         with store.start("live", LiveOptions(flush_interval_s=0.1)) as recording:
             for one in messages(0, 50, 0):
                 recording.write(CHANNELS[one.topic], one.raw, log_time=one.log_time)
-            assert str(recording.capture.follower.state.failure) == "MongoDB does not answer"
+            assert str(recording.index_failure) == "MongoDB does not answer"
             away = False
         report = recording.close()
         assert (report.failure, report.indexed) == (None, report.entry.documents)

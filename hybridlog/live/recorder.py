@@ -383,20 +383,20 @@ class Recorder:
                 lost.update({cause.value: count for cause, count in one.lost.items()})
             shown = [one for one in self._topics.values() if one.tallies or one.is_present]
         topics = [one.look(elapsed, now_steady) for one in sorted(shown, key=attrgetter("topic"))]
-        capture = self._target.capture
-        stored, failure = capture.writer.totals, capture.follower.state.failure
+        stored, stored_bytes = self._target.stored
+        failure = self._target.index_failure
         state = RecorderState(
             self.name,
             now - self._started,
             topics,
             sum(topic.messages for topic in topics),
-            stored.messages,
+            stored,
             dict(lost),
             self._target.filled,
-            capture.lag,
+            self._target.lag,
             "" if failure is None else str(failure),
             shutil.disk_usage(self._directory.path).free,
-            stored.payload_bytes,
+            stored_bytes,
             self._stalled_s(now),
             incidents=self._incidents.count,
             let_go=None if self._ring is None else self._ring.messages,
@@ -412,8 +412,8 @@ class Recorder:
         return state
 
     def _stalled_s(self, now: float) -> float:
-        written = self._target.capture.writer.written.total()
-        if self._target.taken.total() <= written or written != self._written:
+        taken, written = self._target.progress
+        if taken <= written or written != self._written:
             self._written, self._written_at = written, now
         waited = now - self._written_at - self._options.flush_interval_s
         return waited if waited > _SLOW_WRITE_S else 0.0

@@ -24,7 +24,7 @@ from hybridlog.live.policy import SMALL_BYTES
 from hybridlog.record.capture import Capture
 from hybridlog.record.losses import Cause, Ledger, Loss
 from hybridlog.record.recorder import RecordReport
-from hybridlog_storage.errors import DiskFullError, UsageError
+from hybridlog_storage.errors import DatabaseError, DiskFullError, UsageError
 from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD
 from hybridlog_storage.messages import Channel, LooseBatch, Schema
 from hybridlog_storage.segments.segment_format import LOSSES_METADATA, json_metadata
@@ -286,6 +286,27 @@ class LiveRecording:
     def sealed(self) -> int:
         """Number of sealed segments."""
         return self.capture.writer.totals.segments
+
+    @property
+    def stored(self) -> tuple[int, int]:
+        """Messages in chunks, and the bytes of their payloads."""
+        totals = self.capture.writer.totals
+        return totals.messages, totals.payload_bytes
+
+    @property
+    def progress(self) -> tuple[int, int]:
+        """Messages taken, and those of them that are written to the disk."""
+        return self.taken.total(), self.capture.writer.written.total()
+
+    @property
+    def lag(self) -> int:
+        """Messages that are not indexed yet."""
+        return self.capture.lag
+
+    @property
+    def index_failure(self) -> DatabaseError | None:
+        """The error that stopped the index, None while it works."""
+        return self.capture.follower.state.failure
 
     @property
     def first_time(self) -> int | None:

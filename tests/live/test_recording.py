@@ -43,10 +43,6 @@ pytestmark = pytest.mark.mongo
 Seen = tuple[str, int, int, bytes]
 
 
-def stored(recording: LiveRecording) -> int:
-    return recording.capture.writer.totals.messages
-
-
 def channel(topic: str) -> Channel:
     return Channel(topic, "ros1", TEXT)
 
@@ -313,7 +309,7 @@ def test_memory_that_a_message_lies_in_is_held_until_it_is_laid_down(store: hl.S
         released.release()
         with pytest.raises(BufferError):
             reused.clear()
-        wait_for(lambda: stored(recording) == 2)
+        wait_for(lambda: recording.stored[0] == 2)
         wait_for(lambda: not recording._inbox)
     assert [m.raw for m in store.topic("/talk")] == [text(b"one"), text(b"two")]
 
@@ -336,7 +332,7 @@ def test_who_closes_it_while_the_same_thread_does_is_told(
     """As the handler of a signal may; what comes of it is left to whoever opens the store."""
     recording = store.start("talk")
     recording.write(channel("/talk"), text(b"kept"))
-    wait_for(lambda: recording.capture.lag == 0 and stored(recording) == 1)
+    wait_for(lambda: recording.lag == 0 and recording.stored[0] == 1)
     monkeypatch.setattr(recording.capture, "close", lambda _: recording.close())
     with recording:
         for _ in range(2):
@@ -388,14 +384,13 @@ def test_what_a_mongod_had_lost_when_it_died_is_indexed_again_and_counted_once(
     speech = channel("/speech")
     with store.start("talk", flush_interval_s=0.2) as recording:
         recording.write(speech, text(b"lost"), log_time=1)
-        wait_for(lambda: recording.capture.lag == 0 and stored(recording) == 1)
+        wait_for(lambda: recording.lag == 0 and recording.stored[0] == 1)
         database, key = store.shared.index.database_for("This"), recording.id[-16:]
         assert database.delete(collection_of("/speech"), {"_meta.rec": key}) == 1
         kill_mongod(store.directory.path)
         recording.write(speech, text(b"after"), log_time=2, publish_time=3)
-        follower = recording.capture.follower
-        wait_for(lambda: follower.state.failure is not None)
-        wait_for(lambda: follower.state.failure is None and recording.capture.lag == 1)
+        wait_for(lambda: recording.index_failure is not None)
+        wait_for(lambda: recording.index_failure is None and recording.lag == 1)
         report = recording.close()
     (found,) = report.entry.channels
     assert (found.stats.messages, found.stats.payload_bytes) == (2, 8 + 9)
@@ -417,7 +412,7 @@ def test_documents_of_many_chunks_are_sent_together(
             for own in topics:
                 recording.write(own, text(bytes([number]) * 2000), log_time=number)
             wait_for(lambda n=number: totals.chunks == 3 * (n + 1))
-        assert recording.capture.lag == 15
+        assert recording.lag == 15
         assert not inserted
     names = [collection for _, collection, *_ in inserted if collection.startswith("topic")]
     assert sorted(names) == [collection_of(own.topic) for own in topics]
@@ -437,15 +432,15 @@ def test_a_mongod_that_stands_still_costs_nothing(store: hl.Store) -> None:
 
     with store.start("talk") as recording:
         recording.write(speech, text(b"0"), log_time=1)
-        wait_for(lambda: recording.capture.lag == 0 and stored(recording) == 1)
+        wait_for(lambda: recording.lag == 0 and recording.stored[0] == 1)
         os.kill(pid, signal.SIGSTOP)
         try:
             must_return(write)
-            wait_for(lambda: stored(recording) == 99)
-            assert recording.capture.lag > 0
+            wait_for(lambda: recording.stored[0] == 99)
+            assert recording.lag > 0
         finally:
             os.kill(pid, signal.SIGCONT)
-        wait_for(lambda: recording.capture.lag == 0)
+        wait_for(lambda: recording.lag == 0)
     assert store.topic("/speech").count() == 99
 
 
@@ -475,7 +470,7 @@ with hl.open(sys.argv[2], create=True) as store, store.start("live", settings=sm
     speaker = threading.Thread(target=speak)
     speaker.start()
     speaker.join()
-    while recording.capture.writer.totals.messages < len(said) or recording.capture.lag:
+    while recording.stored[0] < len(said) or recording.lag:
         time.sleep(0.01)
     print(json.dumps([len(said), sorted(set(sys.modules) - before)]))
 """

@@ -80,7 +80,7 @@ class Running:
     def flushed(self, limit_s: float = 60) -> Known:
         """Wait until everything is in the files and the index; return what is there."""
         self.seen_by(self.before, limit_s)
-        wait_for(lambda: not self.recording.capture.lag)
+        wait_for(lambda: not self.recording.lag)
         return Known(self.sent)
 
     def seen_by(self, store: hl.Store, limit_s: float = 60) -> None:

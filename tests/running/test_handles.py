@@ -76,9 +76,9 @@ def test_a_segment_that_cannot_be_read_any_more_is_told(
                 assert time.monotonic() < deadline
                 time.sleep(0.02)
             assert not store.topic("said").completeness().has_losses
-            before = recording.capture.writer.totals.messages
+            before = recording.stored
             recording.write(SAID, b'{"n": 2}', log_time=START + 1)
-            while recording.capture.writer.totals.messages == before:
+            while recording.stored == before:
                 time.sleep(0.02)
             time.sleep(0.5)  # until it is flushed
 
