@@ -669,10 +669,9 @@ def ended(end: Mapping[str, Any]) -> Callable[[Manifest], Manifest]:
     return how
 
 
-def unlisted(inventory: Inventory) -> Callable[[Manifest], Manifest] | None:
+def unlisted(inventory: Inventory) -> Callable[[Manifest], Manifest]:
     """The change that lists valid segments which the manifest lacks, and what they need."""
-    numbers = [misfit.segment for misfit in inventory.misfits if misfit.is_unlisted]
-    return _listing_of(inventory, numbers) if numbers else None
+    return _listing_of(inventory, [one.segment for one in inventory.misfits if one.is_unlisted])
 
 
 def made_again(inventory: Inventory, old: Manifest | None) -> Manifest:

@@ -191,7 +191,7 @@ def _target(to: str | Path, options: CopyOptions, store: Store) -> Iterator[Targ
             yield Target(server, lambda name: free_name(name, server.names()))
         return
     if address is not None:
-        from hybridlog.maintenance.bucket_derived import bring_derived
+        from hybridlog.maintenance.derived import bring_derived
         from hybridlog_storage.remote.store import RemoteDirectory
 
         if source.place == address:
@@ -935,7 +935,7 @@ class Store:
     def _repair(
         self, names: Mapping[str, str] | None, progress: Progress | None
     ) -> tuple[list[Repaired], list[Finding]]:
-        from hybridlog.maintenance.repair import repair, repair_index
+        from hybridlog.maintenance.verify import repair, repair_index
 
         done, left = repair(self.directory, self.catalog, self.repairs, names)
         self.refresh()

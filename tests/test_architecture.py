@@ -63,7 +63,6 @@ ALLOWED = {
         "hybridlog.columns",
         "hybridlog.entries",
         "hybridlog.live.sources.ros1",
-        "hybridlog.live.sources.ros2.receiver",
         "hybridlog.live.state",
         "hybridlog.maintenance",
         "hybridlog.record.capture",
@@ -78,10 +77,7 @@ ALLOWED = {
     ),
     "obstore": ("hybridlog_storage.remote.bucket",),
     "pandas": ("hybridlog.frames", "hybridlog.training.lerobot"),
-    "picows": (
-        "hybridlog.live.sources.foxglove.connection",
-        "hybridlog.live.sources.foxglove.session",
-    ),
+    "picows": ("hybridlog.live.sources.foxglove.connection",),
     "polars": ("hybridlog.frames.frame",),
     "pyarrow": (
         "hybridlog.across",

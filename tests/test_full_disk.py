@@ -43,7 +43,7 @@ def test_a_crash_on_a_full_disk_waits_for_room(
         running = store.start("crash", flush_interval_s=0.05)
         for n in range(50):
             running.write(channel, b'{"n": %d}' % n, log_time=n)
-        while sum(running._capture.writer.written.values()) < 50:
+        while sum(running.capture.writer.written.values()) < 50:
             time.sleep(0.01)
         shutil.copytree(tmp_path / "store", tmp_path / "after", ignore=lambda *_: ["mongod"])
         running.close()

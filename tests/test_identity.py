@@ -20,7 +20,7 @@ import hybridlog as hl
 from hybridlog.columns.folders import files_of
 from hybridlog.index.access import IndexAccess
 from hybridlog.maintenance.copying import Copying
-from hybridlog.maintenance.repair import become_another
+from hybridlog.maintenance.verify import become_another
 from hybridlog.query.intervals import Intervals
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import (

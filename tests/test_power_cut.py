@@ -69,7 +69,7 @@ class Run:
                             (CHANNEL, OTHER)[number % 2], message(number), log_time=1000 + number
                         )
                         if number % 8 == 7:
-                            recording._capture.writer.flush()
+                            recording.capture.writer.flush()
                     recording.close()
                     self.is_closed = not self.power.is_off
             finally:

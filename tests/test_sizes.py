@@ -14,7 +14,7 @@ import hybridlog as hl
 from hybridlog.query.topics import matcher
 from hybridlog_storage.catalog import Catalog
 from hybridlog_storage.messages import Channel, Schema
-from hybridlog_storage.mongo.database import CollectionStats, Database
+from hybridlog_storage.mongo.database import Database
 from tests import places
 from tests.calls import Calls
 from tests.cli.running import run

@@ -179,6 +179,10 @@ class RecordChoices(Between, Latched, InStore, AsJson, Quiet):
         "and judge the recording at its end.",
         "FILE",
     )
+    no_derive: bool = _live(
+        "Make no tables and no index now: a later command does.",
+        excludes=("ring", "trigger", "contract"),
+    )
     set_tag: tuple[str, ...] = option("Store KEY=VALUE with it.", "K=V")
     cache_size: int | None = cache_size()
 

@@ -125,7 +125,7 @@ def _record(choices: RecordChoices) -> None:
 def recorder_options(choices: RecordChoices) -> RecorderOptions:
     """Options for the recorder from those of the command; patterns are checked."""
     from hybridlog.contract import Contract
-    from hybridlog.follow.triggers import Trigger
+    from hybridlog.follow.child import Trigger
     from hybridlog.live.memory import default_budget
     from hybridlog.live.policy import priority_rule, throttle_rule
     from hybridlog.live.recorder import RecorderOptions
@@ -158,6 +158,7 @@ def recorder_options(choices: RecordChoices) -> RecorderOptions:
         after_s=choices.after or 0.0,
         no_index=no_index,
         use_sim_time=choices.use_sim_time,
+        derives=not choices.no_derive,
         contract=None if choices.contract is None else Contract.read(choices.contract),
     )
 

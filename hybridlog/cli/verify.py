@@ -42,7 +42,7 @@ def verify_command(given: _Given) -> None:
     index up to date before that.
     """
     if given.new_id:
-        from hybridlog.maintenance.repair import become_another
+        from hybridlog.maintenance.verify import become_another
         from hybridlog.store import store_path
 
         become_another(store_path(given.store), given.mongo)

@@ -305,11 +305,6 @@ def files_of(root: Path, prefixes: Collection[str] = ("",)) -> Iterator[ColumnFi
                         yield ColumnFile(root / TABLES / folder / name)
 
 
-def recordings_of(root: Path) -> set[str]:
-    """Ids of all recordings with tables."""
-    return {section.id for file in files_of(root) for section in file.about.sections}
-
-
 def _reader(path: Path) -> ColumnFile | None:
     """A shared file; one that cannot be read is removed, since all of it can be made again."""
     try:

@@ -19,7 +19,6 @@ from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.left import LeftCodec
 from hybridlog.schema.states import State, state_of
-from hybridlog_storage.disk import durability
 from hybridlog_storage.manifest import Part, rows_line
 from hybridlog_storage.ordering import distinct
 from hybridlog_storage.segments.segment_file import rows_name
@@ -55,7 +54,7 @@ class _OpenFile:
 
     name: str
     topic: str
-    writer: ParquetFileWriter | None = None
+    writer: ParquetFileWriter
     tables: list[pa.Table] = field(default_factory=list)
     waiting: int = 0
     pending: list[tuple[int, int]] = field(default_factory=list)
@@ -120,8 +119,7 @@ class RowsWriter:
     def discard(self) -> None:
         """Remove the files that are not finished."""
         for file in self._open.values():
-            if file.writer is not None:
-                file.writer.discard()
+            file.writer.discard()
 
     def _file(self, kind: _Kind, schema: pa.Schema) -> _OpenFile:
         found = self._open.get((kind, schema))
@@ -129,27 +127,20 @@ class RowsWriter:
             if len(self._open) >= _MAX_OPEN:
                 self._finish(self._open.pop(next(iter(self._open))))
             name = rows_name(self._log.number, self._version + len(self.names))
+            front = b"" if self.names else self._front
             self.names.append(name)
-            found = self._open[kind, schema] = _OpenFile(name, kind[0])
+            writer = ParquetFileWriter(self._folder / name, schema, level=_LEVEL, front=front)
+            found = self._open[kind, schema] = _OpenFile(name, kind[0], writer)
         return found
 
     def _flush(self, file: _OpenFile) -> None:
-        table = pa.concat_tables(file.tables).combine_chunks()
-        path = self._folder / file.name
-        try:
-            if file.writer is None:
-                front = self._front if file.name == self.names[0] else b""
-                file.writer = ParquetFileWriter(path, table.schema, level=_LEVEL, front=front)
-            file.writer.write(table)
-        except OSError as error:
-            raise durability.explain(error, path, "writing") from error
+        file.writer.write(pa.concat_tables(file.tables).combine_chunks())
         file.chunks.append(file.pending)
         file.tables, file.pending, file.waiting = [], [], 0
 
     def _finish(self, file: _OpenFile) -> None:
         if file.tables:
             self._flush(file)
-        assert file.writer is not None
         parts = {number: _joined(own) for number, own in sorted(file.parts.items())}
         rows = sum(part.messages for part in parts.values())
         digests = {str(self._log.number): self._log.digest}
@@ -158,10 +149,7 @@ class RowsWriter:
             "chunks": file.chunks,
             "parts": {n: [p.messages, p.bytes, p.first, p.last] for n, p in parts.items()},
         }
-        try:
-            size, digest = file.writer.close([section], rows=about, sync=True)
-        except OSError as error:
-            raise durability.explain(error, file.writer.path, "writing") from error
+        size, digest = file.writer.close([section], rows=about, sync=True)
         self._written.append(rows_line(self._log, file.name, size, digest, parts))
 
 

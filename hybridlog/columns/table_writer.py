@@ -31,7 +31,6 @@ from hybridlog.columns.layout import (
     parts_folder,
     shape_folder,
     table_schema_of,
-    topics_of,
     type_prefix,
 )
 from hybridlog.columns.rows import Piece, Places, as_table, columns_from, piece_of
@@ -49,7 +48,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.columns.fields import FieldShape
-    from hybridlog.columns.parquet_file import ParquetFileWriter
     from hybridlog.schema.codec import Decoded
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.messages import Channel
@@ -109,24 +107,20 @@ class _Topic:
         self.rows = 0
         self.pieces: list[Piece] = []
         """Rows in memory."""
-        self.size = 0
-        """Bytes of the rows in memory."""
         self.files: list[_File] = []
         """Unfinished files, with rows of segments that are not closed yet."""
         self.finished: list[tuple[str, Path]] = []
         """Folders and paths of finished files."""
         self.has_failed = False
 
-    def add(self, piece: Piece) -> None:
-        self.pieces.append(piece)
-        self.rows += piece.rows
-        self.size += piece.size
+    @property
+    def size(self) -> int:
+        """Bytes of the rows in memory."""
+        return sum(piece.size for piece in self.pieces)
 
-    def take(self, segments: Collection[int]) -> list[Piece]:
-        """Remove and return the rows in memory that belong to some segments."""
-        found = [piece for piece in self.pieces if piece.segment in segments]
-        self.pieces = [piece for piece in self.pieces if piece.segment not in segments]
-        self.size = sum(piece.size for piece in self.pieces)
+    def take(self) -> list[Piece]:
+        """Remove and return the rows in memory."""
+        found, self.pieces = self.pieces, []
         return found
 
     def give_up(self) -> None:
@@ -134,7 +128,6 @@ class _Topic:
         self.has_failed = self.is_wanted
         self.is_wanted = False
         self.pieces.clear()
-        self.size = 0
         self.finished.clear()
         for file in self.files:
             file.discard()
@@ -184,97 +177,59 @@ def _counts(pieces: Sequence[Piece]) -> TopicCounts:
 class _File:
     """An unfinished file of one topic."""
 
-    def __init__(self, path: Path, topic: _Topic) -> None:
-        self.path = path
-        self.schema: Any = None
-        self._topic = topic
-        self.segments: set[int] = set()
-        self._counts = TopicCounts(0)
-        self._writer: ParquetFileWriter | None = None
-
-    def write(self, pieces: list[Piece]) -> None:
-        """Write rows as row groups; UnfitError if the type of their fields is not the file's."""
+    def __init__(self, path: Path, topic: _Topic, schema: Any) -> None:
         from hybridlog.columns.parquet_file import ParquetFileWriter
 
-        table = self._topic.table(pieces)
-        if self._writer is None:
-            self.schema = table.schema
-            self._writer = ParquetFileWriter(self.path, table.schema)
-        elif table.schema != self.schema:
-            table = self._fitting(table)
+        self.path = path
+        self.schema = schema
+        self.segments: set[int] = set()
+        self._topic = topic
+        self._counts = TopicCounts(0)
+        self._writer = ParquetFileWriter(path, schema)
+
+    def write(self, table: Any, pieces: list[Piece]) -> None:
+        """Write rows as row groups."""
         step = _rows_of_group(table)
         for begin in range(0, table.num_rows, step):
             self._writer.write(table.slice(begin, step))
         self.segments.update(piece.segment for piece in pieces)
         self._counts = self._counts.plus(_counts(pieces))
 
-    def _fitting(self, table: Any) -> Any:
-        """Rows with the columns of the file."""
-        import pyarrow as pa
-
-        from hybridlog.columns.fields import UnfitError
-        from hybridlog.columns.fields import joined as joined_columns
-
-        kind = pa.struct(list(self.schema))
-        fitting = joined_columns([pa.nulls(0, kind), table.to_struct_array().combine_chunks()])
-        if fitting.type != kind:
-            raise UnfitError("the file has other columns")
-        return pa.Table.from_struct_array(fitting).cast(self.schema)
-
     def close(self, digests: Mapping[int, str]) -> None:
         """Finish the file."""
-        assert self._writer is not None
         segments = {str(number): digests[number] for number in sorted(self.segments)}
         section = Section(self._topic.recording, self._topic.name, 0, segments, self._counts)
         self._writer.close([section])
 
     def discard(self) -> None:
         """Delete the unfinished file."""
-        if self._writer is not None:
-            self._writer.discard()
+        self._writer.discard()
 
 
 class TableWriter:
     """Writes the tables of one recording, which this process has locked for writing.
 
     Those of the topics that the store's settings name have arrays in full. Without `topics`, all
-    have tables; with `is_new`, there are none yet.
+    have tables, and there are none yet.
     """
 
     def __init__(
-        self,
-        root: Path,
-        recording: str,
-        name: str,
-        *,
-        topics: Collection[str] | None = None,
-        is_new: bool = True,
+        self, root: Path, recording: str, name: str, topics: Collection[str] | None = None
     ) -> None:
         self._root = root
         self._recording = recording
         self._name = name
         self._wanted = topics
-        self._is_new = is_new
         self._arrays = frozenset(read_settings(root).arrays)
         self._parts = parts_folder(root, recording)
-        self._has_parts = False
         self._numbers = 0
         self._has_ended = False
         self.problem = ""  # why no table was written
         self._held: list[StoredChunk] = []  # of one segment
         self._channels: dict[int, Channel] = {}
-        self._has_grown = False  # rows were decoded since the last look at their size
         self._topics: dict[tuple[str, str], _Topic] = {}
         self._of_channel: dict[int, tuple[_Topic, Codec, State]] = {}
-        self._has_publish_time: dict[int, bool] = {}
-        self._seen: set[int] = set()  # segments
         self._cut: dict[int, str] = {}  # digests of the closed ones
-
-    @property
-    def rows_in_memory(self) -> int:
-        """Number of rows waiting to be written."""
-        pieces = (piece.rows for topic in self._topics.values() for piece in topic.pieces)
-        return sum(len(chunk.batch) for chunk in self._held) + sum(pieces)
 
     def add(self, chunk: StoredChunk, channels: Mapping[int, Channel]) -> None:
         """Add the messages of a chunk."""
@@ -283,8 +238,6 @@ class TableWriter:
         with self._harmless():
             self._channels.update(channels)
             self._collect(chunk)
-            self._seen.add(chunk.segment)
-            self._spill()
 
     def cut(self, segment: int, digest: str) -> None:
         """Register that a segment gets no more messages."""
@@ -308,10 +261,8 @@ class TableWriter:
         self._topics.clear()
         self._of_channel.clear()
         self._held.clear()
-        if self._has_parts:
-            with suppress(OSError):
-                files.remove_tree(self._parts)
-        self._has_parts = False
+        with suppress(OSError):
+            files.remove_tree(self._parts)
 
     @contextmanager
     def _harmless(self) -> Iterator[None]:
@@ -337,9 +288,9 @@ class TableWriter:
         """Make rows of the collected messages."""
         if not self._held:
             return
-        self._has_grown = True
         held, self._held = self._held, []
         batch, places = joined([chunk.batch for chunk in held]), Places.of(held)
+        has_publish_time = {n: one.has_publish_time for n, one in self._channels.items()}
         for topic, codec, state, rows in self._by_topic(batch.channel):
             with self._only(topic):
                 piece = piece_of(
@@ -348,11 +299,13 @@ class TableWriter:
                     places.take(rows),
                     codec,
                     state,
-                    has_publish_time=self._has_publish_time,
+                    has_publish_time=has_publish_time,
                     columns=topic.columns,
                 )
                 piece.has_arrays = topic.has_arrays and state is State.WHOLE
-                topic.add(piece)
+                topic.pieces.append(piece)
+                topic.rows += piece.rows
+        self._spill()
 
     def _by_topic(
         self, channel: NDArray[np.int32]
@@ -379,7 +332,6 @@ class TableWriter:
                 topic.is_wanted = self._wanted is None or channel.topic in self._wanted
             state = state_of(channel.message_encoding)
             found = self._of_channel[number] = topic, codec_for(channel), state
-            self._has_publish_time[number] = channel.has_publish_time
         return found
 
     @contextmanager
@@ -395,49 +347,38 @@ class TableWriter:
 
     # From rows in memory to files.
 
-    @property
-    def _pending(self) -> int:
-        return sum(topic.size for topic in self._topics.values())
-
     def _spill(self) -> None:
         """Write rows of the largest topics if too many are waiting in memory."""
-        if not self._has_grown or self._pending < _PENDING:
+        left = sum(topic.size for topic in self._topics.values())
+        if left < _PENDING:
             return
-        self._has_grown = False
-        self._decode()
-        left = self._pending
-        opened = sum(len(topic.files) for topic in self._topics.values())
         for topic in sorted(self._topics.values(), key=lambda topic: -topic.size):
             if left <= _LEFT:
                 return
             left -= topic.size
+            opened = sum(len(topic.files) for topic in self._topics.values())
             if opened >= _OPEN_FILES and not topic.files:
                 topic.give_up()
                 continue
             with self._only(topic):
-                opened += self._write(topic, topic.take(self._seen))
+                self._write(topic)
 
-    def _write(self, topic: _Topic, pieces: list[Piece]) -> int:
-        """Write rows to an unfinished file of a topic; returns the number of new files."""
-        from hybridlog.columns.fields import UnfitError
-
-        if not pieces:
-            return 0
-        self._check_room()
-        if topic.files:
-            with suppress(UnfitError):
-                topic.files[-1].write(pieces)
-                return 0
-        topic.files.append(_File(self._new_part(), topic))
-        topic.files[-1].write(pieces)
-        return 1
+    def _write(self, topic: _Topic) -> None:
+        """Write rows to an unfinished file of a topic."""
+        if pieces := topic.take():
+            self._check_room()
+            table = topic.table(pieces)
+            file = next((one for one in topic.files if one.schema == table.schema), None)
+            if file is None:
+                file = _File(self._new_part(), topic, table.schema)
+                topic.files.append(file)
+            file.write(table, pieces)
 
     def _new_part(self) -> Path:
-        if not self._has_parts:
+        if not self._numbers:
             with suppress(FileNotFoundError):
                 files.remove_tree(self._parts)  # left from a crash
             files.make_folders(self._parts)
-            self._has_parts = True
         self._numbers += 1
         return self._parts / f"{self._numbers}{SUFFIX}"
 
@@ -450,9 +391,8 @@ class TableWriter:
         self._cut[segment] = digest
         for topic in self._topics.values():
             with self._only(topic):
-                pieces = [piece for piece in topic.pieces if piece.segment in self._cut]
-                if _are_long(pieces) or any(segment in file.segments for file in topic.files):
-                    self._write(topic, topic.take(self._cut))
+                if _are_long(topic.pieces) or any(segment in one.segments for one in topic.files):
+                    self._write(topic)
                 self._finish(topic)
 
     def _finish(self, topic: _Topic) -> None:
@@ -470,10 +410,6 @@ class TableWriter:
         from hybridlog.columns.folders import Addition, TableFolders
 
         self._decode()
-        for number in sorted(self._seen - self._cut.keys()):
-            digest = entry.digests.get(str(number))
-            if digest is not None:
-                self._cut_segment(number, digest)
         incomplete = self._incomplete(entry)
         begin = min((first for _, first, _ in entry.spans), default=entry.created)
         additions: dict[str, Addition] = {}
@@ -481,11 +417,10 @@ class TableWriter:
             if topic.name in incomplete:
                 topic.give_up()
             with self._only(topic):
-                pieces = topic.take(self._cut)
-                if _are_long(pieces):
-                    self._write(topic, pieces)
+                if _are_long(topic.pieces):
+                    self._write(topic)
                     self._finish(topic)
-                elif pieces:
+                elif pieces := topic.take():
                     table = topic.table(pieces)
                     numbers = sorted({piece.segment for piece in pieces})
                     digests = {str(number): self._cut[number] for number in numbers}
@@ -495,13 +430,12 @@ class TableWriter:
             for folder, path in topic.finished:
                 additions.setdefault(folder, Addition()).files.append(path)
         replaced: set[str] = set()
-        if not self._is_new:
+        if self._wanted is not None:
             # An older table may be the only copy of fields in a damaged chunk.
-            replaced = {*(topics_of(entry) if self._wanted is None else self._wanted)} - incomplete
+            replaced = {*self._wanted} - incomplete
         if additions or replaced:
             self._check_room()
             types = {type_prefix(c.type) for c in entry.channels if c.topic in replaced}
-            self._has_parts = True
             folders = TableFolders(self._root, self._recording, entry.created, entry.digests)
             folders.add(additions, replaced, types)
 

@@ -16,9 +16,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import hybridlog
 from hybridlog.entries import put_entry
-from hybridlog.follow.child import ENDED, RECOVERED, Followed, Task
+from hybridlog.follow.child import ENDED, RECOVERED, Followed, Task, Trigger
 from hybridlog.follow.follower import Follower, begin_again, make_rows_ahead
-from hybridlog.follow.triggers import Trigger
 from hybridlog.maintenance.tables import missing
 from hybridlog.query.answers.follow import Arrivals
 from hybridlog.query.counters import Counters

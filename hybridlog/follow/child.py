@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from hybridlog.entries import put_entry
+from hybridlog.query.predicate.parser import parse
+from hybridlog.query.topics import TopicMatcher, matcher, split_topic
+from hybridlog_storage.errors import UsageError, WhereError
 
 if TYPE_CHECKING:
-    import subprocess
     from multiprocessing.connection import Connection
 
-    from hybridlog.follow.triggers import Trigger
+    from hybridlog.query.predicate.tree import Predicate
     from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.errors import DatabaseError
@@ -199,32 +203,28 @@ class FollowerProcess:
                 told += 1
             if not control.poll(_POLL_S):
                 continue
-            kind, *values = control.recv()
-            self._has_told |= kind in {"read", "state"}
-            if kind == "hit":
-                text, times = values
-                for at in times:
-                    self._hit(text, at)
-            elif kind == "read":
-                self._task = self._task._replace(seen=values[0])
-                self.judged = values[0][1]
-            elif kind == "seen":
-                self._has_seen = True
-            elif kind == "state":
-                (self.state,) = values
-            elif kind == "say":
-                self._say(*values)
-            elif kind == "failed":
-                (self._why,) = values
-                return False
-            else:
-                return True
+            match control.recv():
+                case ("hit", text, times):
+                    for at in times:
+                        self._hit(text, at)
+                case ("read", seen):
+                    self._has_told, self.judged = True, seen[1]
+                    self._task = self._task._replace(seen=seen)
+                case ("seen",):
+                    self._has_seen = True
+                case ("state", state):
+                    self._has_told, self.state = True, state
+                case ("say", text):
+                    self._say(text)
+                case ("failed", why):
+                    self._why = why
+                    return False
+                case _:
+                    return True
         return False
 
 
 def _started(control: Connection[Any, Any]) -> subprocess.Popen[bytes]:
-    import subprocess
-
     places = [str(Path(place).absolute()) for place in sys.path]
     return subprocess.Popen(  # noqa: S603 - our own module
         [sys.executable, "-c", _START.format(places, control.fileno())],
@@ -236,3 +236,33 @@ def _started(control: Connection[Any, Any]) -> subprocess.Popen[bytes]:
         pass_fds=[control.fileno()],
         start_new_session=True,  # Ctrl-C is for the recorder
     )
+
+
+@dataclass(frozen=True, slots=True)
+class Trigger:
+    """A condition on messages of topics; without a predicate any of them fires it."""
+
+    text: str
+    fits: TopicMatcher
+    predicate: Predicate | None
+
+    @classmethod
+    def of(cls, text: str) -> Trigger:
+        """Parse `/diagnostics: status[*].level >= 2`, or a topic alone.
+
+        Raises:
+            UsageError: The topic is missing.
+            TopicError: The pattern is malformed.
+            WhereError: The predicate is malformed, or is not about the fields of one message.
+        """
+        topic, condition = split_topic(text)
+        if not topic or (not condition and " " in topic):
+            raise UsageError(f"--trigger wants TOPIC, or TOPIC: PREDICATE, not {text!r}.")
+        fits, predicate = matcher([topic]), parse(condition) if condition else None
+        if predicate is not None:
+            names = {path.split(".", 1)[0] for path in predicate.fields()}
+            if names & {"_id", "_meta"} or predicate.filters:
+                raise WhereError(
+                    f"A trigger asks for fields of the message alone, not for {condition}."
+                )
+        return cls(text, fits, predicate)

@@ -244,9 +244,7 @@ class Follower:
 
     def _begin(self) -> None:
         entry, topics = self._entry, self._topics
-        self._tables = TableWriter(
-            self._directory.path, entry.id, entry.name, topics=topics, is_new=topics is None
-        )
+        self._tables = TableWriter(self._directory.path, entry.id, entry.name, topics)
         self._damage = self._catalog.damage(entry.id)
         self._segments: dict[int, _Segment] = {}
         self._ended: set[int] = set()
@@ -257,11 +255,6 @@ class Follower:
         return self._indexed + (0 if self._sender is None else self._sender.messages)
 
     @property
-    def missed(self) -> int:
-        """Number of messages that it lacks after a failure of the database."""
-        return self.messages - self.indexed if self.failure is not None else 0
-
-    @property
     def problem(self) -> str:
         """Why no tables were made; empty if they were."""
         return self._tables.problem
@@ -269,9 +262,9 @@ class Follower:
     @property
     def state(self) -> Followed:
         """How far it is."""
-        return Followed(
-            self._target.is_wanted, self.messages, self.indexed, self.missed, self.failure
-        )
+        read, indexed, failure = self.messages, self.indexed, self.failure
+        missed = 0 if failure is None else read - indexed
+        return Followed(self._target.is_wanted, read, indexed, missed, failure)
 
     def make_rows(self) -> None:
         """See `make_rows_ahead`."""

@@ -304,7 +304,7 @@ class IndexAccess:
         return self.connected
 
     def _connect(self, *, brings: bool) -> Database:
-        from hybridlog.maintenance import index
+        from hybridlog.maintenance.derived import StoreIndex
 
         shared = self._shared
         if self.connected is None:
@@ -312,7 +312,7 @@ class IndexAccess:
         changed: set[str] = set()
         database = self._open()
         if brings and self.may_write:
-            store = index.StoreIndex(shared.directory, shared.catalog, database, self._progress)
+            store = StoreIndex(shared.directory, shared.catalog, database, self._progress)
             session = self._shared.now()
             changed = store.bring_up_to_date(
                 session.snapshot(),

@@ -71,7 +71,7 @@ class Index:
         Raises:
             StoreError: A named recording is being written.
         """
-        from hybridlog.maintenance.index import StoreIndex
+        from hybridlog.maintenance.derived import StoreIndex
 
         shared = self._shared
         database = shared.index.database_for("Rebuilding the index", writes=True)
@@ -153,7 +153,7 @@ class Index:
             TopicError: No recording has a topic, and this is no full name.
             StoreError: The store cannot be written.
         """
-        from hybridlog.maintenance.arrays import index_arrays
+        from hybridlog.maintenance.derived import index_arrays
 
         if not topics or not all(isinstance(name, str) for name in topics):
             raise UsageError('Name the topics one by one, as in store.index.arrays("scan", "tf").')

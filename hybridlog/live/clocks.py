@@ -51,7 +51,6 @@ class Recording(Sink, Protocol):
             detail: Text for the user.
             at: Time of the loss, ns.
         """
-        ...
 
 
 class SimulatedTime(Sink):

@@ -22,7 +22,7 @@ from hybridlog.entries import text as as_text
 from hybridlog.entries import with_said
 from hybridlog.follow.child import RECOVERED, FollowerProcess, Task
 from hybridlog.live.clocks import CLOCK, MachineClock, SimulatedTime
-from hybridlog.live.incidents import Incidents, Moment
+from hybridlog.live.incidents import GROUPS, RULE, Incidents, Moment, Ring, Silence, SilenceWatch
 from hybridlog.live.memory import resident_bytes
 from hybridlog.live.policy import (
     SMALL_BYTES,
@@ -33,10 +33,7 @@ from hybridlog.live.policy import (
     first_fit,
 )
 from hybridlog.live.recording import LiveOptions, LiveRecording, follow_interval_s
-from hybridlog.live.ring import GROUPS, Ring
-from hybridlog.live.silence import RULE, Silence, SilenceWatch
-from hybridlog.live.state import RecorderState, StateFile
-from hybridlog.live.statistics import Tally, TopicCounts
+from hybridlog.live.state import RecorderState, StateFile, Tally, TopicCounts
 from hybridlog.maintenance.edit import remove_if
 from hybridlog.maintenance.keep import RetentionThread
 from hybridlog.maintenance.retention import Rules
@@ -45,6 +42,7 @@ from hybridlog.record.losses import Cause, Loss
 from hybridlog.record.marks import CLOCK_SET, CONTRACT
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.completion import completed
+from hybridlog.wording import size
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import (
     DiskFullError,
@@ -59,7 +57,7 @@ from hybridlog_storage.messages import REDUCED, Channel, left_channel
 
 if TYPE_CHECKING:
     from hybridlog.contract import Contract
-    from hybridlog.follow.triggers import Trigger
+    from hybridlog.follow.child import Trigger
     from hybridlog.live.sources.base import LiveSource, Sink
     from hybridlog.query.topics import TopicMatcher
     from hybridlog.record.recorder import RecordReport
@@ -84,7 +82,8 @@ class RecorderOptions(LiveOptions):
 
     It stops after `max_bytes` of payloads, or when less than `reserve_bytes` are free. After
     `ring_s` messages go that no pin touches. What lies `before_s` (None: as long as the ring) and
-    `after_s` around a trigger or signal is marked and pinned.
+    `after_s` around a trigger or signal is marked and pinned. Unless it `derives`, tables and index
+    are left to a later command.
     """
 
     name: str = "live"
@@ -101,6 +100,7 @@ class RecorderOptions(LiveOptions):
     after_s: float = 0.0
     use_sim_time: bool = False
     contract: Contract | None = None
+    derives: bool = True
 
     def __post_init__(self) -> None:
         """Refuse limits that would stop the recorder at once, and a ring that holds too little."""
@@ -153,6 +153,10 @@ class Recorder:
         say: Callable[[str], None],
         clock: MachineClock | None = None,
     ) -> None:
+        if not (options.derives or Rules.of(store.directory.settings.retention).is_empty):
+            raise UsageError(
+                "The rules of this store delete what the follower has read: leave out --no-derive."
+            )
         self._clock = clock or MachineClock()
         self._sources = sources
         self._options = options
@@ -176,9 +180,8 @@ class Recorder:
         self._started = time.monotonic()
         self._looked = self._written_at = self._started
         self._written = 0
-        self._stored_bytes = 0
         self._newest = max(store.summaries(), key=attrgetter("created"), default=None)
-        self._silence = SilenceWatch(options.contract, self._now, self._note_silence)
+        self._silence = SilenceWatch(options.contract, self._note_silence)
         self._settled_at = 0.0
         self._ended_at: int | None = None
         self._simulated: SimulatedTime | None = None
@@ -202,18 +205,21 @@ class Recorder:
         )
         self._incidents = Incidents(
             partial(self._directory.manifests.change, self._target.id),
-            None if options.use_sim_time else self._clock,
-            lambda: self._target.first_time,
-            self._ring,
-            self.say,
+            clock=None if options.use_sim_time else self._clock,
+            first=lambda: self._target.first_time,
+            ring=self._ring,
+            silence=self._silence,
+            now=self._now,
+            say=self.say,
         )
         try:
             self._retention = RetentionThread(
                 store.directory,
                 partial(remove_if, store.shared),
-                self._target,
-                options.reserve_bytes,
-                self.say,
+                self._target.id,
+                sealed=lambda: self._target.sealed,
+                reserve=options.reserve_bytes,
+                say=self.say,
                 window=round((options.before_s or ring_s or 0) * 1e9),
                 judged=lambda: self._follower.judged,
             )
@@ -223,7 +229,7 @@ class Recorder:
             raise
 
     def _begin_to_follow(self, entry: RecordingEntry) -> FollowerProcess:
-        index, triggers = self._shared.index, self._options.triggers
+        index, options, triggers = self._shared.index, self._options, self._options.triggers
         task = Task(
             self._directory.address,
             index.wanted,
@@ -237,7 +243,7 @@ class Recorder:
             self._shared.catalog,
             task,
             triggers,
-            has_documents=index.is_wanted,
+            has_documents=index.is_wanted and options.derives,
             hit=lambda text, time: self.fire(text, self._passed(time)),
             say=self.say,
         )
@@ -268,7 +274,8 @@ class Recorder:
                 recording is removed.
         """
         try:
-            self._follower.start()
+            if self._options.derives:
+                self._follower.start()
             for source in self._sources:
                 source.start(self._sink)
         except BaseException:
@@ -277,7 +284,6 @@ class Recorder:
             self._says.remove()
             self._target.abort()
             raise
-        self._silence.start()
         now = self._clock.now()
         if self._simulated is None and self._newest is not None and self._newest.created > now:
             says = f"the clock of this machine says {format_time(now)}"
@@ -319,15 +325,14 @@ class Recorder:
         for source in self._sources:
             source.stop()
         self._over.set()
-        self._silence.stop(ended_at)
         if self._simulated is not None:
             self._simulated.close()
         self._follower.wait_s, self._follower.left = wait_s, left
         self._says.remove()
         self._retention.stop()
-        self._incidents.stop()
+        self._incidents.stop(ended_at)
         if self._is_marked(self._target.id) or (
-            not (self.stopped_for_disk and self._target.is_empty)
+            not (self.stopped_for_disk and self._target.first_time is None)
             and (self._recorded_by_content or any(source.was_reached for source in self._sources))
         ):
             report = self._target.close()
@@ -548,7 +553,7 @@ class Recorder:
             else:
                 self._lose_for_room(recorded, received)
         except HybridlogError as error:
-            cause = _cause_of(error)
+            cause = Cause.DISK if isinstance(error, DiskFullError) else Cause.QUEUE
             self._refuse(cause, str(error))
             self._lose(recorded, cause, str(error), received)
 
@@ -722,9 +727,8 @@ class Recorder:
             if self.is_full:
                 self._end("its manifest is full")
                 return
-        grown, self._stored_bytes = state.stored_bytes - self._stored_bytes, state.stored_bytes
-        # Messages in memory will be written, and as many new ones before the next check.
-        coming = state.filled * options.budget_bytes + grown
+        # Messages in memory will be written, and those of a second until the next check.
+        coming = state.filled * options.budget_bytes + state.bytes_per_s
         try:
             check_room(state.free_bytes, options.reserve_bytes, coming)
         except DiskFullError as error:
@@ -758,11 +762,6 @@ class Recorder:
         self._incidents.note(new_random(), Moment(text, {"cause": CLOCK_SET, **tags}, at))
 
 
-def _cause_of(error: HybridlogError) -> Cause:
-    """The cause of the loss of a message that could not be written."""
-    return Cause.DISK if isinstance(error, DiskFullError) else Cause.QUEUE
-
-
 def make_room(store: Store, reserve_bytes: int) -> None:
     """Check that a disk has as much free space as the reserve, once the store's rules made room.
 
@@ -787,9 +786,4 @@ def check_room(free_bytes: int, reserve_bytes: int, coming_bytes: float = 0) -> 
     """
     if free_bytes < reserve_bytes + coming_bytes:
         lower = ", or lower --reserve" if reserve_bytes else ""
-        left = _megabytes(free_bytes)
-        raise DiskFullError(f"The disk has only {left} left: free some{lower}.")
-
-
-def _megabytes(count: float) -> str:
-    return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"
+        raise DiskFullError(f"The disk has only {size(free_bytes)} left: free some{lower}.")

@@ -10,8 +10,8 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from operator import index as index_of
 from queue import Empty, SimpleQueue
@@ -24,7 +24,7 @@ from hybridlog.live.policy import SMALL_BYTES
 from hybridlog.record.capture import Capture
 from hybridlog.record.losses import Cause, Ledger, Loss
 from hybridlog.record.recorder import RecordReport
-from hybridlog_storage.errors import DatabaseError, DiskFullError, HybridlogError, UsageError
+from hybridlog_storage.errors import DatabaseError, DiskFullError, UsageError
 from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD
 from hybridlog_storage.messages import Channel, LooseBatch, Schema
 from hybridlog_storage.segments.segment_format import LOSSES_METADATA, json_metadata
@@ -157,7 +157,7 @@ class LiveRecording:
         """Messages that a full disk cost, by topic; known after the end."""
         self.make_room: Callable[[], bool] = lambda: False
         """Called when the disk is full; returns whether to try again."""
-        self._capture = Capture(
+        self.capture = capture = Capture(
             directory,
             catalog,
             follow,
@@ -171,9 +171,10 @@ class LiveRecording:
             make_room=self._when_full,
             on_written=self._notify,
         )
-        self.id = self._capture.entry.id
+        """Its files and its follower."""
+        self.id = capture.entry.id
         """Recording id."""
-        self.name = self._capture.entry.name
+        self.name = capture.entry.name
         """Its name in the store."""
         self._thread = threading.Thread(target=self._run, name="hybridlog-record", daemon=True)
         self._thread.start()
@@ -201,7 +202,7 @@ class LiveRecording:
         self._check()
         for channel in channels:
             _check_channel(channel)
-            self._capture.expect(channel)
+            self.capture.expect(channel)
 
     def write(
         self,
@@ -282,35 +283,35 @@ class LiveRecording:
         return min(max(self._unwritten, 0) / self._options.budget_bytes, 1.0)
 
     @property
+    def sealed(self) -> int:
+        """Number of sealed segments."""
+        return self.capture.writer.totals.segments
+
+    @property
     def stored(self) -> tuple[int, int]:
         """Messages in chunks, and the bytes of their payloads."""
-        totals = self._capture.writer.totals
+        totals = self.capture.writer.totals
         return totals.messages, totals.payload_bytes
 
     @property
     def progress(self) -> tuple[int, int]:
         """Messages taken, and those of them that are written to the disk."""
-        return sum(self.taken.values()), self._capture.writer.written.total()
+        return self.taken.total(), self.capture.writer.written.total()
 
     @property
-    def sealed(self) -> int:
-        """Number of sealed segments."""
-        return self._capture.writer.totals.segments
+    def lag(self) -> int:
+        """Messages that are not indexed yet."""
+        return self.capture.lag
 
     @property
-    def channels(self) -> Mapping[int, Channel]:
-        """Channels so far by the numbers that they have in the segments."""
-        return self._capture.writer.channels
+    def index_failure(self) -> DatabaseError | None:
+        """The error that stopped the index, None while it works."""
+        return self.capture.follower.state.failure
 
     @property
     def first_time(self) -> int | None:
         """The least log time, ns; None without messages."""
         return self._least if self._channels else None
-
-    @property
-    def is_empty(self) -> bool:
-        """True if it has taken no message."""
-        return not self._channels
 
     @property
     def taken(self) -> Counter[str]:
@@ -320,16 +321,6 @@ class LiveRecording:
             for channel, taken in self._taken.items():
                 found[channel.topic] += taken.messages
         return found
-
-    @property
-    def lag(self) -> int:
-        """Messages that are not indexed yet."""
-        return self._capture.lag
-
-    @property
-    def index_failure(self) -> HybridlogError | None:
-        """The error that stopped the index, None while it works."""
-        return self._capture.follower.state.failure
 
     def close(self) -> RecordReport:
         """Write, index and seal everything, and return a report.
@@ -363,35 +354,28 @@ class LiveRecording:
     def _close_once(self) -> RecordReport:
         try:
             end = {"status": "complete", "losses": []}
-            if isinstance(self.failure, DiskFullError):
-                failure = self._capture.close_truncated(end, self._cut_off())
-            elif self.failure is not None:
-                raise self.failure
-            else:
-                failure = self._close_whole(end)
+            try:
+                if self.failure is not None:
+                    raise self.failure
+                failure = self.capture.close(end)
+            except DiskFullError:  # as much as fits
+                failure = self.capture.close_truncated(end, self._cut_off())
         except BaseException:
-            self._capture.abort()
+            self.capture.abort()
             raise
         return RecordReport(
-            self._capture.entry,
+            self.capture.entry,
             [],
-            self._capture.indexed,
-            self._capture.follower.state.missed,
+            self.capture.indexed,
+            self.capture.follower.state.missed,
             failure,
             0,
             time.monotonic() - self._started,
         )
 
-    def _close_whole(self, end: Mapping[str, Any]) -> DatabaseError | None:
-        """Write everything; if the disk fills up now, as much as fits."""
-        try:
-            return self._capture.close(end)
-        except DiskFullError:
-            return self._capture.close_truncated(end, self._cut_off())
-
     def _cut_off(self) -> list[dict[str, Any]]:
         """Rows of the ledger, with the messages that were taken but not written."""
-        writer = self._capture.writer
+        writer = self.capture.writer
         for channel, taken in self._taken.items():
             count = taken.messages - writer.written_of(channel)
             if count:
@@ -411,12 +395,12 @@ class LiveRecording:
         """
         with self._closing:
             self._end()
-            self._capture.rollback()
+            self.capture.rollback()
 
     @property
     def _unwritten(self) -> int:
         """Bytes that were taken and are not in a file."""
-        return self._received - self._capture.writer.stored_bytes
+        return self._received - self.capture.writer.stored_bytes
 
     def _notify(self) -> None:
         """There is room for another message."""
@@ -449,7 +433,7 @@ class LiveRecording:
         flushed = reported = time.monotonic()
         interval = self._options.flush_interval_s
         tick = min(_TICK_S, interval / 10)
-        with suppress(BaseException), self._failing():
+        try:
             while True:
                 with suppress(Empty):
                     self._calls.get(timeout=tick)
@@ -463,35 +447,29 @@ class LiveRecording:
                     # As late as possible: a chunk of a slow topic costs more than its
                     # content. A message has waited for one tick, and waits for another.
                     age = interval * _FLUSH_AT - 2 * tick
-                    self._capture.writer.flush_older(age, most=self._most_open())
+                    self.capture.writer.flush_older(age, most=self._most_open())
                     flushed = now
                 if now - reported >= interval / 4:
                     self._write_losses()
                     reported = now
+        except BaseException as error:
+            # The threads that write and close would wait forever.
+            with self._lock:
+                self.failure = self.failure or error
+                self._room.notify_all()
 
     def _most_open(self) -> int | None:
         """Bytes that open chunks may have: what they hold is missing in the budget."""
         is_tight, self._is_tight = self._is_tight, False
-        if is_tight and self._capture.writer.is_idle:
+        if is_tight and self.capture.writer.is_idle:
             return 0  # or nothing would ever make room
         budget = self._options.budget_bytes
         return budget // 8 if self._unwritten > budget // 4 else None
 
-    @contextmanager
-    def _failing(self) -> Iterator[None]:
-        """Pass any error on to the threads that write and close, which would wait forever."""
-        try:
-            yield
-        except BaseException as error:
-            with self._lock:
-                self.failure = self.failure or error
-                self._room.notify_all()
-            raise
-
     def _write_losses(self, *, everything: bool = False) -> None:
         rows = self.ledger.take(everything=everything)
         if rows:
-            self._capture.writer.add_extra(json_metadata(LOSSES_METADATA, {"rows": rows}))
+            self.capture.writer.add_extra(json_metadata(LOSSES_METADATA, {"rows": rows}))
 
     def _take(self) -> None:
         """Move queued messages into chunks."""
@@ -499,7 +477,7 @@ class LiveRecording:
             inbox, self._inbox = self._inbox, deque()
             self._moved = self._received
         if inbox:
-            self._capture.writer.append(_batch(inbox), self._channels)
+            self.capture.writer.append(_batch(inbox), self._channels)
 
 
 def _pinned(payload: object) -> memoryview:
@@ -516,26 +494,18 @@ def _check_channel(channel: object) -> None:
     """Refuse a channel that no segment can hold."""
     if not isinstance(channel, Channel):
         raise UsageError(f"{channel!r} is not a Channel")
-    schema = channel.schema
-    if not (schema is None or isinstance(schema, Schema)):
-        raise UsageError(f"the schema of the channel {channel.topic!r} must be a Schema")
-    if schema is not None and not isinstance(schema.data, bytes):
-        kind = type(schema.data).__name__
-        raise UsageError(f"the schema of the channel {channel.topic!r} must be bytes, not {kind}")
-    if not isinstance(channel.metadata, Mapping):
+    schema, metadata = channel.schema, channel.metadata
+    schema = Schema("", "", b"") if schema is None else schema
+    if not (isinstance(schema, Schema) and isinstance(schema.data, bytes)):
+        raise UsageError(f"the channel {channel.topic!r} must have a Schema of bytes, or None")
+    if not isinstance(metadata, Mapping):
         raise UsageError(f"the metadata of the channel {channel.topic!r} must be a mapping")
-    texts = [channel.topic, channel.message_encoding, *channel.metadata, *channel.metadata.values()]
-    if schema is not None:
-        texts += [schema.name, schema.encoding]
-    for text in texts:
-        if not isinstance(text, str):
-            raise UsageError(f"the channel {channel.topic!r} has {text!r} instead of text")
-        try:
-            text.encode()
-        except UnicodeEncodeError as error:
+    texts = [channel.topic, channel.message_encoding, schema.name, schema.encoding]
+    for text in (*texts, *metadata, *metadata.values()):
+        if not isinstance(text, str) or text.encode(errors="ignore").decode() != text:
             raise UsageError(
-                f"the channel {channel.topic!r} has {text!r}, which UTF-8 cannot encode"
-            ) from error
+                f"the channel {channel.topic!r} has {text!r} instead of text that UTF-8 can encode"
+            )
 
 
 def follow_interval_s(options: LiveOptions) -> float | None:

@@ -5,17 +5,20 @@ Other processes read the file. A recorder runs as long as its recording is locke
 
 from __future__ import annotations
 
+import math
 import time
+from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from operator import attrgetter
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from hybridlog.live.statistics import TopicState
+from hybridlog.record.losses import Cause
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import HybridlogError, StoreError, UsageError
 from hybridlog_storage.stopping import pause
@@ -162,12 +165,11 @@ def _resolve(name: str, recorders: Mapping[str, str]) -> str:
     Raises:
         UsageError: No recorder matches, or several do.
     """
-    whole = [one for one, known in recorders.items() if name in {one, known}]
-    named = [one for one, known in recorders.items() if name and known.startswith(name)]
-    begun = [
-        one for one in recorders if name and name in {one[: len(name)], one[-16:][: len(name)]}
+    fitting = [one for one, known in recorders.items() if name in {one, known}] or [
+        one
+        for one, known in recorders.items()
+        if name and any(text.startswith(name) for text in (known, one, one[-16:]))
     ]
-    fitting = whole or named or begun
     if len(fitting) != 1:
         what = "is ambiguous" if fitting else "is no running recorder"
         known = ", ".join(recorders[one] for one in fitting or recorders)
@@ -177,3 +179,103 @@ def _resolve(name: str, recorders: Mapping[str, str]) -> str:
 
 def _path(store: Path, recording: str) -> Path:
     return store / _FOLDER / f"{recording}{_SUFFIX}"
+
+
+_RATES = 60  # so many past rates give the expected rate
+_NS = 1e9
+
+
+@dataclass(slots=True)
+class Tally:
+    """Counters of one channel; one thread at a time updates them. Times in ns."""
+
+    messages: int = 0
+    payload_bytes: int = 0
+    last: int = 0
+    gaps: int = 0
+    squares: int = 0
+    counted: int = 0
+
+    def add(self, size: int, received: int) -> None:
+        """Count a message."""
+        if self.last:
+            gap = received - self.last
+            self.gaps += gap
+            self.squares += gap * gap
+            self.counted += 1
+        self.last = received
+        self.messages += 1
+        self.payload_bytes += size
+
+
+@dataclass(frozen=True, slots=True)
+class TopicState:
+    """Statistics of a topic at one time."""
+
+    topic: str
+    type: str
+    messages: int
+    payload_bytes: int
+    hz: float
+    expected_hz: float | None
+    bytes_per_s: float
+    jitter_ms: float | None
+    silent_s: float | None
+    thinned: int
+    lost: int
+
+
+@dataclass(slots=True)
+class TopicCounts:
+    """What was received and lost of a topic."""
+
+    topic: str
+    type: str = ""
+    is_present: bool | None = None  # has publishers; None: has never had any
+    tallies: list[Tally] = field(default_factory=list)
+    lost: Counter[Cause] = field(default_factory=Counter)
+    _messages: int = 0
+    _bytes: int = 0
+    _usual: deque[float] = field(default_factory=lambda: deque(maxlen=_RATES))
+
+    @property
+    def has_come(self) -> bool:
+        """True if it has had publishers or messages; not of what is lost alone."""
+        return bool(self.tallies) or self.is_present is not None
+
+    def look(self, elapsed_s: float, now: int) -> TopicState:
+        """The topic's statistics since the last call."""
+        messages = sum(tally.messages for tally in self.tallies)
+        size = sum(tally.payload_bytes for tally in self.tallies)
+        hz = (messages - self._messages) / elapsed_s
+        rate = (size - self._bytes) / elapsed_s
+        self._messages, self._bytes = messages, size
+        expected = median(self._usual) if len(self._usual) >= 3 else None
+        self._usual.append(hz)
+        last = max((tally.last for tally in self.tallies), default=0)
+        thinned = self.lost[Cause.THROTTLE]
+        return TopicState(
+            self.topic,
+            self.type,
+            messages,
+            size,
+            hz,
+            expected,
+            rate,
+            self._jitter(),
+            max(now - last, 0) / _NS if last else None,
+            thinned,
+            sum([*self.lost.values()]) - thinned,
+        )
+
+    def _jitter(self) -> float | None:
+        """Largest standard deviation of the time between messages of a channel, ms."""
+        worst: float | None = None
+        for tally in self.tallies:
+            # A message that arrives between these lines counts at the next call.
+            count, total, squares = tally.counted, tally.gaps, tally.squares
+            tally.counted = tally.gaps = tally.squares = 0
+            if count >= 2:
+                deviation = math.sqrt(max(squares / count - (total / count) ** 2, 0.0)) / 1e6
+                worst = deviation if worst is None else max(worst, deviation)
+        return worst

@@ -186,9 +186,9 @@ def remove_if(
                 directory.manifests.remove(entry.id, check)
             except RecordingGoneError as error:
                 raise gone(entry.name) from error
-            shared.catalog.remove(entry.id)
-            with suppress(OSError, StoreError):  # the next connection removes them
+            with suppress(OSError, StoreError):  # or else the next opening does both
                 tables.remove(directory, entry.id, entry)
+                shared.catalog.remove(entry.id)
             if database is not None:
                 _clear(database, entry)
     except ConnectionLostError:

@@ -104,27 +104,20 @@ def expire(
     late, before = [log for log in going if log not in ready], 0
     report = reporter(progress, manifest.name, sum(log.bytes for log in late))
     for log in late:
-
-        def tell(at: int, before: int = before) -> None:
-            report(before + at)
-
-        def go(log: File = log) -> None:
-            made = _rows_of(directory, recording, log, version, tell)
-            _go(directory, recording, {log.number: made}, check, copy)
-            done.freed -= sum(one.bytes for one in made)
-
-        try:
+        while True:
             try:
-                go()
+                made = _rows_of(directory, recording, log, version)
+                _go(directory, recording, {log.number: made}, check, copy)
+                done.freed -= sum(one.bytes for one in made)
             except DiskFullError:
-                if not make_room():
-                    raise
-                go()
-        except DiskFullError:
-            let_go(directory, recording, partial(_lines_of, log.number), check, NO_ROOM)
-        except SegmentError as error:
-            done.damaged[log.number] = str(error)
+                if make_room():
+                    continue
+                let_go(directory, recording, partial(_lines_of, log.number), check, NO_ROOM)
+            except SegmentError as error:
+                done.damaged[log.number] = str(error)
+            break
         before += log.bytes
+        report(before)
     done.freed += sum(log.bytes for log in going if log.number not in done.damaged)
     return done
 
@@ -183,16 +176,12 @@ def make_rows(
 
 
 def _rows_of(
-    directory: StoreDirectory,
-    recording: str,
-    log: File,
-    version: int = 0,
-    report: Callable[[int], None] = lambda _: None,
+    directory: StoreDirectory, recording: str, log: File, version: int = 0
 ) -> tuple[File, ...]:
     """Write the rows of a log, in place of what a crash has left of such."""
     path, left = directory.recording(recording), directory.listing(recording).rows
     _remove(path, [name for name in left if int(name[:6]) == log.number])
-    return write_rows(path, replace(log, gone="expired"), path, version=version, report=report)
+    return write_rows(path, replace(log, gone="expired"), path, version=version)
 
 
 def _go(
@@ -279,19 +268,11 @@ def let_go(
     return changed
 
 
-def write_rows(
-    recording: Path,
-    line: File,
-    into: Path,
-    *,
-    version: int = 0,
-    report: Callable[[int], None] = lambda _: None,
-) -> tuple[File, ...]:
+def write_rows(recording: Path, line: File, into: Path, *, version: int = 0) -> tuple[File, ...]:
     """Write what is left of the messages of a log; returns the lines of the files in order.
 
-    The line of the log says that it is gone; the folder of its recording stays as it is. `report`
-    is told the byte up to which the log was read. A damaged log, or one with what rows cannot keep,
-    raises SegmentError.
+    The line of the log says that it is gone; the folder of its recording stays as it is. A damaged
+    log, or one with what rows cannot keep, raises SegmentError.
     """
     from hybridlog.columns.rows_writer import RowsWriter
 
@@ -306,7 +287,6 @@ def write_rows(
         try:
             for place in summary.chunks:
                 writer.add(reader.read_chunk(place))
-                report(place.offset + place.length)
             return writer.close()
         except BaseException as error:
             writer.discard()
@@ -340,18 +320,11 @@ def may_go(log: File) -> bool:
 
 
 def _remove(folder: Path, names: Collection[str]) -> None:
-    """Remove files, if they are there."""
-    failure: OSError | None = None
-    for name in names:
-        try:
-            files.unlink(folder / name)
-        except FileNotFoundError:
-            continue
-        except OSError as error:
-            failure = failure or error
+    """Remove files, if they are there; after an error, the next opening removes the others."""
     try:
-        if failure is not None:
-            raise failure
+        for name in names:
+            with suppress(FileNotFoundError):
+                files.unlink(folder / name)
         if names:
             files.sync_folder(folder)
     except OSError as error:

@@ -16,7 +16,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final
 
 from hybridlog.maintenance.expiry import Expired, expire, let_go
 from hybridlog.maintenance.retention import (
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from hybridlog.maintenance.report import Progress
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
-    from hybridlog_storage.manifest import File, Manifest
+    from hybridlog_storage.manifest import Manifest
 
     Remove = Callable[[str, Callable[[Manifest], None]], None]
 
@@ -59,16 +59,6 @@ SPARE: Final = "spare"
 _SPARE_BYTES: Final = 8 << 20
 _SPARE_SHARE: Final = 64  # of the quota, at most
 _LEAST_SPARE: Final = 1 << 16
-
-
-class Own(Protocol):
-    """The recording that this process makes; it holds the lock of it."""
-
-    id: str
-
-    @property
-    def sealed(self) -> int:
-        """Number of segments sealed so far."""
 
 
 @dataclass(slots=True)
@@ -91,7 +81,7 @@ class Keeper:
 
     Args:
         remove: Removes a whole recording, by its id, unless a check of its manifest raises.
-        own: The recording that this process makes; None if it makes none.
+        own: Id of the recording that this process makes, and so holds; None if it makes none.
         window: The newest of it that goes last, ns: a trigger may want it.
         judged: Returns the numbers of its segments that triggers have seen, None for all: the
             others go last.
@@ -103,7 +93,7 @@ class Keeper:
         self,
         directory: StoreDirectory,
         remove: Remove,
-        own: Own | None = None,
+        own: str | None = None,
         *,
         window: int = 0,
         judged: Callable[[], Collection[int] | None] = lambda: None,
@@ -195,7 +185,7 @@ class Keeper:
                 self._unproven.add(manifest.name)
                 continue
             failed = self._failed[manifest.id]
-            is_own = self._is_own(manifest.id)
+            is_own = manifest.id == self._own
             if is_own:
                 held = held_of(manifest, now, self._window, self._judged())
             else:
@@ -211,34 +201,28 @@ class Keeper:
                 left, held = [], replace(held, is_ended=False)
             yield replace(held, segments=left)
 
-    def _is_own(self, recording: str) -> bool:
-        return self._own is not None and recording == self._own.id
-
     def _do(self, step: Step, rules: Rules, found: KeepReport, how: Mapping[str, Any]) -> None:
         """Do a step, with the room of the spare file if there is no other; reports in `found`."""
         if self._failed[step.id] and not step.segments:
             return  # planned before it was known: the next plan judges again
         check = partial(_check, step, rules)
-        try:
+        while True:
             try:
                 done = self._done(step, check, how)
+                break
             except DiskFullError:
                 if not use_spare(self._directory):
                     raise
-                done = self._done(step, check, how)
-        except DiskFullError:
-            raise
-        except ChangedError as error:  # the next plan judges again
-            found.problems.append(str(error))
-        except (StoreError, TopicError) as error:
-            found.problems.append(str(error))
-            self._failed[step.id].add(_WHOLE)
-        else:
-            found.freed_bytes += done.freed
-            for number, reason in done.damaged.items():
-                cure = "Its payloads stay until the file is restored from a copy"
-                found.problems.append(f"{reason}. {cure}")
-                self._failed[step.id].add(number)
+            except (StoreError, TopicError) as error:
+                found.problems.append(str(error))
+                if not isinstance(error, ChangedError):  # else the next plan judges again
+                    self._failed[step.id].add(_WHOLE)
+                return
+        found.freed_bytes += done.freed
+        for number, reason in done.damaged.items():
+            cure = "Its payloads stay until the file is restored from a copy"
+            found.problems.append(f"{reason}. {cure}")
+            self._failed[step.id].add(number)
 
     def _done(
         self, step: Step, check: Callable[[Manifest], None], how: Mapping[str, Any]
@@ -246,13 +230,18 @@ class Keeper:
         if not step.segments and not step.groups:
             self._remove(step.id, check)
             return Expired(freed=step.bytes)
-        is_own = self._is_own(step.id)
+        is_own = step.id == self._own
         with ExitStack() as held:
             if not is_own:
                 lock = self._directory.writing(step.id, step.recording, wait_s=LOCK_WAIT_S)
                 held.enter_context(lock)
             if step.groups:
-                let_go(self._directory, step.id, partial(_of_groups, step.groups), check)
+                let_go(
+                    self._directory,
+                    step.id,
+                    lambda now: [file for file in now.files if file.group in step.groups],
+                    check,
+                )
                 done = Expired(freed=step.bytes)
             else:
                 at_hand = self._directory.at_hand(step.id, step.segments, check)
@@ -265,10 +254,6 @@ class Keeper:
                     done = expire(here, step.id, step.segments, check=check, version=version, **how)
             self._changed(step.id)
         return done
-
-
-def _of_groups(groups: Sequence[int], manifest: Manifest) -> list[File]:
-    return [file for file in manifest.files if file.group in groups]
 
 
 def _check(step: Step, rules: Rules, manifest: Manifest) -> None:
@@ -338,6 +323,8 @@ class RetentionThread:
 
     Args:
         remove: Removes a whole recording, by its id, unless a check of its manifest raises.
+        own: Id of the recording that this process makes.
+        sealed: Returns the number of its segments that are sealed.
         reserve: Bytes that the recorder wants free at least, where rules may make room.
         say: Shows a line to the user, each text once.
         window: The newest of the recording that goes last, ns.
@@ -348,10 +335,11 @@ class RetentionThread:
         self,
         directory: StoreDirectory,
         remove: Remove,
-        own: Own,
+        own: str,
+        *,
+        sealed: Callable[[], int],
         reserve: int,
         say: Callable[[str], None],
-        *,
         window: int,
         judged: Callable[[], Collection[int] | None],
     ) -> None:
@@ -364,7 +352,7 @@ class RetentionThread:
             judged=judged,
             is_wanted=lambda: not self._over.is_set(),
         )
-        self._own = own
+        self._sealed = sealed
         self._reserve = self._wanted = reserve
         self._say = say
         self._over = threading.Event()
@@ -418,7 +406,7 @@ class RetentionThread:
         looked = last_pass = -_AGES_S
         sealed = 0
         while not self._over.wait(_TICK_S):
-            now, count, is_low = time.monotonic(), self._own.sealed, False
+            now, count, is_low = time.monotonic(), self._sealed(), False
             is_asked = self._asked > self._passes
             freed = 0
             try:

@@ -79,8 +79,6 @@ class StoreFiles:
 
         directory, catalog, report = self.directory, self.catalog, self.report
         mends = self.mends and not catalog.is_in_memory
-        # A recording has its manifest before it has tables.
-        gone = tables.unfinished(directory) if mends else set()
         rows = catalog.summaries()
         report.unreadable.clear()
         ids = directory.ids()
@@ -89,17 +87,15 @@ class StoreFiles:
             directory.manifests.clear()  # what killed processes left
         for name in directory.manifests.without():
             report.unreadable[name] = _lost(directory, name)
-        for summary in rows if mends or catalog.is_in_memory else ():
-            # The row of a recording that is unreadable now may be valid again later.
-            if summary.id not in found and summary.id not in report.unreadable:
-                catalog.remove(summary.id)
-                gone.add(summary.id)
+        # The row of a recording that is unreadable now may be valid again later.
+        known = found.keys() | report.unreadable.keys()
+        gone = {one.id for one in rows} - known
+        if mends:
+            tables.clear(directory, gone, known)
+        for recording in gone if mends or catalog.is_in_memory else ():
+            catalog.remove(recording)
         topics = {one.topics: catalog.topics(one.topics) for one in found.values()}
-        snapshot = Snapshot(found.values(), topics)
-        if gone and mends and not report.unreadable:
-            tables.remove_unfinished(directory, snapshot)
-            tables.remove_all(directory, gone - found.keys())
-        return snapshot
+        return Snapshot(found.values(), topics)
 
     def catch_up(self, snapshot: Snapshot, recordings: AbstractSet[str]) -> Snapshot | None:
         """All recordings after some came, went or changed; None if only `look_at_all` can tell."""
@@ -193,7 +189,7 @@ class StoreFiles:
             return None
         if files != state_of(listing, manifest):
             return None
-        if _is_interrupted(manifest, listing):
+        if not manifest.is_ended or listing.open or listing.left_over(manifest):
             holder = directory.holder(recording)
             if holder is None or not (holder.is_recording or entry.status != "open"):
                 return None
@@ -273,17 +269,11 @@ def recover(directory: StoreDirectory, recording: str, report: RepairReport) -> 
     adopt = unlisted(inventory)
 
     def change(now: Manifest) -> Manifest:
-        now = now if adopt is None else adopt(now)
+        now = adopt(now)
         return now if now.is_ended else ended({"status": "recovered"})(now)
 
     directory.manifests.change(recording, change)
     return True
-
-
-def _is_interrupted(manifest: Manifest, listing: Listing) -> bool:
-    """True if a recording goes on, or a process has left something to mend."""
-    is_ended = manifest.is_ended and not listing.open
-    return not is_ended or bool(listing.left_over(manifest))
 
 
 def recover_segments(

@@ -81,7 +81,7 @@ class Rules:
                 _size(values, "quota"),
                 _size(values, "min-free"),
                 _age(values, "max-age"),
-                tuple(_topic_rule(topic, topics) for topic in topics),
+                tuple(TopicRule(n, matcher([n]), _age_ns(a), str(a)) for n, a in topics.items()),
                 Choice.of(tag=tags).tag,
                 _age(values, "fields-age"),
             )
@@ -149,11 +149,6 @@ def _age_ns(value: object) -> int:
         return parse_duration(text)
     except TimeError as error:
         raise UsageError(f"{value!r} is no age: write 12h, 30d or 2y") from error
-
-
-def _topic_rule(topic: str, topics: Mapping[str, Any]) -> TopicRule:
-    age = topics[topic]
-    return TopicRule(topic, matcher([topic]), _age_ns(age), str(age))
 
 
 @dataclass(frozen=True, slots=True)

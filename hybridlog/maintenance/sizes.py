@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
@@ -84,17 +84,17 @@ class Sizes:
 
     def by_recording(self) -> list[Size]:
         """The recordings, largest first."""
-        groups: dict[str, list[Size]] = defaultdict(list)
-        for row in self.rows:
-            groups[row.recording].append(row)
-        return _largest_first(_sum(name, "", rows) for name, rows in groups.items())
+        return self._by(lambda row: (row.recording, ""))
 
     def by_topic(self) -> list[Size]:
         """The topics in all recordings, largest first."""
-        groups: dict[str, list[Size]] = defaultdict(list)
+        return self._by(lambda row: ("", row.topic))
+
+    def _by(self, key: Callable[[Size], tuple[str, str]]) -> list[Size]:
+        groups: dict[tuple[str, str], list[Size]] = defaultdict(list)
         for row in self.rows:
-            groups[row.topic].append(row)
-        return _largest_first(_sum("", topic, rows) for topic, rows in groups.items())
+            groups[key(row)].append(row)
+        return _largest_first(_sum(*names, rows) for names, rows in groups.items())
 
 
 def sizes_of(

@@ -14,7 +14,6 @@ from hybridlog_storage.errors import StoreError, TopicError
 if TYPE_CHECKING:
     from hybridlog.columns.column_file import ColumnFile
     from hybridlog.columns.tables import Tables
-    from hybridlog.snapshot import Snapshot
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
 
@@ -83,17 +82,10 @@ class TableChecker:
         return self._checked[file.number]
 
 
-def announce_removal(directory: StoreDirectory, recording: str) -> None:
-    """Make a folder that is there until all tables of a recording are gone."""
-    with suppress(OSError):
-        files.make_folders(parts_folder(directory.path, recording))
-
-
 def remove(directory: StoreDirectory, recording: str, entry: RecordingEntry | None = None) -> None:
     """Remove all tables of a recording."""
     from hybridlog.columns.folders import TableFolders
 
-    announce_removal(directory, recording)
     prefixes = [""] if entry is None else {type_prefix(one.type) for one in entry.channels}
     created = None if entry is None else entry.created
     TableFolders(directory.path, recording, created).remove(prefixes)
@@ -101,40 +93,19 @@ def remove(directory: StoreDirectory, recording: str, entry: RecordingEntry | No
         files.remove_tree(parts_folder(directory.path, recording))
 
 
-def unfinished(directory: StoreDirectory) -> set[str]:
-    """Ids of recordings with unfinished files, or whose removal was not finished."""
-    return {name.removeprefix("r") for name in _names(directory, PARTS)}
+def clear(directory: StoreDirectory, gone: Collection[str], known: Collection[str]) -> None:
+    """Remove tables of removed recordings, and unfinished files that a crash has left.
 
-
-def remove_all(directory: StoreDirectory, recordings: Collection[str]) -> None:
-    """Remove the tables of removed recordings, as far as that is possible now."""
-    for recording in sorted(recordings):
-        with suppress(OSError):
-            remove(directory, recording)
-
-
-def remove_unfinished(directory: StoreDirectory, snapshot: Snapshot) -> None:
-    """Remove unfinished files that a crash has left."""
-    for name in _names(directory, PARTS):
-        place = snapshot.by_id.get(name.removeprefix("r"))
-        if place is None:
-            continue
-        one = snapshot.summaries[place]
-        with suppress(OSError, StoreError, TopicError), directory.writing(one.id):
-            files.remove_tree(directory.path / PARTS / name)
-
-
-def are_left(directory: StoreDirectory, snapshot: Snapshot) -> bool:
-    """True if the removal of the tables of a recording was not finished."""
-    return not unfinished(directory) <= snapshot.by_id.keys()
-
-
-def remove_orphans(directory: StoreDirectory, present: Collection[str]) -> None:
-    """Remove tables of removed recordings."""
-    from hybridlog.columns.folders import recordings_of
-
-    there = unfinished(directory) | recordings_of(directory.path)
-    remove_all(directory, {one for one in there if one[-16:] not in present})
+    `known` are the recordings that there are. What is impossible now is done the next time.
+    """
+    unfinished = {name.removeprefix("r") for name in _names(directory, PARTS)}
+    for recording in sorted(unfinished.union(gone)):
+        with suppress(OSError, StoreError, TopicError):
+            if recording not in known:
+                remove(directory, recording)
+                continue
+            with directory.writing(recording):
+                files.remove_tree(parts_folder(directory.path, recording))
 
 
 def _names(directory: StoreDirectory, top: str) -> list[str]:

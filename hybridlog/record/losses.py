@@ -56,15 +56,6 @@ class Cause(StrEnum):
     """They were stored, and their part of the store is missing or damaged."""
 
 
-@dataclass(slots=True)
-class _Open:
-    """A row that may still grow."""
-
-    first: int
-    last: int
-    count: int | None
-
-
 @dataclass(frozen=True, slots=True)
 class Loss:
     """Messages that are lost.
@@ -91,19 +82,27 @@ class Ledger:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._open: dict[tuple[str, Cause, str], _Open] = {}
+        self._open: dict[tuple[str, Cause, str], dict[str, Any]] = {}  # rows that may still grow
 
     def note(self, loss: Loss) -> None:
         """Note lost messages."""
         first, last = sorted((loss.first, loss.last))
-        key = loss.topic, loss.cause, loss.detail
+        row = {
+            "cause": loss.cause.value,
+            "count": loss.count,
+            "file": "",
+            "from": first,
+            "length": None,
+            "offset": None,
+            "reason": loss.detail,
+            "to": last,
+            "topic": loss.topic or None,
+        }
         with self._lock:
-            row = self._open.get(key)
-            if row is None:
-                self._open[key] = _Open(first, last, loss.count)
-            else:
-                row.first, row.last = min(row.first, first), max(row.last, last)
-                row.count = _sum(row.count, loss.count)
+            known = self._open.setdefault((loss.topic, loss.cause, loss.detail), row)
+            if known is not row:
+                known["from"], known["to"] = min(known["from"], first), max(known["to"], last)
+                known["count"] = _sum(known["count"], loss.count)
 
     def take(self, *, everything: bool = False) -> list[dict[str, Any]]:
         """The rows since the last call; the ledger forgets them.
@@ -115,9 +114,9 @@ class Ledger:
             ready = [
                 key
                 for key, row in self._open.items()
-                if everything or key[1] is not Cause.THROTTLE or row.last - row.first >= _SLOW_NS
+                if everything or key[1] is not Cause.THROTTLE or row["to"] - row["from"] >= _SLOW_NS
             ]
-            return [_as_dict(*key, self._open.pop(key)) for key in ready]
+            return [self._open.pop(key) for key in ready]
 
 
 def joined(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -164,7 +163,7 @@ def losses_of(entry: RecordingEntry) -> list[dict[str, Any]]:
         losses.append(
             _uncounted(CRASH, "its last segment is read once the store can be written again")
         )
-    if was_cut_short(entry):
+    if "recovered" in {entry.status, entry.end.get("status")}:  # a crash ended it
         losses.append(_uncounted(CRASH, "what came after its last message was not stored"))
         damage = entry.end.get("damage", [])
         losses.extend(_uncounted("damaged segment", str(reason)) for reason in damage)
@@ -175,11 +174,6 @@ def _uncounted(cause: str, reason: str) -> dict[str, Any]:
     """A loss of an unknown number of messages."""
     row: dict[str, Any] = {"cause": cause, "file": "", "offset": None, "reason": reason}
     return row | {"count": None, "topic": None}
-
-
-def was_cut_short(entry: RecordingEntry) -> bool:
-    """True for a recording that a crash ended, whatever its status is."""
-    return "recovered" in {entry.status, entry.end.get("status")}
 
 
 def extent_of(entry: RecordingEntry) -> tuple[int, int]:
@@ -202,18 +196,3 @@ def _lost_from_store(entry: RecordingEntry) -> Iterator[Mapping[str, Any]]:
 
 def _sum(one: int | None, other: int | None) -> int | None:
     return None if one is None or other is None else one + other
-
-
-def _as_dict(topic: str, cause: Cause, detail: str, row: _Open) -> dict[str, Any]:
-    """A row in the form of segments and catalog."""
-    return {
-        "cause": cause.value,
-        "count": row.count,
-        "file": "",
-        "from": row.first,
-        "length": None,
-        "offset": None,
-        "reason": detail,
-        "to": row.last,
-        "topic": topic or None,
-    }

@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -44,7 +45,6 @@ if TYPE_CHECKING:
     from hybridlog.snapshot import Snapshot
     from hybridlog_storage.catalog import Catalog
     from hybridlog_storage.disk.directory import StoreDirectory
-    from hybridlog_storage.summary import RecordingSummary
 
 _FOLLOW_S = 0.5  # between two looks of the follower
 _MAX_PARTS = 1000  # of a log, whose fingerprints the recording has
@@ -140,11 +140,6 @@ def record(
     from hybridlog.follow.follower import in_thread  # a live recorder loads none of it
 
     started = time.monotonic()
-
-    def refuse_known(snapshot: Snapshot) -> None:
-        if not options.again:
-            _refuse_known(snapshot.by_fingerprint, source, fingerprint)
-
     capture = Capture(
         directory,
         catalog,
@@ -161,7 +156,7 @@ def record(
         },
         settings=options.settings,
         no_index=options.no_index,
-        check=refuse_known,
+        check=None if options.again else partial(_refuse_known, source, fingerprint),
     )
     try:
         copy = _Copy(source, capture.writer, options)
@@ -205,7 +200,8 @@ class _Copy:
         self._source = source
         self._writer = writer
         self._between = options.between
-        self._choice = _Choice(options, self.front)
+        self._matcher = options.matcher
+        self._wanted: list[bool] = []  # of the channels
         self._completed = _Completed(source)
 
     def run(self, progress: Callable[[int, int], None] | None) -> None:
@@ -216,16 +212,32 @@ class _Copy:
             safe_point()
             self._copy_extras()
             read += len(batch)
-            chosen = self._choice.of(batch, source.channels)
+            chosen = self._chosen(batch)
             writer.append(chosen, self._completed.of(chosen))
             if progress is not None:
                 progress(source.bytes_read, writer.totals.messages)
         for batch in self.front.batches() if self.front is not None else ():
             writer.append(batch, self._completed.of(batch))
         self._copy_extras()
-        for channel in self._choice.channels(self._completed.all()):
-            writer.declare(channel)
+        for channel in self._completed.all():
+            if self._matcher is None or self._matcher(channel.topic):
+                writer.declare(channel)
         self.skipped = read - writer.totals.messages
+
+    def _chosen(self, batch: Batch) -> Batch:
+        """The wanted messages of a batch."""
+        channels = self._source.channels
+        if self._matcher is not None:
+            self._wanted += [self._matcher(one.topic) for one in channels[len(self._wanted) :]]
+            batch = _where(batch, np.array(self._wanted, np.bool_)[batch.channel])
+        if self._between is not None:
+            begin, end = self._between
+            times = placed(batch.log_time)
+            inside = (times >= begin) & (times < end)
+            if self.front is not None:
+                batch, inside = self.front.split(batch, inside, channels)
+            batch = _where(batch, inside)
+        return batch
 
     def _copy_extras(self) -> None:
         """Store attachments and metadata records; a slice holds the attachments up to its end."""
@@ -274,37 +286,6 @@ class _Completed:
         self._open.update(range(known, len(self._channels)))
 
 
-class _Choice:
-    """Selects the wanted messages."""
-
-    def __init__(self, options: RecordOptions, front: LatchedFront | None) -> None:
-        self._matcher = options.matcher
-        self._between = options.between
-        self._front = front
-        self._wanted: list[bool] = []
-
-    def channels(self, channels: list[Channel]) -> list[Channel]:
-        """The wanted ones of some channels."""
-        if self._matcher is None:
-            return channels
-        return [channel for channel in channels if self._matcher(channel.topic)]
-
-    def of(self, batch: Batch, channels: list[Channel]) -> Batch:
-        """The wanted messages of a batch."""
-        if self._matcher is not None:
-            for channel in channels[len(self._wanted) :]:
-                self._wanted.append(self._matcher(channel.topic))
-            batch = _where(batch, np.array(self._wanted, np.bool_)[batch.channel])
-        if self._between is not None:
-            begin, end = self._between
-            times = placed(batch.log_time)
-            inside = (times >= begin) & (times < end)
-            if self._front is not None:
-                batch, inside = self._front.split(batch, inside, channels)
-            batch = _where(batch, inside)
-        return batch
-
-
 def _where(batch: Batch, mask: NDArray[np.bool_]) -> Batch:
     return batch if mask.all() else batch.take(mask)
 
@@ -345,9 +326,8 @@ def _identity(fingerprint: Fingerprint) -> dict[str, object]:
     return {"fingerprint": fingerprint.whole, **parts}
 
 
-def _refuse_known(
-    recorded: Mapping[str, RecordingSummary], source: Source, fingerprint: Fingerprint
-) -> None:
+def _refuse_known(source: Source, fingerprint: Fingerprint, snapshot: Snapshot) -> None:
+    recorded = snapshot.by_fingerprint
     known = recorded.get(fingerprint.whole)
     if known is None and len(fingerprint.parts) > 1:
         parts = [recorded.get(part) for part in fingerprint.parts]

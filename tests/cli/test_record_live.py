@@ -26,8 +26,7 @@ import hybridlog as hl
 from hybridlog.cli import record_live
 from hybridlog.cli.live_table import drawn, summary
 from hybridlog.live.sources.base import Sink
-from hybridlog.live.state import RecorderState
-from hybridlog.live.statistics import TopicState
+from hybridlog.live.state import RecorderState, TopicState
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.messages import Channel, Schema
 from tests import places

@@ -390,9 +390,9 @@ def _serve() -> NoReturn:
     import hybridlog.columns.tables
     import hybridlog.formats.mcap.reader
     import hybridlog.maintenance.copying
+    import hybridlog.maintenance.derived
     import hybridlog.maintenance.edit
-    import hybridlog.maintenance.index
-    import hybridlog.maintenance.repair
+    import hybridlog.maintenance.verify
     import hybridlog.record.recorder
     import hybridlog.store
     import tests.faults.logs

@@ -19,7 +19,7 @@ import bson
 from pymongo import MongoClient
 
 import hybridlog as hl
-from hybridlog.columns.folders import recordings_of
+from hybridlog.columns.folders import files_of
 from hybridlog.columns.layout import PARTS
 from hybridlog.entries import describe_now, state_now, take_inventory, with_said
 from hybridlog.record.losses import losses_of
@@ -323,7 +323,7 @@ def _check_tables(store: hl.Store) -> None:
     """None is of a recording that is gone, and nothing is unfinished."""
     ids = {entry.id for entry in store.recordings()} | store.repairs.unreadable.keys()
     path = store.directory.path
-    there = recordings_of(path)
+    there = {section.id for file in files_of(path) for section in file.about.sections}
     _check(there <= ids, f"there are tables of {there - ids}")
     unfinished = [str(p) for p in (path / PARTS).glob("*/**/*")]
     _check(not unfinished, f"unfinished tables are left: {unfinished}")

@@ -19,7 +19,7 @@ import pytest
 import zstandard
 
 from hybridlog.formats.yaml_values import YamlError, parse_yaml
-from hybridlog.live.sources.ros2.overrides import read_overrides
+from hybridlog.live.sources.ros2.source import read_overrides
 from hybridlog_storage.errors import SegmentError, UsageError
 from hybridlog_storage.segments.compression import Compressor, decompress
 from tests.formats import test_rosbag1 as bags

@@ -23,8 +23,8 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.contract import Contract, TopicRules
-from hybridlog.follow.triggers import Trigger
-from hybridlog.live import ring
+from hybridlog.follow.child import Trigger
+from hybridlog.live import incidents
 from hybridlog.live.recorder import Recorder, RecorderOptions
 from hybridlog.maintenance.edit import mark_now
 from hybridlog.maintenance.retention import MIN_SEGMENT
@@ -85,7 +85,7 @@ class Robot:
         )
         if part == "box":
             self.speed = speed / SLOWER
-            ring._LATE_S = 0.1  # type: ignore[misc]
+            incidents._LATE_S = 0.1  # type: ignore[misc]
             options = replace(
                 options,
                 contract=None,

@@ -196,7 +196,7 @@ def test_a_disk_that_has_room_for_little_more(
     channel = scan_channel()
     for number in range(5):
         robot.speaker.say(channel, scan(number, 400_000))
-    wait_for(lambda: robot.recorder._target._capture.writer.written.total() == 5)  # type: ignore[union-attr]
+    wait_for(lambda: robot.recorder._target.capture.writer.written.total() == 5)  # type: ignore[union-attr]
     pwritev = os.pwritev
 
     def full(fd: int, pieces: list[memoryview], position: int) -> int:
@@ -262,6 +262,21 @@ def test_a_recorder_that_is_refused_at_once_leaves_no_recording(store: hl.Store)
     assert robot.recorder.stop() == []
     assert robot.recorder.look().lost == {"disk": 1}
     assert not store.directory.ids()
+
+
+def test_what_no_follower_derives_is_made_later(store: hl.Store) -> None:
+    alone = RecorderOptions(reserve_bytes=0, derives=False)
+    robot = Running(store, alone)
+    robot.speaker.say(text_channel(), text("x"), SECOND)
+    (report,) = robot.recorder.stop()
+    assert (report.entry.messages, report.indexed, report.failure) == (1, 0, None)
+    assert store.repairs.indexed == {}
+    store.connect()
+    assert len(documents_of(store, "/chatter")) == 1
+    assert store.repairs.indexed == {robot.recorder.name: 1}
+    store.directory.change_settings(retention={"quota": "1GB"})
+    with pytest.raises(UsageError, match="leave out --no-derive"):
+        Running(store, alone)
 
 
 def test_bounds_of_time_and_size(store: hl.Store) -> None:
@@ -454,13 +469,13 @@ def test_the_reserve_holds_for_what_waits_in_memory(
     robot.rows()
     robot = Running(store, RecorderOptions(reserve_bytes=0, budget_bytes=512 << 20))
     robot.recorder.look()
-    assert "only 157 MB left: free some." in robot.recorder.reason
+    assert "only 157.3 MB left: free some." in robot.recorder.reason
     assert robot.recorder.stop() == []
     robot = Running(store, RecorderOptions(reserve_bytes=120 << 20, budget_bytes=64 << 20))
     robot.recorder.look()
     assert robot.recorder.wait(0)
     assert robot.recorder.stopped_for_disk
-    assert "only 157 MB left: free some, or lower --reserve." in robot.recorder.reason
+    assert "only 157.3 MB left: free some, or lower --reserve." in robot.recorder.reason
     assert robot.recorder.stop() == []
 
 

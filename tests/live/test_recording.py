@@ -229,7 +229,7 @@ def test_chunks_are_flushed_within_the_interval(store: hl.Store, calls: Calls) -
         flushed.clear()
         with store.start("talk", flush_interval_s=interval) as recording:
             recording.write(channel("/talk"), text(b"x"))
-            wait_for(lambda: recording._capture.writer.totals.chunks == 1)
+            wait_for(lambda: recording.capture.writer.totals.chunks == 1)
         tick = min(live._TICK_S, interval / 10)
         assert {0 < age <= interval - 2 * tick for _, age, *_ in flushed} == {True}
 
@@ -333,7 +333,7 @@ def test_who_closes_it_while_the_same_thread_does_is_told(
     recording = store.start("talk")
     recording.write(channel("/talk"), text(b"kept"))
     wait_for(lambda: recording.lag == 0 and recording.stored[0] == 1)
-    monkeypatch.setattr(recording, "_close_whole", lambda _: recording.close())
+    monkeypatch.setattr(recording.capture, "close", lambda _: recording.close())
     with recording:
         for _ in range(2):
             with pytest.raises(UsageError, match="is being closed, or closing it was interrupted"):
@@ -407,7 +407,7 @@ def test_documents_of_many_chunks_are_sent_together(
     limit(index_interval=lambda _: 1e6)
     topics = [channel(f"/topic{number}") for number in range(3)]
     with store.start("talk", flush_interval_s=0.05) as recording:
-        totals = recording._capture.writer.totals
+        totals = recording.capture.writer.totals
         for number in range(5):
             for own in topics:
                 recording.write(own, text(bytes([number]) * 2000), log_time=number)

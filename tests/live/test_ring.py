@@ -12,9 +12,8 @@ import pytest
 import hybridlog as hl
 from hybridlog.entries import summary_by, summary_of, topic_types
 from hybridlog.follow import child
-from hybridlog.follow.triggers import Trigger
+from hybridlog.follow.child import Trigger
 from hybridlog.live import incidents
-from hybridlog.live import ring as ring_module
 from hybridlog.live.recorder import RecorderOptions
 from hybridlog.record.losses import Cause, Loss
 from hybridlog.record.marks import MARKS
@@ -29,7 +28,7 @@ RING_S = 0.4
 
 @pytest.fixture(autouse=True)
 def is_prompt(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ring_module, "_LATE_S", 0.1)
+    monkeypatch.setattr(incidents, "_LATE_S", 0.1)
     monkeypatch.setattr(incidents, "_EVERY_S", 0.02)
 
 

@@ -11,8 +11,8 @@ import pytest
 import hybridlog as hl
 from hybridlog.contract import Contract, TopicRules
 from hybridlog.contract.judge import broken
+from hybridlog.live.incidents import Silence, SilenceWatch
 from hybridlog.live.recorder import Recorder, RecorderOptions
-from hybridlog.live.silence import Silence, SilenceWatch
 from hybridlog.live.sources.replay import ReplaySource
 from hybridlog.record.marks import MARKS
 from tests.across.test_check import write_mcap
@@ -130,7 +130,7 @@ class Watch(SilenceWatch):
     def __init__(self, **topics: TopicRules) -> None:
         self.begun: list[tuple[str, int, int]] = []
         self.over: list[tuple[str, int, int]] = []
-        super().__init__(Contract(topics), lambda: 0, self.note)
+        super().__init__(Contract(topics), self.note)
 
     def note(self, one: Silence, mark: str, is_over: bool) -> None:
         (self.over if is_over else self.begun).append((one.topic, one.begin, one.end))

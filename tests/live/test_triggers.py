@@ -14,7 +14,7 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.follow import child
-from hybridlog.follow.triggers import Trigger
+from hybridlog.follow.child import Trigger
 from hybridlog.live.policy import priority_rule, throttle_rule
 from hybridlog.live.recorder import RecorderOptions
 from hybridlog.live.recording import LIVE_SETTINGS

@@ -18,7 +18,7 @@ from pymongo import MongoClient
 
 import hybridlog as hl
 from hybridlog.contract import Contract
-from hybridlog.follow.triggers import Trigger
+from hybridlog.follow.child import Trigger
 from hybridlog.query.choice import Choice
 from hybridlog.query.predicate.mongo_filter import MAX_DEPTH
 from hybridlog.query.query import Query

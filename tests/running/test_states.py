@@ -195,7 +195,7 @@ def test_extras_and_what_is_shown(tmp_path: Path) -> None:
         record.write_bytes(b"fx: 500")
         with record.open("rb") as file:
             part = FilePart(lambda at, size: os.pread(file.fileno(), size, at), 0, 7)
-            writer = found.recording._capture.writer
+            writer = found.recording.capture.writer
             writer.add_extra(Attachment(START, START, record.name, "text/yaml", part))
             writer.add_extra(Metadata(name="robot", metadata={"name": "seven"}))
             wait_for(lambda: found.before.metadata(LABEL))

@@ -74,14 +74,15 @@ def test_what_is_left_of_recordings_that_are_gone(few: hl.Store, tmp_path: Path)
     gone = few.entry("more").id
     assert contents(few) != before
     places.lose(root, "more")
-    few.refresh()
-    few.connect()
+    with hl.open(root, mongo="none") as again:
+        again.recordings()
     assert contents(few) == before
-    # A removal that was not finished.
+    # What was not finished.
     (root / PARTS / f"r{gone}").mkdir(parents=True)
-    few.refresh()
-    few.connect()
+    with hl.open(root, mongo="none") as again:
+        again.recordings()
     assert not unfinished(few)
+    few.refresh()
     assert compare(few) == 90
 
 

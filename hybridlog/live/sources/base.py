@@ -34,11 +34,9 @@ class Sink(Protocol):
         A source asks for each new topic, and subscribes to nothing else. Names are as it spells
         them; the type is empty if not known yet.
         """
-        ...
 
     def expect(self, channel: Channel) -> None:
         """Prepare for a channel, before its first message. Takes some milliseconds."""
-        ...
 
     def take(
         self,
@@ -59,31 +57,24 @@ class Sink(Protocol):
             sent: Send time by the sender's clock, ns since the epoch, if known.
             sequence: Sequence number of the sender, if known.
         """
-        ...
 
     def lost(self, loss: Loss) -> None:
         """Note messages that are lost."""
-        ...
 
     def clock(self, now: int, *, received: int) -> None:
         """Note the time of a simulation, ns, as a source without a topic for it reports it."""
-        ...
 
     def topic_came(self, topic: str, type_name: str) -> None:
         """Note that a wanted topic has publishers."""
-        ...
 
     def topic_gone(self, topic: str) -> None:
         """Note that a topic has no publishers left."""
-        ...
 
     def say(self, text: str) -> None:
         """Show the user a problem and its remedy in a line, each once; recording goes on."""
-        ...
 
     def ended(self, reason: str = "") -> None:
         """Note that the source has ended by itself; `reason` is empty after a regular end."""
-        ...
 
 
 class PeerError(Exception):

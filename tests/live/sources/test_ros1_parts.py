@@ -14,14 +14,13 @@ import pytest
 
 from hybridlog.live.sources.base import Cause, PeerError, one_line
 from hybridlog.live.sources.network import endpoint_of
-from hybridlog.live.sources.ros1.handshake import (
-    WireError,
+from hybridlog.live.sources.ros1.rpc import RpcServer
+from hybridlog.live.sources.ros1.stream import Stream
+from hybridlog.live.sources.ros1.subscription import (
     channel_of,
     decode_header,
     encode_header,
 )
-from hybridlog.live.sources.ros1.rpc import RpcServer
-from hybridlog.live.sources.ros1.stream import Stream
 from hybridlog.live.sources.sequence_gaps import has_sequence_numbers
 from hybridlog_storage.messages import Channel, Schema
 from tests.live.sources.ros1_peers import Collector, framed
@@ -38,7 +37,7 @@ def test_any_bytes_are_a_header_or_an_error() -> None:
             body[draw.randrange(len(body))] = draw.randrange(256)
         try:
             fields = decode_header(bytes(body[: draw.randrange(len(body) + 1)]))
-        except WireError:
+        except PeerError:
             continue
         channel_of("/t", fields)
 

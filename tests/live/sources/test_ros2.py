@@ -11,9 +11,13 @@ from pathlib import Path
 import pytest
 
 from hybridlog.live.sources.base import Cause, Loss
-from hybridlog.live.sources.ros2.overrides import read_overrides
-from hybridlog.live.sources.ros2.process import PYTHON_VARIABLE, candidates, environment_for
-from hybridlog.live.sources.ros2.source import Ros2Source
+from hybridlog.live.sources.ros2.source import (
+    PYTHON_VARIABLE,
+    Ros2Source,
+    candidates,
+    environment_for,
+    read_overrides,
+)
 from hybridlog_storage.errors import MissingDependencyError, SourceError, UsageError
 from tests.limits import Limit
 from tests.live.sources.heard import Heard, must_return
@@ -160,7 +164,7 @@ BROKEN = [
     ('raw(EVENT, 3, b"\\xff\\xfe{")', "JSON"),
     ('raw(EVENT, 200000, b"[" * 200000)', "JSON"),
     ('raw(EVENT, 4, b"[ 1]")', "not an object"),
-    ('event(event="what")', "Invalid value 'what'"),
+    ('event(event="what")', "a malformed event: {'event': 'what'}"),
     ('event(event="gone", topic=5)', "topic"),
     ('channel(number="x")', "number"),
     ('channel(definition="\\ud800")', "not text"),

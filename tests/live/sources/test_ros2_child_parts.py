@@ -22,9 +22,14 @@ from hybridlog.live.sources.ros2.child.definitions import (
     Definitions,
     UnknownTypeError,
 )
-from hybridlog.live.sources.ros2.child.middleware import Offer
+from hybridlog.live.sources.ros2.child.middleware import (
+    VARIABLES,
+    Offer,
+    default_profile,
+    is_set_up,
+    profile,
+)
 from hybridlog.live.sources.ros2.child.outbox import Outbox
-from hybridlog.live.sources.ros2.child.profile import VARIABLES, default_profile, is_set_up, profile
 from hybridlog.live.sources.ros2.child.qos import Profile
 from hybridlog.live.sources.ros2.child.topics import Topics
 from hybridlog.live.sources.ros2.child.wire import MAX_PAYLOAD
@@ -211,7 +216,7 @@ def test_a_message_too_large_for_the_wire_is_refused(limit: Limit) -> None:
     with ours, theirs:
         outbox = Outbox(theirs)
         outbox.message(0, bytes(11), 1, 0, -1)
-        assert outbox.refused[0].count == 1
+        assert outbox.refused[0][0] == 1
 
 
 class FakeSubscription:

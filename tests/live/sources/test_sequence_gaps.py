@@ -10,8 +10,8 @@ from collections.abc import Callable, Sequence
 import pytest
 
 from hybridlog.live.sources.base import Cause
+from hybridlog.live.sources.foxglove.connection import Session
 from hybridlog.live.sources.foxglove.protocol import MESSAGE_DATA
-from hybridlog.live.sources.foxglove.session import Session
 from hybridlog.live.sources.ros1.stream import Stream
 from hybridlog.live.sources.sequence_gaps import SequenceGap, SequenceGapDetector
 from hybridlog_storage.messages import Channel, Schema

@@ -1,31 +1,53 @@
-"""Connects to a Foxglove server, and reads until stopped."""
+"""Connects to a Foxglove server, and reads until stopped: channels, subscriptions, messages."""
 
 from __future__ import annotations
 
 import asyncio
+import json
 import logging
+import re
 import socket
 import ssl
 import threading
 import time
-from collections.abc import Callable
+from collections import Counter, deque
+from collections.abc import Callable, Iterable
 from contextlib import suppress
+from dataclasses import dataclass
 from math import inf
+from operator import attrgetter
+from struct import Struct
 from typing import Any, Final
 
 from picows import (
     WSCloseCode,
+    WSFrame,
     WSHandshakeError,
     WSListener,
+    WSMsgType,
     WSProtocolError,
     WSTransport,
     ws_connect,
 )
 
 from hybridlog.live.sources.base import Cause, Loss, PeerError, Sink, one_line
-from hybridlog.live.sources.foxglove.protocol import Address
-from hybridlog.live.sources.foxglove.session import Session
+from hybridlog.live.sources.foxglove.protocol import (
+    MAX_TEXT,
+    MESSAGE_DATA,
+    SUBPROTOCOLS,
+    TIME,
+    Address,
+    Offer,
+    parse_channel,
+)
 from hybridlog.live.sources.network import Endpoint, Network, reason_of
+from hybridlog.live.sources.sequence_gaps import (
+    SequenceGap,
+    SequenceGapDetector,
+    has_sequence_numbers,
+    joined_gap,
+)
+from hybridlog_storage.messages import Channel
 
 _TICK_S: Final = 0.25  # interval at which a silent connection checks whether to stop
 _OPEN_S: Final = 10.0
@@ -197,3 +219,309 @@ def _reason_of(error: OSError) -> str:
     if isinstance(error, ConnectionResetError | BrokenPipeError):
         return "the connection broke"
     return f"cannot be reached ({reason_of(error)})"
+
+
+_MAX_CHANNELS: Final = 1 << 16
+_MAX_RETIRED: Final = 1 << 12
+_MAX_NS: Final = 1 << 63
+_NO_CHANNEL = re.compile(
+    r"(?i)unknown channel\D{0,20}(\d{1,20})\b|channel\D{0,20}(\d{1,20}) is not available"
+)
+_LARGE: Final = 1 << 14  # bytes from which a second copy costs more than a view
+_MAX_REFUSALS: Final = 20
+_RETRY_S: Final = 0.02
+_SEND_S: Final = 3.0
+_NUMBER: Final = Struct("<I").unpack_from
+_HEAD: Final = Struct("<xIQ")
+_TIME: Final = Struct("<xQ")
+_CONTENT: Final = attrgetter("topic", "message_encoding", "schema", "metadata")
+_BINARY: Final = WSMsgType.BINARY
+
+
+@dataclass(slots=True)
+class _Subscription:
+    """A subscription, and how often the server has refused it."""
+
+    number: int
+    offer: Offer
+    refusals: int = 0
+
+
+class Session(WSListener):
+    """One connection; picows calls it in the thread that reads.
+
+    `missed` are topics of an earlier connection, with the time of its end, ns since the epoch.
+    Topics that are available again are removed.
+    """
+
+    max_bytes: Final = 1 << 30  # of a message
+
+    def __init__(self, sink: Sink, name: str, missed: dict[str, int]) -> None:
+        self.problem: Exception | None = None  # why the session ended the connection
+        self._sink = sink
+        self._take = sink.take
+        self._name = name
+        self._missed = missed
+        self._next = 0
+        self._routes: dict[int, tuple[Channel, SequenceGapDetector | None]] = {}
+        self._subscriptions: dict[int, _Subscription] = {}
+        self._topics: Counter[str] = Counter()
+        self._retired: deque[int] = deque()
+        self._gathered: bytearray | None = None
+        self._gathered_is_text = False
+        self._loop = asyncio.get_running_loop()
+        self._transport: WSTransport
+        self._overdue: asyncio.TimerHandle
+
+    def _say(self, text: str) -> None:
+        """Report a problem; the text may quote the server."""
+        self._sink.say(f"{self._name}: {one_line(text)}")
+
+    # The connection.
+
+    def on_ws_connected(self, transport: WSTransport) -> None:
+        """Check the protocol."""
+        self._transport = transport
+        transport.underlying_transport.set_write_buffer_limits(1)
+        if transport.response.headers.get("Sec-WebSocket-Protocol") not in SUBPROTOCOLS:
+            self._fail(
+                PeerError(
+                    "a websocket server that does not speak Foxglove; start foxglove_bridge or "
+                    "a program with the Foxglove SDK, and give its port"
+                )
+            )
+
+    def on_ws_frame(self, transport: WSTransport, frame: WSFrame) -> None:
+        """Take a frame."""
+        if self.problem is not None:
+            return
+        try:
+            kind, size = frame.msg_type, frame.payload_size
+            if frame.rsv1 or frame.rsv2 or frame.rsv3:
+                raise PeerError("violates the websocket protocol (reserved bits are set)")
+            if size > self.max_bytes:
+                return  # picows, which ends the connection, may still read it
+            if kind is _BINARY and frame.fin and self._gathered is None:
+                if size < _LARGE:
+                    self._binary(frame.get_payload_as_bytes())
+                else:
+                    self._binary(frame.get_payload_as_memoryview())
+            elif kind is WSMsgType.CLOSE:
+                if transport.is_close_frame_sent:
+                    transport.disconnect(graceful=False)
+                    return
+                transport.send_close(WSCloseCode.OK)
+                reason = frame.get_close_reason()
+                raise PeerError("closed the connection" + (f" ({reason})" if reason else ""))
+            elif kind not in {WSMsgType.PING, WSMsgType.PONG}:
+                self._gather(frame)
+        except Exception as error:
+            self._fail(error)
+
+    def pause_writing(self) -> None:
+        """Read on when the server reads, too."""
+        self._transport.underlying_transport.pause_reading()
+        error = PeerError(f"has not read for {_SEND_S:g} s")
+        self._overdue = self._loop.call_later(_SEND_S, self._fail, error)
+
+    def resume_writing(self) -> None:
+        """The server has read."""
+        self._overdue.cancel()
+        self._transport.underlying_transport.resume_reading()
+
+    def _fail(self, error: Exception) -> None:
+        self.problem = self.problem or error
+        self._transport.disconnect(graceful=False)
+
+    def _send(self, operation: str, **values: object) -> None:
+        self._transport.send(WSMsgType.TEXT, json.dumps({"op": operation, **values}))
+
+    def _subscribe(self, wanted: Iterable[_Subscription]) -> None:
+        asked = [{"id": each.number, "channelId": each.offer.id} for each in wanted]
+        self._send("subscribe", subscriptions=asked)
+
+    # Messages.
+
+    def _gather(self, frame: WSFrame) -> None:
+        """Take a text, or a message in pieces."""
+        if (frame.msg_type is WSMsgType.CONTINUATION) is (self._gathered is None):
+            raise PeerError("violates the websocket protocol (pieces of messages are mixed)")
+        if self._gathered is None:
+            self._gathered = bytearray()
+            self._gathered_is_text = frame.msg_type is WSMsgType.TEXT
+        limit = MAX_TEXT if self._gathered_is_text else self.max_bytes
+        if len(self._gathered) + frame.payload_size > limit:
+            kind = "JSON message" if self._gathered_is_text else "message in pieces"
+            raise PeerError(f"sends a {kind} of more than {limit} bytes")
+        self._gathered += frame.get_payload_as_memoryview()
+        if frame.fin:
+            whole, self._gathered = bytes(self._gathered), None
+            (self._text if self._gathered_is_text else self._binary)(whole)
+
+    def _binary(self, data: bytes | memoryview) -> None:
+        """Take a binary message."""
+        if len(data) < _HEAD.size or data[0] != MESSAGE_DATA:
+            self._other(data)
+            return
+        subscription, log_time = _HEAD.unpack_from(data)
+        route = self._routes.get(subscription)
+        if route is None:
+            self._ignored("messages of an unknown subscription", "of an unknown subscription")
+            return
+        channel, gaps = route
+        received = time.time_ns()
+        if log_time >= _MAX_NS:
+            self._say(
+                f"gives {channel.topic!r} a time after the year 2262; it is replaced by the "
+                "receive time"
+            )
+            log_time = received
+        payload = bytes(data[_HEAD.size :])
+        self._take(channel, payload, received=received, sent=log_time)
+        if gaps is not None and len(payload) >= 4:
+            gaps.see(_NUMBER(payload)[0], received)
+            if gaps.waiting:
+                self._report(channel.topic, gaps.confirmed())
+
+    def _other(self, data: bytes | memoryview) -> None:
+        """Take the server's time; answers to requests are not recorded."""
+        if not data:
+            self._ignored("an empty binary message")
+        elif data[0] == MESSAGE_DATA or (data[0] == TIME and len(data) < _TIME.size):
+            self._ignored(f"a message of {len(data)} bytes, shorter than its header")
+        elif data[0] == TIME:
+            self._sink.clock(_TIME.unpack_from(data)[0], received=time.time_ns())
+
+    def _ignored(self, what: str, detail: str = "too short for a message") -> None:
+        """Note a lost message of an unknown topic."""
+        now = time.time_ns()
+        self._sink.lost(Loss("", Cause.UNREADABLE, 1, now, now, detail))
+        are = "they are" if what.startswith("messages") else "it is"
+        self._say(f"sends {what}; {are} ignored")
+
+    # JSON messages.
+
+    def _text(self, data: bytes) -> None:
+        """Handle a JSON message; operations that do not matter to a recorder are ignored."""
+        try:
+            message = json.loads(data.decode())
+        except (ValueError, RecursionError) as error:
+            self._say(f"sent a message that is not JSON ({error}); it is ignored")
+            return
+        match message:
+            case {"op": "advertise", "channels": list(channels)}:
+                self._advertise(channels)
+            case {"op": "unadvertise", "channelIds": list(numbers)}:
+                for number in numbers:
+                    if type(number) is int and number in self._subscriptions:
+                        self._retire(number)
+            case {"op": "advertise" | "unadvertise" as operation}:
+                self._say(f"sent something else than a list of channels to {operation}")
+            case {"op": "status"}:
+                self._status(str(message.get("message")))
+            case {"op": str()}:
+                pass
+            case _:
+                self._say("sent a JSON message without an operation ('op'); it is ignored")
+
+    def _advertise(self, channels: list[object]) -> None:
+        wanted: list[_Subscription] = []
+        for entry in channels:
+            try:
+                offer = parse_channel(entry)
+            except PeerError as error:
+                self._say(str(error))
+                continue
+            subscription = self._offered(offer)
+            if subscription is not None:
+                wanted.append(subscription)
+        if wanted:
+            self._subscribe(wanted)
+
+    def _offered(self, offer: Offer) -> _Subscription | None:
+        """A new subscription to a channel, None if it needs none."""
+        topic = offer.channel.topic
+        known = self._subscriptions.get(offer.id)
+        if known is not None:
+            if _CONTENT(known.offer.channel) == _CONTENT(offer.channel):
+                return None
+            self._send("unsubscribe", subscriptionIds=[known.number])
+            self._retire(offer.id)
+        if not self._sink.wants(topic, offer.type_name):
+            return None
+        if len(self._subscriptions) >= _MAX_CHANNELS:
+            self._say(f"has more than {_MAX_CHANNELS} channels; the rest is ignored")
+            return None
+        if offer.problem:
+            self._say(
+                f"the definition of {topic!r} {offer.problem}; its messages are recorded, but "
+                "their fields cannot be searched"
+            )
+        gaps = SequenceGapDetector() if has_sequence_numbers(offer.channel) else None
+        subscription = _Subscription(self._next, offer)
+        self._next += 1
+        self._subscriptions[offer.id] = subscription
+        self._routes[subscription.number] = (offer.channel, gaps)
+        self._topics[topic] += 1
+        if self._topics[topic] == 1:
+            self._sink.topic_came(topic, offer.type_name)
+        self._sink.expect(offer.channel)
+        since = self._missed.pop(topic, None)
+        if since is not None:
+            detail = "the connection was down; messages of this time are unknown"
+            self._sink.lost(Loss(topic, Cause.CONNECTION, None, since, time.time_ns(), detail))
+        return subscription
+
+    def _retire(self, channel_id: int) -> None:
+        """Remove a channel. Late messages of it are still recorded."""
+        gone = self._subscriptions.pop(channel_id)
+        self._retired.append(gone.number)
+        if len(self._retired) > _MAX_RETIRED:
+            self._routes.pop(self._retired.popleft(), None)
+        topic = gone.offer.channel.topic
+        self._topics[topic] -= 1
+        if not self._topics[topic]:
+            del self._topics[topic]
+            self._sink.topic_gone(topic)
+
+    def _status(self, text: str) -> None:
+        """Handle a status message: retry a refused subscription, or show it to the user.
+
+        A server may advertise a channel a moment before it accepts subscriptions.
+        """
+        found = _NO_CHANNEL.search(text)
+        refused = self._subscriptions.get(int(found[found.lastindex or 1])) if found else None
+        if refused is None:
+            self._say(f"says: {text}")
+            return
+        refused.refusals += 1
+        if refused.refusals > _MAX_REFUSALS:
+            topic = refused.offer.channel.topic
+            self._say(f"offers {topic!r}, but does not send it ({text})")
+            return
+        self._loop.call_later(_RETRY_S * (refused.refusals - 1), self._retry, refused)
+
+    def _retry(self, refused: _Subscription) -> None:
+        if self._subscriptions.get(refused.offer.id) is refused:
+            self._subscribe([refused])
+
+    def _report(self, topic: str, gaps: list[SequenceGap]) -> None:
+        """Notes messages that a publisher counted and that never came, in one row."""
+        if gaps:
+            gap = joined_gap(gaps)
+            detail = "numbers are missing in header.seq"
+            self._sink.lost(Loss(topic, Cause.TRANSPORT, gap.missing, gap.first, gap.last, detail))
+
+    def end(self, *, is_stopped: bool) -> None:
+        """End the session, as the source was stopped or the connection has ended."""
+        now = time.time_ns()
+        for channel, gaps in self._routes.values():
+            if gaps is not None:
+                self._report(channel.topic, gaps.finish())
+        for topic in self._topics:
+            if not is_stopped and len(self._missed) < _MAX_CHANNELS:
+                self._missed[topic] = now
+            self._sink.topic_gone(topic)
+        self._topics.clear()
+        self._subscriptions.clear()
+        self._routes.clear()

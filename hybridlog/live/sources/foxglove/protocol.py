@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import binascii
-import json
 import re
 from collections.abc import Mapping
 from typing import Final, NamedTuple, TypeGuard
@@ -102,33 +101,23 @@ def without_user(url: str) -> str:
     return one_line(re.sub(r"//[^/]*@", "//", url), _MAX_SHOWN)
 
 
-def parse_text(data: bytes) -> Mapping[str, object]:
-    """Parse a JSON message."""
-    try:
-        message = json.loads(data.decode())
-    except (ValueError, RecursionError) as error:
-        raise PeerError(f"sent a message that is not JSON ({error}); it is ignored") from error
-    if not isinstance(message, dict) or not isinstance(message.get("op"), str):
-        raise PeerError("sent a JSON message without an operation ('op'); it is ignored")
-    return message
-
-
 def parse_channel(entry: object) -> Offer:
     """Parse an advertised channel.
 
     A channel with an unreadable definition has none: its messages are recorded, but their
     fields cannot be searched.
     """
-    if not isinstance(entry, dict):
-        raise PeerError("advertised a channel that is not a JSON object; it is ignored")
-    number = entry.get("id")
-    if type(number) is not int or not 0 <= number < _MAX_ID:
-        raise PeerError("advertised a channel without a number ('id'); it is ignored")
-    topic, encoding = entry.get("topic"), entry.get("encoding")
-    if not _is_text(topic) or not topic:
-        raise PeerError(f"advertised channel {number} without a topic; it is ignored")
-    if not _is_text(encoding):
-        raise PeerError(f"advertised {topic!r} without an encoding; it is ignored")
+    entry = entry if isinstance(entry, dict) else {}
+    number, topic, encoding = (entry.get(key) for key in ("id", "topic", "encoding"))
+    if (
+        type(number) is not int
+        or not 0 <= number < _MAX_ID
+        or not topic
+        or not (_is_text(topic) and _is_text(encoding))
+    ):
+        raise PeerError(
+            "advertised a channel without number ('id'), topic or encoding; it is ignored"
+        )
     name = entry.get("schemaName")
     schema, problem = _parse_schema(entry, name if _is_text(name) else "", encoding)
     metadata = entry.get("metadata")

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
+import socket
 import xmlrpc.client
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
@@ -18,6 +20,7 @@ from xml.parsers.expat import ExpatError
 from hybridlog.live.sources.base import PeerError, one_line
 from hybridlog.live.sources.network import (
     PATIENCE_S,
+    Endpoint,
     Network,
     UnreachedError,
     endpoint_of,
@@ -25,8 +28,9 @@ from hybridlog.live.sources.network import (
 )
 
 if TYPE_CHECKING:
-    import socket
     from collections.abc import Callable, Mapping
+
+    from hybridlog.live.sources.network import Addresses
 
     Method = Callable[[tuple[object, ...]], list[object]]
 
@@ -65,41 +69,46 @@ async def call(network: Network, uri: str, method: str, *arguments: Any) -> obje
 
 async def _exchange(connected: socket.socket, request: bytes) -> bytes:
     """Sends a request, and returns the body of the answer."""
+    await asyncio.get_running_loop().sock_sendall(connected, request)
+    words, length, begun = await _head(connected)
+    if len(words) < 2 or not words[0].startswith(b"HTTP/"):
+        raise PeerError("it does not speak HTTP")
+    if words[1] != b"200":
+        raise PeerError(f"it answers {one_line(b' '.join(words[1:]))}")
+    return await _body(connected, begun, length, _MAX_ANSWER)
+
+
+async def _head(connected: socket.socket) -> tuple[list[bytes], int | None, bytearray]:
+    """The words of the first line of a call or answer, the length of its body, and its begin."""
     loop = asyncio.get_running_loop()
-    await loop.sock_sendall(connected, request)
     got = bytearray()
-    total: int | None = None
-    body = -1
-    while total is None or len(got) < total:
+    while (end := got.find(b"\r\n\r\n")) < 0:
+        data = await loop.sock_recv(connected, 64 << 10)
+        if not data or len(got) > _MAX_HTTP_HEADER:
+            raise PeerError("it does not speak HTTP")
+        got += data
+    first, *fields = bytes(got[:end]).split(b"\r\n")
+    return first.split(None, 2), _content_length(fields), got[end + 4 :]
+
+
+async def _body(connected: socket.socket, got: bytearray, length: int | None, most: int) -> bytes:
+    """The body of a call or answer; without a length, all that comes."""
+    loop = asyncio.get_running_loop()
+    while length is None or len(got) < length:
+        if max(length or 0, len(got)) > most:
+            raise PeerError(f"its answer is longer than {most >> 20} MiB")
         data = await loop.sock_recv(connected, 64 << 10)
         if not data:
-            break
+            if length is None:
+                break
+            raise PeerError("it closed in the middle of its answer")
         got += data
-        if body < 0:
-            body = got.find(b"\r\n\r\n")
-            if body < 0 and len(got) > _MAX_HTTP_HEADER:
-                raise PeerError("it answers with an endless header")
-            if body >= 0:
-                body += 4
-                length = _content_length(bytes(got[:body]))
-                total = None if length is None else body + length
-        if body >= 0 and max(total or 0, len(got)) > body + _MAX_ANSWER:
-            raise PeerError(f"its answer is longer than {_MAX_ANSWER >> 20} MiB")
-    if body < 0:
-        raise PeerError("it does not speak HTTP")
-    if total is not None and len(got) < total:
-        raise PeerError("it closed in the middle of its answer")
-    status = bytes(got[: got.find(b"\r\n")]).split(None, 2)
-    if len(status) < 2 or not status[0].startswith(b"HTTP/"):
-        raise PeerError("it does not speak HTTP")
-    if status[1] != b"200":
-        raise PeerError(f"it answers {one_line(b' '.join(status[1:]))}")
-    return bytes(got[body:total])
+    return bytes(got[:length])
 
 
-def _content_length(head: bytes) -> int | None:
-    """The content length in an HTTP header, None if it has none."""
-    for line in head.split(b"\r\n")[1:]:
+def _content_length(fields: list[bytes]) -> int | None:
+    """The content length in the lines of an HTTP header, None if it has none."""
+    for line in fields:
         name, _, value = line.partition(b":")
         if name.strip().lower() == b"content-length":
             value = value.strip()
@@ -199,31 +208,16 @@ class RpcServer:
         loop = asyncio.get_running_loop()
         with contextlib.suppress(OSError, PeerError):
             async with asyncio.timeout(PATIENCE_S):
-                values, method = _parsed(await self._request(client))
+                words, length, begun = await _head(client)
+                if words[:1] != [b"POST"] or length is None:
+                    return
+                values, method = _parsed(await _body(client, begun, length, _MAX_REQUEST))
                 body = self._result(method, values).encode()
                 head = (
                     "HTTP/1.0 200 OK\r\nContent-Type: text/xml\r\n"
                     f"Content-Length: {len(body)}\r\n\r\n"
                 )
                 await loop.sock_sendall(client, head.encode() + body)
-
-    async def _request(self, client: socket.socket) -> bytes:
-        loop = asyncio.get_running_loop()
-        got = bytearray()
-        while (end := got.find(b"\r\n\r\n")) < 0:
-            data = await loop.sock_recv(client, 64 << 10)
-            if not data or len(got) > _MAX_HTTP_HEADER:
-                raise PeerError("it does not speak HTTP")
-            got += data
-        length = _content_length(bytes(got[:end]))
-        if not got.startswith(b"POST ") or length is None or length > _MAX_REQUEST:
-            raise PeerError("its call is malformed")
-        while len(got) < end + 4 + length:
-            data = await loop.sock_recv(client, 64 << 10)
-            if not data:
-                raise PeerError("it closed in the middle of its call")
-            got += data
-        return bytes(got[end + 4 : end + 4 + length])
 
     def _result(self, method: str | None, values: tuple[object, ...]) -> str:
         known = self._methods.get(method or "")
@@ -235,3 +229,90 @@ class RpcServer:
 
 def _close(client: socket.socket, _: asyncio.Task[None]) -> None:
     client.close()
+
+
+_BACKLOG: Final = 64
+
+
+async def listen(
+    network: Network, environment: Mapping[str, str], say: Callable[[str], None]
+) -> tuple[socket.socket, str]:
+    """Opens the node's socket on `ROS_HOSTNAME` or `ROS_IP`; returns also its host for peers.
+
+    Without these variables it listens on loopback. A master on another computer then cannot
+    announce publishers, and polling finds them.
+    """
+    is_ipv6 = environment.get("ROS_IPV6") == "on"
+    loopback = "::1" if is_ipv6 else "127.0.0.1"
+    variable = "ROS_HOSTNAME" if environment.get("ROS_HOSTNAME") else "ROS_IP"
+    host = environment.get(variable) or loopback
+    try:
+        return _bound(await network.addresses_of(host), is_ipv6=is_ipv6), host
+    except OSError as error:
+        if host == loopback:
+            raise
+        say(
+            f"{variable}={one_line(host)} is not an address of this computer ({reason_of(error)}); "
+            "the ROS master cannot announce publishers, so polling must find them"
+        )
+    return _bound(await network.addresses_of(loopback), is_ipv6=is_ipv6), loopback
+
+
+def _bound(addresses: Addresses, *, is_ipv6: bool) -> socket.socket:
+    """A socket that listens on the first address, if possible of the preferred family."""
+    preferred = socket.AF_INET6 if is_ipv6 else socket.AF_INET
+    family, address = min(addresses, key=lambda entry: entry[0] != preferred)
+    made = socket.socket(family, socket.SOCK_STREAM)
+    try:
+        made.setblocking(False)
+        made.bind(address)
+        made.listen(_BACKLOG)
+    except BaseException:
+        made.close()
+        raise
+    return made
+
+
+def uri_of(host: str, listening: socket.socket) -> str:
+    """The node's address for calls."""
+    return f"http://{Endpoint(host, listening.getsockname()[1])}/"
+
+
+def methods(
+    master_uri: str,
+    topics: Callable[[], list[str]],
+    changed: Callable[[str], None],
+    say: Callable[[str], None],
+) -> dict[str, Method]:
+    """The slave API of a node that only subscribes.
+
+    `topics` returns those that the node is registered for; `changed` is called with one whose
+    publishers may have changed.
+    """
+
+    def publisher_update(arguments: tuple[object, ...]) -> list[object]:
+        if len(arguments) == 3 and isinstance(arguments[1], str):
+            changed(arguments[1])
+            return [1, "", 0]
+        return [-1, "publisherUpdate takes a caller, a topic and its publishers", 0]
+
+    def shutdown(arguments: tuple[object, ...]) -> list[object]:
+        caller = one_line(str(arguments[0])) if arguments else "a node"
+        say(f"{caller} asks this node to shut down; only its own user can stop a recording")
+        return [-1, "only its own user can stop a recorder", 0]
+
+    def answer(value: Callable[[], object]) -> Method:
+        return lambda _: [1, "", value()]
+
+    return {
+        "getBusInfo": answer(list),
+        "getBusStats": answer(lambda: [[], [], []]),
+        "getMasterUri": answer(lambda: master_uri),
+        "getPid": answer(os.getpid),
+        "getPublications": answer(list),
+        "getSubscriptions": answer(lambda: [[topic, "*"] for topic in topics()]),
+        "paramUpdate": answer(int),
+        "publisherUpdate": publisher_update,
+        "requestTopic": lambda _: [0, "this node publishes nothing", 0],
+        "shutdown": shutdown,
+    }

@@ -5,9 +5,7 @@ from __future__ import annotations
 import io
 import time
 from json import dumps
-from typing import TYPE_CHECKING, Annotated
-
-import msgspec
+from typing import TYPE_CHECKING, Any
 
 from hybridlog.live.sources.base import Cause, Loss, one_line
 from hybridlog.live.sources.ros2.child.wire import (
@@ -27,51 +25,7 @@ if TYPE_CHECKING:
 
 # Reads of whole multiples of this size bypass the buffer.
 _BUFFER = 32 << 10
-_Number = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
-
-
-class _Candidate(msgspec.Struct, tag_field="event", tag="candidate"):
-    topic: str
-    type: str
-
-
-class _Channel(msgspec.Struct, tag_field="event", tag="channel"):
-    number: _Number
-    topic: str
-    type: str
-    encoding: str
-    definition: str
-    offered: str
-    hash: str
-
-
-class _Topic(msgspec.Struct, tag_field="event", tag="topic"):
-    topic: str
-    type: str
-
-
-class _Gone(msgspec.Struct, tag_field="event", tag="gone"):
-    topic: str
-
-
-class _Lost(msgspec.Struct, tag_field="event", tag="lost"):
-    topic: str
-    cause: Cause
-    count: _Number | None
-    first: _Number
-    last: _Number
-    detail: str
-
-
-class _Say(msgspec.Struct, tag_field="event", tag="say"):
-    text: str
-
-
-class _Bye(msgspec.Struct, tag_field="event", tag="bye"):
-    pass
-
-
-_Event = _Candidate | _Channel | _Topic | _Gone | _Lost | _Say | _Bye
+_MAX_INT = 2**63 - 1
 
 
 class Receiver:
@@ -110,7 +64,7 @@ class Receiver:
                 kind, length = HEADER.unpack(header)
                 check_frame(kind, length)
                 if kind == EVENT:
-                    self._event(_parsed(_read(file, length)))
+                    self._event(parse_object(_read(file, length)))
                 else:
                     self._message(file, length)
                 self.last_received = time.time_ns()
@@ -130,47 +84,67 @@ class Receiver:
             sequence=sequence if sequence >= 0 else None,
         )
 
-    def _event(self, event: _Event) -> None:
+    def _event(self, event: dict[str, Any]) -> None:
         match event:
-            case _Candidate(topic, kind):
+            case {"event": "candidate", "topic": str(topic), "type": str(kind)}:
                 if self._sink.wants(topic, kind):
                     command = dumps({"subscribe": topic, "type": kind})
                     self._peer.sendall(command.encode("ascii") + b"\n")
-            case _Channel():
+            case {
+                "event": "channel",
+                "number": int(),
+                "topic": str(),
+                "type": str(),
+                "encoding": str(),
+                "definition": str(),
+                "offered": str(),
+                "hash": str(),
+            }:
                 self._channel(event)
-            case _Topic(topic, kind):
+            case {"event": "topic", "topic": str(topic), "type": str(kind)}:
                 self.present.add(topic)
                 self._sink.topic_came(topic, kind)
-            case _Gone(topic):
+            case {"event": "gone", "topic": str(topic)}:
                 self.present.discard(topic)
                 self._sink.topic_gone(topic)
-            case _Lost(topic, cause, count, first, last, detail):
-                self._sink.lost(Loss(topic, cause, count, first, last, one_line(detail)))
-            case _Say(text):
+            case {
+                "event": "lost",
+                "topic": str(topic),
+                "cause": str(cause),
+                "count": int() | None as count,
+                "first": int(first),
+                "last": int(last),
+                "detail": str(detail),
+            } if cause in {*Cause} and all(0 <= n <= _MAX_INT for n in (count or 0, first, last)):
+                self._sink.lost(Loss(topic, Cause(cause), count, first, last, one_line(detail)))
+            case {"event": "say", "text": str(text)}:
                 self._sink.say(one_line(f"ROS 2: {text}"))
-            case _Bye():
+            case {"event": "bye"}:
                 self.said_bye = True
+            case _:
+                raise WireError(f"a malformed event: {one_line(repr(event))}")
 
-    def _channel(self, event: _Channel) -> None:
+    def _channel(self, event: dict[str, Any]) -> None:
+        topic = event["topic"]
         try:
-            definition = event.definition.encode("utf-8", "surrogateescape")
+            definition = event["definition"].encode("utf-8", "surrogateescape")
         except UnicodeEncodeError as error:
             raise WireError("a definition that is not text") from error
-        metadata = {"offered_qos_profiles": event.offered}
-        if event.hash:
-            metadata["topic_type_hash"] = event.hash
-        channel = self._channels[event.number] = Channel(
-            topic=event.topic,
+        metadata = {"offered_qos_profiles": event["offered"]}
+        if event["hash"]:
+            metadata["topic_type_hash"] = event["hash"]
+        channel = self._channels[event["number"]] = Channel(
+            topic=topic,
             message_encoding="cdr",
-            schema=Schema(event.type, event.encoding, definition),
+            schema=Schema(event["type"], event["encoding"], definition),
             metadata=metadata,
             has_publish_time=True,
         )
         self._sink.expect(channel)
-        self.subscribed.add(event.topic)
-        since = self._outages.pop(event.topic, None)
+        self.subscribed.add(topic)
+        since = self._outages.pop(topic, None)
         if since is not None:
-            report_outage(self._sink, event.topic, since)
+            report_outage(self._sink, topic, since)
 
 
 def report_outage(sink: Sink, topic: str, since: int) -> None:
@@ -184,12 +158,3 @@ def _read(file: io.BufferedIOBase, size: int) -> bytes:
     if len(data) < size:
         raise WireError("it ended in the middle of a frame")
     return data
-
-
-def _parsed(body: bytes) -> _Event:
-    """The event in the body of a frame; a definition may have surrogates, so `json` reads it."""
-    try:
-        event: _Event = msgspec.convert(parse_object(body), _Event)
-    except msgspec.ValidationError as error:
-        raise WireError(f"a malformed event: {error}") from error
-    return event

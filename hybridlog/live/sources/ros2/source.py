@@ -6,19 +6,36 @@ A child that dies is restarted with growing pauses. The outage is reported for e
 from __future__ import annotations
 
 import os
+import reprlib
+import shutil
+import signal
+import socket
+import subprocess
+import sys
 import time
-from threading import Lock
-from typing import TYPE_CHECKING
+from collections import deque
+from contextlib import suppress
+from json import dumps
+from pathlib import Path
+from threading import Event, Lock, Thread
+from typing import TYPE_CHECKING, Any
 
+from hybridlog.formats.yaml_values import YamlError, parse_yaml, read_yaml
 from hybridlog.live.sources.base import ThreadedSource, one_line
-from hybridlog.live.sources.ros2.child.wire import WireError
-from hybridlog.live.sources.ros2.overrides import read_overrides
-from hybridlog.live.sources.ros2.process import ChildError, Process, launch
+from hybridlog.live.sources.ros2.child.qos import DURATIONS, FOREVER, Profile
+from hybridlog.live.sources.ros2.child.wire import (
+    EVENT,
+    HEADER,
+    WireError,
+    check_frame,
+    parse_object,
+)
 from hybridlog.live.sources.ros2.receiver import Receiver, report_outage
 from hybridlog_storage.errors import MissingDependencyError, SourceError, UsageError
 
 if TYPE_CHECKING:
-    from pathlib import Path
+    from collections.abc import Mapping, Sequence
+    from typing import IO
 
     from hybridlog.live.sources.base import Sink
 
@@ -163,3 +180,272 @@ class Ros2Source(ThreadedSource):
                     return child
             child.end()
         return None
+
+
+PYTHON_VARIABLE = "HYBRIDLOG_ROS2_PYTHON"
+
+START = Path(__file__).with_name("child") / "__main__.py"
+
+HELLO_S = 30.0
+"""Time limit for a child to load rclpy and send its greeting."""
+
+SOCKET_BYTES = 4 << 20
+"""Requested size of the socket buffer; the kernel may give less."""
+
+_POLL_S = 0.2
+_MAX_LINES = 30
+_MAX_LINE = 300
+_MAX_HELLO = 1 << 16
+
+_REMEDY = (
+    "on a robot, source the set-up file of ROS first (source /opt/ros/DISTRO/setup.bash); "
+    "elsewhere install the wheels into a virtual environment of their own (python3 -m venv ros2; "
+    "ros2/bin/pip install ros-rclpy ros-rmw-fastrtps-cpp ros-std-msgs ros-sensor-msgs "
+    f"ros-geometry-msgs) and name its Python: {PYTHON_VARIABLE}=ros2/bin/python"
+)
+
+
+class ChildError(Exception):
+    """The child did not start; the message is one line with the reason."""
+
+
+class ChildMissingError(ChildError):
+    """The Python does not exist, or has no rclpy."""
+
+
+class Process:
+    """A running child, which has sent its greeting, `hello`.
+
+    `settings` is its first line of input; `cancelled` is set to give up waiting for the greeting. A
+    Python that does not exist, or has no rclpy, raises ChildMissingError.
+    """
+
+    def __init__(
+        self,
+        python: str,
+        settings: Mapping[str, Any],
+        environment: Mapping[str, str],
+        cancelled: Event,
+    ) -> None:
+        self.peer, theirs = socket.socketpair()
+        self._cancelled = cancelled
+        self._lines: deque[str] = deque(maxlen=_MAX_LINES)
+        for end, option in ((self.peer, socket.SO_RCVBUF), (theirs, socket.SO_SNDBUF)):
+            end.setsockopt(socket.SOL_SOCKET, option, SOCKET_BYTES)
+        try:
+            with theirs:
+                self._process = subprocess.Popen(  # noqa: S603
+                    [python, "-u", str(START), str(theirs.fileno())],
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.PIPE,
+                    stderr=subprocess.STDOUT,
+                    pass_fds=[theirs.fileno()],
+                    env=dict(environment),
+                    # Ctrl-C must only reach the recorder, which ends its child.
+                    start_new_session=True,
+                )
+        except OSError as error:
+            self.peer.close()
+            raise ChildMissingError(f"{python} cannot be started: {error.strerror}") from error
+        assert self._process.stdout is not None
+        self._listener = Thread(target=self._listen, args=(self._process.stdout,), daemon=True)
+        self._listener.start()
+        self.pid = self._process.pid
+        try:
+            self.hello = self._greet(python, settings)
+        except BaseException:
+            self.end()
+            raise
+
+    def _listen(self, output: IO[bytes]) -> None:
+        """Stores the last lines of output, which may explain a failure."""
+        with output:
+            while line := output.readline(1 << 12):
+                self._lines.append(line.decode(errors="replace").strip()[:_MAX_LINE])
+
+    def _greet(self, python: str, settings: Mapping[str, Any]) -> dict[str, Any]:
+        deadline = time.monotonic() + HELLO_S
+        self.peer.settimeout(_POLL_S)
+        try:
+            self.peer.sendall(dumps(settings).encode("ascii") + b"\n")
+            kind, length = HEADER.unpack(self._receive(HEADER.size, deadline))
+            check_frame(kind, length)
+            if kind != EVENT or length > _MAX_HELLO:
+                raise WireError("something else than a greeting")
+            hello = parse_object(self._receive(length, deadline))
+        except TimeoutError as error:
+            raise ChildError(f"{python} did not load rclpy within {HELLO_S:.0f} s") from error
+        except OSError as error:
+            raise ChildMissingError(f"{python} ended: {self.exit_report()}") from error
+        except WireError as error:
+            raise ChildError(f"{python}: {error}") from error
+        self.peer.settimeout(None)
+        if hello.get("event") == "hello":
+            return hello
+        why = f"{python}: {one_line(str(hello.get('why')))}"
+        raise ChildMissingError(why) if hello.get("missing") else ChildError(why)
+
+    def _receive(self, size: int, deadline: float) -> bytes:
+        """Receives exactly `size` bytes by a deadline of the monotonic clock, or raises OSError."""
+        parts = b""
+        while len(parts) < size:
+            if self._cancelled.is_set() or time.monotonic() > deadline:
+                raise TimeoutError
+            try:
+                part = self.peer.recv(size - len(parts))
+            except TimeoutError:
+                continue
+            if not part:
+                raise ConnectionResetError
+            parts += part
+        return parts
+
+    def exit_report(self) -> str:
+        """Exit code or signal of the child, and its last line of output."""
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(1.0)
+        self._listener.join(1.0)
+        code = self._process.returncode
+        if code is None:
+            how = "it still runs"
+        elif code < 0:
+            with suppress(ValueError):
+                code = signal.Signals(-code).name
+            how = f"killed by {code}"
+        else:
+            how = f"exit code {code}"
+        lines = [line for line in self._lines if line]
+        return one_line(f"{how}: {lines[-1]}" if lines else how)
+
+    def end_input(self) -> None:
+        """Asks the child to pass on its messages and end."""
+        with suppress(OSError):
+            self.peer.shutdown(socket.SHUT_WR)
+
+    def kill(self) -> None:
+        """Kills the child, and ends reads from it."""
+        self._process.kill()
+        with suppress(OSError):
+            self.peer.shutdown(socket.SHUT_RDWR)
+
+    def end(self) -> None:
+        """Ends the child within a second."""
+        self.end_input()
+        try:
+            self._process.wait(1.0)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._listener.join(1.0)
+        self.peer.close()
+
+
+def launch(
+    python: str | None, settings: Mapping[str, Any], domain_id: int | None, cancelled: Event
+) -> tuple[Process, str]:
+    """Starts a child under the first Python that has rclpy; returns also its interpreter.
+
+    Of `candidates`, or `python` alone if it is given; `cancelled` is set to give up. Without
+    `domain_id` it is that of the environment.
+    """
+    tried = []
+    for name in [python] if python else candidates(os.environ):
+        try:
+            environment = environment_for(name, domain_id)
+            return Process(name, settings, environment, cancelled), name
+        except ChildMissingError as error:
+            tried.append(str(error))
+    raise MissingDependencyError(
+        f"recording ROS 2 needs a Python that has rclpy ({'; '.join(tried)}): {_REMEDY}"
+    )
+
+
+def candidates(environment: Mapping[str, str]) -> Sequence[str]:
+    """Interpreters that may have rclpy, at least one, the most likely first."""
+    named = environment.get(PYTHON_VARIABLE)
+    if named:
+        return [named]
+    found = []
+    if environment.get("ROS_DISTRO") or environment.get("AMENT_PREFIX_PATH"):
+        # The first on the PATH may be our own; ROS is built for the system's Python.
+        on_path = shutil.which("python3", path=environment.get("PATH"))
+        found = [path for path in (on_path, "/usr/bin/python3") if path and Path(path).exists()]
+    return list(dict.fromkeys([*found, sys.executable]))
+
+
+def environment_for(python: str, domain_id: int | None) -> dict[str, str]:
+    """The environment of a child."""
+    found = dict(os.environ)
+    if python != sys.executable:
+        # The wheels set this once they have found their libraries, and the child has others.
+        found.pop("_ROS_WHEELS_BOOTSTRAP_COMPLETE", None)
+    if domain_id is not None:
+        found["ROS_DOMAIN_ID"] = str(domain_id)
+    return found
+
+
+MAX_DEPTH = 1_000_000
+
+_POLICIES = {
+    "history": {"system_default": 0, "keep_last": 1, "keep_all": 2},
+    "reliability": {"system_default": 0, "reliable": 1, "best_effort": 2},
+    "durability": {"system_default": 0, "transient_local": 1, "volatile": 2},
+    "liveliness": {"system_default": 0, "automatic": 1, "manual_by_topic": 3},
+}
+
+
+def read_overrides(path: Path) -> dict[str, dict[str, Any]]:
+    """Reads the overrides: fields of `Profile` by topic."""
+    data = read_yaml(path, "QoS overrides")
+    try:
+        root = parse_yaml(data)
+    except YamlError as error:
+        raise UsageError(f"{path}: invalid YAML: {error}") from error
+    if root is None:
+        return {}
+    if not isinstance(root, dict):
+        raise UsageError(f"{path}: topics with policies below them are expected")
+    found = {}
+    for topic, policies in root.items():
+        if not isinstance(topic, str) or not isinstance(policies, dict):
+            raise UsageError(
+                f"{path}: {reprlib.repr(topic)}: a topic with policies below it is expected"
+            )
+        name = topic if topic.startswith("/") else f"/{topic}"
+        found[name] = {
+            str(key): _policy(key, value, f"{path}: {topic}") for key, value in policies.items()
+        }
+    return found
+
+
+def _policy(name: object, value: object, where: str) -> int:
+    """The number of a policy."""
+    if name in DURATIONS:
+        return _duration(value, f"{where}: {name}")
+    if name == "depth":
+        if isinstance(value, bool) or not isinstance(value, int) or not 0 < value <= MAX_DEPTH:
+            raise UsageError(
+                f"{where}: depth is a number from 1 to {MAX_DEPTH}, not {reprlib.repr(value)}"
+            )
+        return value
+    if name == "avoid_ros_namespace_conventions":
+        if not isinstance(value, bool):
+            raise UsageError(f"{where}: {name} is true or false, not {reprlib.repr(value)}")
+        return value
+    words = _POLICIES.get(name) if isinstance(name, str) else None
+    if words is None:
+        known = ", ".join(Profile._fields)
+        raise UsageError(f"{where}: unknown policy {name!r}; choose one of {known}")
+    number = words.get(value.lower()) if isinstance(value, str) else None
+    if number is None:
+        raise UsageError(f"{where}: {name} is one of {', '.join(words)}, not {reprlib.repr(value)}")
+    return number
+
+
+def _duration(value: object, where: str) -> int:
+    """A duration in ns."""
+    if isinstance(value, dict) and set(value) == {"sec", "nsec"}:
+        sec, nsec = value["sec"], value["nsec"]
+        if all(isinstance(part, int) and part >= 0 for part in (sec, nsec)):
+            return int(min(sec * 1_000_000_000 + nsec, FOREVER))
+    raise UsageError(f"{where} is a duration, {{sec: 1, nsec: 0}}, not {reprlib.repr(value)}")

@@ -21,6 +21,8 @@ from hybridlog.live.sources.ros2.child.wire import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from hybridlog.live.sources.ros2.child.definitions import Definition
 
 BUDGET = 256 << 20
@@ -32,17 +34,6 @@ _MAX_BUFFERS = 64
 _MAX_REPORTS = 10_000  # different ones
 
 
-class Refusal:
-    """Refused messages of one channel since the last report."""
-
-    __slots__ = ("count", "first", "last")
-
-    def __init__(self, received: int) -> None:
-        self.count = 0
-        self.first = received
-        self.last = received
-
-
 class Outbox:
     """Packs messages and events into frames, and sends them.
 
@@ -52,7 +43,8 @@ class Outbox:
 
     Attributes:
         waiting: Queued bytes.
-        refused: Messages by channel that did not fit or were too large.
+        refused: Messages by channel that did not fit or were too large since the last report:
+            their number, first and last receive time.
     """
 
     def __init__(self, peer: socket.socket, budget: int = BUDGET) -> None:
@@ -63,7 +55,7 @@ class Outbox:
         self._batch: list[bytes] = []  # small messages
         self._small = 0  # their bytes
         self.waiting = 0
-        self.refused: dict[int, Refusal] = {}
+        self.refused: dict[int, list[int]] = {}
         self._channels: list[str] = []
         self._said: set[str] = set()
 
@@ -71,11 +63,9 @@ class Outbox:
         """Adds a message; the arguments are those of `wire.ENTRY`."""
         size = len(payload)
         if (self.waiting and self.waiting + size > self._budget) or size > MAX_PAYLOAD:
-            refusal = self.refused.get(channel)
-            if refusal is None:
-                refusal = self.refused[channel] = Refusal(received)
-            refusal.count += 1
-            refusal.last = received
+            refused = self.refused.setdefault(channel, [0, received, received])
+            refused[0] += 1
+            refused[2] = received
             return
         head = HEADER.pack(MESSAGE, ENTRY.size + size)
         entry = ENTRY.pack(channel, size, received, sent, number)
@@ -118,12 +108,12 @@ class Outbox:
         cause: str,
         count: int | None,
         *,
-        times: tuple[int, int] | None = None,
+        times: Sequence[int] = (),
         detail: str = "",
     ) -> None:
         """Reports lost messages; `cause` is a value of `base.Cause`, `count` None if unknown.
 
-        `times` are begin and end of the loss, ns since the epoch; None for now.
+        `times` are begin and end of the loss, ns since the epoch; without, it is now.
         """
         first, last = times or (time.time_ns(),) * 2
         values = {"count": count, "first": first, "last": last, "detail": detail}
@@ -132,9 +122,8 @@ class Outbox:
     def report_refused(self) -> None:
         """Reports messages that were refused."""
         detail = "the recorder did not take them from the ROS 2 child in time"
-        for number, one in self.refused.items():
-            topic, times = self._channels[number], (one.first, one.last)
-            self.lost(topic, "queue", one.count, times=times, detail=detail)
+        for number, (count, *times) in self.refused.items():
+            self.lost(self._channels[number], "queue", count, times=times, detail=detail)
         self.refused.clear()
 
     def say(self, text: str) -> None:

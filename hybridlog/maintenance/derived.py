@@ -1,0 +1,278 @@
+"""Brings what is derived of recordings up to date: the index, tables with arrays, buckets."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from hybridlog.columns.layout import SHARED, SUFFIX, TABLES, topics_of, type_prefix
+from hybridlog.entries import describe, take_inventory
+from hybridlog.follow.follower import bring, make_tables
+from hybridlog.maintenance.opening import open_catalog
+from hybridlog.maintenance.report import ArraysOfTopic
+from hybridlog.snapshot import UNFINISHED
+from hybridlog_storage.disk import files
+from hybridlog_storage.disk.directory import LOCK_WAIT_S
+from hybridlog_storage.errors import (
+    HeldError,
+    HybridlogError,
+    SegmentError,
+    StoreError,
+    TopicError,
+    unreadable,
+)
+from hybridlog_storage.messages import EXPIRED_IDS
+from hybridlog_storage.mongo.index_state import IndexState
+from hybridlog_storage.settings import read_settings
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Mapping, Sequence
+
+    from hybridlog.columns.tables import Tables
+    from hybridlog.maintenance.report import Progress, RepairReport
+    from hybridlog.shared import Shared
+    from hybridlog.snapshot import Snapshot
+    from hybridlog_storage.catalog import Catalog, RecordingEntry
+    from hybridlog_storage.disk.directory import StoreDirectory
+    from hybridlog_storage.mongo.database import Database
+    from hybridlog_storage.remote.bucket import Object
+    from hybridlog_storage.remote.store import RemoteDirectory
+    from hybridlog_storage.summary import RecordingSummary
+
+
+@dataclass(frozen=True, slots=True)
+class StoreIndex:
+    """The index of a store. All methods raise `DatabaseError` if MongoDB fails."""
+
+    directory: StoreDirectory
+    catalog: Catalog
+    database: Database
+    progress: Progress | None = None
+
+    def bring_up_to_date(
+        self,
+        snapshot: Snapshot,
+        entry_of: Callable[[RecordingSummary], RecordingEntry],
+        *,
+        index: str,
+        removes: bool,
+        report: RepairReport,
+    ) -> set[str]:
+        """Index missing segments, remove documents of removed recordings; returns changed ids.
+
+        Recordings that the catalog knows to be in this index are not looked at, unless the index
+        has another number of recordings than these. `removes` is False in a copy of the store that
+        the index belongs to: what it does not have may be there.
+        """
+        directory, state = self.directory, IndexState(self.database)
+        behind = [one for one in snapshot.summaries if one.indexed_by != index]
+        known = state.of([one.key for one in behind]) if behind else {}
+        is_other = state.count() - len(known) != len(snapshot) - len(behind)
+        if is_other:
+            behind, known = snapshot.summaries, state.of()
+            if removes:
+                self._remove_orphans(known, report)
+        changed, current = set(), []
+        for summary in behind:
+            entry = entry_of(summary)
+            indexed = known.get(entry.key)
+            if indexed is not None and indexed.is_whole(entry) and entry.is_decoded:
+                current.append(entry.id)
+            elif directory.is_writable:  # else the segments answer, without an index
+                self._bring_one(entry, report)
+                changed.add(entry.id)
+        if current:
+            self.catalog.put_indexed(current, index)
+        return changed.union(current)
+
+    def _bring_one(self, entry: RecordingEntry, report: RepairReport) -> None:
+        """Bring one recording up to date, unless another process is writing it."""
+        # The process that holds the lock indexes it.
+        with suppress(HeldError, TopicError):
+            try:
+                chunks = self._bring(entry)
+            except SegmentError as error:
+                report.unreadable[entry.id] = str(error)
+            else:
+                if chunks is not None:
+                    report.indexed[entry.name] = chunks
+
+    def _bring(self, entry: RecordingEntry, **options: Any) -> int | None:
+        directory, catalog, database = self.directory, self.catalog, self.database
+        return bring(directory, catalog, entry, database, progress=self.progress, **options).chunks
+
+    def _remove_orphans(self, known: Iterable[str], report: RepairReport) -> None:
+        """Remove recordings without a directory from the index.
+
+        The directories are listed after the index, so they include recordings that have begun
+        meanwhile.
+        """
+        directory, state = self.directory, IndexState(self.database)
+        gone = {*known} - {one[-16:] for one in (*directory.ids(), *directory.manifests.without())}
+        if gone:
+            state.forget(gone)
+            report.removed += sorted(gone)
+
+    def rebuild(self, entries: Iterable[RecordingEntry]) -> dict[str, HybridlogError]:
+        """Rebuild the index of recordings from their segments; returns why some are unchanged.
+
+        The next opening finishes an interrupted rebuild. Unchanged ones, by id, are gone, or
+        another process holds them.
+        """
+        left: dict[str, HybridlogError] = {}
+        for chosen in entries:
+            try:
+                self._bring(chosen, anew=True, wait_s=LOCK_WAIT_S)
+            except (HeldError, TopicError) as error:
+                left[chosen.id] = error
+        return left
+
+    def clear(self) -> None:
+        """Remove all documents but those of recordings that are being written."""
+        ids = self.directory.ids()
+        held = [one[-16:] for one in ids if self.directory.holder(one) is not None]
+        IndexState(self.database).clear_all(but=held)
+
+
+def index_arrays(
+    directory: StoreDirectory,
+    catalog: Catalog,
+    entries: Sequence[RecordingEntry],
+    topics: Sequence[str],
+    known: Tables,
+    *,
+    off: bool = False,
+    progress: Progress | None = None,
+) -> list[ArraysOfTopic]:
+    """Change the setting of topics, and make their tables anew where these differ from it."""
+    others = [one for one in read_settings(directory.path).arrays if one not in topics]
+    directory.change_settings(arrays=tuple(sorted(others if off else {*others, *topics})))
+    found = {topic: ArraysOfTopic(topic) for topic in topics}
+    channels = [channel for entry in entries for channel in entry.channels]
+    types = {one: {type_prefix(c.type) for c in channels if c.topic == one} for one in topics}
+    before = _bytes(directory.path, types)
+    for entry in entries:
+        own = topics_of(entry) & found.keys()
+        wanted = {topic for topic in own if _differs(known, entry, found[topic], off=off)}
+        if not wanted:
+            continue
+        make_tables(directory, catalog, entry, topics=wanted, progress=progress)
+        known.look_again()
+        for topic in wanted:
+            is_left = _differs(known, entry, found[topic], off=off)
+            (found[topic].left if is_left else found[topic].recordings).append(entry.name)
+    after = _bytes(directory.path, types)
+    for topic, one in found.items():
+        one.bytes_before, one.bytes_after = before[topic], after[topic]
+    return list(found.values())
+
+
+def _bytes(root: Path, types: Mapping[str, set[str]]) -> dict[str, int]:
+    """Bytes of all tables of the types of each topic."""
+    from hybridlog.columns.folders import files_of
+
+    sizes: Counter[str] = Counter()
+    for file in files_of(root, set[str]().union(*types.values())):
+        sizes[file.path.parent.name.rpartition("~")[0] + "~"] += file.size_bytes
+    return {topic: sum(sizes[one] for one in own) for topic, own in types.items()}
+
+
+def _differs(known: Tables, entry: RecordingEntry, found: ArraysOfTopic, *, off: bool) -> bool:
+    """True if a table is not as the setting of its topic is; notes whether it can have arrays.
+
+    Arrays of a recording from which some have expired are in no answer, and so in no table.
+    """
+    topic, differs = found.topic, None
+    for file, _, section in known.sections_of(entry):
+        if section.topic == topic:
+            can_have = bool(file.arrays)
+            found.has_arrays = found.has_arrays or can_have
+            is_other = can_have and bool(section.counts.arrays) is off
+            differs = differs or is_other
+    is_expired = any(one.id >= EXPIRED_IDS for one in entry.channels if one.topic == topic)
+    return differs is not False and (off or not is_expired)
+
+
+_TRIES: Final = 10  # while others write the catalog, too
+
+
+def bring_derived(source: Shared, target: RemoteDirectory, recordings: Collection[str]) -> None:
+    """Bring the tables and the rows of the catalog of recordings that were copied into a bucket.
+
+    Nothing depends on it: without it answers are the same, and take more requests.
+    """
+    known = {}
+    for recording in recordings:
+        entry = source.now().entry_if_there(recording)
+        if entry is not None and entry.status not in UNFINISHED:
+            known[recording] = entry, _bring_tables(source, target, entry)
+    cells = target.source.cells
+    for _ in range(_TRIES if known else 0):
+        target.manifests.look(now=True)
+        catalog = open_catalog(target)
+        for recording, (entry, tables) in known.items():
+            with suppress(StoreError):  # who asks for it there is told what is wrong
+                _describe(source.catalog, entry, target, catalog)
+                cells.put_tables(recording, tables)
+        if cells.save():
+            return
+    cells.close()  # a manifest may have been made again
+
+
+def _describe(
+    known: Catalog, entry: RecordingEntry, target: RemoteDirectory, catalog: Catalog
+) -> None:
+    """Make the row of the catalog from what is there, and from what decoding found out here."""
+    for number, digest in entry.digests.items():
+        decoded = known.decoded(entry, int(number))
+        if decoded is not None:
+            catalog.put_decoded(entry.id, int(number), digest, decoded)
+    catalog.put_damage(entry.id, known.damage(entry.id))
+    catalog.put(describe(catalog, take_inventory(target, entry.id)))
+
+
+def _bring_tables(source: Shared, target: RemoteDirectory, entry: RecordingEntry) -> list[Object]:
+    """Write the tables of a recording; no file of them has another recording."""
+    from hybridlog_storage.copy_places import read
+
+    found, numbers = [], dict[str, int]()
+    with tempfile.TemporaryDirectory(prefix="hybridlog-") as place:
+        for path in _tables(source, entry, Path(place)):
+            folder = path.parent.name
+            number = numbers[folder] = numbers.get(folder, -1) + 1
+            name = f"{TABLES}/{folder}/{entry.id}-{number}{SUFFIX}"
+            try:
+                fd = files.open_file(path, os.O_RDONLY)
+            except OSError as error:
+                raise unreadable(error, path) from error
+            try:
+                size = os.fstat(fd).st_size
+                found.append(target.bucket.put(name, size, read(fd, 0, size)))
+            finally:
+                os.close(fd)
+    return found
+
+
+def _tables(source: Shared, entry: RecordingEntry, root: Path) -> list[Path]:
+    """Files with the fields of a recording; of shared ones its rows alone, below `root`."""
+    from hybridlog.columns.folders import Addition, TableFolders, files_of
+
+    found = []
+    shared = defaultdict[str, Addition](Addition)
+    for file, begin, section in source.tables.sections_of(entry):
+        if not section.segments.items() <= entry.digests.items():
+            continue  # they are of what it was before
+        if not file.path.name.startswith(SHARED):
+            found.append(file.path)
+            continue
+        with suppress(StoreError):  # what is damaged is left out: messages answer, too
+            rows = file.table().slice(begin, section.rows)
+            shared[file.path.parent.name].pieces.append((section, rows))
+    TableFolders(root, entry.id, entry.created).add(shared)
+    return found + [reader.path for reader in files_of(root)]
