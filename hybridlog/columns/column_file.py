@@ -47,17 +47,6 @@ LAST: Final = (1 << 63) - 1
 """Upper bound of all log times."""
 
 
-class ReusedBytes(NamedTuple):
-    """The row groups of the file that a new one replaces.
-
-    They keep their place in the new file, where nothing refers to them: DuckDB reads the
-    footer, and opens the file again by its name for the rows.
-    """
-
-    offset: int
-    data: bytes
-
-
 class Leaf(NamedTuple):
     """A column in Parquet's order.
 
@@ -172,14 +161,6 @@ class ColumnFile:
 
     def _column(self, group: int, leaf: int) -> Any:
         return self._parquet.metadata.row_group(group).column(leaf)
-
-    def reusable(self) -> ReusedBytes:
-        """The bytes of its row groups."""
-        begin, end = self.about.span
-        try:
-            return ReusedBytes(begin, self._source.raw(begin, end))
-        except (OSError, StoreError) as error:
-            raise self._damaged(error) from error
 
     def table(self) -> pa.Table:
         """All rows."""

@@ -16,8 +16,8 @@ from bson.errors import BSONError
 from bson.int64 import Int64
 
 from hybridlog.schema.column import RESERVED, top_level_names
-from hybridlog.schema.summary import nearest_double, summary_of
-from hybridlog.schema.text import repaired_text
+from hybridlog.schema.summary import summary_of
+from hybridlog.schema.text import nearest, repaired_text
 from hybridlog_storage.errors import PayloadError
 
 if TYPE_CHECKING:
@@ -160,7 +160,7 @@ def _indexed(value: Plain, limit: int, depth: int) -> object:
     if isinstance(value, str):
         return repaired_text(value)
     if isinstance(value, int) and not _INT64_MIN <= value <= _INT64_MAX:
-        return nearest_double(value)
+        return nearest(value)
     return value
 
 

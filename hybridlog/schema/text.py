@@ -1,4 +1,4 @@
-"""Plain Python values as JSON text, and text that UTF-8 can encode."""
+"""Plain Python values as JSON text, text that UTF-8 can encode, and numbers as doubles."""
 
 from __future__ import annotations
 
@@ -47,3 +47,11 @@ def repaired_text(text: str) -> str:
     except UnicodeEncodeError:
         return text.encode("utf-16-le", "surrogatepass").decode("utf-16-le", "replace")
     return text
+
+
+def nearest(value: float) -> float:
+    """The nearest double; an infinity beyond the largest."""
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf if value > 0 else -math.inf

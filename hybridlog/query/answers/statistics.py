@@ -24,7 +24,6 @@ from hybridlog.query.rows import summaries_in
 from hybridlog.query.times import DurationLike, parse_duration
 from hybridlog.record.losses import topics_of
 from hybridlog.schema.kinds import NUMBERS
-from hybridlog.schema.summary import Totals
 from hybridlog.wording import listed
 from hybridlog_storage.errors import DefinitionError, UsageError
 from hybridlog_storage.times import END, placed
@@ -75,7 +74,7 @@ class _Running:
         self.count = self.nan = self.infinite = 0
         self.least: int | float | None = None
         self.most: int | float | None = None
-        self._total = Totals(1)
+        self._total = np.longdouble(0)  # no sum of doubles overflows it
         self._mean = 0.0
         self._squares, self._exponent = 0.0, -1074  # squares of numbers divided by 2**exponent
 
@@ -93,12 +92,9 @@ class _Running:
         self.least = low if self.least is None else min(self.least, low)
         self.most = high if self.most is None else max(self.most, high)
         numbers, count = values.astype(np.float64), len(values)
-        before, own, first = self._mean, self._total, np.zeros(1, np.intp)
-        if self.count:
-            own = Totals(1)
-            own.add(numbers, first, first)
-        self._total.add(numbers, first, first)
-        mean = float(own.means(np.array([count]))[0])
+        before, total = self._mean, numbers.sum(dtype=np.longdouble)
+        self._total += total
+        mean = float(total / count)
         size = max(abs(low), abs(high))
         exponent = max(math.frexp(size)[1] if size else self._exponent, self._exponent)
         self._squares = math.ldexp(self._squares, 2 * (self._exponent - exponent))
@@ -109,9 +105,7 @@ class _Running:
         step = math.ldexp(mean, -exponent) - math.ldexp(before, -exponent)
         self._squares += step * step * self.count * count / (self.count + count)
         self.count += count
-        self._mean = mean
-        if own is not self._total:
-            self._mean = float(self._total.means(np.array([self.count]))[0])
+        self._mean = float(self._total / self.count)
 
     @property
     def _std(self) -> float:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import TypeGuard
 
+from hybridlog.schema.text import nearest
+
 LOW, HIGH = -(2**63), 2**63 - 1
 """Smallest and greatest int64."""
 
@@ -17,14 +19,6 @@ def is_number(value: object) -> TypeGuard[float]:
 def is_nan(value: object) -> bool:
     """True if a value is NaN."""
     return isinstance(value, float) and math.isnan(value)
-
-
-def nearest(value: float) -> float:
-    """The nearest double; an infinity beyond the largest."""
-    try:
-        return float(value)
-    except OverflowError:
-        return math.inf if value > 0 else -math.inf
 
 
 def for_doubles(order: str, value: float) -> tuple[str, float]:

@@ -19,29 +19,15 @@ Order = Literal["==", "!=", "<", "<=", ">", ">="]
 
 
 class _Node:
-    """Equality and hash of nodes."""
+    """Equality and hash of nodes, by what is shown of them: `1` is not `True`, NaN equals NaN."""
 
     __slots__ = ()
 
-    def _key(self) -> tuple[object, ...]:
-        named = (getattr(self, each.name) for each in dataclasses.fields(self) if each.compare)  # type: ignore[arg-type]
-        return (type(self).__name__, *map(_key_of, named))
-
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Node) and self._key() == other._key()
+        return isinstance(other, _Node) and repr(self) == repr(other)
 
     def __hash__(self) -> int:
-        return hash(self._key())
-
-
-def _key_of(value: object) -> object:
-    if isinstance(value, tuple):
-        return tuple(map(_key_of, value))
-    if isinstance(value, bool):
-        return "bool", value  # True would equal 1
-    if isinstance(value, float) and value != value:  # noqa: PLR0124
-        return ("nan",)
-    return value
+        return hash(repr(self))
 
 
 class Slice(NamedTuple):
@@ -73,7 +59,7 @@ class Field(_Node):
     """
 
     parts: Parts
-    position: int = dataclasses.field(default=0, compare=False)
+    position: int = dataclasses.field(default=0, repr=False)
 
     @property
     def path(self) -> str:
@@ -93,7 +79,7 @@ class Compare(_Node):
     field: Field
     order: Order
     value: Value
-    position: int = dataclasses.field(default=0, compare=False)
+    position: int = dataclasses.field(default=0, repr=False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,7 +89,7 @@ class Member(_Node):
     field: Field
     values: tuple[Value, ...]
     negated: bool
-    position: int = dataclasses.field(default=0, compare=False)
+    position: int = dataclasses.field(default=0, repr=False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,7 +107,7 @@ class Match(_Node):
     field: Field
     pattern: str
     negated: bool
-    position: int = dataclasses.field(default=0, compare=False)
+    position: int = dataclasses.field(default=0, repr=False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
