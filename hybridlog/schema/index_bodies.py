@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from hybridlog.schema.codec import columns_of, no_rows
+from hybridlog.schema.codec import no_rows
 from hybridlog.schema.column import Records, header_stamps
 from hybridlog.schema.document import TooLarge, bodies
 
@@ -52,7 +52,7 @@ def bodies_of(codec: Codec, batch: Batch) -> Iterator[BodyGroup]:
         if len(batch):
             yield _without_fields(np.arange(len(batch)), None)
         return
-    decoded = columns_of(codec, batch)
+    decoded = codec.columns_of(batch)
     if isinstance(decoded.records, Records):
         yield from _of_columns(decoded, decoded.records)
     else:

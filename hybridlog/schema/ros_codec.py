@@ -9,6 +9,7 @@ from contextlib import suppress
 from functools import lru_cache
 from typing import TYPE_CHECKING, Literal, cast
 
+from hybridlog.schema.codec import Codec
 from hybridlog.schema.definition import (
     ArrayOf,
     FieldPath,
@@ -43,11 +44,8 @@ _TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(?:/[A-Za-z][A-Za-z0-9_]*)*\Z")
 _REGISTERING = threading.Lock()
 
 
-class RosCodec:
+class RosCodec(Codec):
     """Messages of one ROS type."""
-
-    indexed = True
-    reason: str | None = None
 
     def __init__(self, schema: Schema, wire: Literal["ros1", "cdr"]) -> None:
         self._name = schema.name

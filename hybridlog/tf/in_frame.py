@@ -269,7 +269,7 @@ def _tables_of_poses(planner: Planner) -> Iterator[pa.Table]:
                 columns |= _pose_in_frame(columns, pose, moved)
         for name, inside in found.lists.items():
             columns[name] = _list_in_frame(
-                columns[name], inside, looked, recordings, frames, times
+                columns[name], inside, looked, recordings=recordings, frames=frames, times=times
             )
         columns[frame] = pa.array([question.frame] * table.num_rows, pa.string())
         yield pa.table({name: column for name, column in columns.items() if name not in hidden})
@@ -308,6 +308,7 @@ def _list_in_frame(
     column: Any,
     poses: Sequence[_Pose],
     looked: _Looked,
+    *,
     recordings: Sequence[str],
     frames: Sequence[str],
     times: NDArray[np.int64],

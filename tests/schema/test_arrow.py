@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hybridlog.columns.left_rows import reduced
-from hybridlog.schema.codec import Codec, Decoded, columns_of
+from hybridlog.schema.codec import Codec, Decoded
 from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.messages import REDUCED, Batch, Channel, Schema, left_channel
 
@@ -24,7 +24,7 @@ JSON = codec_for(Channel("/t", "json", None))
 def decoded_of(codec: Codec, payloads: list[bytes], fields: set[str] | None = None) -> Decoded:
     length = np.array([len(p) for p in payloads], np.int64)
     data, offset, none = b"".join(payloads), np.cumsum(length) - length, np.zeros(len(length))
-    return columns_of(codec, Batch(data, offset, length, none, none, none, none), fields)
+    return codec.columns_of(Batch(data, offset, length, none, none, none, none), fields)
 
 
 def arrow_of(codec: Codec, payloads: list[bytes], fields: set[str] | None = None) -> Any:
@@ -177,5 +177,5 @@ def test_reduced_messages_have_what_the_index_has() -> None:
     assert [u.rows.tolist() for u in decoded.unreadable] == [[1]]
     (row,) = decoded.arrow().to_pylist()
     assert row["r"] is None
-    assert decoded.records.statistic("r", "max").to_pylist() == [99.0]  # type: ignore[union-attr]
+    assert decoded.records.statistics(["r.max"])["r.max"].to_pylist() == [99.0]  # type: ignore[union-attr]
     assert (row["n"], row["s"], row["t"].value) == (7, "x", 5 * 10**9 + 6)

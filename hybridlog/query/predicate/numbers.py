@@ -22,7 +22,7 @@ def is_nan(value: object) -> bool:
 
 
 def for_doubles(order: str, value: float) -> tuple[str, float]:
-    """The equivalent comparison of doubles with a double; it is never `== nan`.
+    """The equivalent comparison of doubles with a double, that nearest to a value.
 
     Args:
         order: `<`, `<=`, `>` or `>=`.
@@ -31,11 +31,8 @@ def for_doubles(order: str, value: float) -> tuple[str, float]:
     near = nearest(value)
     if near == value:
         return order, near
-    # No double lies between the value and its neighbours.
-    below = near if near < value else math.nextafter(near, -math.inf)
-    if order in {"<", "<="}:
-        return "<=", below
-    return ">=", math.nextafter(below, math.inf)
+    # No double lies between both, so it is on the other side or it is not.
+    return (order[0] if (order[0] == "<") == (near > value) else f"{order[0]}="), near
 
 
 def for_integers(order: str, value: float) -> tuple[str, int] | bool:
