@@ -253,7 +253,7 @@ class Listing:
         self._path = path
         self._read_at: tuple[int, int] | None = None  # inode, and time of its last change
 
-    def look(self) -> bool:
+    def read(self) -> bool:
         """Read the entries if they may have changed; returns whether it did."""
         try:
             now, names = files.changed_names(self._path, self._read_at)

@@ -6,6 +6,7 @@ The footer's is the 4 bytes in front of it, a CRC-32. Other readers ignore both.
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -105,45 +106,37 @@ class _Sink:
 
     def __init__(self, path: Path) -> None:
         self.closed = False
-        self._is_abandoned = False
         self._fd = files.open_file(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
         self._waiting = bytearray()
+        self._most = _WRITTEN
         self._position = 0
-        self._footer: bytearray | None = None
         self._digest = hasher()
 
     def write(self, data: Buffer) -> int:
         """Write bytes."""
         data = memoryview(data).cast("B")
-        if self._is_abandoned:
-            return len(data)  # pyarrow closes its writer when it is collected
-        self._position += len(data)
-        if self._footer is not None:
-            self._footer += data
-            return len(data)
-        self._waiting += data
-        if len(self._waiting) >= _WRITTEN:
-            self._flush()
+        if self._fd >= 0:  # pyarrow closes its writer when it is collected
+            self._position += len(data)
+            self._waiting += data
+            if len(self._waiting) >= self._most:
+                self._flush()
         return len(data)
 
     def end_body(self) -> None:
         """Begin the footer."""
-        self._footer = bytearray()
+        self._flush()
+        self._most = sys.maxsize
 
     def finish(self, *, sync: bool) -> tuple[int, str]:
         """Seal the footer, write all remaining bytes; return size and digest of the file."""
-        assert self._footer is not None
-        seal = crc32(self._footer).to_bytes(4, "little")
-        self._waiting += seal + self._footer
+        self._waiting[:0] = crc32(self._waiting).to_bytes(4, "little")
         self._flush()
         if sync:
             files.system.sync(self._fd)
         self.abandon()
-        return self._position + len(seal), self._digest.hexdigest()
+        return self._position + 4, self._digest.hexdigest()
 
     def abandon(self) -> None:
-        self._is_abandoned = True
-        self._waiting.clear()
         if self._fd >= 0:
             os.close(self._fd)
         self._fd = -1

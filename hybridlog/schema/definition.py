@@ -147,8 +147,6 @@ def parse_definition(schema: Schema) -> MessageType:
 @lru_cache(maxsize=1024)
 def parsed_with_supplied(schema: Schema) -> tuple[MessageType, frozenset[str]]:
     """Parse a definition; returns also the names of the standard types that it lacked."""
-    if not schema.encoding:
-        raise DefinitionError(f"{schema.name}: no definition in the source")
     if schema.encoding not in {"ros1msg", "ros2msg", "ros2idl", "omgidl"}:
         raise DefinitionError(f"{schema.name}: {schema.encoding!r} is not a ROS definition")
     if len(schema.data) > MAX_DEFINITION:

@@ -44,27 +44,21 @@ _UNROLL = 16
 
 
 class Bodies(NamedTuple):
-    """Bodies of equal width.
+    """Bodies of equal width, or why there are none.
 
     Attributes:
         rows: intp[k], rows of the input.
         body: uint8[k, width], the BSON elements of the top level, without the
-            document's length in front and its final NUL.
+            document's length in front and its final NUL; or a reason.
     """
 
     rows: NDArray[np.intp]
-    body: NDArray[np.uint8]
-
-
-class TooLarge(NamedTuple):
-    """Rows whose bodies exceed the size limit."""
-
-    rows: NDArray[np.intp]
+    body: NDArray[np.uint8] | str
 
 
 def bodies(
     records: Records, *, array_limit: int = 32, max_bytes: int = 8 << 20
-) -> Iterator[Bodies | TooLarge]:
+) -> Iterator[Bodies]:
     """Make the body of each row; every row is in exactly one of the results.
 
     The bytes equal `bson.encode` of the row's dictionary and depend on that row alone. Memory does
@@ -76,7 +70,7 @@ def bodies(
     width = _spread(top.width, len(records)) - 5
     large = width > max_bytes
     if large.any():
-        yield TooLarge(np.flatnonzero(large))
+        yield Bodies(np.flatnonzero(large), f"its fields take more than {max_bytes >> 20} MiB")
     rows = np.flatnonzero(~large)
     slab = np.cumsum(width[rows]) // _SLAB
     for part in np.split(rows, np.flatnonzero(np.diff(slab)) + 1):
@@ -337,12 +331,9 @@ def _array(column: Arrays, limit: int) -> _Node:
     if not short.any():
         return _summary(column, counts)
     some = np.flatnonzero(short)
-    part = take(column, some)
-    assert isinstance(part, Arrays)
-    lists = _List(_node(part.values, limit), counts[short])
-    part = take(column, np.flatnonzero(~short))
-    assert isinstance(part, Arrays)
-    return _Either(short, lists, _summary(part, counts[~short]))
+    lists = _List(_node(take(column, some).values, limit), counts[short])
+    long = take(column, np.flatnonzero(~short))
+    return _Either(short, lists, _summary(long, counts[~short]))
 
 
 def _summary(column: Arrays, counts: NDArray[np.int64]) -> _Record:

@@ -9,14 +9,14 @@ import numpy as np
 
 from hybridlog.schema.codec import no_rows
 from hybridlog.schema.column import Records, header_stamps
-from hybridlog.schema.document import TooLarge, bodies
+from hybridlog.schema.document import bodies
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from numpy.typing import NDArray
 
-    from hybridlog.schema.codec import Codec, Decoded
+    from hybridlog.schema.codec import Codec
     from hybridlog_storage.messages import Batch
 
 ARRAY_LIMIT: Final = 32
@@ -53,32 +53,21 @@ def bodies_of(codec: Codec, batch: Batch) -> Iterator[BodyGroup]:
             yield _without_fields(np.arange(len(batch)), None)
         return
     decoded = codec.columns_of(batch)
-    if isinstance(decoded.records, Records):
-        yield from _of_columns(decoded, decoded.records)
+    records, stamps = decoded.records, None
+    if isinstance(records, Records):
+        stamps = header_stamps(records)
+        made = bodies(records, array_limit=ARRAY_LIMIT, max_bytes=MAX_BYTES)
     else:
-        for made, own in decoded.records.bodies(ARRAY_LIMIT, MAX_BYTES):
-            rows = decoded.rows[own]
-            if isinstance(made, str):
-                yield _without_fields(rows, made)
-            else:
-                yield BodyGroup(rows, made, None, None, _surplus_among(rows, decoded))
+        made = records.bodies(ARRAY_LIMIT, MAX_BYTES)
+    for own, body in made:
+        rows = decoded.rows[own]
+        if isinstance(body, str):
+            yield _without_fields(rows, body)
+            continue
+        surplus = np.intersect1d(rows, decoded.surplus) if len(decoded.surplus) else no_rows()
+        yield BodyGroup(rows, body, None, None if stamps is None else stamps[own], surplus)
     for bad in decoded.unreadable:
         yield _without_fields(bad.rows, bad.reason)
-
-
-def _of_columns(decoded: Decoded, records: Records) -> Iterator[BodyGroup]:
-    stamps = header_stamps(records)
-    for group in bodies(records, array_limit=ARRAY_LIMIT, max_bytes=MAX_BYTES):
-        rows = decoded.rows[group.rows]
-        if isinstance(group, TooLarge):
-            yield _without_fields(rows, f"its fields take more than {MAX_BYTES >> 20} MiB")
-            continue
-        own = None if stamps is None else stamps[group.rows]
-        yield BodyGroup(rows, group.body, None, own, _surplus_among(rows, decoded))
-
-
-def _surplus_among(rows: NDArray[np.intp], decoded: Decoded) -> NDArray[np.intp]:
-    return np.intersect1d(rows, decoded.surplus) if len(decoded.surplus) else no_rows()
 
 
 def _without_fields(rows: NDArray[np.intp], error: str | None) -> BodyGroup:

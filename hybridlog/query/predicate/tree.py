@@ -176,13 +176,13 @@ Condition: TypeAlias = Compare | Member | Exists | Match
 Node: TypeAlias = Condition | And | Or | Not | Near | MongoFilter
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True)
 class Predicate:
     """A predicate that was parsed and checked.
 
     Attributes:
         root: The tree.
-        text: The text as written, for messages.
+        text: The text as written, to be shown.
     """
 
     root: Node
@@ -203,9 +203,6 @@ class Predicate:
             for item in (each.root.items if isinstance(each.root, And) else (each.root,))
         ]
         return Predicate(And(tuple(items)), " and ".join(f"({each.text})" for each in target))
-
-    def __repr__(self) -> str:
-        return f"<Predicate {spelled(self.root)}>"
 
     def conditions(self) -> Iterator[Condition]:
         """Every single condition, from left to right."""
@@ -249,44 +246,3 @@ def nodes(node: Node) -> Iterator[Node]:
             yield from nodes(item)
         case _:
             pass
-
-
-def spelled(node: Node) -> str:
-    """The node as text of the language; a filter as MongoDB writes it."""
-    match node:
-        case Not(item):
-            return f"not ({spelled(item)})"
-        case MongoFilter():
-            return str(node.to_filter())
-        case Near(topic, predicate):
-            return f"{topic}: {predicate}"
-        case And(items):
-            return " and ".join(map(_bracketed, items)) or "anything"
-        case Or(items):
-            return " or ".join(map(_bracketed, items)) or "nothing"
-        case _:
-            return _condition(node)
-
-
-def _condition(node: Condition) -> str:
-    path = node.field.path.replace(".[", "[")
-    match node:
-        case Compare(order=order, value=value):
-            return f"{path} {order} {_literal(value)}"
-        case Member(values=values, negated=negated):
-            members = ", ".join(map(_literal, values))
-            return f"{path} {'not in' if negated else 'in'} [{members}]"
-        case Exists(present=present):
-            return f"{path} {'exists' if present else 'missing'}"
-        case Match(pattern=pattern, negated=negated):
-            return f"{path} {'!~' if negated else '~'} {pattern!r}"
-
-
-def _bracketed(node: Node) -> str:
-    return f"({spelled(node)})" if isinstance(node, And | Or) else spelled(node)
-
-
-def _literal(value: Value) -> str:
-    if value is None:
-        return "null"
-    return str(value).lower() if isinstance(value, bool) else repr(value)

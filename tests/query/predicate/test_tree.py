@@ -47,12 +47,6 @@ def test_predicates_are_equal_when_they_ask_for_the_same() -> None:
     assert parse("x == 1") != 1
 
 
-def test_what_mongodb_is_asked_is_shown_as_it_is_written() -> None:
-    shown = repr(mongo_filter({"x": 1, "y": {"$lt": 2}}, None) & parse("z == 1"))
-    assert shown == "<Predicate {'x': 1, 'y': {'$lt': 2}} and z == 1>"
-    assert repr(mongo_filter({}, None)) == "<Predicate anything>"
-
-
 def test_joined() -> None:
     everything = mongo_filter({}, None)
     one, two = parse("x < 5"), parse("y > 1 and z == 2")
