@@ -23,7 +23,7 @@ from hybridlog.columns.fields import (
     names_of,
     original_name,
 )
-from hybridlog.columns.layout import ABOUT, OWN, OWN_COLUMNS, About, Section, TopicCounts
+from hybridlog.columns.layout import ABOUT, OWN, OWN_COLUMNS, About, Section
 from hybridlog.schema.arrow_types import is_list
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import files
@@ -309,17 +309,6 @@ class ColumnFile:
                 yield TablePart(self, group, low - before, high - low, *bounds)
             before += own
 
-    @lazy
-    def counts(self) -> TopicCounts:
-        """Counts of all its rows."""
-        return TopicCounts(
-            *map(sum, zip(*(one.counts for one in self.about.sections), strict=True))
-        )
-
-    def all_parts(self) -> list[TablePart]:
-        """All rows, as if they were of one topic."""
-        return [TablePart(self, group, 0, rows) for group, rows in enumerate(self.groups)]
-
 
 class _Source:
     """Provides Parquet's bytes, after verifying the checksum of the footer."""
@@ -443,9 +432,3 @@ class OpenFiles:
             self._open.move_to_end(file.number)
             while len(self._open) > files.most_open(_OPEN_FILES):
                 self._open.popitem(last=False)[1].release()
-
-    def clear(self) -> None:
-        """Forget all columns and files."""
-        self._cache.drop("column")
-        with self._lock:
-            self._open.clear()

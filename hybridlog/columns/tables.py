@@ -168,16 +168,6 @@ class Tables:
         self._channels: tuple[RecordingEntry, dict[str, list[ChannelEntry]]] | None = None
         self._lock = threading.RLock()
 
-    def invalidate(self) -> None:
-        """Forget all files, columns and invalid tables."""
-        with self._lock:
-            self._found.clear()
-            self._looked_at.clear()
-            self._folders = _Folders(self._root / TABLES, self.opened)
-            self._sealed.clear()
-            self._channels = None
-        self.opened.clear()
-
     def of(self, recording: RecordingEntry, topic: str) -> TopicTable | None:
         """The table of a topic in a recording; None without one that the catalog confirms."""
         key = recording.id, topic
@@ -204,8 +194,10 @@ class Tables:
 
     def whole(self, file: ColumnFile, *, arrays: bool) -> TopicTable:
         """All rows of a file, as if of one topic; with `arrays`, all count as rows with arrays."""
-        counts = file.counts._replace(arrays=file.counts.rows if arrays else 0)
-        return TopicTable("", file.all_parts(), counts, self.opened)
+        unreadable = sum(section.counts.unreadable for section in file.about.sections)
+        counts = TopicCounts(file.rows, unreadable, file.rows if arrays else 0)
+        parts = [TablePart(file, group, 0, rows) for group, rows in enumerate(file.groups)]
+        return TopicTable("", parts, counts, self.opened)
 
     def check(self, recording: RecordingEntry, topic: str) -> TopicTable:
         """The table of a topic in a recording; FileNotFoundError if these segments have none."""

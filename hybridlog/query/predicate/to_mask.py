@@ -181,15 +181,9 @@ class _Objects:
             yield from _reached(message, parts)
         if stat is None:
             return
-        name = ".".join(part for part in parts[:-1] if isinstance(part, str))
-        is_countable = stat == "n" or types.kind(name) != "other"
         for array in _reached(message, parts[:-1]):
-            if not types.known:
-                has = isinstance(array, list) and _has_statistic(array, stat)
-            else:
-                has = is_countable and isinstance(array, list | bytes)
-            if has:
-                yield statistic_of(array, stat)  # type: ignore[arg-type]
+            if isinstance(array, list | bytes) and (types.known or _has_statistic(array, stat)):
+                yield statistic_of(array, stat)
             elif types.known and isinstance(array, Mapping) and stat in array:
                 yield array[stat]
 
@@ -206,11 +200,10 @@ def _reached(value: object, parts: Parts) -> Iterator[object]:
     elif isinstance(value, Mapping):
         if str(part) in value:
             yield from _reached(value[str(part)], rest)
+    elif isinstance(value, list) and isinstance(part, int):
+        yield from _reached(value[part], rest) if part < len(value) else ()
     elif isinstance(value, list):
-        if isinstance(part, int) and part < len(value):
-            yield from _reached(value[part], rest)
-        # MongoDB also accepts a number as a name.
-        for inner in _flat(value) if isinstance(part, str) else value:
+        for inner in _flat(value):
             if isinstance(inner, Mapping):
                 yield from _reached(inner, parts)
 
@@ -318,26 +311,10 @@ class _Columns:
                 inner = _Leaves(pc.struct_field(values, str(part)), rows)
                 yield from self._reach(inner, rest, (*names, str(part)))
         elif is_list(kind):
-            yield from self._into_list(values, rows, parts, names)
-
-    def _into_list(
-        self, values: pa.Array, rows: Rows, parts: Parts, names: tuple[str, ...]
-    ) -> Iterator[_Leaves]:
-        """The values at a path through lists."""
-        part = parts[0]
-        elements = _flattened(values, rows)
-        while isinstance(part, str) and is_list(elements.values.type):
-            elements = _flattened(elements.values, elements.rows)
-        inside = elements.values.type
-        named = pa.types.is_struct(inside) and inside.get_field_index(str(part)) >= 0
-        if isinstance(part, int):
-            if named:
-                raise _UnfitError  # an index, or a field with a number as its name
-            yield from self._reach(_at_place(values, rows, part), parts[1:], names)
-        elif named:
-            yield from self._reach(elements, parts, names)
-        else:
-            _plain(elements.values)
+            if isinstance(part, int):
+                yield from self._reach(_at_place(values, rows, part), rest, names)
+            else:
+                yield from self._reach(_flattened(values, rows), parts, names)
 
     def _is_summary(self, kind: pa.DataType, names: tuple[str, ...], *, is_element: bool) -> bool:
         if self.types.known:
