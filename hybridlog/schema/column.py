@@ -7,7 +7,6 @@ pandas frames are made from them. No row of a column is a Python object.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, TypeVar
 
 import numpy as np
@@ -173,33 +172,3 @@ def top_level_names(names: Collection[str]) -> list[str]:
                 name += "_"  # noqa: PLW2901
         spelled.append(name)
     return spelled
-
-
-def repaired(strings: Strings) -> Strings:
-    """The same strings with invalid UTF-8 replaced by U+FFFD.
-
-    Valid strings, by far the usual case, are not copied.
-    """
-    low, high = int(strings.offset[0]), int(strings.offset[-1])
-    data = strings.data[low:high]
-    if not len(data) or int(data.max()) < 0x80 or _valid(data, strings.offset - low):
-        return strings
-    raw = data.tobytes()
-    bounds = (strings.offset - low).tolist()
-    cells = [raw[begin:end].decode("utf-8", "replace").encode() for begin, end in pairwise(bounds)]
-    offset = np.zeros(len(bounds), np.int64)
-    np.cumsum([len(cell) for cell in cells], out=offset[1:])
-    return Strings(np.frombuffer(b"".join(cells), np.uint8), offset)
-
-
-def _valid(data: NDArray[np.uint8], offset: NDArray[np.int64]) -> bool:
-    """True if every string is UTF-8: all bytes are, and no string starts within a character."""
-    starts = offset[:-1]
-    starts = starts[starts < len(data)]
-    if bool(((data[starts] & 0xC0) == 0x80).any()):
-        return False
-    try:
-        data.tobytes().decode()
-    except UnicodeDecodeError:
-        return False
-    return True

@@ -43,21 +43,12 @@ class Summary:
 
 def summary_of(values: Sequence[object]) -> Summary | None:
     """The summary of one list of Python numbers and booleans; None of other values."""
-    numbers = [value for value in values if isinstance(value, bool | int | float)]
-    if len(numbers) < len(values):
+    if not all(isinstance(value, int | float) for value in values):
         return None
-    kind: type[np.generic] = np.float64
-    if numbers and all(isinstance(value, bool) for value in numbers):
-        kind = np.bool_
-    elif numbers and all(isinstance(value, int) for value in numbers):
-        low, high = min(numbers), max(numbers)
-        if low >= -(1 << 63) and high < 1 << 63:
-            kind = np.int64
-        elif low >= 0 and high < 1 << 64:
-            kind = np.uint64
-    if kind is np.float64:
-        numbers = [nearest(value) for value in numbers]
-    return summarise(Scalars(np.array(numbers, kind)), np.array([0, len(numbers)], np.int64))
+    numbers: NDArray[Any] = np.array(values)
+    if numbers.dtype == object:  # integers of more than 64 bits
+        numbers = np.array([nearest(value) for value in values], np.float64)  # type: ignore[arg-type]
+    return summarise(Scalars(numbers), np.array([0, len(numbers)], np.int64))
 
 
 def summarise(values: Scalars, offset: NDArray[np.int64]) -> Summary:

@@ -74,9 +74,7 @@ class _Running:
         self.count = self.nan = self.infinite = 0
         self.least: int | float | None = None
         self.most: int | float | None = None
-        self._total = np.longdouble(0)  # no sum of doubles overflows it
-        self._mean = 0.0
-        self._squares, self._exponent = 0.0, -1074  # squares of numbers divided by 2**exponent
+        self._total = self._squares = np.longdouble(0)
 
     def add(self, column: pa.Array[Any]) -> None:
         values = column.drop_null().to_numpy(zero_copy_only=False)
@@ -91,26 +89,20 @@ class _Running:
         low, high = values.min().item(), values.max().item()
         self.least = low if self.least is None else min(self.least, low)
         self.most = high if self.most is None else max(self.most, high)
-        numbers, count = values.astype(np.float64), len(values)
-        before, total = self._mean, numbers.sum(dtype=np.longdouble)
+        numbers, count = values.astype(np.longdouble), len(values)  # in which no sum overflows
+        total = numbers.sum()
+        mean = total / count
+        self._squares += np.square(numbers - mean).sum()
+        if self.count:
+            step = mean - self._total / self.count
+            self._squares += step * step * self.count * count / (self.count + count)
         self._total += total
-        mean = float(total / count)
-        size = max(abs(low), abs(high))
-        exponent = max(math.frexp(size)[1] if size else self._exponent, self._exponent)
-        self._squares = math.ldexp(self._squares, 2 * (self._exponent - exponent))
-        self._exponent = exponent
-        self._squares += float(
-            np.square(np.ldexp(numbers, -exponent) - math.ldexp(mean, -exponent)).sum()
-        )
-        step = math.ldexp(mean, -exponent) - math.ldexp(before, -exponent)
-        self._squares += step * step * self.count * count / (self.count + count)
         self.count += count
-        self._mean = float(self._total / self.count)
 
     @property
     def _std(self) -> float:
         with np.errstate(over="ignore"):  # it may be greater than the greatest double
-            return float(np.ldexp(math.sqrt(self._squares / (self.count - 1)), self._exponent))
+            return float(np.sqrt(self._squares / (self.count - 1)))
 
     def result(self, topic: str, field: str) -> FieldStatistics:
         few = self.count < 2
@@ -122,7 +114,7 @@ class _Running:
             self.infinite,
             self.least,
             self.most,
-            self._mean if self.count else None,
+            float(self._total / self.count) if self.count else None,
             None if few else self._std,
         )
 
