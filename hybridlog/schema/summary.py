@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -45,9 +46,11 @@ def summary_of(values: Sequence[object]) -> Summary | None:
     """The summary of one list of Python numbers and booleans; None of other values."""
     if not all(isinstance(value, int | float) for value in values):
         return None
-    numbers: NDArray[Any] = np.array(values)
-    if numbers.dtype == object:  # integers of more than 64 bits
-        numbers = np.array([nearest(value) for value in values], np.float64)  # type: ignore[arg-type]
+    numbers: NDArray[Any] = np.array([nearest(value) for value in values], np.float64)  # type: ignore[arg-type]
+    if values and not any(isinstance(value, float) for value in values):
+        for kind in (np.uint64, np.int64) if min(values) >= 0 else (np.int64,):  # type: ignore[type-var, operator]
+            with suppress(OverflowError):
+                numbers = np.array(values, kind)
     return summarise(Scalars(numbers), np.array([0, len(numbers)], np.int64))
 
 
