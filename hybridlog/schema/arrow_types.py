@@ -450,12 +450,8 @@ def part_of_summary(records: Array, path: Sequence[str], name: str) -> Array | N
 
     The array is a summary there, or of a fixed length.
     """
-    for inner in path:
-        at = records.type.get_field_index(inner) if _types.is_struct(records.type) else -1
-        if at < 0:
-            return None
-        records = records.flatten()[at]
-    if is_array(records.type):
-        return statistic(records, name)
-    at = records.type.get_field_index(name) if is_summary(records.type) else -1
-    return None if at < 0 else records.flatten()[at]
+    try:
+        found = pc.struct_field(records, list(path))
+        return statistic(found, name) if is_array(found.type) else pc.struct_field(found, name)
+    except pa.ArrowException:
+        return None

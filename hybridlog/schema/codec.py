@@ -195,10 +195,10 @@ def stamps_of(codec: Codec, batch: Batch) -> tuple[NDArray[np.intp], NDArray[np.
 def stamp_array(records: pa.StructArray) -> pa.Array[Any] | None:
     """The header stamps of decoded messages, timestamp[ns]; None when they have none."""
     import pyarrow as pa
+    import pyarrow.compute as pc
 
-    found: pa.Array[Any] = records
-    for name in STAMP.split("."):
-        if not pa.types.is_struct(found.type) or found.type.get_field_index(name) < 0:
-            return None
-        found = found.flatten()[found.type.get_field_index(name)]
+    try:
+        found: pa.Array[Any] = pc.struct_field(records, STAMP.split("."))
+    except pa.ArrowException:
+        return None
     return found if pa.types.is_timestamp(found.type) else None

@@ -12,6 +12,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -181,7 +182,11 @@ class _List:
     def __post_init__(self) -> None:
         self.count = _same(self.counts)
         if self.count is not None and isinstance(self.child.width, int):
-            self.width = 5 + self.count * (2 + self.child.width) + _digits_before(self.count)
+            self.width = (
+                5
+                + self.count * (2 + self.child.width)
+                + sum(len(str(key)) for key in range(self.count))
+            )
         else:
             self.width = 5 + np.diff(offsets(self.element_widths())[offsets(self.counts)])
 
@@ -236,15 +241,6 @@ def _digits(index: NDArray[np.int64]) -> NDArray[np.int64]:
     return digits
 
 
-def _digits_before(count: int) -> int:
-    """Total decimal digits of all array keys below `count`."""
-    digits, power = count, 10
-    while power < count:
-        digits += count - power
-        power *= 10
-    return digits
-
-
 def _node(column: Column, limit: int) -> _Node:
     if isinstance(column, Scalars):
         return _number(column.values)
@@ -288,32 +284,15 @@ def _number(values: NDArray[Any], has: NDArray[np.bool_] | None = None) -> _Numb
 
 
 def _text(column: Strings) -> _Text:
-    start, length = column.offset[:-1], np.diff(column.offset)
     begin, end = int(column.offset[0]), int(column.offset[-1])
-    data = np.ascontiguousarray(column.data[begin:end])
-    start = start - begin
-    if (data < 0x80).all():
-        return _Text(data, start, length)
-    raw = data.tobytes()
-    # The validity of a string must not depend on its neighbours, so each string that is
-    # not plain ASCII is checked separately.
-    high = offsets((data >= 0x80).astype(np.int64))
-    odd = np.flatnonzero(high[start + length] > high[start])
-    mended: dict[int, bytes] = {}
-    for row in odd.tolist():
-        text = raw[start[row] : start[row] + length[row]]
-        try:
-            text.decode()
-        except UnicodeDecodeError:
-            mended[row] = text.decode(errors="replace").encode()
-    if mended:
-        start, length = start.copy(), length.copy()
-        behind = len(raw)
-        for row, text in mended.items():
-            start[row], length[row] = behind, len(text)
-            behind += len(text)
-        data = np.frombuffer(b"".join((raw, *mended.values())), np.uint8)
-    return _Text(data, start, length)
+    data, bounds = np.ascontiguousarray(column.data[begin:end]), column.offset - begin
+    if bool((data >= 0x80).any()):
+        # The validity of a string must not depend on its neighbours.
+        raw = data.tobytes()
+        cells = [raw[a:b].decode(errors="replace").encode() for a, b in pairwise(bounds.tolist())]
+        data = np.frombuffer(b"".join(cells), np.uint8)
+        bounds = offsets(np.array([*map(len, cells)], np.int64))
+    return _Text(data, bounds[:-1], np.diff(bounds))
 
 
 def _record(column: Records, limit: int, *, top: bool = False) -> _Record:
