@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias, cast
 import numpy as np
 
 from hybridlog.query.times import format_time
-from hybridlog.schema.codec import columns_of
 from hybridlog.schema.column import Records
 from hybridlog.schema.states import State
 from hybridlog_storage.errors import HybridlogError, PayloadError
@@ -219,7 +218,7 @@ class Documents:
     def decoded(self, row: int) -> Decoded:
         """The columns of one message."""
         codec = self._channels[int(self._batch.channel[row])].codec
-        decoded = columns_of(codec, self._batch.take(slice(row, row + 1)))
+        decoded = codec.columns_of(self._batch.take(slice(row, row + 1)))
         if decoded.unreadable:
             raise PayloadError(f"the payload cannot be read: {decoded.unreadable[0].reason}")
         return decoded

@@ -141,8 +141,8 @@ class Shared(ABC):
             self._segments.clear()  # each is closed by the last thread that reads from it
         self.cache.drop("chunk")
         self._tables_tried.clear()
-        if "tables" in vars(self):
-            self.tables.invalidate()
+        self.cache.drop("column")
+        vars(self).pop("tables", None)
 
     # Recordings.
 

@@ -94,6 +94,7 @@ ALLOWED = {
         "hybridlog.schema.arrow_types",
         "hybridlog.schema.codec",
         "hybridlog.schema.left",
+        "hybridlog.schema.summary",
         "hybridlog.query",
         "hybridlog.sql",
         "hybridlog.tf",

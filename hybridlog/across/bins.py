@@ -20,7 +20,6 @@ from hybridlog.query.predicate.types import FieldTypes
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.schema.arrow_columns import numbers
 from hybridlog.schema.arrow_types import is_number, is_time
-from hybridlog.schema.summary import Totals
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.ordering import run_starts
 from hybridlog_storage.times import placed
@@ -189,7 +188,7 @@ class _Column:
         self._how = how
         self._choose = np.minimum if how == "min" else np.maximum
         self._count = np.zeros(size, np.int64)
-        self._totals = Totals(size if how == "mean" else 0)
+        self._sums = np.zeros(size if how == "mean" else 0, np.longdouble)  # overflows by no double
         self._parts: list[tuple[NDArray[np.int64], NDArray[Any]]] = []  # bins, their values
         self._kinds: set[pa.DataType] = set()
 
@@ -202,14 +201,15 @@ class _Column:
             self._parts.append((bins, self._choose.reduceat(values, begins)))
             self._kinds.add(kind)
         elif len(row):
-            self._totals.add(values.astype(np.float64), begins, bins)
+            self._sums[bins] += np.add.reduceat(values, begins, dtype=np.longdouble)
         self._count[bins] += np.diff(np.append(begins, len(row)))
 
     def array(self) -> pa.Array[Any]:
         """The aggregate of each bin; null without any value."""
         missing = self._count == 0
         if self._how == "mean":
-            return pa.array(self._totals.means(self._count), mask=missing)
+            means = self._sums / np.maximum(self._count, 1)
+            return pa.array(means.astype(np.float64), mask=missing)
         row, values = (np.concatenate(parts) for parts in zip(*self._parts, strict=True))
         begins = run_starts(row)
         found = np.zeros(len(missing), values.dtype)

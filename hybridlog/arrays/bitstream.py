@@ -64,7 +64,7 @@ class FrameOrder:
             return True
         try:
             return self._follows(data)
-        except IndexError:
+        except ValueError:
             return True  # cut short: the decoder refuses it
 
     def _follows(self, data: bytes) -> bool:
@@ -104,21 +104,20 @@ class _Bits:
     """Reads bits of a unit, without the bytes that keep start codes out of it."""
 
     def __init__(self, data: bytes) -> None:
-        self._data = data.replace(b"\0\0\3", b"\0\0")
+        self._bits = "".join(f"{byte:08b}" for byte in data.replace(b"\0\0\3", b"\0\0"))
         self._at = 0
 
     def take(self, count: int) -> int:
-        found = 0
-        for _ in range(count):
-            found = found << 1 | self._data[self._at >> 3] >> (7 - (self._at & 7)) & 1
-            self._at += 1
-        return found
+        """Some bits as a number; ValueError if the unit is cut short."""
+        self._at += count
+        if self._at > len(self._bits):
+            raise ValueError
+        return int(self._bits[self._at - count : self._at], 2)
 
     def golomb(self) -> int:
-        zeros = 0
-        while not self.take(1):
-            zeros += 1
-        return (1 << zeros) - 1 + self.take(zeros)
+        zeros = self._bits.index("1", self._at) - self._at
+        self._at += zeros
+        return self.take(zeros + 1) - 1
 
 
 def _units(data: bytes) -> Iterator[bytes]:

@@ -23,7 +23,7 @@ from hybridlog.columns.fields import (
     names_of,
     original_name,
 )
-from hybridlog.columns.layout import ABOUT, OWN, OWN_COLUMNS, About, Section, TopicCounts
+from hybridlog.columns.layout import ABOUT, OWN, OWN_COLUMNS, About, Section
 from hybridlog.schema.arrow_types import is_list
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import files
@@ -45,17 +45,6 @@ FIRST: Final = -(1 << 63)
 """Lower bound of all log times."""
 LAST: Final = (1 << 63) - 1
 """Upper bound of all log times."""
-
-
-class ReusedBytes(NamedTuple):
-    """The row groups of the file that a new one replaces.
-
-    They keep their place in the new file, where nothing refers to them: DuckDB reads the
-    footer, and opens the file again by its name for the rows.
-    """
-
-    offset: int
-    data: bytes
 
 
 class Leaf(NamedTuple):
@@ -172,14 +161,6 @@ class ColumnFile:
 
     def _column(self, group: int, leaf: int) -> Any:
         return self._parquet.metadata.row_group(group).column(leaf)
-
-    def reusable(self) -> ReusedBytes:
-        """The bytes of its row groups."""
-        begin, end = self.about.span
-        try:
-            return ReusedBytes(begin, self._source.raw(begin, end))
-        except (OSError, StoreError) as error:
-            raise self._damaged(error) from error
 
     def table(self) -> pa.Table:
         """All rows."""
@@ -328,17 +309,6 @@ class ColumnFile:
                 yield TablePart(self, group, low - before, high - low, *bounds)
             before += own
 
-    @lazy
-    def counts(self) -> TopicCounts:
-        """Counts of all its rows."""
-        return TopicCounts(
-            *map(sum, zip(*(one.counts for one in self.about.sections), strict=True))
-        )
-
-    def all_parts(self) -> list[TablePart]:
-        """All rows, as if they were of one topic."""
-        return [TablePart(self, group, 0, rows) for group, rows in enumerate(self.groups)]
-
 
 class _Source:
     """Provides Parquet's bytes, after verifying the checksum of the footer."""
@@ -462,9 +432,3 @@ class OpenFiles:
             self._open.move_to_end(file.number)
             while len(self._open) > files.most_open(_OPEN_FILES):
                 self._open.popitem(last=False)[1].release()
-
-    def clear(self) -> None:
-        """Forget all columns and files."""
-        self._cache.drop("column")
-        with self._lock:
-            self._open.clear()

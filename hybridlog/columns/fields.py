@@ -18,6 +18,7 @@ from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from hybridlog.columns.layout import EMPTY, ORIGINAL, RESERVED, SUMMARY, column_names
 from hybridlog.schema.arrow_columns import structs
@@ -201,9 +202,7 @@ def _filled(summaries: Array, lists: Array | None) -> Array:
     parts = [whole.field(whole.type.get_field_index(field.name)) for field in kind]
     columns = {field.name: part.cast(field.type) for part, field in zip(parts, kind, strict=True)}
     made = structs(columns, len(lists), missing_of(lists), list(kind))
-    rows = np.arange(len(lists))
-    rows[summaries.is_valid().to_numpy(zero_copy_only=False)] += len(lists)
-    return pa.concat_arrays([made, summaries]).take(pa.array(rows))
+    return pc.coalesce(summaries, made)
 
 
 def _is_changed(field: Any) -> bool:

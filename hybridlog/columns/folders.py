@@ -24,9 +24,9 @@ from typing import Any, Final
 
 import pyarrow as pa
 
-from hybridlog.columns.column_file import ColumnFile, ReusedBytes
+from hybridlog.columns.column_file import ColumnFile
 from hybridlog.columns.layout import SHARED, SUFFIX, TABLES, Section, parts_folder
-from hybridlog.columns.parquet_file import NoRoomError, ParquetFileWriter
+from hybridlog.columns.parquet_file import ParquetFileWriter
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import StoreError, unreadable
 
@@ -69,8 +69,6 @@ class TableFolders:
         self._recording = recording
         self._created = created
         self._digests = digests or {}
-        self._numbers = 0
-        self._keeps_bytes = True
 
     def add(
         self,
@@ -82,7 +80,6 @@ class TableFolders:
 
         `prefixes` are beginnings of the names of folders that may have such tables.
         """
-        self._keeps_bytes = not prefixes  # tables that are made anew leave no holes
         with suppress(FileExistsError):
             files.make_folder(self._root / TABLES)
         with files.locked_folder(self._root / TABLES):
@@ -183,53 +180,32 @@ class TableFolders:
             if section.id != self._recording or stays:
                 pieces.append((section, table.slice(before, section.rows)))
         if pieces:
-            self._write(path, pieces, reader)
+            self._write(path, pieces)
         else:
             files.unlink(path)
 
-    def _write(
-        self, path: Path, pieces: Iterable[_Piece], before: ColumnFile | None = None
-    ) -> None:
-        """Write a shared file, in place of `before`, and give it its name by one rename."""
+    def _write(self, path: Path, pieces: Iterable[_Piece]) -> None:
+        """Write a shared file, and give it its name by one rename."""
         pieces = sorted(pieces, key=lambda piece: piece[0].place)
         found = [section for section, _ in pieces]
         schema = pieces[0][1].schema
         table = pa.concat_tables(
             [rows if rows.schema.equals(schema) else rows.cast(schema) for _, rows in pieces]
         ).combine_chunks()
-        reused = before.reusable() if before is not None and self._keeps_bytes else None
-        in_front = False
-        if reused is not None and before is not None:
-            size = len(reused.data) * table.num_rows / max(before.rows, 1)
-            in_front = size < reused.offset
-        try:
-            part = self._part(found, table, reused, in_front=in_front)
-        except NoRoomError:
-            part = self._part(found, table, reused, in_front=False)
-        files.rename(part, path)
-
-    def _part(
-        self, sections: Sequence[Section], table: Any, reused: ReusedBytes | None, *, in_front: bool
-    ) -> Path:
-        """A finished file without its name."""
         parts = parts_folder(self._root, self._recording)
         files.make_folders(parts)
-        self._numbers += 1
-        part = parts / f"{SHARED}{self._numbers}{SUFFIX}"
+        part = parts / f"{SHARED}{SUFFIX}"
         files.remove_tree(part)
-        writer = ParquetFileWriter(
-            part,
-            table.schema,
-            reused=reused,
-            in_front=in_front,
-        )
+        # A reader that knows the footer of the file before finds nothing at its places.
+        front = bytes(1 + table.num_rows % 251)
+        writer = ParquetFileWriter(part, table.schema, front=front)
         try:
             writer.write(table)
-            writer.close(sections, sync=True)
+            writer.close(found, sync=True)
         except BaseException:
             writer.discard()
             raise
-        return part
+        files.rename(part, path)
 
     def _publish(
         self, place: Path, parts: Sequence[Path], names: Collection[str], old: Sequence[str]
@@ -277,7 +253,7 @@ class Listing:
         self._path = path
         self._read_at: tuple[int, int] | None = None  # inode, and time of its last change
 
-    def look(self) -> bool:
+    def read(self) -> bool:
         """Read the entries if they may have changed; returns whether it did."""
         try:
             now, names = files.changed_names(self._path, self._read_at)

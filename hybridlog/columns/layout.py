@@ -15,7 +15,6 @@ files have the same schema, of which `shape8` is a hash.
 from __future__ import annotations
 
 import hashlib
-import json
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -83,21 +82,8 @@ def type_prefix(type_name: str) -> str:
 
 def shape_folder(type_name: str, schema: Any) -> str:
     """Folder of a message type, whose name may be empty, by the Arrow schema of its tables."""
-    text = json.dumps([_described(column) for column in schema])
+    text = schema.to_string(truncate_metadata=False, show_schema_metadata=False)
     return type_prefix(type_name) + hashlib.sha256(text.encode()).hexdigest()[:8]
-
-
-def _described(column: Any) -> list[Any]:
-    """Name, names of ours, type and inner columns of a column."""
-    kind = column.type
-    known = column.metadata or {}
-    names = [column.name, *(known.get(key, b"").decode() for key in (ORIGINAL, SUMMARY))]
-    if not kind.num_fields:
-        return [names, str(kind), []]
-    inner = [_described(kind.field(number)) for number in range(kind.num_fields)]
-    if hasattr(kind, "value_field"):  # elements of lists have no name of their own
-        return [names, f"list {getattr(kind, 'list_size', '')}", [inner[0][1:]]]
-    return [names, "struct", inner]
 
 
 def table_schema_of(channel: Channel) -> str:
@@ -180,13 +166,12 @@ class Section:
 
 @dataclass(frozen=True, slots=True)
 class About:
-    """The description of a file of tables, in the file; `span` is where row groups begin and end.
+    """The description of a file of tables, in the file.
 
     `of_rows` is what a file of rows says of them besides; empty in a table.
     """
 
     sections: Sequence[Section]
-    span: tuple[int, int] = (0, 0)
     version: int = VERSION
     of_rows: Mapping[str, Any] = field(default_factory=dict, repr=False)
 
@@ -203,7 +188,4 @@ class About:
             raise StoreError("the description of the table cannot be read") from error
         if about.version != VERSION:
             raise StoreError("the table has another version")
-        begin, end = about.span
-        if not 0 <= begin <= end:
-            raise StoreError("the description of the table contradicts itself")
         return about

@@ -6,6 +6,7 @@ The footer's is the 4 bytes in front of it, a CRC-32. Other readers ignore both.
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -15,7 +16,7 @@ import msgspec
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from hybridlog.columns.column_file import ReusedBytes, leaves
+from hybridlog.columns.column_file import leaves
 from hybridlog.columns.layout import ABOUT, About, Section
 from hybridlog.schema.arrow_types import is_bytes
 from hybridlog_storage.checksum import crc32
@@ -29,26 +30,14 @@ _WRITTEN: Final = 1 << 20  # bytes buffered before a write
 _RUNNING: Final = frozenset({"t", "log_time", "seq", "pub", "stamp", "ref.chunk", "ref.off"})
 
 
-class NoRoomError(Exception):
-    """Row groups do not fit in front of the kept ones."""
-
-
 class ParquetFileWriter:
     """Writes one file of a table, in the folder of a recording's unfinished tables.
 
-    It keeps the row groups `reused` from the file that it replaces, with `in_front` behind the new
-    ones. No reader of Parquet looks at the bytes of `front`.
+    No reader of Parquet looks at the bytes of `front`.
     """
 
     def __init__(
-        self,
-        path: Path,
-        schema: pa.Schema,
-        *,
-        level: int = 1,
-        reused: ReusedBytes | None = None,
-        in_front: bool = False,
-        front: bytes = b"",
+        self, path: Path, schema: pa.Schema, *, level: int = 1, front: bytes = b""
     ) -> None:
         self.path = path
         self._sink = _Sink(path)
@@ -73,12 +62,7 @@ class ParquetFileWriter:
                 write_statistics=ordered,
                 write_page_checksum=True,
             )
-            if front:
-                self._file.write(front)
-            self._behind = reused if in_front else None
-            if reused is not None and not in_front:
-                self._put(reused)
-            self._begin = self._file.tell()
+            self._file.write(front)
         except BaseException:
             self.discard()
             raise
@@ -96,17 +80,11 @@ class ParquetFileWriter:
     ) -> tuple[int, str]:
         """Finish the file, with its sections in order; returns its bytes, and BLAKE3 of them.
 
-        `rows` is what a file of rows says of them besides. Row groups that do not fit in front of
-        the kept ones raise NoRoomError.
+        `rows` is what a file of rows says of them besides.
         """
         try:
-            span = self._begin, self._file.tell()
-            if self._behind is not None:
-                if span[1] > self._behind.offset:
-                    raise NoRoomError
-                self._put(self._behind)
             self._sink.end_body()
-            about = About(sections, span, of_rows=dict(rows or {}))
+            about = About(sections, of_rows=dict(rows or {}))
             self._writer.add_key_value_metadata(
                 {ABOUT.decode(): msgspec.json.encode(about).decode()}
             )
@@ -115,11 +93,6 @@ class ParquetFileWriter:
         except BaseException:
             self.discard()
             raise
-
-    def _put(self, reused: ReusedBytes) -> None:
-        """Write kept bytes at their place."""
-        self._file.write(bytes(reused.offset - self._file.tell()))
-        self._file.write(reused.data)
 
     def discard(self) -> None:
         """Delete the unfinished file."""
@@ -133,45 +106,37 @@ class _Sink:
 
     def __init__(self, path: Path) -> None:
         self.closed = False
-        self._is_abandoned = False
         self._fd = files.open_file(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
         self._waiting = bytearray()
+        self._most = _WRITTEN
         self._position = 0
-        self._footer: bytearray | None = None
         self._digest = hasher()
 
     def write(self, data: Buffer) -> int:
         """Write bytes."""
         data = memoryview(data).cast("B")
-        if self._is_abandoned:
-            return len(data)  # pyarrow closes its writer when it is collected
-        self._position += len(data)
-        if self._footer is not None:
-            self._footer += data
-            return len(data)
-        self._waiting += data
-        if len(self._waiting) >= _WRITTEN:
-            self._flush()
+        if self._fd >= 0:  # pyarrow closes its writer when it is collected
+            self._position += len(data)
+            self._waiting += data
+            if len(self._waiting) >= self._most:
+                self._flush()
         return len(data)
 
     def end_body(self) -> None:
         """Begin the footer."""
-        self._footer = bytearray()
+        self._flush()
+        self._most = sys.maxsize
 
     def finish(self, *, sync: bool) -> tuple[int, str]:
         """Seal the footer, write all remaining bytes; return size and digest of the file."""
-        assert self._footer is not None
-        seal = crc32(self._footer).to_bytes(4, "little")
-        self._waiting += seal + self._footer
+        self._waiting[:0] = crc32(self._waiting).to_bytes(4, "little")
         self._flush()
         if sync:
             files.system.sync(self._fd)
         self.abandon()
-        return self._position + len(seal), self._digest.hexdigest()
+        return self._position + 4, self._digest.hexdigest()
 
     def abandon(self) -> None:
-        self._is_abandoned = True
-        self._waiting.clear()
         if self._fd >= 0:
             os.close(self._fd)
         self._fd = -1

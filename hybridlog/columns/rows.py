@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from hybridlog.schema.codec import columns_of, no_rows, stamp_array
+from hybridlog.schema.codec import no_rows, stamp_array
 from hybridlog.schema.left import LeftFields
 from hybridlog.schema.states import State
 from hybridlog_storage.messages import EXPIRED_IDS
@@ -105,7 +105,7 @@ def piece_of(
     errors: list[str | None] = [None] * count
     found, surplus = None, no_rows()
     if codec.indexed:
-        decoded = columns_of(codec, batch, fields)
+        decoded = codec.columns_of(batch, fields)
         surplus = decoded.surplus
         for bad in decoded.unreadable:
             for row in bad.rows.tolist():

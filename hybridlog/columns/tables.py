@@ -15,6 +15,7 @@ import threading
 from collections import OrderedDict, defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
+from itertools import chain
 from pathlib import Path
 from stat import S_ISDIR
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -55,13 +56,12 @@ class TopicRows(NamedTuple):
         return self.section.segments.items() <= recording.digests.items()
 
 
-class _Folder:
+class _Folder(Listing):
     """The files of a folder."""
 
     def __init__(self, path: Path, opened: OpenFiles) -> None:
-        self._path = path
+        super().__init__(path)
         self._opened = opened
-        self._listing = Listing(path)
         self._shared: list[int] = []  # numbers in the names of shared files
         self._own: dict[str, list[str]] = {}  # files of long topics, by recording
         self._files: dict[str, tuple[tuple[int, int, int], ColumnFile | None]] = {}
@@ -76,33 +76,25 @@ class _Folder:
         """The rows of a topic in the files that were looked at."""
         return self._rows.get((recording, topic), [])
 
-    def look(self, recording: RecordingEntry) -> None:
-        """Open files that may have rows of a recording, if they are new or were replaced."""
-        self._look()
-        for name in self._own.get(recording.id, ()):
+    def look(self, recording: RecordingEntry | None) -> None:
+        """Open files that may have rows of a recording, or all, if they are new or replaced."""
+        if self.read():
+            self._drop_replaced()
+        tables = [*self._own.values()] if recording is None else [self._own.get(recording.id, [])]
+        for name in chain.from_iterable(tables):
             self._open(name)
-        for name in shared_for(self._shared, recording.created):
-            file = self._open(name)
-            if file is not None and file.about.has(recording.id):
-                break
+        if recording is not None:
+            for name in shared_for(self._shared, recording.created):
+                file = self._open(name)
+                if file is not None and file.about.has(recording.id):
+                    break
 
-    def look_at_all(self) -> None:
-        """Open all files that are new or were replaced."""
-        self._look()
-        for name in sorted(self._listing.names):
-            if name.endswith(SUFFIX):
-                self._open(name)
-
-    def _look(self) -> None:
-        """Look which files there are, and drop those that were replaced."""
-        if not self._listing.look():
-            return
-        names = self._listing.names
+    def _drop_replaced(self) -> None:
         before, self._files, self._rows = self._files, {}, {}
         for name, (identity, file) in before.items():
-            if name in names and identity == _identity(names[name]):
+            if name in self.names and identity == _identity(self.names[name]):
                 self._add(name, identity, file)
-        tables = sorted(name for name in names if name.endswith(SUFFIX))
+        tables = sorted(name for name in self.names if name.endswith(SUFFIX))
         self._shared = shared_times(tables)
         self._own = {}
         for name in tables:
@@ -110,7 +102,7 @@ class _Folder:
 
     def _open(self, name: str) -> ColumnFile | None:
         """A file, if there is one that can be read."""
-        status = self._listing.names.get(name)
+        status = self.names.get(name)
         if name in self._files or status is None:
             return self._files[name][1] if status is not None else None
         file: ColumnFile | None = None
@@ -138,25 +130,24 @@ def _identity(status: os.stat_result) -> tuple[int, int, int]:
     return status.st_ino, status.st_size, status.st_mtime_ns
 
 
-class _Folders:
+class _Folders(Listing):
     """The folders in one place."""
 
     def __init__(self, place: Path, opened: OpenFiles) -> None:
-        self._place = place
+        super().__init__(place)
         self._opened = opened
-        self._listing = Listing(place)
         self._known: dict[str, dict[str, _Folder]] = {}  # by the beginning of their names
 
     def look(self) -> None:
         """Look which folders there are."""
-        if not self._listing.look():
+        if not self.read():
             return
         before, self._known = self._known, {}
-        for name, about in sorted(self._listing.names.items()):
+        for name, about in sorted(self.names.items()):
             if S_ISDIR(about.st_mode):
                 begin = f"{name.rpartition('~')[0]}~"
                 folder = before.get(begin, {}).get(name)
-                folder = folder or _Folder(self._place / name, self._opened)
+                folder = folder or _Folder(self._path / name, self._opened)
                 self._known.setdefault(begin, {})[name] = folder
 
     def of(self, types: Iterable[str]) -> list[_Folder]:
@@ -176,16 +167,6 @@ class Tables:
         self._sealed: OrderedDict[str, _Folders] = OrderedDict()
         self._channels: tuple[RecordingEntry, dict[str, list[ChannelEntry]]] | None = None
         self._lock = threading.RLock()
-
-    def invalidate(self) -> None:
-        """Forget all files, columns and invalid tables."""
-        with self._lock:
-            self._found.clear()
-            self._looked_at.clear()
-            self._folders = _Folders(self._root / TABLES, self.opened)
-            self._sealed.clear()
-            self._channels = None
-        self.opened.clear()
 
     def of(self, recording: RecordingEntry, topic: str) -> TopicTable | None:
         """The table of a topic in a recording; None without one that the catalog confirms."""
@@ -213,8 +194,10 @@ class Tables:
 
     def whole(self, file: ColumnFile, *, arrays: bool) -> TopicTable:
         """All rows of a file, as if of one topic; with `arrays`, all count as rows with arrays."""
-        counts = file.counts._replace(arrays=file.counts.rows if arrays else 0)
-        return TopicTable("", file.all_parts(), counts, self.opened)
+        unreadable = sum(section.counts.unreadable for section in file.about.sections)
+        counts = TopicCounts(file.rows, unreadable, file.rows if arrays else 0)
+        parts = [TablePart(file, group, 0, rows) for group, rows in enumerate(file.groups)]
+        return TopicTable("", parts, counts, self.opened)
 
     def check(self, recording: RecordingEntry, topic: str) -> TopicTable:
         """The table of a topic in a recording; FileNotFoundError if these segments have none."""
@@ -331,7 +314,7 @@ class Tables:
             known.look()
             folders = known.of(self._types_of(recording, topic))
             for folder in folders:
-                folder.look_at_all()
+                folder.look(None)
             rows = [rows for folder in folders for rows in folder.rows(recording.id, topic)]
             while len(self._sealed) > _MAX_RUNNING:
                 self._sealed.popitem(last=False)

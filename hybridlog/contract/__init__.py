@@ -7,6 +7,7 @@ import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -127,28 +128,20 @@ class _Reader:
                 inner = self._mapping(rules, key)
                 self._left -= len(inner)
                 if self._left < 0:
-                    raise self._error(
-                        rules, key, f"there are more than {MAX_RULES} offsets and shares"
-                    )
-                read = _duration if key == "offset" else _share
-                values[key] = {str(one): self._value(inner, one, read) for one in inner}
+                    why = f"there are more than {MAX_RULES} offsets and shares"
+                    raise self._error(rules, key, why)
+                values[key] = {str(one): self._value(inner, one, _KINDS[key]) for one in inner}
                 for one in inner if key == "share" else ():
-                    self._value({one: one}, one, _predicate, self._lines.get((id(inner), one)))
+                    self._value(inner, one, partial(_check_predicate, one))
             else:
                 values[key] = self._value(rules, key, _KINDS[key])
         return TopicRules(**values)
 
-    def _value(
-        self,
-        holder: Mapping[Any, object],
-        key: object,
-        read: Callable[[Any], Any],
-        line: int | None = None,
-    ) -> Any:
+    def _value(self, holder: Mapping[Any, object], key: object, read: Callable[[Any], Any]) -> Any:
         try:
             return read(holder[key])
         except (HybridlogError, ValueError) as error:
-            raise self._error(holder, key, str(error), line) from error
+            raise self._error(holder, key, str(error)) from error
 
     def _mapping(self, holder: Mapping[Any, object], key: object) -> Mapping[object, object]:
         value = holder.get(key)
@@ -165,30 +158,21 @@ class _Reader:
                 cure = f"did you mean `{near[0]}`?" if near else f"there are {listed(known, 20)}"
                 raise self._error(holder, key, f"there is no rule `{key}`; {cure}")
 
-    def _error(
-        self, holder: Mapping[Any, object], key: object, why: str, line: int | None = None
-    ) -> UsageError:
-        line = line or self._lines.get((id(holder), key))
+    def _error(self, holder: Mapping[Any, object], key: object, why: str) -> UsageError:
+        line = self._lines.get((id(holder), key))
         place = f", line {line}" if line else ""
         return UsageError(f"{self._name}{place}: {why.removesuffix('.')}.")
 
 
-def _text(value: object) -> str:
-    if not isinstance(value, str):
-        raise ValueError(f"{value!r} is no name: write it in quotes")
+def _checked(value: Any, fits: bool, why: str) -> Any:  # noqa: FBT001
+    if not fits:
+        raise ValueError(f"{value!r} {why}")
     return value
 
 
-def _flag(value: object) -> bool:
-    if not isinstance(value, bool):
-        raise ValueError(f"{value!r} is neither true nor false")
-    return value
-
-
-def _count(value: object) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-        raise ValueError(f"{value!r} is no number of messages: write 0 or more")
-    return value
+def _count(value: Any) -> Any:
+    fits = type(value) is int and value >= 0
+    return _checked(value, fits, "is no number of messages: write 0 or more")
 
 
 def _number(value: object) -> float:
@@ -196,16 +180,14 @@ def _number(value: object) -> float:
         found = float(value) if isinstance(value, int | str) and not isinstance(value, bool) else -1
     except ValueError:
         found = -1.0
-    if not 0 <= found < math.inf:
-        raise ValueError(f"{value!r} is no number of at least 0")
+    _checked(value, 0 <= found < math.inf, "is no number of at least 0")
     return found
 
 
 def _share(value: object) -> float:
     text = str(value).strip()
     found = _number(text.removesuffix("%").strip()) / (100 if text.endswith("%") else 1)
-    if found > 1:
-        raise ValueError(f"{value!r} is no share: write 95% or 0.95")
+    _checked(value, found <= 1, "is no share: write 95% or 0.95")
     return found
 
 
@@ -217,13 +199,6 @@ def parse_share(text: str) -> float:
         raise UsageError(f"{error}.") from error
 
 
-def _rate(value: object) -> float:
-    found = _number(value)
-    if not found:
-        raise ValueError("a rate of 0 is none: leave out `rate`, or the topic")
-    return found
-
-
 def _age(value: object) -> int:
     text = str(value).strip()
     return -parse_duration(text[1:]) if text.startswith("-") else parse_duration(text)
@@ -233,25 +208,27 @@ def _duration(value: object) -> int:
     return parse_duration(value if isinstance(value, int) else str(value))
 
 
-def _predicate(value: object) -> None:
-    text = _text(value)
-    if names_topics(text):
-        raise ValueError("a share is of one topic's messages: leave the other topic out")
-    predicate = parse(text)
-    if not predicate.asks_fields:
-        raise ValueError(f"{text!r} is not about fields of the message")
+def _flag(value: Any) -> Any:
+    return _checked(value, isinstance(value, bool), "is neither true nor false")
+
+
+def _check_predicate(given: object, _: object) -> None:
+    text = _KINDS["type"](given)
+    _checked(text, not names_topics(text), "is of two topics: leave the other topic out")
+    _checked(text, parse(text).asks_fields, "is not about fields of the message")
 
 
 _KINDS: Final[Mapping[str, Callable[[Any], Any]]] = {
-    "type": _text,
-    "rate": _rate,
+    "type": lambda one: _checked(one, isinstance(one, str), "is no name: write it in quotes"),
+    "rate": lambda one: _checked(_number(one), _number(one) > 0, "is no rate: leave out the topic"),
     "tolerance": _share,
     "lost": _count,
     "least_age": _age,
     "greatest_age": _age,
     "stamps_in_order": _flag,
     "optional": _flag,
-    **dict.fromkeys(("longest_gap", "jitter", "late_start", "early_stop"), _duration),
+    "share": _share,
+    **dict.fromkeys(("longest_gap", "jitter", "late_start", "early_stop", "offset"), _duration),
 }
 
 

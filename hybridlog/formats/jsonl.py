@@ -90,7 +90,7 @@ def json_line(row: object) -> str:
         try:
             return json.dumps(row, ensure_ascii=False, allow_nan=False, default=_base64)
         except ValueError:  # NaN or an infinity; rare, so it is looked for only then
-            return json.dumps(without_nan(row), ensure_ascii=False, default=_base64)
+            return json.dumps(without_nan(row, _base64), ensure_ascii=False)
     except RecursionError:
         raise UsageError("a message is nested too deep for JSON") from None
 

@@ -23,7 +23,7 @@ from hybridlog.frames.names import (
 from hybridlog.index.indexing import rows_by_channel
 from hybridlog.schema.arrow_columns import TIME, numbers, structs
 from hybridlog.schema.arrow_types import common_schema, common_type, converted
-from hybridlog.schema.codec import columns_of, stamp_array
+from hybridlog.schema.codec import stamp_array
 from hybridlog.schema.column import STAMP
 from hybridlog.schema.left import LeftFields
 from hybridlog_storage.errors import DefinitionError
@@ -196,7 +196,7 @@ class Decoder:
 
     def decoded(self, number: int, batch: Batch) -> Decoded:
         """The fields of messages of one channel; those that cannot be read are counted."""
-        found = columns_of(self.channels[number].codec, batch, self._fields[number])
+        found = self.channels[number].codec.columns_of(batch, self._fields[number])
         self._counters.unreadable += len(batch) - len(found.rows)
         if isinstance(found.records, LeftFields):
             requested = {path.replace("[]", "") for path in self._chosen or ()}

@@ -12,7 +12,6 @@ from hybridlog.frames.names import is_summary
 from hybridlog.query.predicate.to_mask import mask_of_objects, to_mask
 from hybridlog.query.predicate.tree import Predicate, is_meta
 from hybridlog.schema.arrow_columns import structs
-from hybridlog.schema.codec import columns_of
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -62,7 +61,7 @@ class MessageFilter:
         if not channel.codec.indexed:
             return Matches(holds, len(batch))
         fields = self._elements if channel.is_reduced else self._fields
-        decoded = columns_of(channel.codec, batch, fields)
+        decoded = channel.codec.columns_of(batch, fields)
         rows = decoded.rows
         times = batch.log_time[rows], seq[rows], batch.publish_time[rows]
         lacking = np.zeros(len(rows), np.bool_)

@@ -10,7 +10,7 @@ import numpy as np
 
 from hybridlog.query.answers.marks import mark_topics
 from hybridlog.query.intervals import Intervals
-from hybridlog.query.predicate.tree import And, Near, Node, Not, Or, nodes, spelled
+from hybridlog.query.predicate.tree import And, Condition, Near, Node, Not, Or, nodes
 from hybridlog.query.question import Question
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import TIME_LIMIT
@@ -62,9 +62,9 @@ def split_own(node: Node) -> tuple[list[Node], list[Node]]:
         found = [split_own(item) for item in node.items]
         return [one for own, _ in found for one in own], [one for _, far in found for one in far]
     for inner in nodes(node):
-        if not isinstance(inner, And | Or | Not | Near):
+        if isinstance(inner, Condition):
             raise WhereError(
-                f"{spelled(inner)!r} is about the message itself, and can only be joined by "
+                f"{inner.field.path!r} is of the message itself, and can only be joined by "
                 "`and` with conditions on other topics. Name its topic to let any message near "
                 "in time satisfy it."
             )

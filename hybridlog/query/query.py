@@ -140,9 +140,7 @@ class Query:
         if question.during is not None:
             found["during"] = f"during {len(question.during)} intervals"
         if question.predicate is not None:
-            from hybridlog.query.predicate.tree import spelled
-
-            text = spelled(question.predicate.root)
+            text = question.predicate.text
             found["predicate"] = f"where {text if len(text) <= 200 else text[:200] + '…'}"
         if question.fields is not None:
             found["fields"] = f"fields {listed(question.fields, 5)}"

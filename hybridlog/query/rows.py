@@ -19,7 +19,6 @@ import numpy as np
 from hybridlog.query.chunk_scan import ChunkKey, ChunkScan, RecordingScan, ScanPlan
 from hybridlog.query.predicate.tree import is_meta
 from hybridlog.record.losses import lost_spans
-from hybridlog.schema.codec import columns_of
 from hybridlog.schema.kinds import SINGLE, element_of, width_of
 from hybridlog.snapshot import UNFINISHED
 from hybridlog_storage.errors import HybridlogError, ResourceError, SegmentError, StoreError
@@ -283,7 +282,7 @@ class Rows:
         arrays = {path.rpartition(".")[0] for path in summaries}
         wanted = None if fields is None else {*fields} - {*summaries} | arrays
         for channel, run in self._by_channel(self.plan([rest])) if rest is not None else ():
-            decoded = columns_of(channel.codec, run.batch, wanted)
+            decoded = channel.codec.columns_of(run.batch, wanted)
             self._counters.unreadable += len(run.batch) - len(decoded.rows)
             left: LeftFields | None = None
             if channel.is_reduced:

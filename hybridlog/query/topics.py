@@ -176,9 +176,7 @@ def _regex(pattern: str) -> Regex:
     try:
         return compile_regex(text, _LONGEST_REGEX)
     except RegexError as error:
-        raise TopicError(
-            f"the expression {_shown(text)} is refused at character {error.position + 1}: {error}"
-        ) from None
+        raise TopicError(f"the expression {_shown(text)} is refused: {error}") from None
 
 
 def _glob(pattern: str) -> Regex:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import pyarrow as pa
 
-from hybridlog.schema.column import Column, Records, Scalars, Strings, repaired
+from hybridlog.schema.column import Column, Records, Scalars, Strings
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -31,7 +31,7 @@ def array_of(column: Column) -> pa.Array[Any]:
     if isinstance(column, Scalars):
         return numbers(column.values, column.kind)
     if isinstance(column, Strings):
-        return _strings(repaired(column))
+        return _strings(column)
     if isinstance(column, Records):
         return records_array(column)
     values = array_of(column.values)
@@ -50,12 +50,10 @@ def numbers(
     values: NDArray[Any], kind: Literal["number", "time", "duration"] = "number"
 ) -> pa.Array[Any]:
     """Numbers, booleans or times without nulls."""
-    if values.dtype == np.bool_:
-        return pa.array(values)
     if not (values.flags.c_contiguous and values.flags.aligned):
         values = values.copy()
-    arrow = {"time": TIME, "duration": DURATION}.get(kind) or pa.from_numpy_dtype(values.dtype)
-    return pa.Array.from_buffers(arrow, len(values), [None, pa.py_buffer(values)])
+    array = pa.array(values)
+    return array if kind == "number" else array.view({"time": TIME, "duration": DURATION}[kind])
 
 
 def structs(
@@ -87,14 +85,20 @@ def lists(
 
 
 def _strings(strings: Strings) -> pa.Array[Any]:
+    """Strings, with U+FFFD for what is no UTF-8."""
     low, high = int(strings.offset[0]), int(strings.offset[-1])
     if high - low > OFFSET_LIMIT:
-        kind, places = pa.large_string(), strings.offset - low
+        kind, places = pa.large_binary(), strings.offset - low
     else:
-        kind, places = pa.string(), (strings.offset - low).astype(np.int32)
+        kind, places = pa.binary(), (strings.offset - low).astype(np.int32)
     data = np.ascontiguousarray(strings.data[low:high])
     buffers = [None, pa.py_buffer(places), pa.py_buffer(data)]
-    return pa.Array.from_buffers(kind, len(strings), buffers)
+    cells = pa.Array.from_buffers(kind, len(strings), buffers)
+    text = pa.string() if kind == pa.binary() else pa.large_string()
+    try:
+        return cells.cast(text)
+    except pa.ArrowInvalid:
+        return pa.array([cell.decode(errors="replace") for cell in cells.to_pylist()], text)
 
 
 def _validity(missing: NDArray[np.bool_] | None) -> pa.Buffer | None:

@@ -8,6 +8,7 @@ integers that a double would round beside fractions.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -25,7 +26,6 @@ EXACT = 1 << 53
 """A double represents every integer up to this one, and not the next."""
 MAX_NAMES = 10_000
 """Objects within a message with more different names than this are JSON text."""
-_INT64, _UINT64 = np.iinfo(np.int64), np.iinfo(np.uint64)
 
 
 def objects_array(
@@ -63,10 +63,10 @@ def values_array(
 
 def times_array(values: Sequence[int | None], kind: str) -> pa.Array[Any]:
     """Times or durations in nanoseconds; JSON text if they exceed 64 bits."""
-    present = [value for value in values if value is not None]
-    if present and not (_INT64.min <= min(present) and max(present) <= _INT64.max):
+    try:
+        return pa.array(values, pa.int64()).cast(TIME if kind == "time" else DURATION)
+    except OverflowError:
         return json_array(values)
-    return pa.array(values, pa.int64()).cast(TIME if kind == "time" else DURATION)
 
 
 def json_array(values: Sequence[Any]) -> pa.Array[Any]:
@@ -98,15 +98,14 @@ def _kind(kind: type) -> type:
 
 
 def _numbers(values: Sequence[Any], kinds: set[type]) -> pa.Array[Any] | None:
-    integers = [value for value in values if isinstance(value, int)]
-    low, high = (min(integers), max(integers)) if integers else (0, 0)
     if float in kinds:
-        if low < -EXACT or high > EXACT:
+        if any(isinstance(value, int) and abs(value) > EXACT for value in values):
             return None
         return pa.array([None if v is None else float(v) for v in values], pa.float64())
-    if low >= _INT64.min and high <= _INT64.max:
-        return pa.array(values, pa.int64())
-    return pa.array(values, pa.uint64()) if low >= 0 and high <= _UINT64.max else None
+    for kind in (pa.int64(), pa.uint64()):
+        with suppress(OverflowError, pa.ArrowInvalid):
+            return pa.array(values, kind)
+    return None
 
 
 def _strings(values: Sequence[str | None]) -> pa.Array[Any]:

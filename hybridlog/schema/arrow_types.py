@@ -92,8 +92,7 @@ def is_numeric(kind: pa.DataType) -> bool:
 
 def numpy_type(kind: pa.DataType) -> np.dtype[Any]:
     """The type of its values in numpy; `to_pandas_dtype` would need pandas in older pyarrow."""
-    dtype: np.dtype[Any] = pa.array([], kind).to_numpy(zero_copy_only=False).dtype
-    return dtype
+    return pa.array([], kind).to_numpy(zero_copy_only=False).dtype  # type: ignore[no-any-return]
 
 
 def is_summary(kind: pa.DataType) -> bool:
@@ -115,8 +114,7 @@ def missing_of(array: Array) -> NDArray[np.bool_] | None:
     """Mask of the null rows of an array; None if there are none."""
     if not array.null_count:
         return None
-    missing: NDArray[np.bool_] = array.is_null().to_numpy(zero_copy_only=False)
-    return missing
+    return array.is_null().to_numpy(zero_copy_only=False)  # type: ignore[no-any-return]
 
 
 def lengths_of(array: Array) -> NDArray[np.int64]:
@@ -301,15 +299,10 @@ def extremes(array: Array) -> Array:
 
 def _example(array: Array) -> Array:
     """Two rows of the type of an array, one with a value where the array has one."""
-    kind = array.type
     if array.null_count == len(array):
-        return pa.nulls(2, kind)
-    if kind == pa.json_():
-        return pa.ExtensionArray.from_storage(kind, pa.array(["0", None]))
-    if is_text(kind) or is_bytes(kind):
-        return pa.array([b"", None], pa.binary()).cast(kind)
+        return pa.nulls(2, array.type)
     valid = int(np.argmax(array.is_valid().to_numpy(zero_copy_only=False)))
-    return pa.concat_arrays([array.slice(valid, 1), pa.nulls(1, kind)])
+    return pa.concat_arrays([array.slice(valid, 1), pa.nulls(1, array.type)])
 
 
 # Conversion.
@@ -334,7 +327,8 @@ def converted(array: Array, kind: pa.DataType, *, drops: bool = False) -> Array:
     if is_list(kind) and is_list(array.type):
         made = with_values(array, converted(array.flatten(), kind.value_type, drops=drops))
         return made if made.type == kind else made.cast(kind)
-    if any(same(kind) and same(array.type) for same in (_is_countable, is_text, is_bytes)):
+    numeric = all(is_number(one) or is_time(one) for one in (kind, array.type))
+    if numeric or any(same(kind) and same(array.type) for same in (is_text, is_bytes)):
         return array.cast(kind)
     raise pa.ArrowInvalid(f"{array.type} is not {kind}")
 
@@ -346,10 +340,6 @@ def _numbers_of(array: Array) -> Array:
     values = pa.Array.from_buffers(pa.uint8(), data.size, [None, data])
     kind, buffers = pa.list_(pa.uint8()), [validity, places]
     return pa.Array.from_buffers(kind, len(array), buffers, offset=array.offset, children=[values])
-
-
-def _is_countable(kind: pa.DataType) -> bool:
-    return is_number(kind) or is_time(kind)
 
 
 def _converted_struct(array: Array, kind: pa.DataType, *, drops: bool) -> Array:
@@ -390,11 +380,12 @@ def plain_values(
             {n: v for n, v in zip(names, row, strict=True) if v is not None}
             for row in (zip(*columns, strict=True) if names else [()] * len(array))
         ]
-        return [row if there else None for row, there in zip(rows, _is_there(array), strict=True)]
+        there = array.is_valid().to_pylist()
+        return [row if one else None for row, one in zip(rows, there, strict=True)]
     if is_list(kind):
         lengths = lengths_of(array)
         values = iter(plain_values(_elements(array, int(lengths.sum())), cells))
-        counted = zip(lengths.tolist(), _is_there(array), strict=True)
+        counted = zip(lengths.tolist(), array.is_valid().to_pylist(), strict=True)
         return [[next(values) for _ in range(n)] if there else None for n, there in counted]
     if is_time(kind):
         array = array.cast(pa.int64())
@@ -412,11 +403,6 @@ def _elements(array: Array, total: int) -> Array:
         if end - begin == total:
             return array.values.slice(begin, total)
     return array.flatten()
-
-
-def _is_there(array: Array) -> list[bool]:
-    there: list[bool] = array.is_valid().to_pylist()
-    return there
 
 
 # Summaries.
@@ -464,12 +450,8 @@ def part_of_summary(records: Array, path: Sequence[str], name: str) -> Array | N
 
     The array is a summary there, or of a fixed length.
     """
-    for inner in path:
-        at = records.type.get_field_index(inner) if _types.is_struct(records.type) else -1
-        if at < 0:
-            return None
-        records = records.flatten()[at]
-    if is_array(records.type):
-        return statistic(records, name)
-    at = records.type.get_field_index(name) if is_summary(records.type) else -1
-    return None if at < 0 else records.flatten()[at]
+    try:
+        found = pc.struct_field(records, list(path))
+        return statistic(found, name) if is_array(found.type) else pc.struct_field(found, name)
+    except pa.ArrowException:
+        return None

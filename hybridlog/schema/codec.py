@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NoReturn, Protocol
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from hybridlog.schema.column import STAMP, Records
 from hybridlog_storage.errors import DefinitionError, PayloadError
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Collection, Mapping
 
     import pyarrow as pa
     from numpy.typing import NDArray
@@ -93,20 +93,19 @@ class Decoded:
         return plain_values(self.arrow())
 
 
-class Codec(Protocol):
+class Codec(ABC):
     """Decodes the payloads of a channel. Thread safe."""
 
-    @property
-    def indexed(self) -> bool:
-        """False if only `_meta` is indexed, and nothing can be decoded."""
-
-    @property
-    def reason(self) -> str | None:
-        """Reason why the fields are not indexed, None if they are."""
+    indexed = True
+    """False if only `_meta` is indexed, and nothing can be decoded."""
+    reason: str | None = None
+    """Reason why the fields are not indexed, None if they are."""
 
     def paths(self) -> list[FieldPath]:
         """The fields for predicates; empty if no definition fixes them."""
+        return []
 
+    @abstractmethod
     def columns(
         self,
         buffer: Buffer,
@@ -120,54 +119,32 @@ class Codec(Protocol):
         definition it raises DefinitionError.
         """
 
+    def columns_of(self, batch: Batch, fields: Collection[str] | None = None) -> Decoded:
+        """Decode messages of one channel, with or without their payloads; see `columns`."""
+        return self.columns(batch.buffer, batch.offset, batch.length, fields)
+
+    @abstractmethod
     def decode(self, payload: Buffer) -> object:
         """One message as its format's usual library has it; PayloadError if it does not fit."""
 
 
-class OpaqueCodec:
+class OpaqueCodec(Codec):
     """Codec of payloads that are stored and fetched, but not decoded."""
 
     indexed = False
 
     def __init__(self, reason: str) -> None:
-        self.reason: str | None = reason
+        self.reason = reason
 
-    def paths(self) -> list[FieldPath]:
-        """No fields are known."""
-        return []
-
-    def columns(
-        self,
-        buffer: Buffer,
-        offset: NDArray[np.int64],
-        length: NDArray[np.int64],
-        fields: Collection[str] | None = None,
-    ) -> NoReturn:
+    def columns(self, *_: Any, **__: Any) -> NoReturn:
         """Refuses with DefinitionError."""
         raise DefinitionError(f"cannot be decoded: {self.reason}. `.raw` has the bytes")
 
-    def decode(self, payload: Buffer) -> NoReturn:
-        """Refuses with DefinitionError."""
-        self.columns(payload, no_rows(), no_rows())
+    decode = columns
 
 
-class ObjectCodec(ABC):
+class ObjectCodec(Codec):
     """Codec of messages that are decoded to Python objects one by one."""
-
-    indexed = True
-    reason: str | None = None
-
-    def paths(self) -> list[FieldPath]:
-        """No fields: a message may have any content."""
-        return []
-
-    @abstractmethod
-    def decode(self, payload: Buffer) -> object:
-        """See `Codec.decode`."""
-
-    def read(self, payload: memoryview) -> Any:
-        """The object that columns are made from; PayloadError if the payload does not fit."""
-        return self.decode(payload)
 
     def form(self, values: list[Any], fields: Collection[str] | None) -> Objects:
         """The objects as one value."""
@@ -190,28 +167,23 @@ class ObjectCodec(ABC):
         places = zip(offset.tolist(), length.tolist(), strict=True)
         for row, (start, size) in enumerate(places):
             try:
-                objects.append(self.read(view[start : start + size]))
+                objects.append(self.decode(view[start : start + size]))
             except PayloadError as error:
                 bad.setdefault(str(error), []).append(row)
             else:
                 rows.append(row)
-        unreadable = [Unreadable(np.array(r, np.intp), text) for text, r in bad.items()]
         records = self.form(objects, fields)
-        return Decoded(np.array(rows, np.intp), records, unreadable, no_rows())
+        return Decoded(np.array(rows, np.intp), records, unreadable(bad), no_rows())
 
 
-def columns_of(codec: Codec, batch: Batch, fields: Collection[str] | None = None) -> Decoded:
-    """Decode messages of one channel, with or without their payloads; see `Codec.columns`."""
-    of_rows: Any = getattr(codec, "columns_of", None)  # of a `LeftCodec`
-    if of_rows is not None:
-        found: Decoded = of_rows(batch, fields)
-        return found
-    return codec.columns(batch.buffer, batch.offset, batch.length, fields)
+def unreadable(bad: Mapping[str, list[int]]) -> list[Unreadable]:
+    """Rows that cannot be read, by reason."""
+    return [Unreadable(np.sort(np.array(rows, np.intp)), why) for why, rows in bad.items()]
 
 
 def stamps_of(codec: Codec, batch: Batch) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
     """Rows of those messages of one channel that have a header stamp, and the stamps, ns."""
-    decoded = columns_of(codec, batch, {STAMP})
+    decoded = codec.columns_of(batch, {STAMP})
     found = stamp_array(decoded.arrow())
     if found is None:
         return np.empty(0, np.intp), np.empty(0, np.int64)
@@ -223,10 +195,10 @@ def stamps_of(codec: Codec, batch: Batch) -> tuple[NDArray[np.intp], NDArray[np.
 def stamp_array(records: pa.StructArray) -> pa.Array[Any] | None:
     """The header stamps of decoded messages, timestamp[ns]; None when they have none."""
     import pyarrow as pa
+    import pyarrow.compute as pc
 
-    found: pa.Array[Any] = records
-    for name in STAMP.split("."):
-        if not pa.types.is_struct(found.type) or found.type.get_field_index(name) < 0:
-            return None
-        found = found.flatten()[found.type.get_field_index(name)]
+    try:
+        found: pa.Array[Any] = pc.struct_field(records, STAMP.split("."))
+    except pa.ArrowException:
+        return None
     return found if pa.types.is_timestamp(found.type) else None

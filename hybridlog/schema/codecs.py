@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, cast
 
 from hybridlog.schema.codec import Codec, ObjectCodec, OpaqueCodec
 from hybridlog.schema.completion import has_hidden_fields
-from hybridlog.schema.definition_text import canonical
 from hybridlog.schema.states import State, encoding_of, state_of
 from hybridlog_storage.errors import DefinitionError, PayloadError
 
@@ -17,8 +16,6 @@ if TYPE_CHECKING:
     from hybridlog.schema.objects import Plain
     from hybridlog_storage.messages import Buffer, Channel, Schema
 
-
-_MAX_NAME = 1000  # bytes
 _ROS = {("ros1", "ros1msg"), ("cdr", "ros2msg"), ("cdr", "ros2idl"), ("cdr", "omgidl")}
 
 
@@ -55,9 +52,6 @@ def _defined(encoding: str, schema: Schema | None) -> Codec:
     if schema is None or not (schema.encoding or schema.data):
         named = "" if schema is None or not schema.name else f"{schema.name}: "
         return OpaqueCodec(f"{named}no definition in the source")
-    text = schema.data[:_MAX_NAME].decode(errors="replace").strip()
-    if text and canonical(text) == canonical(schema.name):
-        return OpaqueCodec(f"{schema.name}: the definition in the source is only its name")
     if (encoding, schema.encoding) in _ROS:
         from hybridlog.schema.ros_codec import RosCodec
 

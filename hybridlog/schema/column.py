@@ -7,8 +7,7 @@ pandas frames are made from them. No row of a column is a Python object.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -85,19 +84,14 @@ class Records:
 
 
 Column: TypeAlias = Scalars | Strings | Arrays | Records
-AnyColumn = TypeVar("AnyColumn", bound=Column)
 _T = TypeVar("_T", bound="np.generic")
 
 LONG = 64
 """Mean number of elements from which rows are copied one by one."""
 
 
-def take(column: AnyColumn, rows: NDArray[np.intp] | NDArray[np.int64]) -> AnyColumn:
+def take(column: Any, rows: NDArray[np.intp] | NDArray[np.int64]) -> Any:
     """Select rows of a column, in the given order."""
-    return cast("AnyColumn", _take(column, rows))
-
-
-def _take(column: Column, rows: NDArray[np.intp] | NDArray[np.int64]) -> Column:
     if isinstance(column, Scalars):
         return Scalars(column.values[rows], column.kind)
     if isinstance(column, Records):
@@ -110,7 +104,7 @@ def _take(column: Column, rows: NDArray[np.intp] | NDArray[np.int64]) -> Column:
     if isinstance(values, Scalars):
         picked = Scalars(_pick(values.values, start, counts), values.kind)
         return Arrays(picked, offset, column.width)
-    return Arrays(_take(values, ranges(start, counts)), offset, column.width)
+    return Arrays(take(values, ranges(start, counts)), offset, column.width)
 
 
 def _pick(data: NDArray[_T], start: NDArray[np.int64], count: NDArray[np.int64]) -> NDArray[_T]:
@@ -122,23 +116,19 @@ def _pick(data: NDArray[_T], start: NDArray[np.int64], count: NDArray[np.int64])
     return np.concatenate([data[a:b] for a, b in zip(start.tolist(), ends, strict=True)])
 
 
-def concatenate(columns: Sequence[AnyColumn]) -> AnyColumn:
+def concatenate(columns: Sequence[Any]) -> Any:
     """Concatenate columns of one type."""
-    return cast("AnyColumn", _concatenate(columns))
-
-
-def _concatenate(columns: Sequence[Any]) -> Column:
     first = columns[0]
     if isinstance(first, Scalars):
         return Scalars(np.concatenate([column.values for column in columns]), first.kind)
     if isinstance(first, Records):
-        fields = {name: _concatenate([c.fields[name] for c in columns]) for name in first.fields}
+        fields = {name: concatenate([c.fields[name] for c in columns]) for name in first.fields}
         return Records(fields, sum(column.rows for column in columns))
     offset = offsets(np.concatenate([np.diff(column.offset) for column in columns]))
     if isinstance(first, Strings):
         data = [c.data[int(c.offset[0]) : int(c.offset[-1])] for c in columns]
         return Strings(np.concatenate(data), offset)
-    return Arrays(_concatenate([column.values for column in columns]), offset, first.width)
+    return Arrays(concatenate([column.values for column in columns]), offset, first.width)
 
 
 def ranges(start: NDArray[np.int64], count: NDArray[np.int64]) -> NDArray[np.intp]:
@@ -182,33 +172,3 @@ def top_level_names(names: Collection[str]) -> list[str]:
                 name += "_"  # noqa: PLW2901
         spelled.append(name)
     return spelled
-
-
-def repaired(strings: Strings) -> Strings:
-    """The same strings with invalid UTF-8 replaced by U+FFFD.
-
-    Valid strings, by far the usual case, are not copied.
-    """
-    low, high = int(strings.offset[0]), int(strings.offset[-1])
-    data = strings.data[low:high]
-    if not len(data) or int(data.max()) < 0x80 or _valid(data, strings.offset - low):
-        return strings
-    raw = data.tobytes()
-    bounds = (strings.offset - low).tolist()
-    cells = [raw[begin:end].decode("utf-8", "replace").encode() for begin, end in pairwise(bounds)]
-    offset = np.zeros(len(bounds), np.int64)
-    np.cumsum([len(cell) for cell in cells], out=offset[1:])
-    return Strings(np.frombuffer(b"".join(cells), np.uint8), offset)
-
-
-def _valid(data: NDArray[np.uint8], offset: NDArray[np.int64]) -> bool:
-    """True if every string is UTF-8: all bytes are, and no string starts within a character."""
-    starts = offset[:-1]
-    starts = starts[starts < len(data)]
-    if bool(((data[starts] & 0xC0) == 0x80).any()):
-        return False
-    try:
-        data.tobytes().decode()
-    except UnicodeDecodeError:
-        return False
-    return True

@@ -12,16 +12,15 @@ best is chosen, the newest of equal ones.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from typing import TYPE_CHECKING
 
 from hybridlog.schema.definition import (
-    DEFAULT_RELEASES,
     MessageType,
-    Release,
     parse_definition,
-    parse_for_release,
+    parsed_with_supplied,
     releases,
     standard_text,
     typestore,
@@ -43,7 +42,7 @@ TRIED_MESSAGES = 64
 _TRIED_BYTES = 1 << 22  # of these, but one message at least
 
 _EMPTY_MD5 = "d41d8cd98f00b204e9800998ecf8427e"
-_DEFAULTS = {"ros1msg": DEFAULT_RELEASES[1], "ros2msg": DEFAULT_RELEASES[2]}
+_DEFAULTS = {"ros1msg": 1, "ros2msg": 2}
 _ENCODINGS = {"", "ros1msg", "ros2msg", "ros2idl", "omgidl"}
 
 
@@ -57,7 +56,7 @@ class _Candidate:
         proof: MD5 sum of a ROS 1 type, RIHS01 hash of a ROS 2 type.
     """
 
-    release: Release
+    release: str
     schema: Schema
     type: MessageType
     proof: str
@@ -72,17 +71,12 @@ def completed(channel: Channel, payloads: Sequence[Buffer]) -> Channel:
     wire = _WIRES.get(channel.message_encoding)
     if wire is None or schema is None or not schema.name or schema.encoding not in _ENCODINGS:
         return channel
-    try:
-        found, supplied = parse_for_release(schema, "")
-    except DefinitionError:
-        found, supplied = None, frozenset[str]()
     payloads = _some(payloads)
     own = (0, 0)
-    if found is not None and found.fields:
-        if supplied:
-            return _with_nested(channel, schema, wire, payloads)
-        own = _fit(found, wire, payloads)
-        if own == (len(payloads), len(payloads)):
+    with suppress(DefinitionError):
+        found = parse_definition(schema)
+        own = _fit(found, wire, payloads) if found.fields else own
+        if found.fields and own == (len(payloads), len(payloads)):
             return channel
     proof = _proof(channel.metadata, wire)
     candidates = [each for each in _standard(schema.name, wire) if proof in {"", each.proof}]
@@ -100,13 +94,13 @@ def with_nested(schema: Schema) -> Schema:
     """A definition with those of the standard types that reading supplies, for other readers."""
     if schema.encoding not in _DEFAULTS or has_parts(schema.data.decode(errors="replace")):
         return schema
-    try:
-        _, supplied = parse_for_release(schema, "")
-    except DefinitionError:
-        return schema
-    if not supplied:
-        return schema
-    return replace(schema, data=schema.data + _sections(_DEFAULTS[schema.encoding], supplied))
+    ros = _DEFAULTS[schema.encoding]
+    with suppress(DefinitionError):
+        names = sorted(parsed_with_supplied(schema)[1])
+        rule = "=" * 80
+        texts = (f"\n{rule}\nMSG: {name}\n{standard_text(name, ros)}" for name in names)
+        schema = replace(schema, data=schema.data + "".join(texts).encode())
+    return schema
 
 
 def has_hidden_fields(channel: Channel) -> bool:
@@ -136,32 +130,6 @@ def _proof(metadata: Mapping[str, str], wire: Wire) -> str:
     if wire == "ros1":
         return text.lower() if len(text) == 32 and text.strip("0") else ""
     return text if text.startswith("RIHS01_") and text[7:].strip("0") else ""
-
-
-def _with_nested(
-    channel: Channel, schema: Schema, wire: Wire, payloads: Sequence[Buffer]
-) -> Channel:
-    """The channel, with definitions of nested types if releases differ in them."""
-    candidates: dict[MessageType, _Candidate] = {}
-    for release in releases(wire):
-        try:
-            found, supplied = parse_for_release(schema, release)
-        except DefinitionError:
-            continue
-        if found not in candidates:
-            text = schema.data + _sections(release, supplied)
-            candidates[found] = _Candidate(release, replace(schema, data=text), found, "")
-    if len(candidates) < 2:
-        return channel
-    chosen = _fitting(list(candidates.values()), wire, payloads, better_than=(0, 0))
-    return channel if chosen is None else _with(channel, chosen, "nested types fit the messages")
-
-
-def _sections(release: Release, names: frozenset[str]) -> bytes:
-    """The definitions of standard types, to be appended to a definition."""
-    rule = "=" * 80
-    texts = (f"\n{rule}\nMSG: {name}\n{standard_text(name, release)}" for name in sorted(names))
-    return "".join(texts).encode()
 
 
 @cache

@@ -135,27 +135,18 @@ _ROS1_TIMES = {"time": Instant("time", False, False), "duration": Instant("durat
 _WORDS = frozenset({*DTYPES, "string", *_NOT_PORTABLE})
 
 
-Release: TypeAlias = str
-"""Name of a release in rosbags, as `ROS2_HUMBLE`."""
-
-
 def parse_definition(schema: Schema) -> MessageType:
     """Parse a definition of encoding `ros1msg`, `ros2msg`, `ros2idl` or `omgidl`.
 
-    Missing standard types (`std_msgs/Header`, `geometry_msgs/Point`, ...) are added;
-    definitions in the text take precedence.
+    Missing standard types (`std_msgs/Header`, `geometry_msgs/Point`, ...) are those of Noetic or
+    Kilted; definitions in the text take precedence.
     """
-    return parse_for_release(schema, "")[0]
+    return parsed_with_supplied(schema)[0]
 
 
 @lru_cache(maxsize=1024)
-def parse_for_release(schema: Schema, release: Release) -> tuple[MessageType, frozenset[str]]:
-    """Parse a definition; missing standard types are those of a release, and returned by name.
-
-    Without a release, they are those of Noetic or Kilted.
-    """
-    if not schema.encoding:
-        raise DefinitionError(f"{schema.name}: no definition in the source")
+def parsed_with_supplied(schema: Schema) -> tuple[MessageType, frozenset[str]]:
+    """Parse a definition; returns also the names of the standard types that it lacked."""
     if schema.encoding not in {"ros1msg", "ros2msg", "ros2idl", "omgidl"}:
         raise DefinitionError(f"{schema.name}: {schema.encoding!r} is not a ROS definition")
     if len(schema.data) > MAX_DEFINITION:
@@ -168,16 +159,16 @@ def parse_for_release(schema: Schema, release: Release) -> tuple[MessageType, fr
     top = canonical(schema.name)
     if top not in types:
         top = first
-    resolver = _Resolver(schema.name, types, ros, release)
+    resolver = _Resolver(schema.name, types, ros)
     fields = resolver.message(top)[0].fields
     return MessageType(schema.name, fields), frozenset(resolver.supplied)
 
 
-DEFAULT_RELEASES: dict[int, Release] = {1: "ROS1_NOETIC", 2: "ROS2_KILTED"}
-"""Whose standard types are supplied where none is named, by version of ROS."""
+_RELEASES = {1: "ROS1_NOETIC", 2: "ROS2_KILTED"}
+"""Whose standard types are supplied, by version of ROS."""
 
 
-def releases(wire: Literal["ros1", "cdr"]) -> list[Release]:
+def releases(wire: Literal["ros1", "cdr"]) -> list[str]:
     """The releases that are known, newest first."""
     from rosbags.typesys import Stores
 
@@ -186,7 +177,7 @@ def releases(wire: Literal["ros1", "cdr"]) -> list[Release]:
 
 
 @cache
-def typestore(release: Release) -> Typestore:
+def typestore(release: str) -> Typestore:
     """The standard types of a release; not to be changed."""
     # Imported here, since it is slow and most definitions are complete.
     from rosbags.typesys import Stores, get_typestore
@@ -229,14 +220,14 @@ def _parse_text(name: str, section: Section, ros: int) -> dict[str, list[RawFiel
     return {name: parse_msg(name, section.text, defaults=ros == 2)}
 
 
-def standard_text(name: str, release: Release) -> str | None:
+def standard_text(name: str, ros: int) -> str | None:
     """The definition of a standard type alone, without those of nested types; None of others."""
     package, _, leaf = name.rpartition("/")
     key = name if "/" in package else f"{package}/msg/{leaf}"
-    store = typestore(release)
+    store = typestore(_RELEASES[ros])
     if key not in store.fielddefs:
         return None
-    text, _ = store.generate_msgdef(key, ros_version=1 if release.startswith("ROS1") else 2)
+    text, _ = store.generate_msgdef(key, ros_version=ros)
     return text.split("=" * 80, maxsplit=1)[0]
 
 
@@ -253,14 +244,11 @@ class _Extent:
 class _Resolver:
     """Resolves type names to types, each type once."""
 
-    def __init__(
-        self, owner: str, types: dict[str, list[RawField]], ros: int, release: Release
-    ) -> None:
+    def __init__(self, owner: str, types: dict[str, list[RawField]], ros: int) -> None:
         self.supplied: set[str] = set()
         self._owner = owner
         self._types = types
         self._ros = ros
-        self._release = release or DEFAULT_RELEASES[ros]
         self._done: dict[str, tuple[MessageType, _Extent]] = {}
         self._open: set[str] = set()
         self._by_leaf: dict[str, list[str]] = {}
@@ -279,7 +267,7 @@ class _Resolver:
             raise self._fail(f"messages are nested deeper than {MAX_DEPTH}")
         raw_fields = self._types.get(name)
         if raw_fields is None:
-            text = standard_text(name, self._release)
+            text = standard_text(name, self._ros)
             self.supplied.add(name)
             if text is None:
                 raise self._fail(f"the definition does not say what {name} is")

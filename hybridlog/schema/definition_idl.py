@@ -105,6 +105,8 @@ def _candidates(scope: str, name: str) -> list[str]:
 
 
 class _Parser:
+    """Scopes are the names of the modules around a place, each with a slash behind it."""
+
     def __init__(self, owner: str, text: str, types: IdlTypes) -> None:
         self._owner = owner
         self._types = types
@@ -112,10 +114,17 @@ class _Parser:
             match.group() for match in _TOKEN.finditer(text) if match.lastgroup != "skip"
         ]
         self._at = 0
+        self._definitions = {
+            "module": self._module,
+            "struct": self._struct,
+            "typedef": self._typedef,
+            "const": self._constant,
+            "enum": self._enum,
+        }
 
     def parse(self) -> None:
         while self._peek():
-            self._definition([])
+            self._definition("")
 
     def _fail(self, what: str) -> DefinitionError:
         return DefinitionError(f"{self._owner}: {what}")
@@ -130,10 +139,15 @@ class _Parser:
         self._at += 1
         return token
 
+    def _take(self, sign: str) -> bool:
+        """Skip a sign if it is next."""
+        found = self._peek() == sign
+        self._at += found
+        return found
+
     def _expect(self, sign: str) -> None:
-        token = self._next()
-        if token != sign:
-            raise self._fail(f"expected {sign!r}, found {token[:40]!r}")
+        if not self._take(sign):
+            raise self._fail(f"expected {sign!r}, found {self._next()[:40]!r}")
 
     def _name(self) -> str:
         token = self._next()
@@ -144,103 +158,81 @@ class _Parser:
     def _annotations(self) -> set[str]:
         """Skip annotations; return their names."""
         found = set()
-        while self._peek() == "@":
-            self._at += 1
+        while self._take("@"):
             found.add(self._next())
-            if self._peek() == "(":
-                depth = 0
-                while True:
-                    sign = self._next()
-                    depth += {"(": 1, ")": -1}.get(sign, 0)
-                    if depth == 0:
-                        break
+            depth = int(self._take("("))
+            while depth:
+                depth += {"(": 1, ")": -1}.get(self._next(), 0)
         return found
 
-    def _definition(self, scope: list[str]) -> None:
-        if len(scope) > _MAX_DEPTH:
+    def _definition(self, scope: str) -> None:
+        if scope.count("/") > _MAX_DEPTH:
             raise self._fail("modules are nested too deep")
-        annotations = self._annotations()
-        word = self._next()
-        if word == "module":
-            inner = [*scope, self._name()]
-            self._expect("{")
-            while self._peek() != "}":
-                self._definition(inner)
-            self._expect("}")
-        elif word == "struct":
-            self._struct(scope)
-        elif word == "typedef":
-            self._typedef(scope)
-        elif word == "const":
-            self._constant(scope)
-        elif word == "enum":
-            if "bit_bound" in annotations:
-                raise self._fail("not indexed: an enum with a bit bound")
-            self._enum(scope)
+        annotations, word = self._annotations(), self._next()
+        if word == "enum" and "bit_bound" in annotations:
+            raise self._fail("not indexed: an enum with a bit bound")
+        if word in self._definitions:
+            self._definitions[word](scope)
         elif word != ";":
             raise self._fail(f"not indexed: IDL {word[:40]!r} has no ROS wire form")
-        if self._peek() == ";":
-            self._at += 1
+        self._take(";")
 
-    def _struct(self, scope: list[str]) -> None:
-        name = "/".join([*scope, self._name()])
+    def _module(self, scope: str) -> None:
+        inner = f"{scope}{self._name()}/"
+        self._expect("{")
+        while not self._take("}"):
+            self._definition(inner)
+
+    def _struct(self, scope: str) -> None:
+        name = scope + self._name()
         if self._peek() == ";":
             return  # declared here, defined elsewhere
         if self._peek() == ":":
             raise self._fail("not indexed: a struct that inherits")
         self._expect("{")
         fields: list[RawField] = []
-        while self._peek() != "}":
+        while not self._take("}"):
             if "optional" in self._annotations():
                 raise self._fail("not indexed: optional members")
             fields += self._declared(name)
-        self._expect("}")
         if name in self._types.structs:
             raise self._fail(f"{canonical(name)} is defined twice")
         self._types.structs[name] = fields
 
-    def _typedef(self, scope: list[str]) -> None:
-        for raw in self._declared("/".join([*scope, ""])):
-            self._types.typedefs["/".join([*scope, raw.name])] = raw
+    def _typedef(self, scope: str) -> None:
+        for raw in self._declared(scope):
+            self._types.typedefs[scope + raw.name] = raw
 
     def _declared(self, scope: str) -> list[RawField]:
         """Parse a type and its declarators, up to the semicolon."""
         kind = self._type(scope)
         fields: list[RawField] = []
-        while True:
-            name = self._name()
-            raw = replace(kind, name=name)
-            if self._peek() == "[":
-                self._at += 1
+        while not fields or self._take(","):
+            raw = replace(kind, name=self._name())
+            if self._take("["):
                 width = self._size(scope, "]")
                 if raw.array or self._peek() == "[":
-                    raise self._fail(f"field {name[:80]} is an array of arrays: not indexed")
+                    raise self._fail(f"field {raw.name[:80]} is an array of arrays: not indexed")
                 raw = replace(raw, array=True, width=width)
             fields.append(raw)
-            if (sign := self._next()) == ";":
-                return fields
-            if sign != ",":
-                raise self._fail(f"expected ';', found {sign[:40]!r}")
+        self._expect(";")
+        return fields
 
     def _type(self, scope: str) -> RawField:
         word = self._next()
         if word == "sequence":
             self._expect("<")
-            element = self._type(scope) if self._peek() != "sequence" else None
-            if element is None:
+            if self._peek() == "sequence":
                 raise self._fail("a sequence of sequences: not indexed")
-            bound = None
-            if self._peek() == ",":
-                self._at += 1
-                bound = self._size(scope, ">")
-            else:
+            element = self._type(scope)
+            bound = self._size(scope, ">") if self._take(",") else None
+            if bound is None:
                 self._expect(">")
             return replace(element, array=True, bound=bound)
         if word in {"unsigned", "long"}:
             while self._peek() in {"long", "short", "double"}:
                 word += " " + self._next()
-        if word in {"string", "wstring"} and self._peek() == "<":
-            self._at += 1
+        if word in {"string", "wstring"} and self._take("<"):
             return RawField("", word, text_bound=self._size(scope, ">"))
         if word in _WORDS:
             return RawField("", _WORDS[word])
@@ -252,54 +244,46 @@ class _Parser:
 
     def _size(self, scope: str, end: str) -> int:
         """An array size and the sign behind it."""
-        tokens = self._until(end)
-        number = self._evaluated(tokens, scope)
+        begin, number = self._at, self._value(scope, end)
         if number is None or number < 0:
-            found = " ".join(tokens)
+            found = " ".join(self._tokens[begin : self._at - 1])
             raise self._fail(f"an array size must be a number or a constant, found {found[:40]!r}")
         return number
 
-    def _until(self, end: str) -> list[str]:
-        """The tokens before a sign, which is skipped."""
+    def _value(self, scope: str, end: str) -> int | None:
+        """A number or a constant with or without a sign, up to a sign; None for anything else."""
         tokens: list[str] = []
         while (token := self._next()) != end:
             tokens.append(token)
-        return tokens
-
-    def _evaluated(self, tokens: list[str], scope: str) -> int | None:
-        """The value of a number or a constant with or without a sign; None for anything else."""
         sign = -1 if tokens[:1] == ["-"] else 1
         rest = tokens[1:] if tokens[:1] in (["-"], ["+"]) else tokens
         if len(rest) != 1:
             return None
-        number = _integer(rest[0])
-        if number is None:
-            found = map(self._types.constants.get, _candidates(scope, rest[0]))
-            number = next((value for value in found if value is not None), None)
-        return None if number is None else sign * number
+        known = map(self._types.constants.get, _candidates(scope, rest[0]))
+        numbers = (one for one in (_integer(rest[0]), *known) if one is not None)
+        return next((sign * one for one in numbers), None)
 
-    def _constant(self, scope: list[str]) -> None:
-        self._type("/".join([*scope, ""]))
+    def _constant(self, scope: str) -> None:
+        self._type(scope)
         name = self._name()
         self._expect("=")
-        number = self._evaluated(self._until(";"), "/".join([*scope, ""]))
+        number = self._value(scope, ";")
         if number is not None:
-            self._types.constants["/".join([*scope, name])] = number
+            self._types.constants[scope + name] = number
 
-    def _enum(self, scope: list[str]) -> None:
-        self._types.enums.add("/".join([*scope, self._name()]))
+    def _enum(self, scope: str) -> None:
+        self._types.enums.add(scope + self._name())
         self._expect("{")
-        while self._next() != "}":
-            pass
+        while not self._take("}"):
+            self._next()
 
 
 def _integer(token: str) -> int | None:
     """Parse an unsigned integer literal: decimal, `0x` hexadecimal or octal."""
-    if not token[0].isdigit() or len(token) > _MAX_DIGITS:
+    if len(token) > _MAX_DIGITS:
         return None
-    octal = len(token) > 1 and token.isdigit() and token[0] == "0"
     try:
-        return int(token, 8) if octal else int(token, 0)
+        return int(re.sub(r"\A0(?=[0-9])", "0o", token), 0)
     except ValueError:
         return None
 

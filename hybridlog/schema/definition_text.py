@@ -17,14 +17,15 @@ from typing import TYPE_CHECKING
 from hybridlog_storage.errors import DefinitionError
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator
+    from collections.abc import Collection
 
 MAX_NAME = 255
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*\Z")
 
-_SEPARATOR = re.compile(r"={20,}\s*\Z")
-_HEADER = re.compile(r"(MSG|IDL|SRV|ACTION):\s*(\S+)\s*\Z")
-_RULE = "=" * 80
+_HEADER = r"\s*(MSG|IDL|SRV|ACTION):[^\S\n]*(\S+)[^\S\n]*(?:\n|\Z)"
+_FIRST_LINE = re.compile(_HEADER)
+# A line of `=`, or a rule in front of a header where the newlines around it are missing.
+_RULE = re.compile(rf"^={{20,}}[^\S\n]*(?:\n|\Z)|(?<!=)={{80,}}(?={_HEADER})", re.MULTILINE)
 _PART_RULE = "---"
 _FIELD = re.compile(
     r"(?P<type>[A-Za-z][A-Za-z0-9_/]*)"
@@ -85,42 +86,17 @@ def split_sections(text: str) -> list[Section]:
 
     The newlines around such a line may be missing.
     """
-    sections: list[Section] = []
-    name = kind = ""
-    lines: list[str] = []
-    expect_header = True
-    started = False
-    for line in _lines(text.removeprefix("\ufeff")):
-        if _SEPARATOR.match(line):
-            if started:
-                sections.append(Section(name, kind, "\n".join(lines)))
-            name, kind, lines, expect_header, started = "", "", [], True, False
-            continue
-        if expect_header and (header := _HEADER.match(line.strip())):
-            kind, name = header[1], header[2]
-            expect_header, started = False, True
-            continue
-        if line.strip():
-            expect_header = False
-        lines.append(line)
-        started = True
-    if started or not sections:
-        sections.append(Section(name, kind, "\n".join(lines)))
-    return sections
-
-
-def _lines(text: str) -> Iterator[str]:
-    """The lines of a concatenation; separators get lines of their own."""
-    lines = text.split("\n")
-    for number, line in enumerate(lines):
-        if _RULE in line:
-            end = line.rindex("=") + 1
-            before, behind = line[:end].rstrip("="), line[end:].strip()
-            following = lines[number + 1] if number + 1 < len(lines) else ""
-            if _HEADER.match(behind or following.strip()):
-                yield from filter(None, (before, _RULE, behind))
-                continue
-        yield line
+    text = text.removeprefix("\ufeff")
+    rules = [*_RULE.finditer(text)]
+    begins, ends = [0, *(one.end() for one in rules)], [*(one.start() for one in rules), len(text)]
+    sections = []
+    for part in (text[begin:end] for begin, end in zip(begins, ends, strict=True)):
+        header = _FIRST_LINE.match(part)
+        if header is not None:
+            sections.append(Section(header[2], header[1], part[header.end() :]))
+        elif part.strip() or (part and not sections):
+            sections.append(Section("", "", part))
+    return sections or [Section("", "", "")]
 
 
 def parse_msg(name: str, text: str, *, defaults: bool) -> list[RawField]:

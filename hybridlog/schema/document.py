@@ -12,6 +12,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -44,27 +45,21 @@ _UNROLL = 16
 
 
 class Bodies(NamedTuple):
-    """Bodies of equal width.
+    """Bodies of equal width, or why there are none.
 
     Attributes:
         rows: intp[k], rows of the input.
         body: uint8[k, width], the BSON elements of the top level, without the
-            document's length in front and its final NUL.
+            document's length in front and its final NUL; or a reason.
     """
 
     rows: NDArray[np.intp]
-    body: NDArray[np.uint8]
-
-
-class TooLarge(NamedTuple):
-    """Rows whose bodies exceed the size limit."""
-
-    rows: NDArray[np.intp]
+    body: NDArray[np.uint8] | str
 
 
 def bodies(
     records: Records, *, array_limit: int = 32, max_bytes: int = 8 << 20
-) -> Iterator[Bodies | TooLarge]:
+) -> Iterator[Bodies]:
     """Make the body of each row; every row is in exactly one of the results.
 
     The bytes equal `bson.encode` of the row's dictionary and depend on that row alone. Memory does
@@ -76,7 +71,7 @@ def bodies(
     width = _spread(top.width, len(records)) - 5
     large = width > max_bytes
     if large.any():
-        yield TooLarge(np.flatnonzero(large))
+        yield Bodies(np.flatnonzero(large), f"its fields take more than {max_bytes >> 20} MiB")
     rows = np.flatnonzero(~large)
     slab = np.cumsum(width[rows]) // _SLAB
     for part in np.split(rows, np.flatnonzero(np.diff(slab)) + 1):
@@ -187,7 +182,11 @@ class _List:
     def __post_init__(self) -> None:
         self.count = _same(self.counts)
         if self.count is not None and isinstance(self.child.width, int):
-            self.width = 5 + self.count * (2 + self.child.width) + _digits_before(self.count)
+            self.width = (
+                5
+                + self.count * (2 + self.child.width)
+                + sum(len(str(key)) for key in range(self.count))
+            )
         else:
             self.width = 5 + np.diff(offsets(self.element_widths())[offsets(self.counts)])
 
@@ -242,15 +241,6 @@ def _digits(index: NDArray[np.int64]) -> NDArray[np.int64]:
     return digits
 
 
-def _digits_before(count: int) -> int:
-    """Total decimal digits of all array keys below `count`."""
-    digits, power = count, 10
-    while power < count:
-        digits += count - power
-        power *= 10
-    return digits
-
-
 def _node(column: Column, limit: int) -> _Node:
     if isinstance(column, Scalars):
         return _number(column.values)
@@ -294,32 +284,15 @@ def _number(values: NDArray[Any], has: NDArray[np.bool_] | None = None) -> _Numb
 
 
 def _text(column: Strings) -> _Text:
-    start, length = column.offset[:-1], np.diff(column.offset)
     begin, end = int(column.offset[0]), int(column.offset[-1])
-    data = np.ascontiguousarray(column.data[begin:end])
-    start = start - begin
-    if (data < 0x80).all():
-        return _Text(data, start, length)
-    raw = data.tobytes()
-    # The validity of a string must not depend on its neighbours, so each string that is
-    # not plain ASCII is checked separately.
-    high = offsets((data >= 0x80).astype(np.int64))
-    odd = np.flatnonzero(high[start + length] > high[start])
-    mended: dict[int, bytes] = {}
-    for row in odd.tolist():
-        text = raw[start[row] : start[row] + length[row]]
-        try:
-            text.decode()
-        except UnicodeDecodeError:
-            mended[row] = text.decode(errors="replace").encode()
-    if mended:
-        start, length = start.copy(), length.copy()
-        behind = len(raw)
-        for row, text in mended.items():
-            start[row], length[row] = behind, len(text)
-            behind += len(text)
-        data = np.frombuffer(b"".join((raw, *mended.values())), np.uint8)
-    return _Text(data, start, length)
+    data, bounds = np.ascontiguousarray(column.data[begin:end]), column.offset - begin
+    if bool((data >= 0x80).any()):
+        # The validity of a string must not depend on its neighbours.
+        raw = data.tobytes()
+        cells = [raw[a:b].decode(errors="replace").encode() for a, b in pairwise(bounds.tolist())]
+        data = np.frombuffer(b"".join(cells), np.uint8)
+        bounds = offsets(np.array([*map(len, cells)], np.int64))
+    return _Text(data, bounds[:-1], np.diff(bounds))
 
 
 def _record(column: Records, limit: int, *, top: bool = False) -> _Record:
@@ -337,12 +310,9 @@ def _array(column: Arrays, limit: int) -> _Node:
     if not short.any():
         return _summary(column, counts)
     some = np.flatnonzero(short)
-    part = take(column, some)
-    assert isinstance(part, Arrays)
-    lists = _List(_node(part.values, limit), counts[short])
-    part = take(column, np.flatnonzero(~short))
-    assert isinstance(part, Arrays)
-    return _Either(short, lists, _summary(part, counts[~short]))
+    lists = _List(_node(take(column, some).values, limit), counts[short])
+    long = take(column, np.flatnonzero(~short))
+    return _Either(short, lists, _summary(long, counts[~short]))
 
 
 def _summary(column: Arrays, counts: NDArray[np.int64]) -> _Record:

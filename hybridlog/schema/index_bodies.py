@@ -7,16 +7,15 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from hybridlog.schema.codec import columns_of
 from hybridlog.schema.column import Records, header_stamps
-from hybridlog.schema.document import TooLarge, bodies
+from hybridlog.schema.document import bodies
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from numpy.typing import NDArray
 
-    from hybridlog.schema.codec import Codec, Decoded
+    from hybridlog.schema.codec import Codec
     from hybridlog_storage.messages import Batch
 
 ARRAY_LIMIT: Final = 32
@@ -52,31 +51,23 @@ def bodies_of(
         if len(batch):
             yield _without_fields(np.arange(len(batch)), None)
         return
-    decoded = columns_of(codec, batch)
+    decoded = codec.columns_of(batch)
     if surplus is not None:
         surplus[decoded.surplus] = True
-    if isinstance(decoded.records, Records):
-        yield from _of_columns(decoded, decoded.records)
+    records, stamps = decoded.records, None
+    if isinstance(records, Records):
+        stamps = header_stamps(records)
+        made = bodies(records, array_limit=ARRAY_LIMIT, max_bytes=MAX_BYTES)
     else:
-        for made, own in decoded.records.bodies(ARRAY_LIMIT, MAX_BYTES):
-            rows = decoded.rows[own]
-            if isinstance(made, str):
-                yield _without_fields(rows, made)
-            else:
-                yield BodyGroup(rows, made, None)
+        made = records.bodies(ARRAY_LIMIT, MAX_BYTES)
+    for own, body in made:
+        rows = decoded.rows[own]
+        if isinstance(body, str):
+            yield _without_fields(rows, body)
+        else:
+            yield BodyGroup(rows, body, None, None if stamps is None else stamps[own])
     for bad in decoded.unreadable:
         yield _without_fields(bad.rows, bad.reason)
-
-
-def _of_columns(decoded: Decoded, records: Records) -> Iterator[BodyGroup]:
-    stamps = header_stamps(records)
-    for group in bodies(records, array_limit=ARRAY_LIMIT, max_bytes=MAX_BYTES):
-        rows = decoded.rows[group.rows]
-        if isinstance(group, TooLarge):
-            yield _without_fields(rows, f"its fields take more than {MAX_BYTES >> 20} MiB")
-            continue
-        own = None if stamps is None else stamps[group.rows]
-        yield BodyGroup(rows, group.body, None, own)
 
 
 def _without_fields(rows: NDArray[np.intp], error: str | None) -> BodyGroup:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from itertools import chain
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
-from hybridlog.schema.codec import Decoded, Unreadable, no_rows
+from hybridlog.schema.codec import Codec, Decoded, no_rows, unreadable
 from hybridlog.schema.column import Records
 from hybridlog.schema.objects import Objects
 from hybridlog.schema.states import CAUSES, State
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from numpy.typing import NDArray
 
-    from hybridlog.schema.codec import Codec
     from hybridlog.schema.definition import FieldPath
     from hybridlog_storage.messages import Batch, Buffer
 
@@ -111,20 +111,19 @@ class LeftFields(Objects):
         ]
         return pa.concat_arrays([pa.nulls(0, kind), *arrays]).take(self._order)
 
-    def statistic(self, path: str, what: str) -> pa.Array[Any] | None:
-        """`n`, `min`, `max` or `mean` of an array in each message; None if there is none."""
+    def statistics(self, paths: Iterable[str]) -> dict[str, pa.Array[Any]]:
+        """`n`, `min`, `max` or `mean` of arrays by path (`ranges.min`), of those that have one."""
         from hybridlog.schema.arrow_types import part_of_summary
 
-        names = path.split(".")
-        found = [part_of_summary(part, names, what) for part in self._records({path})]
-        kind = next((one.type for one in found if one is not None), None)
-        return None if kind is None else self._narrowed(found, kind)
-
-    def statistics(self, paths: Iterable[str]) -> dict[str, pa.Array[Any]]:
-        """The same by path (`ranges.min`), of those that have one."""
-        split = ((path, *path.rpartition(".")) for path in paths)
-        found = {path: self.statistic(array, what) for path, array, _, what in split}
-        return {path: values for path, values in found.items() if values is not None}
+        made = {}
+        for path in paths:
+            array, _, what = path.rpartition(".")
+            names = array.split(".")
+            found = [part_of_summary(part, names, what) for part in self._records({array})]
+            kind = next((one.type for one in found if one is not None), None)
+            if kind is not None:
+                made[path] = self._narrowed(found, kind)
+        return made
 
     def lacking(self, but: Collection[str] = ()) -> NDArray[np.bool_]:
         """bool[n], True where a wanted array, none of `but`, has only its summary left."""
@@ -134,7 +133,7 @@ class LeftFields(Objects):
         return np.concatenate([np.zeros(0, np.bool_), *found])[self._order]
 
 
-class LeftCodec:
+class LeftCodec(Codec):
     """Codec of messages whose payloads are gone; `state` says why."""
 
     def __init__(self, original: Codec, state: State) -> None:
@@ -168,7 +167,7 @@ class LeftCodec:
             return self.columns(b"", no_rows(), no_rows(), fields)
         parts: list[pa.StructArray] = []
         order = np.zeros(len(places.row), np.int64)
-        errors: list[str | None] = [None] * len(order)
+        bad: dict[str, list[int]] = {}
         surplus: list[NDArray[np.intp]] = [no_rows()]
         for part, own, rows in places.by_part():
             found = part.take(rows)
@@ -176,18 +175,14 @@ class LeftCodec:
             parts.append(fields_in(found))
             error = found.field("error")
             for row, reason in zip(own.tolist(), error.to_pylist(), strict=True):
-                errors[row] = reason
+                if reason is not None:
+                    bad.setdefault(reason, []).append(row)
             has_surplus = found.field("ref").field("surplus").to_numpy(zero_copy_only=False)
             surplus.append(own[has_surplus])
-        bad: dict[str, list[int]] = {}
-        for row, reason in enumerate(errors):
-            if reason is not None:
-                bad.setdefault(reason, []).append(row)
-        good = np.flatnonzero([reason is None for reason in errors])
+        good = np.setdiff1d(np.arange(len(order)), [*chain.from_iterable(bad.values())])
         empty = self.original.columns(b"", no_rows(), no_rows(), fields)
         records = LeftFields(parts, order[good], fields, empty)
-        unreadable = [Unreadable(np.array(own, np.intp), why) for why, own in bad.items()]
-        return Decoded(good, records, unreadable, np.sort(np.concatenate(surplus)))
+        return Decoded(good, records, unreadable(bad), np.sort(np.concatenate(surplus)))
 
     def decode(self, payload: Buffer) -> NoReturn:
         """Refuses with PayloadError."""

@@ -16,15 +16,15 @@ from bson.errors import BSONError
 from bson.int64 import Int64
 
 from hybridlog.schema.column import RESERVED, top_level_names
-from hybridlog.schema.summary import nearest_double, summary_of
-from hybridlog.schema.text import repaired_text
+from hybridlog.schema.document import Bodies
+from hybridlog.schema.summary import summary_of
+from hybridlog.schema.text import nearest, repaired_text
 from hybridlog_storage.errors import PayloadError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator
 
     import pyarrow as pa
-    from numpy.typing import NDArray
 
 Plain: TypeAlias = "dict[str, Plain] | list[Plain] | str | bytes | bool | int | float | None"
 """What a payload is made of. An `Int64` is stored as int64 whatever its value."""
@@ -109,13 +109,8 @@ class Objects:
             return None
         return [path.replace("[]", "").split(".") for path in self.fields]
 
-    def bodies(
-        self, array_limit: int, max_bytes: int
-    ) -> Iterator[tuple[NDArray[np.uint8] | str, NDArray[np.intp]]]:
-        """Bodies of index documents of equal width, or why there are none, and their messages.
-
-        Arrays of more than `array_limit` elements are summarised.
-        """
+    def bodies(self, array_limit: int, max_bytes: int) -> Iterator[Bodies]:
+        """As of `document.bodies`."""
         found: dict[int | str, tuple[list[int], list[bytes]]] = {}
         for row, value in enumerate(self.plain(whole=False)):
             body = _body_of(value, array_limit, max_bytes)
@@ -125,7 +120,7 @@ class Objects:
         for key, (rows, parts) in found.items():
             table = np.frombuffer(b"".join(parts), np.uint8)
             made = key if isinstance(key, str) else table.reshape(len(rows), key)
-            yield made, np.array(rows, np.intp)
+            yield Bodies(np.array(rows, np.intp), made)
 
 
 def _body_of(value: dict[str, Any], array_limit: int, max_bytes: int) -> bytes | str:
@@ -160,7 +155,7 @@ def _indexed(value: Plain, limit: int, depth: int) -> object:
     if isinstance(value, str):
         return repaired_text(value)
     if isinstance(value, int) and not _INT64_MIN <= value <= _INT64_MAX:
-        return nearest_double(value)
+        return nearest(value)
     return value
 
 

@@ -6,9 +6,10 @@ import re
 import struct
 import threading
 from contextlib import suppress
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Literal, cast
 
+from hybridlog.schema.codec import Codec
 from hybridlog.schema.definition import (
     ArrayOf,
     FieldPath,
@@ -43,19 +44,16 @@ _TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(?:/[A-Za-z][A-Za-z0-9_]*)*\Z")
 _REGISTERING = threading.Lock()
 
 
-class RosCodec:
+class RosCodec(Codec):
     """Messages of one ROS type."""
-
-    indexed = True
-    reason: str | None = None
 
     def __init__(self, schema: Schema, wire: Literal["ros1", "cdr"]) -> None:
         self._name = schema.name
         self._wire: Literal["ros1", "cdr"] = wire
         self._type = parse_definition(schema)
         self._paths = paths(self._type)
-        self._reader = WireReader(self._type, wire)
-        self._selecting = lru_cache(maxsize=64)(self._reader_of)
+        self._readers = lru_cache(maxsize=64)(partial(WireReader, self._type, wire))
+        self._readers(None)  # which refuses some definitions
         self._objects: RosObjects | None = None
 
     def paths(self) -> list[FieldPath]:
@@ -72,7 +70,7 @@ class RosCodec:
         except PayloadError:
             # rosbags refuses payloads with bytes left over.
             with suppress(MisfitError):
-                return self._objects.decode(self._reader.message_in(payload))
+                return self._objects.decode(self._readers(None).message_in(payload))
             raise
 
     def columns(
@@ -83,14 +81,11 @@ class RosCodec:
         fields: Collection[str] | None = None,
     ) -> Decoded:
         """Decode messages; see `Codec.columns`."""
-        reader = self._reader if fields is None else self._selecting(frozenset(fields))
+        reader = self._readers(None if fields is None else frozenset(fields))
         decoded = reader.read(buffer, offset, length)
         for bad in decoded.unreadable:
             bad.reason = f"the payload does not fit {self._name}: {bad.reason}"
         return decoded
-
-    def _reader_of(self, fields: frozenset[str]) -> WireReader:
-        return WireReader(self._type, self._wire, fields)
 
 
 class RosObjects:

@@ -1,9 +1,10 @@
-"""Plain Python values as JSON text, and text that UTF-8 can encode."""
+"""Plain Python values as JSON text, text that UTF-8 can encode, and numbers as doubles."""
 
 from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from typing import Any
 
 MAX_DEPTH = 32
@@ -26,18 +27,9 @@ def json_text(value: object) -> str:
     return repaired_text(text)
 
 
-def without_nan(value: Any) -> Any:
+def without_nan(value: object, default: Callable[[Any], object] = str) -> Any:
     """The value with `"NaN"`, `"Infinity"` and `"-Infinity"` for numbers that JSON lacks."""
-    if isinstance(value, float):
-        if math.isnan(value):
-            return "NaN"
-        if math.isinf(value):
-            return "Infinity" if value > 0 else "-Infinity"
-    elif isinstance(value, dict):
-        return {name: without_nan(item) for name, item in value.items()}
-    elif isinstance(value, list):
-        return [without_nan(item) for item in value]
-    return value
+    return json.loads(json.dumps(value, default=default), parse_constant=str)
 
 
 def repaired_text(text: str) -> str:
@@ -47,3 +39,11 @@ def repaired_text(text: str) -> str:
     except UnicodeEncodeError:
         return text.encode("utf-16-le", "surrogatepass").decode("utf-16-le", "replace")
     return text
+
+
+def nearest(value: float) -> float:
+    """The nearest double; an infinity beyond the largest."""
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf if value > 0 else -math.inf

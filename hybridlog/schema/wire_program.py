@@ -94,7 +94,6 @@ class Run:
 
     fields: tuple[Fixed, ...]
     _layouts: dict[tuple[int, int, int], Layout] = field(default_factory=dict)
-    _sizes: list[int | None] = field(default_factory=lambda: [None] * 8)
 
     def layout(self, first: int, phase: int, modulus: int) -> Layout:
         """Layout from field `first` on, as far as the known phase allows.
@@ -124,10 +123,7 @@ class Run:
 
     def size(self, phase: int) -> int:
         """Bytes of the whole run from a start of that phase (0 to 7)."""
-        size = self._sizes[phase]
-        if size is None:
-            size = self._sizes[phase] = self.layout(0, phase, 8).size
-        return size
+        return self.layout(0, phase, 8).size
 
     def cut(self, phase: int, room: int) -> str:
         """Path of the first field that does not fit into `room` bytes."""

@@ -262,13 +262,15 @@ def _tables_of_poses(planner: Planner) -> Iterator[pa.Table]:
         recordings = [ids[name] for name in names]
         frames = [str(name or "") for name in table[frame].to_pylist()]
         times = table[stamp].cast(pa.int64()).fill_null(0).to_numpy()
-        moved = looked.transforms(recordings, frames, times)
         columns = {name: table[name].combine_chunks() for name in table.column_names}
-        for pose in found.poses:
-            columns |= _pose_in_frame(columns, pose, moved)
+        if found.poses:
+            moved = looked.transforms(recordings, frames, times)
+            for pose in found.poses:
+                columns |= _pose_in_frame(columns, pose, moved)
         for name, inside in found.lists.items():
-            lookup = _Elements(looked, recordings, frames, times, moved)
-            columns[name] = _list_in_frame(columns[name], inside, lookup)
+            columns[name] = _list_in_frame(
+                columns[name], inside, looked, recordings=recordings, frames=frames, times=times
+            )
         columns[frame] = pa.array([question.frame] * table.num_rows, pa.string())
         yield pa.table({name: column for name, column in columns.items() if name not in hidden})
 
@@ -302,42 +304,30 @@ def _pose_in_frame(
     return made
 
 
-class _Elements(NamedTuple):
-    """Transforms of the elements of lists: those of their messages, unless they name a frame."""
-
-    looked: _Looked
-    recordings: Sequence[str]
-    frames: Sequence[str]
-    times: NDArray[np.int64]
-    moved: Transform
-
-    def transforms(self, rows: NDArray[np.int64], frames: Sequence[str | None]) -> Transform:
-        """The transforms of elements, by the number of their message, and their own frame."""
-        others: dict[tuple[int, str], int] = {}
-        index = rows.copy()
-        for place, (row, frame) in enumerate(zip(rows.tolist(), frames, strict=True)):
-            if frame and frame != self.frames[row]:
-                index[place] = len(self.moved) + others.setdefault((row, frame), len(others))
-        of = [row for row, _ in others]
-        own = [frame for _, frame in others]
-        found = self.looked.transforms([self.recordings[r] for r in of], own, self.times[of])
-        return Transform(
-            np.concatenate([self.moved.translation, found.translation])[index],
-            np.concatenate([self.moved.rotation, found.rotation])[index],
-        )
-
-
-def _list_in_frame(column: Any, poses: Sequence[_Pose], lookup: _Elements) -> Any:
-    """A list of structures with poses, at the times of their messages."""
-    values, rows = column.flatten(), pc.list_parent_indices(column).to_numpy()
+def _list_in_frame(
+    column: Any,
+    poses: Sequence[_Pose],
+    looked: _Looked,
+    *,
+    recordings: Sequence[str],
+    frames: Sequence[str],
+    times: NDArray[np.int64],
+) -> Any:
+    """A list of structures with poses, in frames of their own or that of their messages."""
+    values, rows = column.flatten(), pc.list_parent_indices(column).to_pylist()
     columns = flat(values)
     frame = next((name for name in _FRAMES if name in columns), None)
     own = columns[frame].to_pylist() if frame else [None] * len(rows)
-    moved = lookup.transforms(rows.astype(np.int64), own)
+    pairs = [(row, one or frames[row]) for row, one in zip(rows, own, strict=True)]
+    number = {pair: place for place, pair in enumerate(dict.fromkeys(pairs))}
+    of = [row for row, _ in number]
+    found = looked.transforms([recordings[row] for row in of], [f for _, f in number], times[of])
+    places = [number[pair] for pair in pairs]
+    moved = Transform(found.translation[places], found.rotation[places])
     for pose in poses:
         columns |= _pose_in_frame(columns, pose, moved)
     if frame:
-        columns[frame] = pa.array([lookup.looked.target] * len(rows), pa.string())
+        columns[frame] = pa.array([looked.target] * len(rows), pa.string())
     return with_values(column, _nested("", values.type, columns))
 
 

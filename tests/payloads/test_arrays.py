@@ -22,7 +22,6 @@ from rosbags.typesys import Stores, get_typestore
 import hybridlog as hl
 from hybridlog.arrays.message_arrays import to_numpy
 from hybridlog.columns.clouds import PointColumns
-from hybridlog.columns.column_file import ColumnFile
 from hybridlog.columns.fields import FieldShape
 from hybridlog.query.planner import Planner
 from hybridlog.query.rows import Rows
@@ -215,7 +214,7 @@ def test_off_gives_the_columns_back(copy: Path) -> None:
     assert all(before[name].equals(after[name]) for name in before)
 
 
-def test_shared_files_have_no_holes_and_cost_what_it_says(copy: Path, tmp_path: Path) -> None:
+def test_shared_files_cost_what_it_says(copy: Path, tmp_path: Path) -> None:
     log = write_log(tmp_path / "other.mcap", [(f"{one[0]}2", *one[1:]) for one in robot(30)])
     with hl.open(copy, mongo="none") as store:
         store.record(log, name="other")
@@ -225,12 +224,6 @@ def test_shared_files_have_no_holes_and_cost_what_it_says(copy: Path, tmp_path: 
             for one, kind in zip(found, ("LaserScan", "LaserScan", "PointCloud2"), strict=True):
                 paths = files_of(store, kind)
                 assert one.bytes_after == sum(path.stat().st_size for path in paths)
-                for path in paths:
-                    footer = int.from_bytes(path.read_bytes()[-8:-4], "little") + 12
-                    assert [*ColumnFile(path).about.span] == [
-                        4,
-                        path.stat().st_size - footer,
-                    ]
             sizes.append([(one.bytes_before, one.bytes_after) for one in found])
     assert sizes[1] == sizes[3] == [one[::-1] for one in sizes[2]]
     for before, with_, after in zip(*sizes[:3], strict=True):

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hybridlog.schema.codec import Codec, Decoded, columns_of
+from hybridlog.schema.codec import Codec, Decoded
 from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.messages import Batch, Channel, Schema
 
@@ -22,7 +22,7 @@ JSON = codec_for(Channel("/t", "json", None))
 def decoded_of(codec: Codec, payloads: list[bytes], fields: set[str] | None = None) -> Decoded:
     length = np.array([len(p) for p in payloads], np.int64)
     data, offset, none = b"".join(payloads), np.cumsum(length) - length, np.zeros(len(length))
-    return columns_of(codec, Batch(data, offset, length, none, none, none, none), fields)
+    return codec.columns_of(Batch(data, offset, length, none, none, none, none), fields)
 
 
 def arrow_of(codec: Codec, payloads: list[bytes], fields: set[str] | None = None) -> Any:

@@ -117,31 +117,6 @@ def test_a_foreign_file_is_no_table(path: Path, table: pa.Table) -> None:
         ColumnFile(path)
 
 
-def test_what_a_file_replaces_keeps_its_place(path: Path) -> None:
-    """A reader that knows the footer of the file before may read from the new one."""
-    kept, before = None, None
-    sizes = []
-    for number in range(1, 12):
-        rows = np.arange(1000 * number)
-        numbers = np.random.default_rng(number).random(len(rows))
-        table = pa.table({"x": numbers, "t": rows, "seq": rows})
-        in_front = kept is not None and len(kept.data) * 1.3 < kept.offset
-        writer = ParquetFileWriter(path, table.schema, reused=kept, in_front=in_front)
-        writer.write(table)
-        section = Section("id", "/a", 0, {}, TopicCounts(table.num_rows))
-        writer.close([section])
-        assert pq.read_table(path).equals(table)
-        if before is not None:
-            metadata, old = before
-            assert pq.ParquetFile(path, metadata=metadata).read().equals(old)
-        reader = ColumnFile(path)
-        reader.check()
-        kept, before = reader.reusable(), (pq.read_metadata(path), table)
-        sizes.append(reader.size_bytes / len(kept.data))
-        path.unlink()
-    assert max(sizes) < 3.5
-
-
 def test_encodings(recorded: hl.Store) -> None:
     (path,) = (recorded.directory.path / "tables").glob("*/*.parquet")
     group = pq.read_metadata(path).row_group(0)
@@ -169,7 +144,7 @@ def test_names_of_columns(names: list[str], columns: list[str]) -> None:
     assert [name for name, _ in column_names(names)] == names
 
 
-def test_a_folder_is_named_by_its_exact_schema(tmp_path: Path) -> None:
+def test_a_folder_is_named_by_its_exact_schema() -> None:
     inner = pa.struct([("x", pa.float64()), ("y", pa.list_(pa.int8()))])
     columns = [("a", pa.int64()), ("s", inner), ("f", pa.list_(pa.int8(), 3))]
     name = shape_folder("T", pa.schema(columns))
@@ -186,6 +161,3 @@ def test_a_folder_is_named_by_its_exact_schema(tmp_path: Path) -> None:
     ]
     names = {shape_folder("T", pa.schema(other)) for other in [columns, *others]}
     assert len(names) == 8
-    # A file has the schema of which it is named.
-    pq.write_table(pa.schema(columns).empty_table(), tmp_path / "a.parquet")
-    assert shape_folder("T", pq.read_schema(tmp_path / "a.parquet")) == name

@@ -103,7 +103,7 @@ def test_damaged_tables_are_none_and_are_made_again(
     path = file_of(recorded, topic)
     whole = path.read_bytes()
     DAMAGE[harm](path)
-    tables.invalidate()
+    tables.look_again()
     if harm != "garbled":  # of that, only who reads the part is told
         assert tables.of(entry, topic) is None
     places = {f.place for f in recorded.verify().findings}
@@ -126,13 +126,13 @@ def test_a_segment_more_or_less_is_noticed(recorded: hl.Store, tables: Tables) -
     (entry,) = recorded.recordings()
     digest = entry.digests["0"]
     entry.digests["0"] = digest[:-1] + ("0" if digest[-1] != "0" else "1")
-    tables.invalidate()
+    tables.look_again()
     assert tables.of(entry, "/large") is None
     entry.digests["0"] = digest
-    tables.invalidate()
+    tables.look_again()
     assert tables.of(entry, "/large")
     entry.channels[0].stats.messages += 1
-    tables.invalidate()
+    tables.look_again()
     assert tables.of(entry, entry.channels[0].topic) is None
 
 
@@ -147,7 +147,7 @@ def test_memory_of_columns_is_bounded(recorded: hl.Store) -> None:
         assert 0 < cache._size <= 30_000
 
 
-def test_files_are_closed_when_they_are_forgotten(recorded: hl.Store, tables: Tables) -> None:
+def test_files_are_closed_when_they_are_forgotten(recorded: hl.Store) -> None:
     root = recorded.directory.path  # other tests of this process may hold files of theirs
 
     def opened() -> int:
@@ -155,10 +155,11 @@ def test_files_are_closed_when_they_are_forgotten(recorded: hl.Store, tables: Ta
         return sum(root in link.parents and link.suffix == ".parquet" for link in links)
 
     (entry,) = recorded.recordings()
+    tables = Tables(root)
     for topic in topics_of(entry):
         assert tables.of(entry, topic)
     assert opened() == 1
-    tables.invalidate()
+    del tables
     assert opened() == 0
 
 
@@ -174,7 +175,7 @@ def test_several_threads_may_ask_while_all_is_forgotten(recorded: hl.Store, tabl
     with ThreadPoolExecutor(3) as pool:
         asked = [pool.submit(ask) for _ in range(3)]
         while not all(one.done() for one in asked):
-            tables.invalidate()
+            tables.look_again()
         for one in asked:
             one.result()
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import TypeGuard
 
+from hybridlog.schema.text import nearest
+
 LOW, HIGH = -(2**63), 2**63 - 1
 """Smallest and greatest int64."""
 
@@ -19,16 +21,8 @@ def is_nan(value: object) -> bool:
     return isinstance(value, float) and math.isnan(value)
 
 
-def nearest(value: float) -> float:
-    """The nearest double; an infinity beyond the largest."""
-    try:
-        return float(value)
-    except OverflowError:
-        return math.inf if value > 0 else -math.inf
-
-
 def for_doubles(order: str, value: float) -> tuple[str, float]:
-    """The equivalent comparison of doubles with a double; it is never `== nan`.
+    """The equivalent comparison of doubles with a double, that nearest to a value.
 
     Args:
         order: `<`, `<=`, `>` or `>=`.
@@ -37,11 +31,8 @@ def for_doubles(order: str, value: float) -> tuple[str, float]:
     near = nearest(value)
     if near == value:
         return order, near
-    # No double lies between the value and its neighbours.
-    below = near if near < value else math.nextafter(near, -math.inf)
-    if order in {"<", "<="}:
-        return "<=", below
-    return ">=", math.nextafter(below, math.inf)
+    # No double lies between both, so it is on the other side or it is not.
+    return (order[0] if (order[0] == "<") == (near > value) else f"{order[0]}="), near
 
 
 def for_integers(order: str, value: float) -> tuple[str, int] | bool:

@@ -312,9 +312,7 @@ class _Parser:
         try:
             compile_regex(pattern)
         except RegexError as error:
-            # The pattern begins after the quote.
-            place = token.position + 1 + min(error.position, len(token.text))
-            raise error_at(self._text, place, f"the pattern is refused: {error}") from None
+            raise self._fail(token, f"the pattern is refused: {error}") from None
         return Match(field, pattern, negated, token.position)
 
     def _field(self) -> Field:

@@ -6,11 +6,8 @@ summary replaces a long array. Where that matters, columns cannot decide, and ob
 
 from __future__ import annotations
 
-import math
-from abc import ABC, abstractmethod
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from functools import reduce
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -24,7 +21,6 @@ from hybridlog.query.predicate.numbers import (
     for_integers,
     is_nan,
     is_number,
-    nearest,
 )
 from hybridlog.query.predicate.tree import (
     And,
@@ -44,19 +40,18 @@ from hybridlog.query.predicate.tree import (
     Value,
     root_of,
 )
-from hybridlog.query.predicate.types import STATS, FieldTypes, Stat
+from hybridlog.query.predicate.types import FieldTypes, Stat
 from hybridlog.schema.arrow_types import (
     is_array,
-    is_bytes,
     is_list,
-    is_numeric,
+    is_summary,
     is_text,
     is_time,
     lengths_of,
     statistic,
 )
 from hybridlog.schema.summary import summary_of
-from hybridlog.schema.text import repaired_text
+from hybridlog.schema.text import nearest, repaired_text
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -71,7 +66,6 @@ _ORDERS: dict[str, np.ufunc] = {
     ">": np.greater,
     ">=": np.greater_equal,
 }
-_SUMMARIES = (set(STATS), {"n"})
 
 
 def to_mask(
@@ -86,7 +80,7 @@ def to_mask(
             complete, or structs of `n`, `min`, `max` and `mean`.
     """
     try:
-        return _Columns(FieldTypes.of(types), records).node(root_of(node))
+        return _mask(root_of(node), _Columns(FieldTypes.of(types), records))
     except (_UnfitError, pa.ArrowNotImplementedError):
         return None  # Arrow has no functions for lists of JSON text either
 
@@ -100,7 +94,7 @@ def mask_of_objects(
 
     For conditions on its numbers, an array may be `{n, min, max, mean}`.
     """
-    return _Objects(FieldTypes.of(types), messages).node(root_of(node))
+    return _mask(root_of(node), _Objects(FieldTypes.of(types), messages))
 
 
 class _UnfitError(Exception):
@@ -123,64 +117,48 @@ class _Leaves(NamedTuple):
     is_summary: bool = False
 
 
-class _Messages(ABC):
-    """Some messages, of which a predicate is asked."""
-
-    def __init__(self, types: FieldTypes, count: int) -> None:
-        self._types = types
-        self._count = count
-
-    @abstractmethod
-    def exists(self, target: Field) -> Mask:
-        """Mask of the messages that have a field."""
-
-    @abstractmethod
-    def elements(self, target: Field) -> Iterator[_Leaves]:
-        """The values of a field that are no lists, the elements of lists, and nulls."""
-
-    def node(self, node: Node) -> Mask:
-        """Mask of the messages for which a predicate holds.
-
-        Raises:
-            _UnfitError: the columns cannot decide.
-        """
-        match node:
-            case And(items):
-                return reduce(np.logical_and, map(self.node, items), np.ones(self._count, np.bool_))
-            case Or(items):
-                return reduce(np.logical_or, map(self.node, items), np.zeros(self._count, np.bool_))
-            case Not(item):
-                return ~self.node(item)
-            case Exists(target, present):
-                found = self.exists(target)
-                return found if present else ~found
-            case MongoFilter() | Near():
-                raise _UnfitError
-            case Compare(order="!=") | Member(negated=True) | Match(negated=True):
-                return self.exists(node.field) & ~self._holds(node)
-            case _:
-                return self._holds(node)
-
-    def _holds(self, node: Compare | Member | Match) -> Mask:
-        """Mask of the messages with a value that satisfies a condition, without its negation."""
-        found = np.zeros(self._count, np.bool_)
-        for each in self.elements(node.field):
-            found[each.rows[_tested(node, each, self._types)]] = True
-        return found
+def _mask(node: Node, source: _Objects | _Columns) -> Mask:
+    """Mask of the messages for which a predicate holds; _UnfitError if that cannot be told."""
+    found = np.zeros(len(source), np.bool_)
+    match node:
+        case And(items) | Or(items):
+            masks = [_mask(item, source) for item in items]
+            is_and = isinstance(node, And)
+            join = np.logical_and if is_and else np.logical_or
+            joined: Mask = join.reduce([~found if is_and else found, *masks])
+            return joined
+        case Not(item):
+            return ~_mask(item, source)
+        case MongoFilter() | Near():
+            raise _UnfitError
+        case Exists(target, present):
+            for rows in source.there(target):
+                found[rows] = True
+            return found if present else ~found
+    for each in source.elements(node.field):
+        found[each.rows[_tested(node, each, source.types)]] = True
+    if (isinstance(node, Compare) and node.order == "!=") or getattr(node, "negated", False):
+        return _mask(Exists(node.field, present=True), source) & ~found
+    return found
 
 
-class _Objects(_Messages):
+class _Objects:
     """Messages as plain objects, which decide everything."""
 
     def __init__(self, types: FieldTypes, messages: Sequence[Mapping[str, object]]) -> None:
-        super().__init__(types, len(messages))
+        self.types = types
         self._messages = messages
 
-    def exists(self, target: Field) -> Mask:
+    def __len__(self) -> int:
+        return len(self._messages)
+
+    def there(self, target: Field) -> Iterator[Rows]:
+        """The messages that have a field, in some parts."""
         found = (any(True for _ in self._at(one, target)) for one in self._messages)
-        return np.fromiter(found, np.bool_, self._count)
+        yield np.flatnonzero([*found])
 
     def elements(self, target: Field) -> Iterator[_Leaves]:
+        """The values of a field that are no lists, the elements of lists, and nulls."""
         alike: dict[tuple[Any, bool], tuple[list[Any], list[int]]] = defaultdict(lambda: ([], []))
         for row, message in enumerate(self._messages):
             for found in self._at(message, target):
@@ -197,21 +175,15 @@ class _Objects(_Messages):
 
     def _at(self, message: object, target: Field) -> Iterator[object]:
         """Everything at a path: values, whole arrays, statistics of arrays."""
-        parts, types = target.parts, self._types
+        parts, types = target.parts, self.types
         stat = types.statistic(parts)
         if stat is None or not types.known:
             yield from _reached(message, parts)
         if stat is None:
             return
-        name = ".".join(part for part in parts[:-1] if isinstance(part, str))
-        is_countable = stat == "n" or types.kind(name) != "other"
         for array in _reached(message, parts[:-1]):
-            if not types.known:
-                has = isinstance(array, list) and _has_statistic(array, stat)
-            else:
-                has = is_countable and isinstance(array, list | bytes)
-            if has:
-                yield statistic_of(array, stat)  # type: ignore[arg-type]
+            if isinstance(array, list | bytes) and (types.known or _has_statistic(array, stat)):
+                yield statistic_of(array, stat)
             elif types.known and isinstance(array, Mapping) and stat in array:
                 yield array[stat]
 
@@ -228,11 +200,10 @@ def _reached(value: object, parts: Parts) -> Iterator[object]:
     elif isinstance(value, Mapping):
         if str(part) in value:
             yield from _reached(value[str(part)], rest)
+    elif isinstance(value, list) and isinstance(part, int):
+        yield from _reached(value[part], rest) if part < len(value) else ()
     elif isinstance(value, list):
-        if isinstance(part, int) and part < len(value):
-            yield from _reached(value[part], rest)
-        # MongoDB also accepts a number as a name.
-        for inner in _flat(value) if isinstance(part, str) else value:
+        for inner in _flat(value):
             if isinstance(inner, Mapping):
                 yield from _reached(inner, parts)
 
@@ -270,55 +241,44 @@ def statistic_of(values: Sequence[object], stat: Stat) -> float | None:
     """A statistic of an array, equal to that in its summary in the index."""
     if stat == "n":
         return len(values)
-    numbers = [value for value in values if isinstance(value, int | float)]
-    # True counts as 1.
-    finite = [value * 1 for value in numbers if isinstance(value, int) or math.isfinite(value)]
-    if not finite:
-        return None
-    if stat == "mean":
-        found = summary_of(numbers)
-        return float(found.mean[0]) if found is not None and found.has[0] else None
-    return min(finite) if stat == "min" else max(finite)
+    found = summary_of(values)
+    return getattr(found, stat)[0].item() if found is not None and found.has[0] else None
 
 
-class _Columns(_Messages):
+class _Columns:
     """Messages as columns."""
 
     def __init__(self, types: FieldTypes, records: pa.StructArray) -> None:
-        super().__init__(types, len(records))
+        self.types = types
         self._records = records
 
-    def exists(self, target: Field) -> Mask:
-        found = np.zeros(self._count, np.bool_)
-        for leaves in self.leaves(target):
+    def __len__(self) -> int:
+        return len(self._records)
+
+    def there(self, target: Field) -> Iterator[Rows]:
+        """As of `_Objects`."""
+        for leaves in self._leaves(target):
             if leaves.values.null_count and not leaves.is_element:
                 raise _UnfitError  # null, or missing
-            found[leaves.rows] = True
-        return found
+            yield leaves.rows
 
     def elements(self, target: Field) -> Iterator[_Leaves]:
-        for leaves in self.leaves(target):
+        """As of `_Objects`."""
+        for leaves in self._leaves(target):
             yield from _elements(leaves)
 
-    # Paths.
-
-    def leaves(self, target: Field) -> list[_Leaves]:
-        """The values at a path.
-
-        Raises:
-            _UnfitError: the columns cannot decide.
-        """
+    def _leaves(self, target: Field) -> Iterator[_Leaves]:
+        """The values at a path."""
         parts = target.parts
-        top = self._records.type
-        if top.get_field_index(str(parts[0])) < 0:
+        if self._records.type.get_field_index(str(parts[0])) < 0:
             raise _UnfitError
-        start = _Leaves(self._records, np.arange(self._count))
-        stat = self._types.statistic(parts)
+        start = _Leaves(self._records, np.arange(len(self)))
+        stat = self.types.statistic(parts)
         if stat is None:
-            return list(self._reach(start, parts, ()))
-        if not self._types.known:
+            return self._reach(start, parts, ())
+        if not self.types.known:
             raise _UnfitError  # a message may have a field of that name
-        return [_statistic(array, stat) for array in self._reach(start, parts[:-1], ())]
+        return (_statistic(array, stat) for array in self._reach(start, parts[:-1], ()))
 
     def _reach(
         self,
@@ -351,35 +311,16 @@ class _Columns(_Messages):
                 inner = _Leaves(pc.struct_field(values, str(part)), rows)
                 yield from self._reach(inner, rest, (*names, str(part)))
         elif is_list(kind):
-            yield from self._into_list(values, rows, parts, names)
-        elif not _is_scalar(kind):
-            raise _UnfitError
-
-    def _into_list(
-        self, values: pa.Array, rows: Rows, parts: Parts, names: tuple[str, ...]
-    ) -> Iterator[_Leaves]:
-        """The values at a path through lists."""
-        part = parts[0]
-        elements = _flattened(values, rows)
-        while isinstance(part, str) and is_list(elements.values.type):
-            elements = _flattened(elements.values, elements.rows)
-        inside = elements.values.type
-        named = pa.types.is_struct(inside) and inside.get_field_index(str(part)) >= 0
-        if isinstance(part, int):
-            if named:
-                raise _UnfitError  # an index, or a field with a number as its name
-            yield from self._reach(_at_place(values, rows, part), parts[1:], names)
-        elif named:
-            yield from self._reach(elements, parts, names)
-        elif not (_is_scalar(inside) or pa.types.is_struct(inside) or is_list(inside)):
-            raise _UnfitError
+            if isinstance(part, int):
+                yield from self._reach(_at_place(values, rows, part), rest, names)
+            else:
+                yield from self._reach(_flattened(values, rows), parts, names)
 
     def _is_summary(self, kind: pa.DataType, names: tuple[str, ...], *, is_element: bool) -> bool:
-        if not pa.types.is_struct(kind):
-            return False
-        if self._types.known:
-            return not is_element and ".".join(names) in self._types.arrays
-        if set(_names(kind)) in _SUMMARIES:
+        if self.types.known:
+            is_array = not is_element and ".".join(names) in self.types.arrays
+            return is_array and bool(pa.types.is_struct(kind))
+        if is_summary(kind):
             raise _UnfitError  # or a message with fields of these names
         return False
 
@@ -396,17 +337,6 @@ def _plain(values: pa.Array) -> pa.Array:
     if isinstance(values.type, pa.BaseExtensionType):
         raise _UnfitError
     return values.dictionary_decode() if pa.types.is_dictionary(values.type) else values
-
-
-def _names(kind: pa.DataType) -> list[str]:
-    return [kind.field(index).name for index in range(kind.num_fields)]
-
-
-def _is_scalar(kind: pa.DataType) -> bool:
-    if pa.types.is_dictionary(kind):
-        return _is_scalar(kind.value_type)
-    is_plain = is_numeric(kind) or is_text(kind) or is_bytes(kind) or is_time(kind)
-    return is_plain or bool(pa.types.is_null(kind))
 
 
 def _numpy(values: pa.Array) -> NDArray[Any]:
@@ -477,15 +407,13 @@ def _elements(leaves: _Leaves) -> Iterator[_Leaves]:
             break
         inner = _flattened(values, rows)
         values, rows, is_element = _plain(inner.values), inner.rows, True
-    if is_element and pa.types.is_struct(values.type) and set(_names(values.type)) in _SUMMARIES:
+    if is_element and is_summary(values.type):
         raise _UnfitError  # it may be the summary of an array in an array
     yield _Leaves(values, rows, is_element=is_element)
 
 
 def _tested(node: Compare | Member | Match, leaves: _Leaves, types: FieldTypes) -> Mask:
     """Mask of the values that satisfy a condition, without its negation: bool[values]."""
-    if isinstance(leaves.values, np.ndarray):
-        return _of_large(node, leaves.values)
     if leaves.is_summary:
         return _of_summaries(node, leaves, types)
     match node:
@@ -497,45 +425,48 @@ def _tested(node: Compare | Member | Match, leaves: _Leaves, types: FieldTypes) 
             return _equal_to(leaves, values)
         case Compare(order=order, value=value):
             found = _compared(leaves.values, order, value)
-            if leaves.is_element and pa.types.is_floating(leaves.values.type):
+            if leaves.is_element and _kind_of(leaves.values) == "f":
                 found &= np.isfinite(_numpy(leaves.values).astype(np.float64))
             return found
 
 
-def _of_large(node: Compare | Member | Match, values: NDArray[Any]) -> Mask:
-    """The same of integers beyond 64 bits."""
-    found = np.zeros(len(values), np.bool_)
-    if isinstance(node, Compare | Member):
-        order = node.order if isinstance(node, Compare) and node.order != "!=" else "=="
-        for value in (node.value,) if isinstance(node, Compare) else node.values:
-            if is_number(value):
-                found |= _ORDERS[order](values, value).astype(np.bool_)
-    return found
-
-
 def _equal_to(leaves: _Leaves, values: Sequence[Value]) -> Mask:
+    given = leaves.values
     are_int64 = all(type(value) is int and LOW <= value <= HIGH for value in values)
-    if len(values) > 1 and pa.types.is_int64(leaves.values.type) and are_int64:
-        return _numpy(pc.is_in(leaves.values, pa.array(values, pa.int64())))
-    found = np.zeros(len(leaves.values), np.bool_)
+    if len(values) > 1 and are_int64 and isinstance(given, pa.Int64Array):
+        return _numpy(pc.is_in(given, pa.array(values, pa.int64())))
+    found = np.zeros(len(given), np.bool_)
     for value in values:
         if value is not None:
-            found |= _compared(leaves.values, "==", value)
-    if None in values and len(found) and pa.types.is_null(leaves.values.type):
+            found |= _compared(given, "==", value)
+    if None in values and len(found) and isinstance(given, pa.NullArray):
         if not leaves.is_element:
             raise _UnfitError  # null, or missing
         return ~found
     return found
 
 
-def _matching(values: pa.Array, pattern: str) -> Mask:
-    if not is_text(values.type):
+def _kind_of(values: Any) -> str:
+    """The kind of values, as numpy names it: b, i, f, U; O of large integers, empty of others."""
+    if isinstance(values, np.ndarray):
+        return "O"
+    kind = values.type
+    if is_text(kind):
+        return "U"
+    if pa.types.is_boolean(kind):
+        return "b"
+    if pa.types.is_floating(kind):
+        return "f"
+    return "i" if pa.types.is_integer(kind) or is_time(kind) else ""
+
+
+def _matching(values: Any, pattern: str) -> Mask:
+    if _kind_of(values) != "U":
         return np.zeros(len(values), np.bool_)
     try:
-        found = pc.match_substring_regex(values, pattern)
+        return _filled(pc.match_substring_regex(values, pattern))
     except pa.ArrowInvalid as error:
         raise _UnfitError from error
-    return _filled(found)
 
 
 def _filled(found: pa.Array) -> Mask:
@@ -543,38 +474,27 @@ def _filled(found: pa.Array) -> Mask:
     return _numpy(pc.fill_null(found, fill_value=False))
 
 
-def _compared(values: pa.Array, order: str, value: Value) -> Mask:
-    """Mask of the values that satisfy an order; False for values of another kind."""
-    none = np.zeros(len(values), np.bool_)
-    kind = values.type
-    if isinstance(value, bool):
-        return _filled(pc.equal(values, value)) if pa.types.is_boolean(kind) else none
-    if isinstance(value, str):
-        return _texts_compared(values, order, value) if is_text(kind) else none
-    if not is_number(value):
-        return none
-    if pa.types.is_decimal(kind):
-        raise _UnfitError
-    if is_time(kind):
-        if kind.unit != "ns":
-            raise _UnfitError
+def _compared(values: Any, order: str, value: Value) -> Mask:
+    """Mask of the values that satisfy a comparison; False for values of another kind."""
+    kind, found = _kind_of(values), np.zeros(len(values), np.bool_)
+    wanted = {bool: "b", str: "U"}.get(type(value), "ifO" if is_number(value) else "")
+    if not kind or kind not in wanted:
+        return found
+    if kind == "O":
+        return _ORDERS[order](values, value).astype(np.bool_)  # type: ignore[no-any-return]
+    if kind in "bU":
+        try:
+            scalar = pa.scalar(value, values.type)
+        except (pa.ArrowInvalid, UnicodeEncodeError):
+            raise _UnfitError from None
+        return _filled(getattr(pc, _ORDERS[order].__name__)(values, scalar))
+    if is_time(values.type):
         values = values.cast(pa.int64())
-    kind = values.type
-    if not (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
-        return none
     chosen = _valid(values)
     numbers = _numpy(values if chosen.all() else values.filter(pa.array(chosen)))
-    compare = _integers_compared if pa.types.is_integer(kind) else _floats_compared
-    none[chosen] = compare(numbers, order, value)
-    return none
-
-
-def _texts_compared(values: pa.Array, order: str, value: str) -> Mask:
-    try:
-        wanted = pa.scalar(value, values.type)
-    except (pa.ArrowInvalid, UnicodeEncodeError):
-        raise _UnfitError from None
-    return _filled(getattr(pc, _ORDERS[order].__name__)(values, wanted))
+    compare = _integers_compared if kind == "i" else _floats_compared
+    found[chosen] = compare(numbers, order, value)  # type: ignore[arg-type]
+    return found
 
 
 def _integers_compared(numbers: NDArray[Any], order: str, value: float) -> Any:
@@ -611,8 +531,8 @@ def _of_summaries(node: Compare | Member | Match, leaves: _Leaves, types: FieldT
 
     The ends decide what any element being greater or less is asked for; nothing else.
     """
-    names, path = _names(leaves.values.type), node.field.names
-    if not isinstance(node, Compare) or node.order in {"==", "!="} or "min" not in names:
+    path, has_ends = node.field.names, leaves.values.type.get_field_index("min") >= 0
+    if not has_ends or not isinstance(node, Compare) or node.order in {"==", "!="}:
         raise _UnfitError
     end = pc.struct_field(leaves.values, "min" if node.order in {"<", "<="} else "max")
     is_rounded = pa.types.is_floating(end.type) and not types.are_floats(path)

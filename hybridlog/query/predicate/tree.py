@@ -19,29 +19,15 @@ Order = Literal["==", "!=", "<", "<=", ">", ">="]
 
 
 class _Node:
-    """Equality and hash of nodes."""
+    """Equality and hash of nodes, by what is shown of them: `1` is not `True`, NaN equals NaN."""
 
     __slots__ = ()
 
-    def _key(self) -> tuple[object, ...]:
-        named = (getattr(self, each.name) for each in dataclasses.fields(self) if each.compare)  # type: ignore[arg-type]
-        return (type(self).__name__, *map(_key_of, named))
-
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Node) and self._key() == other._key()
+        return isinstance(other, _Node) and repr(self) == repr(other)
 
     def __hash__(self) -> int:
-        return hash(self._key())
-
-
-def _key_of(value: object) -> object:
-    if isinstance(value, tuple):
-        return tuple(map(_key_of, value))
-    if isinstance(value, bool):
-        return "bool", value  # True would equal 1
-    if isinstance(value, float) and value != value:  # noqa: PLR0124
-        return ("nan",)
-    return value
+        return hash(repr(self))
 
 
 class Slice(NamedTuple):
@@ -73,7 +59,7 @@ class Field(_Node):
     """
 
     parts: Parts
-    position: int = dataclasses.field(default=0, compare=False)
+    position: int = dataclasses.field(default=0, repr=False)
 
     @property
     def path(self) -> str:
@@ -93,7 +79,7 @@ class Compare(_Node):
     field: Field
     order: Order
     value: Value
-    position: int = dataclasses.field(default=0, compare=False)
+    position: int = dataclasses.field(default=0, repr=False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,7 +89,7 @@ class Member(_Node):
     field: Field
     values: tuple[Value, ...]
     negated: bool
-    position: int = dataclasses.field(default=0, compare=False)
+    position: int = dataclasses.field(default=0, repr=False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,7 +107,7 @@ class Match(_Node):
     field: Field
     pattern: str
     negated: bool
-    position: int = dataclasses.field(default=0, compare=False)
+    position: int = dataclasses.field(default=0, repr=False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -190,13 +176,13 @@ Condition: TypeAlias = Compare | Member | Exists | Match
 Node: TypeAlias = Condition | And | Or | Not | Near | MongoFilter
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True)
 class Predicate:
     """A predicate that was parsed and checked.
 
     Attributes:
         root: The tree.
-        text: The text as written, for messages.
+        text: The text as written, to be shown.
     """
 
     root: Node
@@ -217,9 +203,6 @@ class Predicate:
             for item in (each.root.items if isinstance(each.root, And) else (each.root,))
         ]
         return Predicate(And(tuple(items)), " and ".join(f"({each.text})" for each in target))
-
-    def __repr__(self) -> str:
-        return f"<Predicate {spelled(self.root)}>"
 
     def conditions(self) -> Iterator[Condition]:
         """Every single condition, from left to right."""
@@ -263,44 +246,3 @@ def nodes(node: Node) -> Iterator[Node]:
             yield from nodes(item)
         case _:
             pass
-
-
-def spelled(node: Node) -> str:
-    """The node as text of the language; a filter as MongoDB writes it."""
-    match node:
-        case Not(item):
-            return f"not ({spelled(item)})"
-        case MongoFilter():
-            return str(node.to_filter())
-        case Near(topic, predicate):
-            return f"{topic}: {predicate}"
-        case And(items):
-            return " and ".join(map(_bracketed, items)) or "anything"
-        case Or(items):
-            return " or ".join(map(_bracketed, items)) or "nothing"
-        case _:
-            return _condition(node)
-
-
-def _condition(node: Condition) -> str:
-    path = node.field.path.replace(".[", "[")
-    match node:
-        case Compare(order=order, value=value):
-            return f"{path} {order} {_literal(value)}"
-        case Member(values=values, negated=negated):
-            members = ", ".join(map(_literal, values))
-            return f"{path} {'not in' if negated else 'in'} [{members}]"
-        case Exists(present=present):
-            return f"{path} {'exists' if present else 'missing'}"
-        case Match(pattern=pattern, negated=negated):
-            return f"{path} {'!~' if negated else '~'} {pattern!r}"
-
-
-def _bracketed(node: Node) -> str:
-    return f"({spelled(node)})" if isinstance(node, And | Or) else spelled(node)
-
-
-def _literal(value: Value) -> str:
-    if value is None:
-        return "null"
-    return str(value).lower() if isinstance(value, bool) else repr(value)

@@ -100,9 +100,9 @@ class FieldTypes:
 
         If the types are unknown, the path may name either, and each message decides.
         """
-        stat = STATS.get(str(parts[-1]))
-        if stat is None or len(parts) < 2 or parts[0] == "_meta" or not self.known:
-            return stat if len(parts) > 1 and parts[0] != "_meta" else None
+        stat = STATS.get(str(parts[-1])) if len(parts) > 1 and parts[0] != "_meta" else None
+        if stat is None or not self.known:
+            return stat
         names = [part for part in parts if isinstance(part, str)]
         path, parent = ".".join(names), ".".join(names[:-1])
         if path in self.types or path in self.inner or parent not in self.arrays:
@@ -176,9 +176,6 @@ class _Checker:
     def check_name(self, target: Field) -> Kind:
         """Refuse a field that does not exist; the kind of one that does."""
         self._check_elements(target)
-        return self._kind(target)
-
-    def _kind(self, target: Field) -> Kind:
         types = self._types
         path = target.names
         if target.parts[0] == "_id":

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.to_mask import mask_of_objects
-from hybridlog.query.predicate.tree import Compare, Predicate, spelled
+from hybridlog.query.predicate.tree import Compare, Predicate
 from hybridlog.query.predicate.types import check
 from hybridlog_storage.errors import WhereError
 
@@ -59,7 +59,7 @@ ANYTHING = dict.fromkeys(
         ("x not in ('a')", "x not in ['a']"),
         ("x not in ('a', 2)", "x not in ['a', 2]"),
         ("in in[1]", "in in [1]"),
-        ("s ~ '^\\d+\"$'", "s ~ '^\\\\d+\"$'"),
+        ("s ~ '^\\d+\"$'", 's ~ "^\\d+\\"$"'),
         ("s ~ 'slip: '", "s ~ 'slip: '"),
         ("s !~ '^a'", "s !~ '^a'"),
         ("x exists", "x exists"),
@@ -84,16 +84,16 @@ ANYTHING = dict.fromkeys(
         ("status[*].level == 2", "status.level == 2"),
         ("position[0] == 2", "position.0 == 2"),
         ("position.0 == 2", "position.0 == 2"),
-        ("`a-b`.`in`[3] == 2", "a-b.in.3 == 2"),
+        ("`a-b`.`in`[3] == 2", "`a-b`.in.3 == 2"),
         ("x[3:8] == 2", "x[3:8] == 2"),
-        ("`not` == 2", "not == 2"),
+        ("`not` == 2", "2 == not"),
         ("_meta.t >= 5", "_meta.t >= 5"),
         ("not x < 1", "not (x < 1)"),
         ("x<1 or y<2 and !(z<3 || w<4)", "x < 1 or (y < 2 and not (z < 3 or w < 4))"),
     ],
 )
 def test_grammar(where: str, expected: str) -> None:
-    assert spelled(checked(where, ANYTHING).root) == expected
+    assert checked(where, ANYTHING) == parse(expected)
     if "_meta" not in where:
         assert parse(where).fields()
 
@@ -114,13 +114,13 @@ def test_nan() -> None:
         ("x < 1)", "expected 'and'", 5),
         ("x < nan", "nan", 4),
         ("x < true", "order", 4),
-        ("x ~ 'ab(?=c)'", "refused: .*without looking around", 7),
-        (r"x ~ '(a)\1'", "back references", 8),
-        (r"x ~ 'a\C'", "matches a byte", 6),
-        ("x ~ 'a{1001}'", "invalid repetition size", 6),
-        ("x ~ 'a++'", "bad repetition operator", 6),
-        ("x ~ '[b-a]'", "invalid character class range", 6),
-        ("x ~ '('", "not a regular expression of RE2", 5),
+        ("x ~ 'ab(?=c)'", "refused: .*without looking around", 4),
+        (r"x ~ '(a)\1'", "back references", 4),
+        (r"x ~ 'a\C'", "matches a byte", 4),
+        ("x ~ 'a{1001}'", "invalid repetition size", 4),
+        ("x ~ 'a++'", "bad repetition operator", 4),
+        ("x ~ '[b-a]'", "invalid character class range", 4),
+        ("x ~ '('", "missing", 4),
         ("x ~ '" + "a" * 1001 + "'", "longer than 1000", None),
         (r"x ~ '(\pL{100}){9}'", "too large", None),
         ('x == "a\\q"', "no escape", 7),
