@@ -78,7 +78,7 @@ class TopicReader:
         if clock != "log":
             # Refused where the topic does not have the clock.
             on_clock = replace(question, clock=clock, bounds=(None, None), during=None)
-            Planner(session, on_clock, Counters()).parts()
+            Planner(session, on_clock, Counters()).split()
             question = replace(question, fields=self._with_time(question.fields, known))
         self.question = question
 

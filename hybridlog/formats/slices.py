@@ -66,7 +66,7 @@ def payload_bytes(query: Query) -> int:
     question = query.question
     if not question.is_by_log_time:
         question = replace(question, bounds=None)
-    parts = Planner(query.session, question, Counters()).parts()
+    parts = Planner(query.session, question, Counters()).split()
     return int(sum(p.share * sum(s.payload_bytes for s in p.stats) for p in parts))
 
 

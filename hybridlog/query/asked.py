@@ -42,7 +42,7 @@ def spans_of(query: Query) -> dict[str, Span]:
     or a range of another clock.
     """
     found: dict[str, Span] = {}
-    for part in Planner(query.session, query.question, Counters()).parts():
+    for part in Planner(query.session, query.question, Counters()).split():
         extent = part.extent
         if extent is not None:
             low, high = found.get(part.recording.id, extent)

@@ -49,7 +49,6 @@ class Planner:
         self.session = session
         self.question = question
         self.counters = counters
-        self._counted: set[Part] = set()  # parts whose messages without fields are counted
         self._ranges = RangeResolver(session, question)
         self._rows = Rows(session, counters)
 
@@ -61,9 +60,15 @@ class Planner:
         return IndexReader(self.session, self.counters)
 
     def parts(self) -> list[Part]:
-        """The question, split by recording and topic; recordings oldest first."""
-        found = [part for one in self._ranges.resolve() for part in self.parts_in(*one)]
-        return self._rows.fitting(found)
+        """The question, split by recording and topic, where it may have an answer.
+
+        Recordings are oldest first. MongoDB is asked once for all.
+        """
+        return self._rows.fitting(self.decided(self.split()))
+
+    def split(self) -> list[Part]:
+        """The same, of which nothing was asked yet."""
+        return [part for one in self._ranges.resolve() for part in self.parts_in(*one)]
 
     def only_part(self) -> Part | None:
         """The only part of the question; None if it has several, or none."""
@@ -81,16 +86,10 @@ class Planner:
         for channel in self.session.channels_of(recording, wanted):
             self._check_clock(channel)
             by_topic[channel.channel.topic].append(channel)
-        predicate = self.question.predicate
-        asks_fields = predicate is not None and predicate.asks_fields
+        clock, predicate = self.question.clock, self.question.predicate
         for topic, channels in by_topic.items():
-            if not any(c.stats.messages for c in channels):
-                continue  # nothing was sent on the topic
-            # Without a definition, for example, messages are not decoded.
-            asked = tuple(c for c in channels if not asks_fields or c.codec.indexed)
-            rest = tuple(c for c in channels if asks_fields and not c.codec.indexed)
-            clock = self.question.clock
-            yield Part(recording, topic, asked, bounds, clock, windows, predicate, rest)
+            if any(c.stats.messages for c in channels):  # else nothing was sent on the topic
+                yield Part(recording, topic, tuple(channels), bounds, clock, windows, predicate)
 
     def channels(self) -> list[RecordedChannel]:
         """Every channel of the question."""
@@ -134,9 +133,7 @@ class Planner:
 
     def recordings_with_any(self) -> set[str]:
         """Ids of the recordings that have a message in the answer."""
-        return {
-            part.recording.id for part in self._decided(self.parts()) if self._rows.count([part])
-        }
+        return {part.recording.id for part in self.parts() if self._rows.count([part])}
 
     def decided(self, parts: Sequence[Part]) -> list[Part]:
         """The parts with predicates for columns and messages: MongoDB is asked once for all."""
@@ -148,13 +145,6 @@ class Planner:
         self.counters.not_indexed += self._lacking(found.documents)
         decidable = dict(zip(wanted, found.parts, strict=True))
         return [decidable.get(part, part) for part in parts]
-
-    def _decided(self, parts: Sequence[Part]) -> list[Part]:
-        """The same; counts the messages without fields once."""
-        self._count_unreadable(parts)
-        found = self.decided(parts)
-        self._counted.update(found)
-        return found
 
     def outcomes(self, part: Part) -> Iterator[MatchColumns]:
         """For each message of a part, whether it matches, in order."""
@@ -179,7 +169,6 @@ class Planner:
         self, parts: Sequence[Part], fields: Collection[str] | None
     ) -> list[Iterator[Values]] | None:
         """The same of each part, if tables have the fields of all their messages."""
-        parts = self._decided(parts)
         for part in parts:
             found = self._rows.tabled(part, fields)
             if found is None or found.rest is not None:
@@ -235,9 +224,11 @@ class Planner:
     def _again(self, ask: Callable[[Sequence[Part]], _T], parts: Sequence[Part]) -> _T:
         """Ask about parts; again about those of recordings whose files were replaced."""
         for _ in range(_RENEWALS):
+            unreadable = self.counters.unreadable
             try:
                 return ask(parts)
             except ChangedError:
+                self.counters.unreadable = unreadable
                 parts = self._renewed(parts)
         return ask(parts)
 
@@ -259,57 +250,43 @@ class Planner:
         return self._again(self._plan, parts)
 
     def _plan(self, parts: Sequence[Part]) -> ScanPlan:
-        parts = self._rows.fitting(self._decided(parts))
+        parts = self._rows.fitting(self.decided(parts))
         return self._rows.plan(parts, reverse=self.question.reverse)
-
-    def _count_unreadable(self, parts: Sequence[Part]) -> None:
-        """Count, once, the messages that the predicate cannot test for want of fields.
-
-        Engines count the messages that they find to be unreadable.
-        """
-        for part in parts:
-            if part in self._counted or part.predicate is None:
-                continue
-            self._counted.add(part)
-            if part.undecodable:
-                unseen = replace(part, channels=part.undecodable, undecodable=(), predicate=None)
-                self.counters.unreadable += self._rows.count([unseen])
 
     def count_expired(self) -> Counter[State]:
         """Number of messages, in the range, whose payloads are gone, by state."""
         found: Counter[State] = Counter()
-        for part in self.parts():
+        for part in self.split():
             for state in GONE:
-                channels = (*part.channels, *part.undecodable)
-                gone = tuple(one for one in channels if one.state is state)
+                gone = tuple(one for one in part.channels if one.state is state)
                 if gone:
-                    own = replace(part, channels=gone, undecodable=(), predicate=None)
+                    own = replace(part, channels=gone, predicate=None)
                     found[state] += self._rows.count([own])
         return found
 
     def not_indexed(self) -> tuple[tuple[str, int], ...]:
         """Number of messages, in the range, that the index lacks, by name of their recording."""
-        parts = self.parts()
+        parts = self.split()
         return self._lacking(self._index.documents(parts)) if parts else ()
 
     def _lacking(self, documents: Mapping[Part, int]) -> tuple[tuple[str, int], ...]:
         """Messages that the index lacks, from the documents that it has of some parts."""
         found: Counter[str] = Counter()
         for part, number in documents.items():
-            channels = (*part.channels, *part.undecodable)
-            whole = replace(part, channels=channels, undecodable=(), predicate=None)
+            whole = replace(part, predicate=None)
             found[part.recording.name] += max(self._rows.count([whole]) - number, 0)
         return tuple((name, number) for name, number in found.items() if number)
 
     def _count(self, parts: Sequence[Part]) -> int:
-        return self._rows.count(self._decided(parts))
+        return self._rows.count(self.decided(parts))
 
     def _lasting(self, part: Part, ask: Callable[[Part], Iterator[_Rows]]) -> Iterator[_Rows]:
         """Rows of a part, to the end if files are replaced or a table is damaged meanwhile."""
-        (part,) = self._decided([part])
+        (part,) = self.decided([part])
         last: tuple[int, int] | None = None
-        renewals = 0
+        renewals, unreadable = 0, self.counters.unreadable
         while True:
+            self.counters.unreadable = unreadable
             try:
                 for item in ask(part):
                     rest = item if last is None else _after(item, last)
@@ -322,7 +299,7 @@ class Planner:
                 renewals += 1
                 if renewals > _RENEWALS:
                     raise
-                (part,) = self._decided(self._renewed([part]))
+                (part,) = self.decided(self._renewed([part]))
             except TABLE_ERRORS:
                 if not self._rows.leave_table(part):
                     raise
@@ -353,7 +330,7 @@ def match_times(session: Session, question: Question, counters: Counters) -> Ite
     if not question.returns_all:
         raise UsageError("Times are those of all messages: leave out limit and every.")
     planner = Planner(session, question, counters)
-    for part in planner.decided(planner.parts()):
+    for part in planner.parts():
         for found in planner.outcomes(part):
             holds = found.holds
             yield MatchTimes(part.recording, part.topic, found.log_time[holds], found.seq[holds])

@@ -122,8 +122,6 @@ class Part:
     Attributes:
         bounds: `[begin, end)` of `clock`, ns; None for all times.
         windows: int64[n, 2], `[begin, end)` of log time, disjoint, in order; None for all times.
-        undecodable: Further channels of the topic, whose messages the predicate cannot test because
-            they have no fields.
     """
 
     recording: RecordingEntry
@@ -133,7 +131,6 @@ class Part:
     clock: Clock
     windows: NDArray[np.int64] | None
     predicate: Predicate | None
-    undecodable: tuple[RecordedChannel, ...] = ()
 
     @property
     def is_unbounded(self) -> bool:
@@ -166,16 +163,22 @@ class Part:
         return self.predicate is not None and bool(self.predicate.filters)
 
     @property
+    def has_fields(self) -> bool:
+        """True if all of its channels have fields: not without a definition, for example."""
+        return all(channel.codec.indexed for channel in self.channels)
+
+    @property
     def lacks_fields(self) -> bool:
         """True if the predicate asks fields that documents may lack: those of unreadable ones."""
         if self.predicate is None or not self.predicate.asks_fields:
             return False
-        return self.recording.status == "open" or any(stats.unreadable for stats in self.stats)
+        is_open = self.recording.status == "open"
+        return is_open or not self.has_fields or any(stats.unreadable for stats in self.stats)
 
     @lazy
     def field_types(self) -> Mapping[str, str] | None:
         """Types of the fields by path; None where a definition does not fix them."""
-        return field_types(self.channels)
+        return field_types(tuple(one for one in self.channels if one.codec.indexed))
 
     @lazy
     def log_windows(self) -> NDArray[np.int64]:

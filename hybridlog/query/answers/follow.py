@@ -85,7 +85,6 @@ class Arrivals(Planner):
             bounds = self._bounds.get(one.id)
             self._arrived.chunks[one.id] = chunks = [*self._arrivals(entry, bounds)]
             parts += self.parts_in(one, bounds, None) if chunks else ()
-        self._counted.clear()
         return ChunkScan(self.plan(parts), session).runs(), any(map(self._goes_on, summaries))
 
     def _goes_on(self, one: RecordingSummary) -> bool:

@@ -146,7 +146,7 @@ class IntervalQueries:
                 for index in np.unique(run.batch.channel).tolist():
                     yield entry_of[index], run.batch.log_time[run.batch.channel == index]
             return
-        for part in self._planner.decided(self._planner.parts()):
+        for part in self._planner.parts():
             yield part.recording, self._planner.times(part)
 
     def _spans(self) -> Iterator[tuple[Part, Span]]:
