@@ -14,7 +14,7 @@ from hybridlog.across.match import match
 from hybridlog.arrays.message_arrays import plain_type
 from hybridlog.query.answers.lost import completeness_of
 from hybridlog.query.answers.marks import marks_in
-from hybridlog.query.answers.statistics import Regularity
+from hybridlog.query.answers.statistics import check
 from hybridlog.query.counters import Counters
 from hybridlog.query.planner import match_times
 from hybridlog.query.query import Query
@@ -73,7 +73,7 @@ class _Judge:
             yield self._lost("", self._contract.lost, lost)
         topics = [name for name in self._contract.topics if name in self._known]
         question = self._question(*topics)
-        checked = Regularity(self._session, question, Counters()).check() if topics else []
+        checked = check(self._session, question, Counters()) if topics else []
         by_topic = {one.topic: one for one in checked}
         beyond = self._beyond()
         for name, rules in self._contract.topics.items():

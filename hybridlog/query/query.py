@@ -579,28 +579,6 @@ class Query:
 
         return resampled(self.session, self.question, step, how, tolerance)
 
-    def rate(self, window: DurationLike | None = None) -> pa.Table:
-        """Number and rate of the messages of each topic.
-
-        Args:
-            window: Length of the windows, a duration; the first begins with the recording or
-                the range, the last may be shorter. None for all messages in one.
-
-        Returns:
-            `begin`, `end`, `recording` (name), `topic`, `messages` and `rate`, messages a
-            second. Without windows: from the first message to the last, and the mean rate
-            from one to the next, null if there is none.
-
-        Raises:
-            UsageError: `limit`, `every`, `reverse`, another clock than the log's, or too many
-                windows.
-            TimeError: no duration, or a range outside of all recordings.
-        """
-        from hybridlog.query.answers.statistics import Regularity
-
-        with self.counters.timed():
-            return Regularity(self.session, self.question, self.counters).rate(window)
-
     def check(self) -> list[TopicCheck]:
         """Check how regularly the topics came: rate, jitter, gap, late start, early stop, losses.
 
@@ -612,10 +590,10 @@ class Query:
             UsageError: `limit`, `every`, `reverse`, or another clock than the log's.
             TimeError: a range outside of all recordings.
         """
-        from hybridlog.query.answers.statistics import Regularity
+        from hybridlog.query.answers.statistics import check
 
         with self.counters.timed():
-            return Regularity(self.session, self.question, self.counters).check()
+            return check(self.session, self.question, self.counters)
 
     def stats(self, *fields: str) -> list[FieldStatistics]:
         """Statistics of the numeric fields: count, NaN, infinite, least, greatest, mean, deviation.
@@ -730,10 +708,10 @@ class Query:
                 log's, or no number of periods.
             TimeError: no duration, or a range outside of all recordings.
         """
-        from hybridlog.query.answers.statistics import Regularity
+        from hybridlog.query.answers.statistics import gaps
 
         with self.counters.timed():
-            return Regularity(self.session, self.question, self.counters).gaps(longer_than, periods)
+            return gaps(self.session, self.question, self.counters, longer_than, periods)
 
     # What an answer lacks.
 

@@ -25,7 +25,6 @@ def test_topics_are_arguments_or_options(store: Path) -> None:
         ("intervals", "--where", "ranges.min < 5"),
         ("intervals", "--gaps"),
         ("stats", "--fields", "ranges.min"),
-        ("stats", "--rate"),
     ):
         found = answer(*words, "scan", *chosen, store=store).json
         assert found == answer(*words, "-t", "scan", *chosen, store=store).json
@@ -43,7 +42,6 @@ def test_topics_are_arguments_or_options(store: Path) -> None:
     [
         ("intervals", "scan", "-r", "robot", "--where", "ranges.min < 5"),
         ("stats", "scan", "odom", "-r", "robot"),
-        ("stats", "scan", "odom", "-r", "robot", "--rate"),
         ("check", "scan", "odom", "-r", "robot"),
         ("diff", "robot", "torn"),
     ],
