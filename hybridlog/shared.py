@@ -27,13 +27,11 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from hybridlog.columns.tables import Tables
-    from hybridlog.query.chunk_columns import ChunkColumns
     from hybridlog.query.question import RecordedChannel
     from hybridlog.record.running import RunningRecording
     from hybridlog.snapshot import Snapshot
     from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
-    from hybridlog_storage.segments.chunk_table import ChunkTable
     from hybridlog_storage.segments.segment_reader import SegmentReader
     from hybridlog_storage.summary import RecordingSummary
 
@@ -50,7 +48,6 @@ class Shared(ABC):
         schemas: Schemas by hash.
         following: Held while running recordings are looked at, and while the newest state changes.
         channels: Channels of recordings by id and topic, and the entry that they are of.
-        columns: Columns of the chunks of a segment, and the table that they are of.
     """
 
     index: Any
@@ -65,10 +62,8 @@ class Shared(ABC):
         self._entries: dict[str, RecordingEntry] = {}  # compared with their files, by id
         self.schemas = {schema_hash(MARK_SCHEMA): MARK_SCHEMA}
         self.channels: dict[str, tuple[RecordingEntry, dict[str, list[RecordedChannel]]]] = {}
-        self.columns: dict[tuple[str, int, frozenset[int]], tuple[ChunkTable, ChunkColumns]] = {}
         self._segments: dict[tuple[str, str], SegmentReader] = {}
         self._rows: dict[tuple[Path, frozenset[tuple[str, ...]]], RecordingRows] = {}
-        self._tables_tried: set[tuple[str, str]] = set()  # looked for, and noted if missing
         self._opening = threading.Lock()
 
     @property
@@ -123,14 +118,11 @@ class Shared(ABC):
         """Drop what was read of some recordings, by their ids."""
         for recording in recordings:
             self.channels.pop(recording, None)
-            entry = self._entries.pop(recording, None)
-            topics = {channel.topic for channel in entry.channels} if entry is not None else set()
-            self._tables_tried -= {(recording, topic) for topic in topics}
+            self._entries.pop(recording, None)
         with self._opening:
             self._rows.clear()
             for key in [key for key in self._segments if key[0] in recordings]:
                 del self._segments[key]
-        self.columns.clear()
         self.cache.drop("chunk")
         if "tables" in vars(self):
             self.tables.look_again()
@@ -140,7 +132,6 @@ class Shared(ABC):
             self._rows.clear()
             self._segments.clear()  # each is closed by the last thread that reads from it
         self.cache.drop("chunk")
-        self._tables_tried.clear()
         if "tables" in vars(self):
             self.tables.invalidate()
 
@@ -156,12 +147,12 @@ class Shared(ABC):
                 self.directory, summary.id, partial(self.entry, summary)
             )
         running.follow()
+        self.schemas |= running.schemas
         entry = running.entry
         if entry is None or entry.status not in UNFINISHED:
             del self._running[summary.id]
-        self.schemas |= running.schemas
-        if entry is not None and entry.status not in UNFINISHED:
-            self._invalidate_tables(entry)
+            if "tables" in vars(self):  # it may have tables now
+                self.tables.look_again()
         return running
 
     def entry(self, summary: RecordingSummary) -> RecordingEntry | None:
@@ -220,23 +211,6 @@ class Shared(ABC):
             _make_room(self._rows)
             found = self._rows[key] = RecordingRows(key[0], cache=self.cache)
         return found
-
-    def note_missing_table(self, recording: RecordingEntry, topic: str) -> None:
-        """Note once that a topic has no table, for `mend` if that can make it."""
-        from hybridlog.maintenance.tables import can_be_made
-
-        key = recording.id, topic
-        if key not in self._tables_tried:
-            self._tables_tried.add(key)
-            if can_be_made(recording, topic, self.tables):
-                self.repairs.noted_tables.add(key)
-
-    def _invalidate_tables(self, recording: RecordingEntry) -> None:
-        """Look for the tables of a recording again, now that it has ended."""
-        topics = {channel.topic for channel in recording.channels}
-        self._tables_tried -= {(recording.id, topic) for topic in topics}
-        if "tables" in vars(self):
-            self.tables.look_again()
 
 
 def _make_room(opened: dict[Any, Any]) -> None:

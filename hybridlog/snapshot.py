@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 UNFINISHED = frozenset({"open", "unfinished"})
 """Statuses of recordings that may have ended, or grown, since the snapshot."""
-_MAX_CACHED = 128  # sets of topics
 _LEAST = 4  # characters of an id that stand for it
 _LATEST = (1 << 63) - 1
 
@@ -58,7 +57,6 @@ class Snapshot:
     ) -> None:
         self.summaries = sorted(summaries, key=_order)
         self._topics = topics
-        self._having: dict[frozenset[str], NDArray[np.intp]] = {}
 
     def __len__(self) -> int:
         return len(self.summaries)
@@ -120,17 +118,8 @@ class Snapshot:
             known = dict(held[number] for number in used.tolist())
             columns["set"] = np.searchsorted(used, columns["set"])
         unfinished = np.flatnonzero(columns["is_open"]).tolist()
-        vars(found).update(_columns=columns, _topics=known, _having={}, unfinished=unfinished)
-        stale = {"tags", "by_id", "by_name", "by_fingerprint"}
-        if before == places[::-1] and [one.id for one in changed] == [
-            self.summaries[place].id for place in before
-        ]:
-            names = [self.summaries[place].name for place in before]
-            is_renamed = names != [one.name for one in changed]
-            stale = {"tags", "by_fingerprint"} | ({"by_name"} if is_renamed else set())
-        if known.keys() != self._topics.keys():
-            stale |= {"topics", "schemas"}
-        for name in stale:
+        vars(found).update(_columns=columns, _topics=known, unfinished=unfinished)
+        for name in ("tags", "by_id", "by_name", "by_fingerprint", "topics", "schemas"):
             vars(found).pop(name, None)
         return found
 
@@ -210,14 +199,9 @@ class Snapshot:
         self, topics: Collection[str], ids: Collection[str] | None = None
     ) -> NDArray[np.intp]:
         """Positions of recordings, all or some by id, that have any of some topics, in order."""
-        wanted = frozenset(topics)
-        found = self._having.get(wanted)
-        if found is None:
-            sets = [any(t.topic in wanted for t in held) for held in self._topics.values()]
-            found = np.flatnonzero(np.array(sets, np.bool_)[self._set])
-            if len(self._having) >= _MAX_CACHED:
-                self._having.clear()
-            self._having[wanted] = found
+        wanted = {*topics}
+        sets = [any(t.topic in wanted for t in held) for held in self._topics.values()]
+        found = np.flatnonzero(np.array(sets, np.bool_)[self._set])
         if ids is None:
             return found
         own = [self.by_id[one] for one in ids if one in self.by_id]

@@ -184,10 +184,7 @@ def test_a_large_image_is_not_decoded(store: hl.Store, limit: Limit) -> None:
     assert Parsed(only(store, "/image")._repr_html_()).images == []
 
 
-def test_topics_and_labels_are_completed(store: hl.Store) -> None:
-    assert store._ipython_key_completions_() == store.topics()
-    assert store["/image"] == store.topic("/image")
-    assert store["/image", "/many"] == store.topic("/image", "/many")
+def test_names_are_completed(store: hl.Store) -> None:
     recordings = store.recordings()
     (label,) = recordings._ipython_key_completions_()
     assert recordings[label] == recordings[0]

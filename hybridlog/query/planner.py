@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 import numpy as np
 
 from hybridlog.query.chunk_scan import ChunkScan, MessageRun
-from hybridlog.query.question import Part
+from hybridlog.query.question import Counters, Part
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.rows import TABLE_ERRORS, Rows
 from hybridlog.schema.column import STAMP
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.query.chunk_scan import ScanPlan
-    from hybridlog.query.counters import Counters
     from hybridlog.query.index_reader import IndexReader
     from hybridlog.query.question import Question, RecordedChannel, Span
     from hybridlog.query.rows import MatchColumns, Values
@@ -43,14 +42,16 @@ _Rows = TypeVar("_Rows", "MatchColumns", "Values")
 
 
 class Planner:
-    """Answers one question."""
+    """Answers one question; `counters` count what that costs."""
 
-    def __init__(self, session: Session, question: Question, counters: Counters) -> None:
+    def __init__(
+        self, session: Session, question: Question, counters: Counters | None = None
+    ) -> None:
         self.session = session
         self.question = question
-        self.counters = counters
+        self.counters = Counters() if counters is None else counters
         self._ranges = RangeResolver(session, question)
-        self._rows = Rows(session, counters)
+        self._rows = Rows(session, self.counters)
 
     @lazy
     def _index(self) -> IndexReader:
@@ -93,9 +94,7 @@ class Planner:
 
     def channels(self) -> list[RecordedChannel]:
         """Every channel of the question."""
-        places = self.session.chosen(self.question).tolist()
-        summaries = self.session.snapshot().summaries
-        return self._channels_of(summaries[place] for place in places)
+        return self._channels_of(self.session.summaries_of(self.question))
 
     @lazy
     def examples(self) -> list[RecordedChannel]:
@@ -192,13 +191,6 @@ class Planner:
         ahead = limit is None or limit > _READ_AHEAD_FROM
         for group in self.groups():
             yield from ChunkScan(self.plan(group), self.session, ahead=ahead).runs()
-
-    def unordered(self) -> Iterator[MessageRun]:
-        """The messages of an answer without `limit` and `every`, unordered."""
-        for group in self.groups():
-            for run in ChunkScan(self.plan(group), self.session).unordered():
-                self.counters.add_messages(run.batch)
-                yield run
 
     def groups(self) -> Iterator[list[Part]]:
         """The parts in groups, those that overlap in time together, in the answer's order.
@@ -325,7 +317,9 @@ class MatchTimes(NamedTuple):
     seq: NDArray[np.int64]
 
 
-def match_times(session: Session, question: Question, counters: Counters) -> Iterator[MatchTimes]:
+def match_times(
+    session: Session, question: Question, counters: Counters | None = None
+) -> Iterator[MatchTimes]:
     """The times of an answer, some at a time; recordings and topics one after the other."""
     if not question.returns_all:
         raise UsageError("Times are those of all messages: leave out limit and every.")
@@ -349,19 +343,17 @@ def _after(item: _Rows, key: tuple[int, int]) -> _Rows | None:
 
 def _decimated(runs: Iterator[MessageRun], question: Question) -> Iterator[MessageRun]:
     """Every n-th message of each topic, up to the limit."""
-    number: dict[str, int] = {}
-    seen: dict[int, int] = defaultdict(int)
+    seen: Counter[str] = Counter()
     given = 0
     for run in runs:
         keep = np.ones(len(run.batch), np.bool_)
-        if question.every > 1:
-            names = (channel.channel.topic for channel in run.channels)
-            of = [number.setdefault(name, len(number)) for name in names]
-            topics = np.array(of, np.intp)[run.batch.channel]
-            for topic in np.unique(topics).tolist():
-                rows = np.flatnonzero(topics == topic)
-                keep[rows] = (seen[topic] + np.arange(len(rows))) % question.every == 0
-                seen[topic] += len(rows)
+        channels: dict[str, list[int]] = defaultdict(list)
+        for number in np.unique(run.batch.channel).tolist() if question.every > 1 else ():
+            channels[run.channels[number].channel.topic].append(number)
+        for topic, own in channels.items():
+            rows = np.flatnonzero(np.isin(run.batch.channel, own))
+            keep[rows] = (seen[topic] + np.arange(len(rows))) % question.every == 0
+            seen[topic] += len(rows)
         rows = np.flatnonzero(keep)
         if question.limit is not None:
             rows = rows[: question.limit - given]

@@ -31,9 +31,8 @@ if TYPE_CHECKING:
 
     from hybridlog.columns.topic_table import TableRows, TopicTable
     from hybridlog.query.chunk_scan import MessageRun
-    from hybridlog.query.counters import Counters
     from hybridlog.query.message_filter import MessageFilter
-    from hybridlog.query.question import Part, RecordedChannel
+    from hybridlog.query.question import Counters, Part, RecordedChannel
     from hybridlog.schema.left import LeftFields
     from hybridlog.session import Session
 
@@ -437,7 +436,7 @@ class Rows:
     def count_in_chunks(self, parts: Sequence[Part]) -> int:
         """Read the messages of some parts and count those that match."""
         scan = ChunkScan(self.plan(parts), self.session)
-        return sum(len(run.batch) for run in scan.unordered())
+        return sum(len(run.batch) for _, run, _ in scan.loaded())
 
     def _outcomes_in_chunks(self, part: Part) -> Iterator[MatchColumns]:
         """Read the messages in order and decide on each."""

@@ -93,15 +93,6 @@ _UNITS: tuple[tuple[str, int], ...] = (
     ("ns", 1),
 )
 _DURATION = re.compile("".join(_PART.format(unit) for unit, _ in _UNITS), re.IGNORECASE)
-_DATETIME64_UNITS = {
-    "D": 86_400 * _SECOND,
-    "h": 3_600 * _SECOND,
-    "m": 60 * _SECOND,
-    "s": _SECOND,
-    "ms": 10**6,
-    "us": 10**3,
-    "ns": 1,
-}
 
 
 def parse_time(text: TimeLike, *, start: int | None, end: int | None) -> int:
@@ -385,14 +376,11 @@ def _from_datetime64(moment: object) -> int:
 
     if not isinstance(moment, np.datetime64) or np.isnat(moment):
         raise TimeError(f"{_shown(moment)} is not a time: {ACCEPTED}")
-    value = np.asarray(moment)
-    unit, count = np.datetime_data(value.dtype)
-    if unit in {"Y", "M", "W"}:
-        value, unit, count = value.astype("datetime64[D]"), "D", 1
-    number = int(value.astype(np.int64)) * count
-    if unit in _DATETIME64_UNITS:
-        return number * _DATETIME64_UNITS[unit]
-    return number // {"ps": 10**3, "fs": 10**6, "as": 10**9}[unit]
+    ns = moment.astype("datetime64[ns]")
+    is_finer = np.datetime_data(moment.dtype)[0] in {"ps", "fs", "as"}
+    if not is_finer and ns.astype(moment.dtype) != moment:
+        return TIME_LIMIT  # numpy has gone beyond 64 bits
+    return int(ns.astype(np.int64))
 
 
 def _checked(ns: int, source: object) -> int:

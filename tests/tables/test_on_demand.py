@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,7 +10,6 @@ import numpy as np
 import pytest
 
 import hybridlog as hl
-from hybridlog.follow import follower
 from hybridlog.query.rows import Rows
 from hybridlog_storage.messages import Channel, Schema
 
@@ -41,19 +39,6 @@ def store(tmp_path: Path) -> Iterator[hl.Store]:
                     text = json.dumps({"v": value, "n": number}).encode()
                     recording.write(MIXED, text, log_time=number * SECOND)
         yield opened
-
-
-def test_a_topic_without_a_table_is_tried_once(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    made: list[set[str]] = []
-    monkeypatch.setattr(follower, "make_tables", lambda *_, topics, until: made.append(topics))
-    shutil.rmtree(store.directory.path / "tables")
-    store.refresh()
-    for _ in range(2):
-        assert store.topic("/imu").where("x > 1").count() > 0
-        store.mend()
-    assert made == [{"/imu", "/mixed"}]  # which share their chunks
 
 
 def test_frames_come_from_tables(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:

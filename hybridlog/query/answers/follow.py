@@ -30,8 +30,7 @@ if TYPE_CHECKING:
     from hybridlog.message import Message
     from hybridlog.query.chunk_columns import Chunk
     from hybridlog.query.chunk_scan import MessageRun
-    from hybridlog.query.counters import Counters
-    from hybridlog.query.question import Part, Question, Span
+    from hybridlog.query.question import Counters, Part, Question, Span
     from hybridlog.session import Asked, Session
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.summary import RecordingSummary

@@ -19,9 +19,9 @@ from hybridlog.query.answers.completeness import (
     not_indexed,
     not_written,
 )
-from hybridlog.query.counters import Counters
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.planner import Planner
+from hybridlog.query.question import Counters
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.record.losses import CRASH, Cause, losses_of
 from hybridlog.schema.states import CAUSES, GONE, State
@@ -128,7 +128,7 @@ def _expired(session: Session, question: Question) -> Counter[State]:
     if not any(one.expired or one.not_copied or one.status in UNFINISHED for one in summaries):
         return Counter()
     with suppress(TimeError, TopicError):  # nothing is in the range, or has this clock
-        return Planner(session, question, Counters()).count_expired()
+        return Planner(session, question).count_expired()
     return Counter()
 
 
@@ -204,8 +204,7 @@ def _unwritten(session: Session, questions: Sequence[Question]) -> tuple[int | N
     """Messages that are not written yet, if questions reach past the last flush.
 
     Returns:
-        The number of messages of the first question, None if a recorder does not answer; and
-        a sentence for each recording.
+        Their number, None if a recorder does not answer; and a sentence for each recording.
     """
     snapshot = session.snapshot()
     topics: dict[int, set[str]] = defaultdict(set)
@@ -221,10 +220,7 @@ def _unwritten(session: Session, questions: Sequence[Question]) -> tuple[int | N
         one = snapshot.summaries[place]
         late = _taken(session, one)
         number = None if late is None else sum(late.get(topic, 0) for topic in names)
-        if late is None or missing is None:
-            missing = None
-        else:
-            missing += sum(late.get(topic, 0) for topic in names & {*questions[0].topics})
+        missing = None if number is None or missing is None else missing + number
         if number != 0:
             sentences.append(not_written(one.name, number, flush_interval_ns(one)))
     return missing, sentences
@@ -267,7 +263,7 @@ def _unindexed(
     if question.predicate is None or not question.predicate.filters:
         return ()
     with suppress(TimeError):  # nothing is in the range
-        return Planner(session, question, Counters()).not_indexed()
+        return Planner(session, question).not_indexed()
     return ()
 
 

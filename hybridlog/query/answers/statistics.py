@@ -32,8 +32,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from numpy.typing import NDArray
 
-    from hybridlog.query.counters import Counters
-    from hybridlog.query.question import Part, Question, RecordedChannel, Span
+    from hybridlog.query.question import Counters, Part, Question, RecordedChannel, Span
     from hybridlog.session import Session
     from hybridlog_storage.summary import RecordingSummary
 
@@ -283,7 +282,9 @@ def gaps(
     return Intervals.of(found)
 
 
-def check(session: Session, question: Question, counters: Counters) -> list[TopicCheck]:
+def check(
+    session: Session, question: Question, counters: Counters | None = None
+) -> list[TopicCheck]:
     """Regularity of topics, the worst first; see `Query.check`."""
     from hybridlog.query.answers.lost import completeness_of
     from hybridlog.query.latching import depth_of
