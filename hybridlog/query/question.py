@@ -13,7 +13,7 @@ import numpy as np
 from hybridlog.query.times import TimeLike
 from hybridlog.schema.states import State, encoding_of, state_of
 from hybridlog_storage.lazy import lazy
-from hybridlog_storage.times import END, span_of
+from hybridlog_storage.times import BEGIN, END, span_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -186,13 +186,7 @@ class Part:
     @lazy
     def log_windows(self) -> NDArray[np.int64]:
         """int64[n, 2]: the log time of the part; bounds of another clock do not restrict it."""
-        low, high = self.bounds if self.bounds and self.clock == "log" else (0, END)
-        if self.windows is None:
-            return np.array([[low, high]] if low < high else [], np.int64).reshape(-1, 2)
-        if self.bounds is None:
-            return self.windows
-        cut = np.clip(self.windows, low, high)
-        return cut[cut[:, 1] > cut[:, 0]]
+        return windows_in(self.windows, self.bounds if self.clock == "log" else None)
 
     @property
     def log_span(self) -> Span:
@@ -319,6 +313,13 @@ class Counters:
             yield
         finally:
             self.elapsed_s = time.monotonic() - started
+
+
+def windows_in(windows: NDArray[np.int64] | None, bounds: Span | None) -> NDArray[np.int64]:
+    """int64[n, 2]: what windows and bounds have in common; None for all times."""
+    found = np.array([[BEGIN, END]], np.int64) if windows is None else windows
+    found = found if bounds is None else np.clip(found, *bounds)
+    return found[found[:, 1] > found[:, 0]]
 
 
 def field_types(channels: tuple[RecordedChannel, ...]) -> dict[str, str] | None:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from hybridlog.query.question import windows_in
 from hybridlog.query.times import (
     format_time,
     is_early,
@@ -154,20 +155,9 @@ class RangeResolver:
             )
         found: list[tuple[RecordingSummary, Span]] = []
         for recording, bounds, windows in self.resolve():
-            if recording.span is None:
-                continue
-            start, end = recording.extent
-            if bounds is not None:
-                start, end = max(start, bounds[0]), min(end, bounds[1])
-            if windows is None:
-                if start < end:
-                    found.append((recording, (start, end)))
-                continue
-            found.extend(
-                (recording, (max(start, low), min(end, high)))
-                for low, high in windows.tolist()
-                if low < end and high > start
-            )
+            if recording.span is not None:
+                inside = windows_in(windows_in(windows, bounds), recording.extent)
+                found += [(recording, (low, high)) for low, high in inside.tolist()]
         return found
 
     def beginnings(self) -> Iterator[tuple[RecordingSummary, int]]:

@@ -21,7 +21,7 @@ from hybridlog.query.answers.completeness import (
 )
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.planner import Planner
-from hybridlog.query.question import Counters
+from hybridlog.query.question import Counters, windows_in
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.record.losses import CRASH, Cause, losses_of
 from hybridlog.schema.states import CAUSES, GONE, State
@@ -167,7 +167,7 @@ def _losses_in(
         entry = doubtful.get(summary.id)
         if entry is None:
             continue
-        chosen = _chosen_windows(bounds if question.clock == "log" else None, windows)
+        chosen = windows_in(windows, bounds if question.clock == "log" else None)
         for row in _ledger(entry):
             if row["count"] == 0:
                 continue
@@ -176,13 +176,6 @@ def _losses_in(
             span = _span_of(entry, row)
             if span is None or bool(((chosen[:, 0] <= span[1]) & (span[0] < chosen[:, 1])).any()):
                 yield entry, row
-
-
-def _chosen_windows(bounds: Span | None, windows: NDArray[np.int64] | None) -> NDArray[np.int64]:
-    chosen = np.array([[BEGIN, END]], np.int64) if windows is None else windows
-    if bounds is not None:
-        chosen = np.clip(chosen, *bounds)
-    return chosen[chosen[:, 1] > chosen[:, 0]]
 
 
 def _ledger(entry: RecordingEntry) -> list[dict[str, Any]]:
