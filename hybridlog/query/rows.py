@@ -159,25 +159,13 @@ class Rows:
         """Number of matching messages in all parts."""
         total = 0
         in_chunks: list[Part] = []
-        asked: list[Part] = []
+        self._count_by_file([part for part in parts if part.predicate is not None])
         for part in parts:
-            if part.predicate is not None:
-                asked.append(part)
-            elif part.is_unbounded:
-                total += part.messages
-            elif not part.is_by_log_time:
-                in_chunks.append(part)
-            else:
-                try:
-                    total += self._count_by_time(part)
-                except SegmentError:
-                    in_chunks.append(part)
-        self._count_by_file(asked)
-        for part in asked:
+            number: int = 0
             left: Part | None = part
             with suppress(*TABLE_ERRORS):
-                matched, left = self._count_in_table(part)
-                total += matched
+                number, left = self._count_of(part)
+            total += number
             if left is not None:
                 in_chunks.append(left)
         return total + (self.count_in_chunks(in_chunks) if in_chunks else 0)
@@ -277,8 +265,12 @@ class Rows:
 
     # Tables.
 
-    def _count_in_table(self, part: Part) -> tuple[int, Part | None]:
-        """Number of matching messages in the table of a part, and what the table has not."""
+    def _count_of(self, part: Part) -> tuple[int, Part | None]:
+        """Number of matching messages without reading chunks, and what is left to read."""
+        if part.predicate is None:
+            if part.is_unbounded:
+                return part.messages, None
+            return (self._count_by_time(part), None) if part.is_by_log_time else (0, part)
         found = self.tabled(part)
         if found is None:
             return 0, part

@@ -188,14 +188,6 @@ class _Arrived(Rows):
     def tabled(self, part: Part, fields: Collection[str] | None = ()) -> None:
         """No tables: they have older messages, too."""
 
-    def fitting(self, parts: Sequence[Part]) -> list[Part]:
-        """All of them."""
-        return [*parts]
-
-    def count(self, parts: Sequence[Part]) -> int:
-        """Count what has come."""
-        return self.count_in_chunks(parts)
-
     def _scan(self, part: Part, indexes: dict[int, int]) -> RecordingScan:
         new = self.chunks[part.recording.id]
         chunks = [chunk for chunk in new if not indexes.keys().isdisjoint(chunk.place.channels)]
