@@ -24,7 +24,6 @@ from hybridlog.query.rows import summaries_in
 from hybridlog.query.times import DurationLike, parse_duration
 from hybridlog.record.losses import topics_of
 from hybridlog.schema.kinds import NUMBERS
-from hybridlog.schema.summary import Totals
 from hybridlog.wording import listed
 from hybridlog_storage.errors import DefinitionError, UsageError
 
@@ -73,9 +72,7 @@ class _Running:
         self.count = self.nan = self.infinite = 0
         self.least: int | float | None = None
         self.most: int | float | None = None
-        self._total = Totals(1)
-        self._mean = 0.0
-        self._squares, self._exponent = 0.0, -1074  # squares of numbers divided by 2**exponent
+        self._mean = self._squares = np.longdouble(0)  # which no square of a double overflows
 
     def add(self, column: pa.Array[Any]) -> None:
         values = column.drop_null().to_numpy(zero_copy_only=False)
@@ -90,34 +87,17 @@ class _Running:
         low, high = values.min().item(), values.max().item()
         self.least = low if self.least is None else min(self.least, low)
         self.most = high if self.most is None else max(self.most, high)
-        numbers, count = values.astype(np.float64), len(values)
-        before, own, first = self._mean, self._total, np.zeros(1, np.intp)
-        if self.count:
-            own = Totals(1)
-            own.add(numbers, first, first)
-        self._total.add(numbers, first, first)
-        mean = float(own.means(np.array([count]))[0])
-        size = max(abs(low), abs(high))
-        exponent = max(math.frexp(size)[1] if size else self._exponent, self._exponent)
-        self._squares = math.ldexp(self._squares, 2 * (self._exponent - exponent))
-        self._exponent = exponent
-        self._squares += float(
-            np.square(np.ldexp(numbers, -exponent) - math.ldexp(mean, -exponent)).sum()
-        )
-        step = math.ldexp(mean, -exponent) - math.ldexp(before, -exponent)
-        self._squares += step * step * self.count * count / (self.count + count)
+        numbers, count = values.astype(np.longdouble), len(values)
+        mean = numbers.mean()
+        step, share = mean - self._mean, count / (self.count + count)
+        self._squares += np.square(numbers - mean).sum() + step * step * self.count * share
+        self._mean += step * share
         self.count += count
-        self._mean = mean
-        if own is not self._total:
-            self._mean = float(self._total.means(np.array([self.count]))[0])
-
-    @property
-    def _std(self) -> float:
-        with np.errstate(over="ignore"):  # it may be greater than the greatest double
-            return float(np.ldexp(math.sqrt(self._squares / (self.count - 1)), self._exponent))
 
     def result(self, topic: str, field: str) -> FieldStatistics:
         few = self.count < 2
+        with np.errstate(over="ignore"):  # it may be greater than the greatest double
+            std = float(np.sqrt(self._squares / max(self.count - 1, 1)))
         return FieldStatistics(
             topic,
             field,
@@ -126,8 +106,8 @@ class _Running:
             self.infinite,
             self.least,
             self.most,
-            self._mean if self.count else None,
-            None if few else self._std,
+            float(self._mean) if self.count else None,
+            None if few else std,
         )
 
 
