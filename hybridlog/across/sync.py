@@ -184,8 +184,9 @@ class Synced(Sequence[tuple["Message", ...]]):
 
 def _in_range(session: Session, question: Question) -> set[int]:
     """Places of the recordings that a question's range touches."""
+    places = session.snapshot().by_id
     try:
-        return set(RangeResolver(session, question).resolve().places.tolist())
+        return {places[one.summary.id] for one in RangeResolver(session, question).resolve()}
     except TimeError:
         return set()
 

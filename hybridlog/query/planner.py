@@ -18,8 +18,10 @@ from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.rows import TABLE_ERRORS, Rows
 from hybridlog.schema.column import STAMP
 from hybridlog.schema.states import GONE
+from hybridlog.snapshot import UNFINISHED
 from hybridlog_storage.errors import ChangedError, TopicError, UsageError
 from hybridlog_storage.lazy import lazy
+from hybridlog_storage.times import END
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -199,7 +201,10 @@ class Planner:
         """
         found = self._ranges.resolve()
         # In the order of the answer; going back, a recording begins with its last message.
-        first, last = found.first, found.last
+        spans = [
+            (one.extent[0], END if one.status in UNFINISHED else one.extent[1]) for one, *_ in found
+        ]
+        first, last = np.array(spans, np.int64).reshape(-1, 2).T
         if self.question.reverse:
             first, last = -last, -first
         order = np.argsort(first, kind="stable")
