@@ -144,7 +144,7 @@ class OpenStore(Shared):
         with self.following:
             self._latest = None
             self.index.note_changes()
-            self._entries = {}
+            self.entries = {}
         self.channels.clear()
         self._drop_files()
 

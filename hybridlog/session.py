@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from hybridlog.query.question import Question
     from hybridlog.shared import Shared
     from hybridlog.snapshot import Snapshot
-    from hybridlog_storage.catalog import Catalog, RecordingEntry
+    from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.segments.chunk import StoredChunk
     from hybridlog_storage.segments.chunk_table import ChunkTable
@@ -82,6 +82,7 @@ class Session:
     def __init__(self, shared: Shared, recordings: Snapshot) -> None:
         self.shared = shared
         self.directory = shared.directory
+        self.catalog = shared.catalog
         self.cache = shared.cache
         self._recordings = recordings
         self._entries: dict[str, RecordingEntry] = {}  # that were asked about, by id
@@ -94,11 +95,6 @@ class Session:
     def again(self) -> Session:
         """The same recordings, of which nothing was asked yet."""
         return Session(self.shared, self._recordings)
-
-    @property
-    def catalog(self) -> Catalog:
-        """Recordings, channels, chunks and schemas."""
-        return self.shared.catalog
 
     @property
     def tables(self) -> Tables:
@@ -174,12 +170,9 @@ class Session:
         return None if place is None else self._entry_of(self._recordings.summaries[place])
 
     def entry(self, recording: str) -> RecordingEntry:
-        """The entry of a recording, by its id or its name."""
-        snapshot = self._recordings
-        found = snapshot.called(recording)
-        if len(found) != 1:
-            raise self._unclear(recording, found)
-        return self.entry_of(snapshot.summaries[found[0]])
+        """The entry of a recording, by its id, its name, or the beginning of one of these."""
+        (found,) = self.select([recording])
+        return found
 
     def chosen(self, question: Question) -> NDArray[np.intp]:
         """Positions in the snapshot of the recordings of a question, oldest first."""
@@ -204,7 +197,7 @@ class Session:
         """The recordings of a question that may lack messages, oldest first."""
         found = []
         for summary in self.summaries_of(question):
-            entry = self._entries.get(summary.id) or self.shared.known_entry(summary.id)
+            entry = self._entries.get(summary.id) or self.shared.entries.get(summary.id)
             is_complete = not summary.has_losses and summary.status == "complete"
             if entry is None and is_complete:
                 continue

@@ -46,6 +46,7 @@ class Shared(ABC):
         repairs: Repairs made when the store was opened.
         cache: What was read or worked out; chunks of single messages are a kind of it.
         schemas: Schemas by hash.
+        entries: Entries of ended recordings that were compared with their files, by id.
         following: Held while running recordings are looked at, and while the newest state changes.
         channels: Channels of recordings by id and topic, and the entry that they are of.
     """
@@ -59,7 +60,7 @@ class Shared(ABC):
         self.cache = Cache()
         self.following = threading.RLock()
         self._running: dict[str, RunningRecording] = {}
-        self._entries: dict[str, RecordingEntry] = {}  # compared with their files, by id
+        self.entries: dict[str, RecordingEntry] = {}
         self.schemas = {schema_hash(MARK_SCHEMA): MARK_SCHEMA}
         self.channels: dict[str, tuple[RecordingEntry, dict[str, list[RecordedChannel]]]] = {}
         self._segments: dict[tuple[str, str], SegmentReader] = {}
@@ -118,7 +119,7 @@ class Shared(ABC):
         """Drop what was read of some recordings, by their ids."""
         for recording in recordings:
             self.channels.pop(recording, None)
-            self._entries.pop(recording, None)
+            self.entries.pop(recording, None)
         with self._opening:
             self._rows.clear()
             for key in [key for key in self._segments if key[0] in recordings]:
@@ -157,7 +158,7 @@ class Shared(ABC):
 
     def entry(self, summary: RecordingSummary) -> RecordingEntry | None:
         """The entry of what is sealed of a recording, compared with its files once."""
-        found = None if summary.status in UNFINISHED else self._entries.get(summary.id)
+        found = None if summary.status in UNFINISHED else self.entries.get(summary.id)
         if found is None:
             entry = self._current(summary)
             if entry is None:
@@ -165,7 +166,7 @@ class Shared(ABC):
             found = with_marks(entry)
             if entry.status in UNFINISHED:
                 return found
-            found = self._entries.setdefault(summary.id, found)
+            found = self.entries.setdefault(summary.id, found)
         return found
 
     def _current(self, summary: RecordingSummary) -> RecordingEntry | None:
@@ -179,10 +180,6 @@ class Shared(ABC):
             # The index may have what the files had before.
             self.index.note_changes()
         return entry
-
-    def known_entry(self, recording: str) -> RecordingEntry | None:
-        """The entry of an ended recording, if it was read."""
-        return self._entries.get(recording)
 
     # Files.
 
