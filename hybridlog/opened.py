@@ -144,9 +144,8 @@ class OpenStore(Shared):
         with self.following:
             self._latest = None
             self.index.note_changes()
-            self._entries = {}
+            self.entries = {}
         self.channels.clear()
-        self.columns.clear()
         self._drop_files()
 
     # Repairs.
@@ -170,17 +169,15 @@ class OpenStore(Shared):
                 for recording in died:
                     self._running.pop(recording, None)
                 self.catch_up(*died, mends=True)
-        by_recording: dict[str, set[str]] = {}
-        for recording, topic in [*repairs.noted_tables]:
-            by_recording.setdefault(recording, set()).add(topic)
         session = self.now()
-        for recording, topics in by_recording.items():
-            entry = session.entry_if_there(recording)
-            if entry is not None:
-                from hybridlog.follow.follower import make_tables
-                from hybridlog.maintenance.tables import missing
+        for recording in {recording for recording, _ in repairs.noted_tables}:
+            from hybridlog.maintenance.tables import missing
 
-                topics.update(missing(self.directory, entry, self.tables))
+            entry = session.entry_if_there(recording)
+            topics = set() if entry is None else missing(self.directory, entry, self.tables)
+            if entry is not None and topics:
+                from hybridlog.follow.follower import make_tables
+
                 try:
                     problem = make_tables(
                         self.directory, self.catalog, entry, topics=topics, until=until
@@ -191,7 +188,7 @@ class OpenStore(Shared):
                     self.tables.look_again()
                     made = (one for one in sorted(topics) if self.tables.of(entry, one) is not None)
                     repairs.tables += [(entry.name, one) for one in made]
-            repairs.noted_tables -= {(recording, topic) for topic in topics}
+            repairs.noted_tables = {one for one in repairs.noted_tables if one[0] != recording}
 
     def recorded(self, report: RecordReport) -> None:
         """See a recording that has ended; if MongoDB is available again, index the rest."""

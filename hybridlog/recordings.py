@@ -40,17 +40,13 @@ class Recordings(Sequence["RecordingEntry"]):
         return len(self.summaries)
 
     @overload
-    def __getitem__(self, index: int | str) -> RecordingEntry: ...
+    def __getitem__(self, index: int) -> RecordingEntry: ...
 
     @overload
     def __getitem__(self, index: slice) -> Recordings: ...
 
-    def __getitem__(self, index: int | str | slice) -> RecordingEntry | Recordings:
-        """The entry of a recording by position or name, or some of the recordings."""
-        if isinstance(index, str):
-            if index not in self.names:
-                raise TopicError(f"{index!r} is not one of {listed(self.names)}.")
-            index = self.names.index(index)
+    def __getitem__(self, index: int | slice) -> RecordingEntry | Recordings:
+        """The entry of a recording by position, or some of the recordings."""
         if isinstance(index, slice):
             return Recordings(self._source, self.summaries[index], self._problem)
         return self._source.now().entry_of(self.summaries[index])
@@ -75,10 +71,6 @@ class Recordings(Sequence["RecordingEntry"]):
         from hybridlog.drawing.notebook import recordings_html
 
         return recordings_html(f"{len(self)} recordings", self.summaries)
-
-    def _ipython_key_completions_(self) -> list[str]:
-        """Names, for `recordings["…"]`."""
-        return list(self.names)
 
     @property
     def ids(self) -> tuple[str, ...]:

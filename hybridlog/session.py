@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from hybridlog.query.question import Question
     from hybridlog.shared import Shared
     from hybridlog.snapshot import Snapshot
-    from hybridlog_storage.catalog import Catalog, RecordingEntry
+    from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.segments.chunk import StoredChunk
     from hybridlog_storage.segments.chunk_table import ChunkTable
@@ -56,8 +56,6 @@ if TYPE_CHECKING:
 
 _MAX_NAMES = 5  # recordings in a message
 _ROW_BYTES = 44  # of a message's columns in a chunk
-_MAX_COLUMNS = 4096  # sets of chunks that are at hand
-_MAX_RESOLVED = 128  # topic patterns
 
 _T = TypeVar("_T")
 _Topics = tuple[tuple[str, ...], tuple[str, ...] | None]
@@ -79,21 +77,14 @@ class Session:
     A question takes one at its beginning, and hands it to all that it calls. What running
     recordings have flushed by then is read when it first asks about them. Where a file is gone or
     was replaced, later questions see the newer state of its recording.
-
-    `resolved` has topics of patterns, as long as the topics are the same.
     """
 
-    def __init__(
-        self,
-        shared: Shared,
-        recordings: Snapshot,
-        resolved: dict[tuple[str, ...], _Topics] | None = None,
-    ) -> None:
+    def __init__(self, shared: Shared, recordings: Snapshot) -> None:
         self.shared = shared
         self.directory = shared.directory
+        self.catalog = shared.catalog
         self.cache = shared.cache
         self._recordings = recordings
-        self._resolved = {} if resolved is None else resolved
         self._entries: dict[str, RecordingEntry] = {}  # that were asked about, by id
 
     def now(self) -> Session:
@@ -103,12 +94,7 @@ class Session:
 
     def again(self) -> Session:
         """The same recordings, of which nothing was asked yet."""
-        return Session(self.shared, self._recordings, self._resolved)
-
-    @property
-    def catalog(self) -> Catalog:
-        """Recordings, channels, chunks and schemas."""
-        return self.shared.catalog
+        return Session(self.shared, self._recordings)
 
     @property
     def tables(self) -> Tables:
@@ -145,8 +131,6 @@ class Session:
             self._entries[recording] = entry
             now = summary_of(entry, summary.look)
             if now != summary:
-                if now.topics != summary.topics:
-                    self._resolved = {}
                 self._recordings = snapshot.with_changes([now], {now.topics: running.topics})
                 shared.replace_latest(snapshot, self)
             return entry
@@ -186,12 +170,9 @@ class Session:
         return None if place is None else self._entry_of(self._recordings.summaries[place])
 
     def entry(self, recording: str) -> RecordingEntry:
-        """The entry of a recording, by its id or its name."""
-        snapshot = self._recordings
-        found = snapshot.called(recording)
-        if len(found) != 1:
-            raise self._unclear(recording, found)
-        return self.entry_of(snapshot.summaries[found[0]])
+        """The entry of a recording, by its id, its name, or the beginning of one of these."""
+        (found,) = self.select([recording])
+        return found
 
     def chosen(self, question: Question) -> NDArray[np.intp]:
         """Positions in the snapshot of the recordings of a question, oldest first."""
@@ -207,14 +188,16 @@ class Session:
             )
         return np.array(sorted(places), np.intp)
 
+    def summaries_of(self, question: Question) -> list[RecordingSummary]:
+        """The recordings of a question in short, oldest first."""
+        places = self.chosen(question).tolist()
+        return [self._recordings.summaries[place] for place in places]
+
     def doubtful(self, question: Question) -> list[RecordingEntry]:
         """The recordings of a question that may lack messages, oldest first."""
-        places = self.chosen(question).tolist()
-        summaries = self._recordings.summaries
         found = []
-        for place in places:
-            summary = summaries[place]
-            entry = self._entries.get(summary.id) or self.shared.known_entry(summary.id)
+        for summary in self.summaries_of(question):
+            entry = self._entries.get(summary.id) or self.shared.entries.get(summary.id)
             is_complete = not summary.has_losses and summary.status == "complete"
             if entry is None and is_complete:
                 continue
@@ -335,15 +318,11 @@ class Session:
         unknown = snapshot.schemas - self.shared.schemas.keys()
         if unknown:
             self.shared.schemas |= self.catalog.schemas(unknown)
-        names = {digest: schema.name for digest, schema in self.shared.schemas.items()}
-        if snapshot.schemas <= names.keys():
-            return names
-        # The catalog has lost a schema; entries have the names, too.
-        lost = snapshot.with_schemas(snapshot.schemas - names.keys())
+        # Those that the catalog has lost are read from segments.
+        lost = snapshot.with_schemas(snapshot.schemas - self.shared.schemas.keys())
         for summary in snapshot.differing(lost):
-            channels = self.entry_of(summary).channels
-            names |= {c.schema: c.type for c in channels if c.schema is not None}
-        return names
+            self.definitions(self.entry_of(summary))
+        return {digest: schema.name for digest, schema in self.shared.schemas.items()}
 
     def resolve(self, names: tuple[str, ...]) -> _Topics:
         """The topics that patterns match, and the recordings that have them."""
@@ -351,13 +330,7 @@ class Session:
         if not names:
             there = f"There are: {listed(known)}." if known else self.when_empty
             raise TopicError(f"Name a topic. {there}")
-        found = self._resolved.get(names)
-        if found is None:
-            found = self.having(resolve(names, known))
-            if len(self._resolved) >= _MAX_RESOLVED:
-                self._resolved.clear()
-            self._resolved[names] = found
-        return found
+        return self.having(resolve(names, known))
 
     def topics_of(self, recordings: Sequence[str] | None) -> list[str]:
         """Names of all topics of the recordings with some ids, or of all, sorted."""
@@ -387,18 +360,22 @@ class Session:
             raise TopicError(f"{error}{join} the store, {known_by} {have} such a topic") from error
 
     def predicate(
-        self, text: str, topics: tuple[str, ...], recordings: tuple[str, ...] | None
+        self,
+        given: str | Mapping[str, object],
+        topics: tuple[str, ...],
+        recordings: tuple[str, ...] | None,
     ) -> Predicate:
-        """A predicate, or a MongoDB filter as JSON, on some topics of some recordings."""
+        """A predicate, or a MongoDB filter, on some topics of some recordings."""
         from hybridlog.query.predicate.mongo_filter import from_json, mongo_filter
         from hybridlog.query.predicate.parser import parse
         from hybridlog.query.predicate.tokens import is_filter
         from hybridlog.query.predicate.types import check
 
-        if is_filter(text):
-            return mongo_filter(from_json(text), self.field_types(topics, recordings))
-        found = parse(text)
-        check(found, self.field_types(topics, recordings))
+        types = self.field_types(topics, recordings)
+        if not isinstance(given, str) or is_filter(given):
+            return mongo_filter(from_json(given) if isinstance(given, str) else given, types)
+        found = parse(given)
+        check(found, types)
         return found
 
     def definitions(self, recording: RecordingEntry) -> Mapping[int, Channel]:
@@ -472,13 +449,14 @@ class Session:
     ) -> ChunkColumns:
         """The chunks of a segment with some channels."""
         table = self.chunk_table(recording, number)
-        key = recording.id, number, frozenset(channels)
-        known = self.shared.columns.get(key)
-        if known is None or known[0] is not table:
-            if len(self.shared.columns) >= _MAX_COLUMNS:
-                self.shared.columns.clear()
-            known = self.shared.columns[key] = table, ChunkColumns(number, table, channels)
-        return known[1]
+        return self.cache.made(
+            "chunks",
+            table,
+            number,
+            frozenset(channels),
+            make=lambda: ChunkColumns(number, table, channels),
+            size_of=lambda made: 2 * made.parts.nbytes + table.parts.nbytes,
+        )
 
     def chunk_table(self, recording: RecordingEntry, number: int) -> ChunkTable:
         """The chunks of a recording's segment; a `ChangedError` if its file is another one."""
@@ -608,16 +586,16 @@ class Session:
         return rows.expired_fields(topic, chunks, self.tables.opened)
 
     def table(self, recording: RecordingEntry, topic: str) -> TopicTable | None:
-        """The table of a topic; None without one. `Shared.mend` creates a missing one again."""
+        """The table of a topic; None without one. A missing one is noted for `OpenStore.mend`."""
         if recording.status in UNFINISHED or (topic == MARKS and recording.marks):
             return None
         found = self.tables.of(recording, topic)
         if found is None:
-            self.shared.note_missing_table(recording, topic)
+            self.shared.repairs.noted_tables.add((recording.id, topic))
         return found
 
     def reject_table(self, recording: RecordingEntry, topic: str) -> None:
-        """Drop a table that turned out to be damaged; `Shared.mend` makes it again."""
+        """Drop a table that turned out to be damaged; `OpenStore.mend` makes it again."""
         self.tables.reject(recording, topic)
         self.shared.repairs.noted_tables.add((recording.id, topic))
 

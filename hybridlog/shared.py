@@ -27,13 +27,11 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from hybridlog.columns.tables import Tables
-    from hybridlog.query.chunk_columns import ChunkColumns
     from hybridlog.query.question import RecordedChannel
     from hybridlog.record.running import RunningRecording
     from hybridlog.snapshot import Snapshot
     from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
-    from hybridlog_storage.segments.chunk_table import ChunkTable
     from hybridlog_storage.segments.segment_reader import SegmentReader
     from hybridlog_storage.summary import RecordingSummary
 
@@ -48,9 +46,9 @@ class Shared(ABC):
         repairs: Repairs made when the store was opened.
         cache: What was read or worked out; chunks of single messages are a kind of it.
         schemas: Schemas by hash.
+        entries: Entries of ended recordings that were compared with their files, by id.
         following: Held while running recordings are looked at, and while the newest state changes.
         channels: Channels of recordings by id and topic, and the entry that they are of.
-        columns: Columns of the chunks of a segment, and the table that they are of.
     """
 
     index: Any
@@ -62,13 +60,11 @@ class Shared(ABC):
         self.cache = Cache()
         self.following = threading.RLock()
         self._running: dict[str, RunningRecording] = {}
-        self._entries: dict[str, RecordingEntry] = {}  # compared with their files, by id
+        self.entries: dict[str, RecordingEntry] = {}
         self.schemas = {schema_hash(MARK_SCHEMA): MARK_SCHEMA}
         self.channels: dict[str, tuple[RecordingEntry, dict[str, list[RecordedChannel]]]] = {}
-        self.columns: dict[tuple[str, int, frozenset[int]], tuple[ChunkTable, ChunkColumns]] = {}
         self._segments: dict[tuple[str, str], SegmentReader] = {}
         self._rows: dict[tuple[Path, frozenset[tuple[str, ...]]], RecordingRows] = {}
-        self._tables_tried: set[tuple[str, str]] = set()  # looked for, and noted if missing
         self._opening = threading.Lock()
 
     @property
@@ -123,14 +119,11 @@ class Shared(ABC):
         """Drop what was read of some recordings, by their ids."""
         for recording in recordings:
             self.channels.pop(recording, None)
-            entry = self._entries.pop(recording, None)
-            topics = {channel.topic for channel in entry.channels} if entry is not None else set()
-            self._tables_tried -= {(recording, topic) for topic in topics}
+            self.entries.pop(recording, None)
         with self._opening:
             self._rows.clear()
             for key in [key for key in self._segments if key[0] in recordings]:
                 del self._segments[key]
-        self.columns.clear()
         self.cache.drop("chunk")
         if "tables" in vars(self):
             self.tables.look_again()
@@ -140,7 +133,6 @@ class Shared(ABC):
             self._rows.clear()
             self._segments.clear()  # each is closed by the last thread that reads from it
         self.cache.drop("chunk")
-        self._tables_tried.clear()
         self.cache.drop("column")
         vars(self).pop("tables", None)
 
@@ -156,17 +148,17 @@ class Shared(ABC):
                 self.directory, summary.id, partial(self.entry, summary)
             )
         running.follow()
+        self.schemas |= running.schemas
         entry = running.entry
         if entry is None or entry.status not in UNFINISHED:
             del self._running[summary.id]
-        self.schemas |= running.schemas
-        if entry is not None and entry.status not in UNFINISHED:
-            self._invalidate_tables(entry)
+            if "tables" in vars(self):  # it may have tables now
+                self.tables.look_again()
         return running
 
     def entry(self, summary: RecordingSummary) -> RecordingEntry | None:
         """The entry of what is sealed of a recording, compared with its files once."""
-        found = None if summary.status in UNFINISHED else self._entries.get(summary.id)
+        found = None if summary.status in UNFINISHED else self.entries.get(summary.id)
         if found is None:
             entry = self._current(summary)
             if entry is None:
@@ -174,7 +166,7 @@ class Shared(ABC):
             found = with_marks(entry)
             if entry.status in UNFINISHED:
                 return found
-            found = self._entries.setdefault(summary.id, found)
+            found = self.entries.setdefault(summary.id, found)
         return found
 
     def _current(self, summary: RecordingSummary) -> RecordingEntry | None:
@@ -188,10 +180,6 @@ class Shared(ABC):
             # The index may have what the files had before.
             self.index.note_changes()
         return entry
-
-    def known_entry(self, recording: str) -> RecordingEntry | None:
-        """The entry of an ended recording, if it was read."""
-        return self._entries.get(recording)
 
     # Files.
 
@@ -220,23 +208,6 @@ class Shared(ABC):
             _make_room(self._rows)
             found = self._rows[key] = RecordingRows(key[0], cache=self.cache)
         return found
-
-    def note_missing_table(self, recording: RecordingEntry, topic: str) -> None:
-        """Note once that a topic has no table, for `mend` if that can make it."""
-        from hybridlog.maintenance.tables import can_be_made
-
-        key = recording.id, topic
-        if key not in self._tables_tried:
-            self._tables_tried.add(key)
-            if can_be_made(recording, topic, self.tables):
-                self.repairs.noted_tables.add(key)
-
-    def _invalidate_tables(self, recording: RecordingEntry) -> None:
-        """Look for the tables of a recording again, now that it has ended."""
-        topics = {channel.topic for channel in recording.channels}
-        self._tables_tried -= {(recording.id, topic) for topic in topics}
-        if "tables" in vars(self):
-            self.tables.look_again()
 
 
 def _make_room(opened: dict[Any, Any]) -> None:

@@ -7,10 +7,8 @@ about, not on what else is in the store.
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from copy import copy
+from collections.abc import Collection, Iterable, Mapping
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING
 
@@ -25,23 +23,12 @@ if TYPE_CHECKING:
 
 UNFINISHED = frozenset({"open", "unfinished"})
 """Statuses of recordings that may have ended, or grown, since the snapshot."""
-_MAX_CACHED = 128  # sets of topics
 _LEAST = 4  # characters of an id that stand for it
 _LATEST = (1 << 63) - 1
 
 
 def _order(one: RecordingSummary) -> tuple[bool, tuple[int, int], str, str]:
     return one.span is None, one.span or (0, 0), one.name, one.id
-
-
-_COLUMNS = [("begin", "i8"), ("end", "i8"), ("is_open", "?"), ("set", "i8")]
-
-
-def _columns_of(summaries: Sequence[RecordingSummary], topics: Iterable[str]) -> NDArray[np.void]:
-    """Columns of a snapshot, a row for each recording; `set` is the number of its topics."""
-    numbers = {digest: number for number, digest in enumerate(topics)}
-    rows = [(*one.extent, one.status in UNFINISHED, numbers[one.topics]) for one in summaries]
-    return np.array(rows, np.dtype(_COLUMNS))
 
 
 class Snapshot:
@@ -58,35 +45,30 @@ class Snapshot:
     ) -> None:
         self.summaries = sorted(summaries, key=_order)
         self._topics = topics
-        self._having: dict[frozenset[str], NDArray[np.intp]] = {}
 
     def __len__(self) -> int:
         return len(self.summaries)
 
     @lazy
-    def _columns(self) -> NDArray[np.void]:
-        """The columns, which a list of recordings does without."""
-        return _columns_of(self.summaries, self._topics)
-
-    @property
     def begin(self) -> NDArray[np.int64]:
         """int64[n], first log time of each, ns."""
-        return self._columns["begin"]
+        return np.array([one.extent[0] for one in self.summaries], np.int64)
 
-    @property
+    @lazy
     def end(self) -> NDArray[np.int64]:
         """int64[n], one past the last log time of each, ns; both count lost messages."""
-        return self._columns["end"]
+        return np.array([one.extent[1] for one in self.summaries], np.int64)
 
-    @property
+    @lazy
     def is_open(self) -> NDArray[np.bool_]:
         """bool[n], whether each may have later messages by now."""
-        return self._columns["is_open"]
+        return np.array([one.status in UNFINISHED for one in self.summaries], np.bool_)
 
-    @property
+    @lazy
     def _set(self) -> NDArray[np.intp]:
         """The number of the topics of each."""
-        return self._columns["set"]
+        numbers = {digest: number for number, digest in enumerate(self._topics)}
+        return np.array([numbers[one.topics] for one in self.summaries], np.intp)
 
     @lazy
     def unfinished(self) -> list[int]:
@@ -100,39 +82,11 @@ class Snapshot:
         gone: Collection[str] = (),
     ) -> Snapshot:
         """All recordings, some of them as they are now; topics are by hash."""
-        changed = sorted(changed, key=_order)
-        same = {*gone, *(one.id for one in changed)} & self.by_id.keys()
-        places = sorted((self.by_id[recording] for recording in same), reverse=True)
-        found = copy(self)
-        found.summaries = self.summaries.copy()
-        for place in places:
-            del found.summaries[place]
-        before = [bisect_left(found.summaries, _order(one), key=_order) for one in changed]
-        for place, one in reversed([*zip(before, changed, strict=True)]):
-            found.summaries.insert(place, one)
-        new = {digest: sorted(of) for digest, of in topics.items() if digest not in self._topics}
-        known = {**self._topics, **new}
-        new_rows = _columns_of(changed, known)
-        columns = np.insert(np.delete(self._columns, places), before, new_rows)
-        used = np.unique(columns["set"])
-        if len(used) < len(known):
-            held = [*known.items()]
-            known = dict(held[number] for number in used.tolist())
-            columns["set"] = np.searchsorted(used, columns["set"])
-        unfinished = np.flatnonzero(columns["is_open"]).tolist()
-        vars(found).update(_columns=columns, _topics=known, _having={}, unfinished=unfinished)
-        stale = {"tags", "by_id", "by_name", "by_fingerprint"}
-        if before == places[::-1] and [one.id for one in changed] == [
-            self.summaries[place].id for place in before
-        ]:
-            names = [self.summaries[place].name for place in before]
-            is_renamed = names != [one.name for one in changed]
-            stale = {"tags", "by_fingerprint"} | ({"by_name"} if is_renamed else set())
-        if known.keys() != self._topics.keys():
-            stale |= {"topics", "schemas"}
-        for name in stale:
-            vars(found).pop(name, None)
-        return found
+        changed = [*changed]
+        left_out = {*gone, *(one.id for one in changed)}
+        summaries = [*(one for one in self.summaries if one.id not in left_out), *changed]
+        known, used = {**self._topics, **topics}, {one.topics for one in summaries}
+        return Snapshot(summaries, {digest: of for digest, of in known.items() if digest in used})
 
     @lazy
     def by_id(self) -> dict[str, int]:
@@ -210,14 +164,9 @@ class Snapshot:
         self, topics: Collection[str], ids: Collection[str] | None = None
     ) -> NDArray[np.intp]:
         """Positions of recordings, all or some by id, that have any of some topics, in order."""
-        wanted = frozenset(topics)
-        found = self._having.get(wanted)
-        if found is None:
-            sets = [any(t.topic in wanted for t in held) for held in self._topics.values()]
-            found = np.flatnonzero(np.array(sets, np.bool_)[self._set])
-            if len(self._having) >= _MAX_CACHED:
-                self._having.clear()
-            self._having[wanted] = found
+        wanted = {*topics}
+        sets = [any(t.topic in wanted for t in held) for held in self._topics.values()]
+        found = np.flatnonzero(np.array(sets, np.bool_)[self._set])
         if ids is None:
             return found
         own = [self.by_id[one] for one in ids if one in self.by_id]

@@ -27,9 +27,8 @@ from hybridlog.index.access import again_if_lost
 from hybridlog.index.of_store import Index
 from hybridlog.maintenance.report import Progress, RepairReport
 from hybridlog.opened import OpenStore
-from hybridlog.query.asked import narrowed
 from hybridlog.query.choice import Choice
-from hybridlog.query.query import Query, of_now
+from hybridlog.query.query import Query, narrowed, of_now
 from hybridlog.query.question import Question
 from hybridlog.query.times import parse_range, parse_time
 from hybridlog.query.topics import namesakes
@@ -307,14 +306,6 @@ class Store:
         summaries = self.summaries()
         title = f"Store {self.directory.place}: {len(summaries)} recordings"
         return recordings_html(title, summaries)
-
-    def _ipython_key_completions_(self) -> list[str]:
-        """Topics, for `store["…"]`."""
-        return self.topics()
-
-    def __getitem__(self, topics: str | tuple[str, ...]) -> Query:
-        """`store["/scan"]` is `store.topic("/scan")`."""
-        return self.topic(*((topics,) if isinstance(topics, str) else topics))
 
     @property
     def catalog(self) -> Catalog:

@@ -249,7 +249,6 @@ def test_queries_of_chosen_recordings(store: hl.Store) -> None:
     assert found.topic("scan").topics == ("/scan",)
     assert found[1:].topic("scan").topics == ("/left/scan",)
     assert found[0].name == "monday 1"
-    assert found["tuesday"].name == "tuesday"
     assert store.topic("/scan").in_recording(tag="robot=8", where="imu: n = 5").count() == 2
     assert store.topic("/scan").in_recording("mon*").count() == 5
     with pytest.raises(TopicError, match="robot=9"):

@@ -617,8 +617,8 @@ def documented_classes() -> list[type]:
     from hybridlog.maintenance.verify import Finding, Verification
     from hybridlog.query.answers.completeness import Completeness
     from hybridlog.query.answers.statistics import FieldStatistics
-    from hybridlog.query.counters import Counters
     from hybridlog.query.intervals import Interval, Intervals
+    from hybridlog.query.question import Counters
     from hybridlog.record.recorder import RecordReport
     from hybridlog.recordings import Recordings
     from hybridlog.training.lerobot import LerobotReport

@@ -22,7 +22,6 @@ from pymongo import MongoClient
 import hybridlog as hl
 from benchmarks.simulator.write import write_bag
 from hybridlog.index import access
-from hybridlog.query.counters import Counters
 from hybridlog.query.index_reader import IndexReader
 from hybridlog.query.planner import Planner
 from hybridlog.query.question import Part
@@ -255,7 +254,7 @@ def test_an_unreachable_server_is_not_waited_for_by_each_question(
 def test_chunks_go_on_where_a_table_fails(store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with hl.open(store) as opened:
         question = opened.topic(IMU).where(WHERE).question
-        planner = Planner(opened.session, question, Counters())
+        planner = Planner(opened.session, question)
         part = planner.parts()[0]
         want = [row for found in planner.outcomes(part) for row in zip(*found, strict=True)]
 
@@ -269,7 +268,7 @@ def test_chunks_go_on_where_a_table_fails(store: Path, monkeypatch: pytest.Monke
 
         outcomes = Rows.outcomes
         monkeypatch.setattr(Rows, "outcomes", breaking)
-        planner = Planner(opened.session, question, Counters())
+        planner = Planner(opened.session, question)
         got = [row for found in planner.outcomes(part) for row in zip(*found, strict=True)]
         assert got == want
         assert len(want) > 100

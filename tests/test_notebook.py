@@ -18,7 +18,6 @@ import hybridlog as hl
 from hybridlog.drawing.notebook import message_html, recordings_html, shown
 from hybridlog.drawing.pixels import SIDE
 from hybridlog.message import Message
-from hybridlog_storage.errors import TopicError
 from hybridlog_storage.messages import Channel, Schema
 from tests.limits import Limit
 from tests.test_snapshot import summary
@@ -184,13 +183,5 @@ def test_a_large_image_is_not_decoded(store: hl.Store, limit: Limit) -> None:
     assert Parsed(only(store, "/image")._repr_html_()).images == []
 
 
-def test_topics_and_labels_are_completed(store: hl.Store) -> None:
-    assert store._ipython_key_completions_() == store.topics()
-    assert store["/image"] == store.topic("/image")
-    assert store["/image", "/many"] == store.topic("/image", "/many")
-    recordings = store.recordings()
-    (label,) = recordings._ipython_key_completions_()
-    assert recordings[label] == recordings[0]
-    with pytest.raises(TopicError, match="'x' is not one of"):
-        recordings["x"]
+def test_a_message_says_what_it_is(store: hl.Store) -> None:
     assert re.fullmatch(r"<Message /image .* 360041 B>", repr(only(store, "/image")))

@@ -39,7 +39,6 @@ READING: Sequence[Sequence[str]] = (
     ("fetch", "-t", "/scan", "-r", "odd", "--fields", "header"),
     ("fetch", "-t", "/number", "--between", "+1s", "+2s", "--format", "jsonl"),
     ("intervals", "-t", "/number", "--where", "data > 3", "--state"),
-    ("stats", "-t", "/number", "--rate"),
     ("intervals", "-t", "/number", "--gaps"),
     ("stats", "-t", "/number"),
     ("sql", "select * from losses"),

@@ -319,23 +319,3 @@ def test_tables_in_parts_are_one_table_in_order(tmp_path: Path) -> None:
             numbers = [n for part in parts for n in part["data"].to_pylist()]
             assert len(numbers) == 2 * count
             assert numbers == sorted(numbers, reverse=query.question.reverse)
-
-
-def test_words_mean_what_is_in_the_store_now(tmp_path: Path) -> None:
-    """Topics and predicates whose meaning is remembered are understood anew after a change."""
-    number = Schema("std_msgs/Int32", "ros1msg", b"int32 data\n")
-    string = Schema("std_msgs/String", "ros1msg", b"string data\n")
-    with hl.open(tmp_path / "store", create=True, require_database=True) as store:
-        with store.start("numbers") as recording:
-            recording.write(Channel("/a/talk", "ros1", number), (7).to_bytes(4, "little"))
-        for _ in range(2):
-            assert store.topic("talk").where("data == 7").count() == 1
-            with pytest.raises(WhereError, match="a number, the value is a string"):
-                store.topic("talk").where("data == 'seven'")
-        with hl.open(tmp_path / "store") as other, other.start("strings") as recording:
-            recording.write(Channel("/b/talk", "ros1", string), b"\x05\0\0\0seven")
-            recording.write(Channel("/a/talk", "ros1", string), b"\x05\0\0\0seven")
-        for _ in range(2):
-            with pytest.raises(TopicError, match="/b/talk"):
-                store.topic("talk")
-            assert store.topic("/a/talk").where("data == 'seven'").count() == 1

@@ -18,8 +18,7 @@ from rosbags.typesys import (
 from rosbags.typesys.store import Typestore
 
 import hybridlog as hl
-from hybridlog.query.asked import channels_of
-from hybridlog.query.query import Query
+from hybridlog.query.query import Query, channels_of
 from hybridlog_storage.messages import Channel, Schema
 from tests.data import DATA, needs_data
 from tests.every_output import compare_every_output

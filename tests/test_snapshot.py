@@ -7,7 +7,6 @@ import random
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
@@ -103,55 +102,6 @@ def test_recordings_are_chosen_by_topic_and_time(
         frozenset(found[n][1]) for n in wanted
     }
     assert len(examples) == len({frozenset(found[n][1]) for n in wanted})
-
-
-KINDS = st.lists(st.sampled_from(TOPICS), unique=True)
-STATUS = st.sampled_from(["open", "unfinished", "complete"])
-TAGS = st.dictionaries(st.sampled_from("kl"), st.sampled_from("vw"))
-
-
-@given(
-    st.lists(st.tuples(SPANS, KINDS, STATUS, TAGS), min_size=1, max_size=6),
-    st.tuples(SPANS, KINDS, STATUS, TAGS),
-    st.integers(0, 5),
-    st.booleans(),
-)
-def test_a_recording_that_has_changed_is_as_if_it_had_been_so(
-    found: list[Any], change: Any, place: int, is_renamed: bool
-) -> None:
-    """Whatever was asked of the snapshot before, and that one stays as it was."""
-
-    def made(number: int, one: Any, **other: Any) -> tuple[RecordingSummary, Any]:
-        span, topics, status, tags = one
-        summed, kinds = summary(number, span, topics, status=status, tags=tags, **other)
-        return summed, topics_of(kinds)
-
-    def told(snapshot: Snapshot) -> Any:
-        places = np.arange(len(snapshot))
-        columns = (snapshot.begin, snapshot.end, snapshot.is_open)
-        having = {topic: snapshot.having([topic]).tolist() for topic in TOPICS}
-        tags = {key: dict(values) for key, values in snapshot.tags.items()}
-        names = snapshot.by_id, snapshot.by_name, snapshot.topics_at(places[:1])
-        held = [snapshot.topics_of(one) for one in snapshot.summaries]
-        rows = [column.tolist() for column in columns]
-        return snapshot.summaries, rows, having, tags, names, held, [*snapshot.summaries]
-
-    all_made = [made(number, one) for number, one in enumerate(found)]
-    place %= len(found)
-    known = {one.topics: kinds for one, kinds in all_made}
-    before = Snapshot([one for one, _ in all_made], known)
-    was = told(before)
-    now, kinds = made(place, change, **({"name": "other"} if is_renamed else {}))
-    rest = [one for one, _ in all_made if one.id != now.id]
-    used = {one.topics for one in rest}
-    left = {digest: of for digest, of in known.items() if digest in used}
-    wanted = Snapshot([*rest, now], {**left, now.topics: kinds})
-    assert told(before.with_changes([], {}, [now.id])) == told(Snapshot(rest, left))
-    assert told(Snapshot(rest, left).with_changes([now], {now.topics: kinds})) == told(wanted)
-    after = before.with_changes([now], {now.topics: kinds})
-    assert told(after) == told(wanted)
-    assert (after.topics, after.schemas) == (wanted.topics, wanted.schemas)
-    assert told(before) == was
 
 
 # Messages of recordings that overlap here and there.

@@ -24,7 +24,7 @@ from hybridlog.frames.answer import text_column
 from hybridlog.frames.names import free_name
 from hybridlog.query.answers.lost import completeness_of
 from hybridlog.query.answers.remarks import remarks
-from hybridlog.query.counters import Counters
+from hybridlog.query.question import Counters
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import DurationLike, format_duration, parse_duration
 from hybridlog.schema.arrow_columns import DURATION, numbers

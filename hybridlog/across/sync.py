@@ -20,9 +20,9 @@ from hybridlog.message import messages_in
 from hybridlog.query.answers.current import message_at
 from hybridlog.query.answers.lost import completeness_of
 from hybridlog.query.answers.video import picture_of
-from hybridlog.query.counters import Counters
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.planner import Planner
+from hybridlog.query.question import Counters
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import DurationLike, parse_duration
 from hybridlog.wording import counted
@@ -184,8 +184,9 @@ class Synced(Sequence[tuple["Message", ...]]):
 
 def _in_range(session: Session, question: Question) -> set[int]:
     """Places of the recordings that a question's range touches."""
+    places = session.snapshot().by_id
     try:
-        return set(RangeResolver(session, question).resolve().places.tolist())
+        return {places[one.summary.id] for one in RangeResolver(session, question).resolve()}
     except TimeError:
         return set()
 
@@ -220,7 +221,7 @@ def _left_out(
     def count(chosen: Collection[int]) -> int:
         own = replace(question, recordings=tuple(summaries[place].id for place in chosen))
         try:
-            return Planner(session, own, Counters()).count() if chosen else 0
+            return Planner(session, own).count() if chosen else 0
         except TimeError:
             return 0  # the range does not touch them
 

@@ -16,9 +16,9 @@ from hybridlog.across.match import UNKNOWN, quaternion_paths
 from hybridlog.frames.names import free_name
 from hybridlog.query.answers.current import message_at
 from hybridlog.query.answers.lost import lost_times
-from hybridlog.query.counters import Counters
 from hybridlog.query.intervals import joined
 from hybridlog.query.planner import Planner
+from hybridlog.query.question import Counters
 from hybridlog.schema.arrow_types import common_type, converted
 from hybridlog.schema.column import STAMP
 from hybridlog.tf.in_frame import stream
@@ -78,7 +78,7 @@ class TopicReader:
         if clock != "log":
             # Refused where the topic does not have the clock.
             on_clock = replace(question, clock=clock, bounds=(None, None), during=None)
-            Planner(session, on_clock, Counters()).parts()
+            Planner(session, on_clock).split()
             question = replace(question, fields=self._with_time(question.fields, known))
         self.question = question
 
@@ -111,7 +111,7 @@ class TopicReader:
     def empty(self) -> pa.Table:
         """No rows, with the columns of all recordings."""
         question = replace(self.question, limit=0, bounds=None, during=None, predicate=None)
-        return next(stream(Planner(self._session, question, Counters())))
+        return next(stream(Planner(self._session, question)))
 
     def tables(self, recording: str, span: tuple[int, int] | None = None) -> Iterator[Block]:
         """The messages beside a recording, by log time.

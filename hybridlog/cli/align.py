@@ -155,7 +155,7 @@ def _queries(
     store: Store, topics: Sequence[str], choice: Choice, beside: Sequence[str]
 ) -> list[Query]:
     """A query for each topic; the base is one topic."""
-    from hybridlog.query.asked import narrowed
+    from hybridlog.query.query import narrowed
 
     others = Choice.of(beside) if beside else choice
     base, *found = (

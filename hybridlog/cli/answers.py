@@ -36,8 +36,8 @@ if TYPE_CHECKING:
     from hybridlog.message import Message
     from hybridlog.query.answers.completeness import Completeness
     from hybridlog.query.answers.follow import Following
-    from hybridlog.query.counters import Counters
     from hybridlog.query.query import Query
+    from hybridlog.query.question import Counters
     from hybridlog.store import Store
     from hybridlog_storage.messages import Buffer
 
@@ -321,11 +321,10 @@ def _answer_of(
         return _rows(query.to_tables())
     from hybridlog.frames.answer import schema_of
     from hybridlog.frames.lines import lines
-    from hybridlog.query.counters import Counters
     from hybridlog.query.planner import Planner
 
     if content == "table":
-        schema = schema_of(Planner(query.session, question, Counters()))
+        schema = schema_of(Planner(query.session, question))
         return Answer(tables=query.to_tables(), schema=schema)
     query.counters.reset()
     return Answer(lines=lines(Planner(query.session, question, query.counters)))

@@ -114,7 +114,7 @@ def _write_log(
 
 def _write_tables(query: Query, form: str, directory: Path, given: _Given) -> None:
     """Write one file a topic, except topics that do not fit or have no message in the range."""
-    from hybridlog.query.asked import narrowed
+    from hybridlog.query.query import narrowed
     from hybridlog.query.ranges import RangeResolver
     from hybridlog_storage.mongo.collection_names import collection_of
 

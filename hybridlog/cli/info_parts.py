@@ -32,7 +32,7 @@ _READABLE = {"ros1msg", "ros2msg", "ros2idl", "jsonschema"}
 
 def show_topics(store: Store, query: Query, topics: Sequence[str], *, as_json: bool) -> None:
     """Print the definition and the fields of topics, those of each type once."""
-    from hybridlog.query.asked import channels_of
+    from hybridlog.query.query import channels_of
 
     seen: dict[tuple[str, str | None], dict[str, Any]] = {}
     for recorded in channels_of(query):
@@ -259,7 +259,7 @@ _ATTACHMENTS = [
 def show_tables(store: Store, query: Query, *, as_json: bool) -> None:
     """Print the Parquet files with the rows of a topic, and SQL for DuckDB."""
     from hybridlog.maintenance.tables import missing
-    from hybridlog.query.asked import channels_of
+    from hybridlog.query.query import channels_of
     from hybridlog.record.marks import MARKS
     from hybridlog.snapshot import UNFINISHED
 

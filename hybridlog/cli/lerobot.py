@@ -97,7 +97,7 @@ def export_set(store: Store, query: Query, target: Path, given: Training, *, for
 
 def _proposed(query: Query) -> str:
     """A map for the topics that are there; those with few messages are in comments."""
-    from hybridlog.query.asked import narrowed
+    from hybridlog.query.query import narrowed
     from hybridlog.training.feature_map import nearly_empty, proposed
 
     empty = nearly_empty(narrowed(query, *proposed(query).topics))

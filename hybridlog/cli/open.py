@@ -189,7 +189,7 @@ def foxglove(source: str, url: str) -> str:
 
 def unplayed(query: Query) -> list[str]:
     """The topics with messages that are left out, since their payload is gone, in a sentence."""
-    from hybridlog.query.asked import channels_of
+    from hybridlog.query.query import channels_of
 
     topics = {each.channel.topic for each in channels_of(query) if each.is_reduced}
     found = listed(sorted(topics), _MAX_SHOWN)

@@ -14,8 +14,7 @@ from hybridlog.across.match import match
 from hybridlog.arrays.message_arrays import plain_type
 from hybridlog.query.answers.lost import completeness_of
 from hybridlog.query.answers.marks import marks_in
-from hybridlog.query.answers.statistics import Regularity
-from hybridlog.query.counters import Counters
+from hybridlog.query.answers.statistics import check
 from hybridlog.query.planner import match_times
 from hybridlog.query.query import Query
 from hybridlog.query.question import Question
@@ -73,7 +72,7 @@ class _Judge:
             yield self._lost("", self._contract.lost, lost)
         topics = [name for name in self._contract.topics if name in self._known]
         question = self._question(*topics)
-        checked = Regularity(self._session, question, Counters()).check() if topics else []
+        checked = check(self._session, question) if topics else []
         by_topic = {one.topic: one for one in checked}
         beyond = self._beyond()
         for name, rules in self._contract.topics.items():
@@ -91,7 +90,7 @@ class _Judge:
         end = self._summary.extent[1]
         ends = [
             one.end or 0
-            for one in marks_in(self._session, [self._summary.id], Counters())
+            for one in marks_in(self._session, [self._summary.id])
             if one.tags.get("cause") == CONTRACT
         ]
         return max([end, *ends]) - end
@@ -168,7 +167,7 @@ class _Judge:
             yield self._result(one.topic, "share", wanted, found, holds=holds)
 
     def _times(self, topic: str) -> NDArray[np.int64]:
-        found = match_times(self._session, self._question(topic), Counters())
+        found = match_times(self._session, self._question(topic))
         return np.concatenate([np.empty(0, np.int64), *(one.log_time for one in found)])
 
     def _at_most(self, topic: str, rule: str, limit: int | None, ns: float) -> Iterator[Result]:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from hybridlog.drawing.series import Series, numbers_of, series
-from hybridlog.query.asked import field_types, narrowed, spans_of
+from hybridlog.query.query import field_types, narrowed, spans_of
 from hybridlog.query.times import format_time
 from hybridlog.wording import listed
 from hybridlog_storage.errors import MissingDependencyError, TopicError, UsageError

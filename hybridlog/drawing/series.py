@@ -15,9 +15,9 @@ import pyarrow.compute as pc
 
 from hybridlog.frames.names import FIELD, is_summary
 from hybridlog.query.answers.infer_fields import infer_fields
-from hybridlog.query.asked import field_types, spans_of
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.periods import GAP_PERIODS, Steps
+from hybridlog.query.query import field_types, spans_of
 from hybridlog.query.times import TIME_LIMIT
 from hybridlog.schema.arrow_types import is_list, is_number, is_time, lengths_of
 from hybridlog.schema.kinds import NUMERIC, element_of, width_of

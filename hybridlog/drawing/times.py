@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from hybridlog.query.answers.interval_queries import IntervalQueries
-from hybridlog.query.counters import Counters
 from hybridlog.query.periods import GAP_PERIODS, usual_period
 from hybridlog.query.planner import match_times
 from hybridlog.query.question import Question
@@ -101,7 +100,7 @@ def lane_of(
         if is_read:
             question = Question((topic,), (recording.id,))
             with suppress(SegmentError):
-                found = match_times(session, question, Counters())
+                found = match_times(session, question)
                 return Lane(_sorted(one.log_time for one in found), exact=True)
         ids = [channel.id for channel in recording.channels if channel.topic == topic]
         parts = session.parts(recording, ids, (BEGIN, END))

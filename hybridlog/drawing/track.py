@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from hybridlog.drawing.series import ShownRows, Wanted, log_times, over_time
-from hybridlog.query.asked import field_types
+from hybridlog.query.query import field_types
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:

@@ -20,9 +20,8 @@ from hybridlog.follow.child import ENDED, RECOVERED, Followed, Task, Trigger
 from hybridlog.follow.follower import Follower, begin_again, make_rows_ahead
 from hybridlog.maintenance.tables import missing
 from hybridlog.query.answers.follow import Arrivals
-from hybridlog.query.counters import Counters
 from hybridlog.query.predicate.types import check
-from hybridlog.query.question import Question
+from hybridlog.query.question import Counters, Question
 from hybridlog.record.marks import MARKS
 from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.errors import (

@@ -60,22 +60,20 @@ def fingerprint(query: Query) -> str:
 
 def payload_bytes(query: Query) -> int:
     """Bytes of payload of a slice, about."""
-    from hybridlog.query.counters import Counters
     from hybridlog.query.planner import Planner
 
     question = query.question
     if not question.is_by_log_time:
         question = replace(question, bounds=None)
-    parts = Planner(query.session, question, Counters()).parts()
+    parts = Planner(query.session, question).split()
     return int(sum(p.share * sum(s.payload_bytes for s in p.stats) for p in parts))
 
 
 def profile_of(query: Query) -> str:
     """The MCAP profile of a slice: `ros1` or `ros2`, empty for others and for a mixture."""
-    from hybridlog.query.counters import Counters
     from hybridlog.query.planner import Planner
 
-    examples = Planner(query.session, query.question, Counters()).examples
+    examples = Planner(query.session, query.question).examples
     spoken = [channel for channel in examples if channel.stats.messages] or examples
     encodings = {channel.channel.message_encoding for channel in spoken}
     return {"ros1": "ros1", "cdr": "ros2"}.get(encodings.pop(), "") if len(encodings) == 1 else ""

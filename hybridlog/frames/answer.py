@@ -51,13 +51,11 @@ FIXED = {"ros1", "cdr"}
 def to_arrow(planner: Planner) -> pa.Table:
     """The whole answer as an Arrow table, in order."""
     question = planner.question
-    groups = _groups(planner, planner.parts(), in_order=not question.returns_all)
+    groups = _groups(planner, planner.parts())
     return _table([block for group in groups for block in group], question)
 
 
-def _groups(
-    planner: Planner, parts: Sequence[Part] | None, *, in_order: bool
-) -> Iterator[Iterable[Block]]:
+def _groups(planner: Planner, parts: Sequence[Part] | None) -> Iterator[Iterable[Block]]:
     """The blocks of an answer, those that overlap in time together; the first have no rows.
 
     Tables may answer the parts; without any, messages are read.
@@ -69,7 +67,7 @@ def _groups(
         for part, values in zip(parts, found, strict=True):
             yield from ([block] for block in _table_blocks(planner, part, values))
         return
-    for run in planner.runs() if in_order else planner.unordered():
+    for run in planner.runs():
         yield decoder.blocks(run)
 
 
@@ -83,7 +81,7 @@ def stream(planner: Planner, *, at_once: bool = False) -> Iterator[pa.Table]:
     part = None if question.reverse else planner.only_part()
     blocks: list[Block] = []
     rows, size, given = 0, 0, False
-    for group in _groups(planner, None if part is None else [part], in_order=True):
+    for group in _groups(planner, None if part is None else [part]):
         for block in group:
             blocks.append(block)
             rows, size = rows + len(block.log_time), size + block.size

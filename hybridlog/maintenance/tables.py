@@ -36,11 +36,6 @@ def missing(
     }
 
 
-def can_be_made(entry: RecordingEntry, topic: str, tables: Tables) -> bool:
-    """True if the missing table of a topic can be created again."""
-    return tables.can_have(entry, topic) or bool(tables.lacking(entry, [topic]))
-
-
 def channels_of(entry: RecordingEntry, topics: Collection[str]) -> set[int]:
     """Ids of the channels of some topics."""
     return {channel.id for channel in entry.channels if channel.topic in topics}

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from hybridlog.query.counters import Counters
 from hybridlog.query.planner import Planner
 from hybridlog.query.question import Question
 from hybridlog.query.times import (
@@ -116,41 +115,34 @@ class _Choosing:
         self._snapshot = self._session.look(ids)
         self.left = sorted(self._snapshot.by_id[one] for one in ids)
 
-    def _keep(self, places: Iterable[int], condition: str) -> bool:
-        """Keep those at some positions; true if any is left."""
+    def _keep(self, places: Iterable[int], condition: str, hint: str) -> None:
+        """Keep those at some positions; `hint` is what helps if none is left."""
         self.conditions.append(condition)
         remaining = {*places}
         self.left = [place for place in self.left if place in remaining]
-        return bool(self.left)
+        if not self.left:
+            raise _NothingLeftError(hint)
 
     def by_name(self, names: Sequence[str]) -> None:
         condition = f"named {' or '.join(map(repr, names))}"
-        if not self._keep(placed(self._session, names), condition):
-            there = listed(summary.name for summary in self._snapshot.summaries)
-            raise _NothingLeftError(f"There are: {there}.")
+        there = listed(summary.name for summary in self._snapshot.summaries)
+        self._keep(placed(self._session, names), condition, f"There are: {there}.")
 
     def by_tag(self, key: str, value: str | None) -> None:
         tags = self._snapshot.tags
         values = tags.get(key, {})
-        if value is None:
-            places = [place for found in values.values() for place in found]
-        else:
-            places = values.get(value, [])
-        shown = key if value is None else f"{key}={value}"
-        if self._keep(places, f"with the tag {shown}"):
-            return
+        chosen = values if value is None else [value]
+        places = [place for one in chosen for place in values.get(one, ())]
+        hint = f"The tags of the store are: {listed(sorted(tags))}."
         if not tags:
             hint = "No recording has a tag; `hybridlog tag RECORDING KEY=VALUE` sets one."
         elif values and not places:
             hint = f"The store has {listed(f'{key}={one}' for one in sorted(values))}."
-        else:
-            hint = f"The tags of the store are: {listed(sorted(tags))}."
-        raise _NothingLeftError(hint)
+        self._keep(places, f"with the tag {key if value is None else f'{key}={value}'}", hint)
 
     def by_topic(self, pattern: str) -> None:
         topics, hint = self._topics(pattern)
-        if not self._keep(self._snapshot.having(topics).tolist(), f"with the topic {pattern!r}"):
-            raise _NothingLeftError(hint)
+        self._keep(self._snapshot.having(topics).tolist(), f"with the topic {pattern!r}", hint)
 
     def _topics(self, pattern: str) -> tuple[list[str], str]:
         """The topics of the recordings that fit a pattern, and what to say if none does."""
@@ -169,14 +161,11 @@ class _Choosing:
     def by_type(self, name: str) -> None:
         names = self._session.type_names()
         schemas = {digest for digest, known in names.items() if _is_type(known, name)}
-        found = self._snapshot.with_schemas(schemas)
-        if self._keep(found.tolist(), f"with messages of the type {name!r}"):
-            return
+        found = self._snapshot.with_schemas(schemas).tolist()
         known = sorted(set(names.values()))
         near = difflib.get_close_matches(name, known, cutoff=0.6)
-        raise _NothingLeftError(
-            f"Did you mean {listed(near)}?" if near else f"The store has: {listed(known)}."
-        )
+        hint = f"Did you mean {listed(near)}?" if near else f"The store has: {listed(known)}."
+        self._keep(found, f"with messages of the type {name!r}", hint)
 
     def by_time(self, begin: TimeLike | None, end: TimeLike | None) -> None:
         for moment in (begin, end):
@@ -191,20 +180,16 @@ class _Choosing:
             start=0,
             end=TIME_LIMIT - 1,
         )
-        before = self.summaries
+        known = [one.span for one in self.summaries if one.span is not None]
+        hint = "`hybridlog ls` shows the times of all."
+        if known:
+            first = format_time(min(span[0] for span in known))
+            hint = f"The others lie between {first} and {format_time(max(s[1] for s in known))}."
         places = self._snapshot.during(self._places, low, high, time.time_ns())
         sides = [] if _is_side(begin) else [f"from {format_time(low)} on"]
         if not _is_side(end):
             sides.append(f"before {format_time(high)}")
-        condition = " ".join(["with messages", *sides])
-        if not self._keep(places.tolist(), condition):
-            known = [one.span for one in before if one.span is not None]
-            hint = "`hybridlog ls` shows the times of all."
-            if known:
-                first = format_time(min(span[0] for span in known))
-                last = format_time(max(span[1] for span in known))
-                hint = f"The others lie between {first} and {last}."
-            raise _NothingLeftError(hint)
+        self._keep(places.tolist(), " ".join(["with messages", *sides]), hint)
 
     def by_age(self, age: DurationLike) -> None:
         latest = time.time_ns() - parse_duration(age)
@@ -213,8 +198,8 @@ class _Choosing:
             for place, one in zip(self.left, self.summaries, strict=True)
             if one.status != "open" and one.extent[0] < one.extent[1] <= latest + 1
         ]
-        if not self._keep(old, f"whose last message is from {format_time(latest)} or before"):
-            raise _NothingLeftError("`hybridlog ls` shows the times of all.")
+        condition = f"whose last message is from {format_time(latest)} or before"
+        self._keep(old, condition, "`hybridlog ls` shows the times of all.")
 
     def by_content(self, condition: str) -> None:
         pattern, predicate = split_topic(condition)
@@ -231,10 +216,10 @@ class _Choosing:
             if predicate:
                 checked = self._session.predicate(predicate, tuple(topics), ids)
                 question = Question(tuple(topics), ids, predicate=checked)
-            planner = Planner(self._session, question, Counters())
+            planner = Planner(self._session, question)
             found = {self._snapshot.by_id[one] for one in planner.recordings_with_any()}
-        if not self._keep(found, f"with a message for which {condition!r} holds"):
-            raise _NothingLeftError(hint or f"{len(there)} with {listed(topics)} were asked.")
+        hint = hint or f"{len(there)} with {listed(topics)} were asked."
+        self._keep(found, f"with a message for which {condition!r} holds", hint)
 
 
 def _is_side(moment: TimeLike | None) -> bool:

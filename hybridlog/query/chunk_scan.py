@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hybridlog.query.counters import Counters
-from hybridlog_storage.disk.copying import interleave, joined
+from hybridlog.query.question import Counters
+from hybridlog_storage.disk.copying import interleave
 from hybridlog_storage.errors import StoreError
 from hybridlog_storage.ordering import distinct, order_of
 from hybridlog_storage.stopping import check_wanted
@@ -39,9 +39,8 @@ if TYPE_CHECKING:
 
 _LOOK_AHEAD = 4
 _MIN_THREADED_BYTES = 4 << 20  # starting threads takes as long as reading a megabyte
-_SMALL_CHUNK_BYTES = 128 << 10  # copying such a chunk is faster than decoding it by itself
 _FETCHED_BYTES = 16 << 20  # asked for at once, where each request takes long
-_MERGED_BYTES = 1 << 20  # small chunks are decoded together up to this size
+_MERGED_BYTES = 1 << 20  # messages of small chunks are together up to this size
 
 ChunkKey = tuple[str, int, int]
 """Recording id, segment number, chunk number in the segment."""
@@ -170,39 +169,24 @@ class ChunkScan:
         started = time.monotonic()
         plan = self._plan
         waiting: list[MessageRun] = []
+        ready: list[MessageRun] = []
+        size = 0
         try:
             for _, run, following in self.loaded():
                 if len(run.batch):
                     waiting.append(run)
-                ready, waiting = self._split(waiting, following)
-                if ready:
-                    whole = _in_order(ready, plan)
+                now, waiting = self._split(waiting, following)
+                ready += now
+                size += sum(len(one.batch.buffer) for one in now)
+                # Decoding each small chunk by itself costs more than copying it.
+                if ready and (size >= _MERGED_BYTES or not self._reads_ahead):
                     plan.counters.elapsed_s = time.monotonic() - started
-                    yield whole
+                    yield _in_order(ready, plan)
+                    ready, size = [], 0
+            if ready:
+                yield _in_order(ready, plan)
         finally:
             plan.counters.elapsed_s = time.monotonic() - started
-
-    def unordered(self) -> Iterator[MessageRun]:
-        """All messages, unordered, one large chunk or many small ones at a time."""
-        plan = self._plan
-        started = time.monotonic()
-        small: list[MessageRun] = []
-        size = 0
-        for _, run, _ in self.loaded():
-            if not len(run.batch):
-                continue
-            length = len(run.batch.buffer)
-            if small and (length > _SMALL_CHUNK_BYTES or size + length > _MERGED_BYTES):
-                yield _merged(small)
-                small, size = [], 0
-            if length > _SMALL_CHUNK_BYTES:
-                yield run
-                continue
-            small.append(run)
-            size += length
-        if small:
-            yield _merged(small)
-        plan.counters.elapsed_s = time.monotonic() - started
 
     def loaded(self) -> Iterator[tuple[ChunkTask, MessageRun, ChunkTask | None]]:
         """Each chunk, its wanted messages, and the chunk after it."""
@@ -371,12 +355,6 @@ def _up_to(tasks: Iterator[ChunkTask], room: int) -> Iterator[ChunkTask]:
 
 _Loaded = tuple[MessageRun, "StoredChunk", int, int]
 """Messages and their chunk, messages unreadable for the predicate, those of them that expired."""
-
-
-def _merged(runs: list[MessageRun]) -> MessageRun:
-    """Several runs as one: decoding each separately costs more than copying it."""
-    seq = np.concatenate([run.seq for run in runs])
-    return MessageRun(joined([run.batch for run in runs]), seq, runs[0].channels)
 
 
 def _in_order(runs: list[MessageRun], plan: ScanPlan) -> MessageRun:

@@ -26,8 +26,7 @@ from hybridlog_storage.times import END
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.query.counters import Counters
-    from hybridlog.query.question import Part
+    from hybridlog.query.question import Counters, Part
     from hybridlog.session import Session
     from hybridlog_storage.mongo.database import Database
 

@@ -27,10 +27,8 @@ Windows: TypeAlias = Callable[[Near], Intervals]
 
 def everything(session: Session, question: Question) -> Intervals:
     """All log time of the recordings of a question."""
-    snapshot = session.look(question.recordings)
-    places = session.chosen(question).tolist()
     whole = np.array([[0, TIME_LIMIT - 1, 0]], np.int64)
-    return Intervals.of((snapshot.summaries[place].id, whole) for place in places)
+    return Intervals.of((one.id, whole) for one in session.summaries_of(question))
 
 
 def question_about(

@@ -55,10 +55,9 @@ def _marks(query: Query) -> Iterator[tuple[str, int, int, str]]:
     A mark of a moment lasts until the next one of a moment, or to the end of the recording.
     """
     from hybridlog.query.answers.marks import marks_in
-    from hybridlog.query.counters import Counters
 
     ends = {one.id: one.extent[1] for one in query.summaries()}
-    found = sorted(marks_in(query.session, query.recordings, Counters()))
+    found = sorted(marks_in(query.session, query.recordings))
     for place, one in enumerate(found):
         moments = (
             later.begin

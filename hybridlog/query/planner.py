@@ -13,19 +13,20 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 import numpy as np
 
 from hybridlog.query.chunk_scan import ChunkScan, MessageRun
-from hybridlog.query.question import Part
+from hybridlog.query.question import Counters, Part
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.rows import TABLE_ERRORS, Rows
 from hybridlog.schema.column import STAMP
 from hybridlog.schema.states import GONE
+from hybridlog.snapshot import UNFINISHED
 from hybridlog_storage.errors import ChangedError, TopicError, UsageError
 from hybridlog_storage.lazy import lazy
+from hybridlog_storage.times import END
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.query.chunk_scan import ScanPlan
-    from hybridlog.query.counters import Counters
     from hybridlog.query.index_reader import IndexReader
     from hybridlog.query.question import Question, RecordedChannel, Span
     from hybridlog.query.rows import MatchColumns, Values
@@ -43,15 +44,16 @@ _Rows = TypeVar("_Rows", "MatchColumns", "Values")
 
 
 class Planner:
-    """Answers one question."""
+    """Answers one question; `counters` count what that costs."""
 
-    def __init__(self, session: Session, question: Question, counters: Counters) -> None:
+    def __init__(
+        self, session: Session, question: Question, counters: Counters | None = None
+    ) -> None:
         self.session = session
         self.question = question
-        self.counters = counters
-        self._counted: set[Part] = set()  # parts whose messages without fields are counted
+        self.counters = Counters() if counters is None else counters
         self._ranges = RangeResolver(session, question)
-        self._rows = Rows(session, counters)
+        self._rows = Rows(session, self.counters)
 
     @lazy
     def _index(self) -> IndexReader:
@@ -61,9 +63,15 @@ class Planner:
         return IndexReader(self.session, self.counters)
 
     def parts(self) -> list[Part]:
-        """The question, split by recording and topic; recordings oldest first."""
-        found = [part for one in self._ranges.resolve() for part in self.parts_in(*one)]
-        return self._rows.fitting(found)
+        """The question, split by recording and topic, where it may have an answer.
+
+        Recordings are oldest first. MongoDB is asked once for all.
+        """
+        return self._rows.fitting(self.decided(self.split()))
+
+    def split(self) -> list[Part]:
+        """The same, of which nothing was asked yet."""
+        return [part for one in self._ranges.resolve() for part in self.parts_in(*one)]
 
     def only_part(self) -> Part | None:
         """The only part of the question; None if it has several, or none."""
@@ -81,22 +89,14 @@ class Planner:
         for channel in self.session.channels_of(recording, wanted):
             self._check_clock(channel)
             by_topic[channel.channel.topic].append(channel)
-        predicate = self.question.predicate
-        asks_fields = predicate is not None and predicate.asks_fields
+        clock, predicate = self.question.clock, self.question.predicate
         for topic, channels in by_topic.items():
-            if not any(c.stats.messages for c in channels):
-                continue  # nothing was sent on the topic
-            # Without a definition, for example, messages are not decoded.
-            asked = tuple(c for c in channels if not asks_fields or c.codec.indexed)
-            rest = tuple(c for c in channels if asks_fields and not c.codec.indexed)
-            clock = self.question.clock
-            yield Part(recording, topic, asked, bounds, clock, windows, predicate, rest)
+            if any(c.stats.messages for c in channels):  # else nothing was sent on the topic
+                yield Part(recording, topic, tuple(channels), bounds, clock, windows, predicate)
 
     def channels(self) -> list[RecordedChannel]:
         """Every channel of the question."""
-        places = self.session.chosen(self.question).tolist()
-        summaries = self.session.snapshot().summaries
-        return self._channels_of(summaries[place] for place in places)
+        return self._channels_of(self.session.summaries_of(self.question))
 
     @lazy
     def examples(self) -> list[RecordedChannel]:
@@ -134,9 +134,7 @@ class Planner:
 
     def recordings_with_any(self) -> set[str]:
         """Ids of the recordings that have a message in the answer."""
-        return {
-            part.recording.id for part in self._decided(self.parts()) if self._rows.count([part])
-        }
+        return {part.recording.id for part in self.parts() if self._rows.count([part])}
 
     def decided(self, parts: Sequence[Part]) -> list[Part]:
         """The parts with predicates for columns and messages: MongoDB is asked once for all."""
@@ -148,13 +146,6 @@ class Planner:
         self.counters.not_indexed += self._lacking(found.documents)
         decidable = dict(zip(wanted, found.parts, strict=True))
         return [decidable.get(part, part) for part in parts]
-
-    def _decided(self, parts: Sequence[Part]) -> list[Part]:
-        """The same; counts the messages without fields once."""
-        self._count_unreadable(parts)
-        found = self.decided(parts)
-        self._counted.update(found)
-        return found
 
     def outcomes(self, part: Part) -> Iterator[MatchColumns]:
         """For each message of a part, whether it matches, in order."""
@@ -179,7 +170,6 @@ class Planner:
         self, parts: Sequence[Part], fields: Collection[str] | None
     ) -> list[Iterator[Values]] | None:
         """The same of each part, if tables have the fields of all their messages."""
-        parts = self._decided(parts)
         for part in parts:
             found = self._rows.tabled(part, fields)
             if found is None or found.rest is not None:
@@ -204,13 +194,6 @@ class Planner:
         for group in self.groups():
             yield from ChunkScan(self.plan(group), self.session, ahead=ahead).runs()
 
-    def unordered(self) -> Iterator[MessageRun]:
-        """The messages of an answer without `limit` and `every`, unordered."""
-        for group in self.groups():
-            for run in ChunkScan(self.plan(group), self.session).unordered():
-                self.counters.add_messages(run.batch)
-                yield run
-
     def groups(self) -> Iterator[list[Part]]:
         """The parts in groups, those that overlap in time together, in the answer's order.
 
@@ -218,7 +201,10 @@ class Planner:
         """
         found = self._ranges.resolve()
         # In the order of the answer; going back, a recording begins with its last message.
-        first, last = found.first, found.last
+        spans = [
+            (one.extent[0], END if one.status in UNFINISHED else one.extent[1]) for one, *_ in found
+        ]
+        first, last = np.array(spans, np.int64).reshape(-1, 2).T
         if self.question.reverse:
             first, last = -last, -first
         order = np.argsort(first, kind="stable")
@@ -235,9 +221,11 @@ class Planner:
     def _again(self, ask: Callable[[Sequence[Part]], _T], parts: Sequence[Part]) -> _T:
         """Ask about parts; again about those of recordings whose files were replaced."""
         for _ in range(_RENEWALS):
+            unreadable = self.counters.unreadable
             try:
                 return ask(parts)
             except ChangedError:
+                self.counters.unreadable = unreadable
                 parts = self._renewed(parts)
         return ask(parts)
 
@@ -259,57 +247,43 @@ class Planner:
         return self._again(self._plan, parts)
 
     def _plan(self, parts: Sequence[Part]) -> ScanPlan:
-        parts = self._rows.fitting(self._decided(parts))
+        parts = self._rows.fitting(self.decided(parts))
         return self._rows.plan(parts, reverse=self.question.reverse)
-
-    def _count_unreadable(self, parts: Sequence[Part]) -> None:
-        """Count, once, the messages that the predicate cannot test for want of fields.
-
-        Engines count the messages that they find to be unreadable.
-        """
-        for part in parts:
-            if part in self._counted or part.predicate is None:
-                continue
-            self._counted.add(part)
-            if part.undecodable:
-                unseen = replace(part, channels=part.undecodable, undecodable=(), predicate=None)
-                self.counters.unreadable += self._rows.count([unseen])
 
     def count_expired(self) -> Counter[State]:
         """Number of messages, in the range, whose payloads are gone, by state."""
         found: Counter[State] = Counter()
-        for part in self.parts():
+        for part in self.split():
             for state in GONE:
-                channels = (*part.channels, *part.undecodable)
-                gone = tuple(one for one in channels if one.state is state)
+                gone = tuple(one for one in part.channels if one.state is state)
                 if gone:
-                    own = replace(part, channels=gone, undecodable=(), predicate=None)
+                    own = replace(part, channels=gone, predicate=None)
                     found[state] += self._rows.count([own])
         return found
 
     def not_indexed(self) -> tuple[tuple[str, int], ...]:
         """Number of messages, in the range, that the index lacks, by name of their recording."""
-        parts = self.parts()
+        parts = self.split()
         return self._lacking(self._index.documents(parts)) if parts else ()
 
     def _lacking(self, documents: Mapping[Part, int]) -> tuple[tuple[str, int], ...]:
         """Messages that the index lacks, from the documents that it has of some parts."""
         found: Counter[str] = Counter()
         for part, number in documents.items():
-            channels = (*part.channels, *part.undecodable)
-            whole = replace(part, channels=channels, undecodable=(), predicate=None)
+            whole = replace(part, predicate=None)
             found[part.recording.name] += max(self._rows.count([whole]) - number, 0)
         return tuple((name, number) for name, number in found.items() if number)
 
     def _count(self, parts: Sequence[Part]) -> int:
-        return self._rows.count(self._decided(parts))
+        return self._rows.count(self.decided(parts))
 
     def _lasting(self, part: Part, ask: Callable[[Part], Iterator[_Rows]]) -> Iterator[_Rows]:
         """Rows of a part, to the end if files are replaced or a table is damaged meanwhile."""
-        (part,) = self._decided([part])
+        (part,) = self.decided([part])
         last: tuple[int, int] | None = None
-        renewals = 0
+        renewals, unreadable = 0, self.counters.unreadable
         while True:
+            self.counters.unreadable = unreadable
             try:
                 for item in ask(part):
                     rest = item if last is None else _after(item, last)
@@ -322,7 +296,7 @@ class Planner:
                 renewals += 1
                 if renewals > _RENEWALS:
                     raise
-                (part,) = self._decided(self._renewed([part]))
+                (part,) = self.decided(self._renewed([part]))
             except TABLE_ERRORS:
                 if not self._rows.leave_table(part):
                     raise
@@ -348,12 +322,14 @@ class MatchTimes(NamedTuple):
     seq: NDArray[np.int64]
 
 
-def match_times(session: Session, question: Question, counters: Counters) -> Iterator[MatchTimes]:
+def match_times(
+    session: Session, question: Question, counters: Counters | None = None
+) -> Iterator[MatchTimes]:
     """The times of an answer, some at a time; recordings and topics one after the other."""
     if not question.returns_all:
         raise UsageError("Times are those of all messages: leave out limit and every.")
     planner = Planner(session, question, counters)
-    for part in planner.decided(planner.parts()):
+    for part in planner.parts():
         for found in planner.outcomes(part):
             holds = found.holds
             yield MatchTimes(part.recording, part.topic, found.log_time[holds], found.seq[holds])
@@ -372,19 +348,17 @@ def _after(item: _Rows, key: tuple[int, int]) -> _Rows | None:
 
 def _decimated(runs: Iterator[MessageRun], question: Question) -> Iterator[MessageRun]:
     """Every n-th message of each topic, up to the limit."""
-    number: dict[str, int] = {}
-    seen: dict[int, int] = defaultdict(int)
+    seen: Counter[str] = Counter()
     given = 0
     for run in runs:
         keep = np.ones(len(run.batch), np.bool_)
-        if question.every > 1:
-            names = (channel.channel.topic for channel in run.channels)
-            of = [number.setdefault(name, len(number)) for name in names]
-            topics = np.array(of, np.intp)[run.batch.channel]
-            for topic in np.unique(topics).tolist():
-                rows = np.flatnonzero(topics == topic)
-                keep[rows] = (seen[topic] + np.arange(len(rows))) % question.every == 0
-                seen[topic] += len(rows)
+        channels: dict[str, list[int]] = defaultdict(list)
+        for number in np.unique(run.batch.channel).tolist() if question.every > 1 else ():
+            channels[run.channels[number].channel.topic].append(number)
+        for topic, own in channels.items():
+            rows = np.flatnonzero(np.isin(run.batch.channel, own))
+            keep[rows] = (seen[topic] + np.arange(len(rows))) % question.every == 0
+            seen[topic] += len(rows)
         rows = np.flatnonzero(keep)
         if question.limit is not None:
             rows = rows[: question.limit - given]

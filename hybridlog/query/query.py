@@ -21,9 +21,8 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from hybridlog.query.choice import Choice
-from hybridlog.query.counters import Counters
 from hybridlog.query.planner import Planner
-from hybridlog.query.question import Clock, Question
+from hybridlog.query.question import Clock, Counters, Question
 from hybridlog.query.times import parse_duration, parse_time
 from hybridlog.wording import listed
 from hybridlog_storage.errors import (
@@ -47,8 +46,8 @@ if TYPE_CHECKING:
     from hybridlog.query.answers.statistics import FieldStatistics, TopicCheck
     from hybridlog.query.choice import During, Tags, Texts
     from hybridlog.query.intervals import Intervals
-    from hybridlog.query.predicate.tree import Near
-    from hybridlog.query.question import RecordedChannel
+    from hybridlog.query.predicate.tree import Near, Predicate
+    from hybridlog.query.question import RecordedChannel, Span
     from hybridlog.query.times import DurationLike, TimeLike
     from hybridlog.session import Asked, Session
     from hybridlog_storage.messages import Batch
@@ -122,37 +121,28 @@ class Query:
 
     def _described(self) -> dict[str, str]:
         """The parts of the question in words."""
-        question, session = self.question, self.session
-        found = {"topics": listed(self.topics, 3)}
+        question = self.question
+        begin, end = question.bounds or (None, None)
         try:
-            places = session.chosen(question).tolist()
+            known = self.summaries()
+            one = f"recording {known[0].name}" if len(known) == 1 else f"{len(known)} recordings"
         except HybridlogError as error:
-            found["recordings"] = str(error)
-        else:
-            summaries = session.snapshot().summaries
-            names = listed((summaries[place].name for place in places[:4]), 3)
-            several = f"{len(places)} recordings"
-            found["recordings"] = several if len(places) != 1 else f"recording {names}"
-        if question.bounds is not None:
-            begin, end = question.bounds
-            clock = "" if question.clock == "log" else f" by {question.clock} time"
-            found["time"] = f"between {begin} and {end}{clock}"
-        if question.during is not None:
-            found["during"] = f"during {len(question.during)} intervals"
-        if question.predicate is not None:
-            text = question.predicate.text
-            found["predicate"] = f"where {text if len(text) <= 200 else text[:200] + '…'}"
-        if question.fields is not None:
-            found["fields"] = f"fields {listed(question.fields, 5)}"
-        if question.frame is not None:
-            found["frame"] = f"in frame {question.frame}"
-        if question.every > 1:
-            found["every"] = f"every {question.every}th"
-        if question.limit is not None:
-            found["limit"] = f"at most {question.limit}"
-        if question.reverse:
-            found["order"] = "latest first"
-        return found
+            one = str(error)
+        predicate = "" if question.predicate is None else question.predicate.text
+        clock = "" if question.clock == "log" else f" by {question.clock} time"
+        found = {
+            "topics": listed(self.topics, 3),
+            "recordings": one,
+            "time": question.bounds is not None and f"between {begin} and {end}{clock}",
+            "during": question.during is not None and f"during {len(question.during)} intervals",
+            "predicate": predicate and f"where {predicate[:200]}{'…' * (len(predicate) > 200)}",
+            "fields": question.fields is not None and f"fields {listed(question.fields, 5)}",
+            "frame": question.frame and f"in frame {question.frame}",
+            "every": question.every > 1 and f"every {question.every}th",
+            "limit": question.limit is not None and f"at most {question.limit}",
+            "order": question.reverse and "latest first",
+        }
+        return {name: words for name, words in found.items() if words}
 
     # Steps.
 
@@ -203,26 +193,22 @@ class Query:
             TopicError: no such topic exists.
             TimeError: `within` is no duration.
         """
-        if isinstance(predicate, str):
-            if ":" in predicate:
-                from hybridlog.query.predicate.parser import names_topics
+        if isinstance(predicate, str) and ":" in predicate:
+            from hybridlog.query.predicate.parser import names_topics
 
-                if names_topics(predicate):
-                    return self._near(predicate, within)
-            checked = self.session.predicate(predicate, self.topics, self.question.recordings)
-        else:
-            from hybridlog.query.predicate.mongo_filter import mongo_filter
-
-            types = self.session.field_types(self.topics, self.question.recordings)
-            checked = mongo_filter(predicate, types)
+            if names_topics(predicate):
+                return self._near(predicate, within)
+        checked = self.session.predicate(predicate, self.topics, self.question.recordings)
         if within is not None:
             raise UsageError(
                 "`within` is for conditions on other topics: where('/odom: twist.twist.linear.x > "
                 "0.5', within='0.1s'). A second predicate is a second where()."
             )
-        if self.question.predicate is not None:
-            checked = self.question.predicate & checked
-        return self._with(predicate=checked or None)
+        return self._satisfying(checked)
+
+    def _satisfying(self, predicate: Predicate) -> Query:
+        known = self.question.predicate
+        return self._with(predicate=(predicate if known is None else known & predicate) or None)
 
     def limit(self, count: int) -> Query:
         """At most this many messages.
@@ -261,7 +247,7 @@ class Query:
 
         if not all(isinstance(path, str) for path in paths):
             raise UsageError('Fields are names: fields("header.stamp", "ranges.min").')
-        known = self.session.field_types(self.topics, self.question.recordings)
+        known = field_types(self)
         for path in paths:
             if known and not (_is_field(path, known) or is_own(path)):
                 raise TopicError(_no_field(path, known, self.topics))
@@ -287,10 +273,7 @@ class Query:
         Raises:
             TopicError: no recording of the query has such a tag.
         """
-        session = self.session
-        places = session.chosen(self.question).tolist()
-        snapshot = session.snapshot()
-        known = {key for place in places for key in snapshot.summaries[place].tags}
+        known = {key for summary in self.summaries() for key in summary.tags}
         for key in keys:
             if key not in known:
                 raise TopicError(
@@ -328,7 +311,11 @@ class Query:
         chosen = choose(self.session, choice)
         if chosen.problem:
             raise TopicError(chosen.problem)
-        return self._on(self.topics, [summary.id for summary in chosen.summaries])
+        session, ids = self.session, [summary.id for summary in chosen.summaries]
+        topics, recordings = session.having(self.topics, ids)
+        there = {*session.topics_of(ids)}
+        others = tuple(topic for topic in self.question.namesakes if topic in there)
+        return self._with(topics=topics, recordings=recordings, namesakes=others)
 
     def during(self, intervals: Intervals) -> Query:
         """Only messages whose log time is in one of some intervals of their recording.
@@ -367,9 +354,7 @@ class Query:
 
     def summaries(self) -> list[RecordingSummary]:
         """The recordings in short, oldest first; some may have no message in the answer."""
-        session = self.session
-        places = session.chosen(self.question).tolist()
-        return [session.snapshot().summaries[place] for place in places]
+        return self.session.summaries_of(self.question)
 
     # Messages.
 
@@ -577,28 +562,6 @@ class Query:
 
         return resampled(self.session, self.question, step, how, tolerance)
 
-    def rate(self, window: DurationLike | None = None) -> pa.Table:
-        """Number and rate of the messages of each topic.
-
-        Args:
-            window: Length of the windows, a duration; the first begins with the recording or
-                the range, the last may be shorter. None for all messages in one.
-
-        Returns:
-            `begin`, `end`, `recording` (name), `topic`, `messages` and `rate`, messages a
-            second. Without windows: from the first message to the last, and the mean rate
-            from one to the next, null if there is none.
-
-        Raises:
-            UsageError: `limit`, `every`, `reverse`, another clock than the log's, or too many
-                windows.
-            TimeError: no duration, or a range outside of all recordings.
-        """
-        from hybridlog.query.answers.statistics import Regularity
-
-        with self.counters.timed():
-            return Regularity(self.session, self.question, self.counters).rate(window)
-
     def check(self) -> list[TopicCheck]:
         """Check how regularly the topics came: rate, jitter, gap, late start, early stop, losses.
 
@@ -610,10 +573,10 @@ class Query:
             UsageError: `limit`, `every`, `reverse`, or another clock than the log's.
             TimeError: a range outside of all recordings.
         """
-        from hybridlog.query.answers.statistics import Regularity
+        from hybridlog.query.answers.statistics import check
 
         with self.counters.timed():
-            return Regularity(self.session, self.question, self.counters).check()
+            return check(self.session, self.question, self.counters)
 
     def stats(self, *fields: str) -> list[FieldStatistics]:
         """Statistics of the numeric fields: count, NaN, infinite, least, greatest, mean, deviation.
@@ -728,10 +691,10 @@ class Query:
                 log's, or no number of periods.
             TimeError: no duration, or a range outside of all recordings.
         """
-        from hybridlog.query.answers.statistics import Regularity
+        from hybridlog.query.answers.statistics import gaps
 
         with self.counters.timed():
-            return Regularity(self.session, self.question, self.counters).gaps(longer_than, periods)
+            return gaps(self.session, self.question, self.counters, longer_than, periods)
 
     # What an answer lacks.
 
@@ -789,10 +752,8 @@ class Query:
         query = self
         if own:
             checked = Predicate(And(tuple(own)), text)
-            check(checked, self.session.field_types(self.topics, self.question.recordings))
-            if self.question.predicate is not None:
-                checked = self.question.predicate & checked
-            query = self._with(predicate=checked)
+            check(checked, field_types(self))
+            query = self._satisfying(checked)
         query = now = of_now(query)
         conditions: list[Query] = []
 
@@ -817,16 +778,6 @@ class Query:
     def _with(self, **changes: Any) -> Query:
         return Query(self.source, replace(self.question, **changes), self.conditions)
 
-    def _on(self, topics: Sequence[str], recordings: Sequence[str] | None) -> Query:
-        """The same conditions on other topics and recordings."""
-        session = self.session
-        topics, chosen = session.having(topics, recordings)
-        others = self.question.namesakes
-        if others and recordings is not None:
-            there = {*session.topics_of(recordings)}
-            others = tuple(topic for topic in others if topic in there)
-        return self._with(topics=topics, recordings=chosen, namesakes=others)
-
     def _as_they_came(self, what: str) -> None:
         """Refuse `in_frame` for answers that it would not change."""
         if self.question.frame is not None:
@@ -842,6 +793,43 @@ def of_now(query: Query) -> Query:
     """The same question with the same counters, at the moment that begins now."""
     found = Query(query.session, query.question, query.conditions)
     found.counters = query.counters
+    return found
+
+
+def narrowed(query: Query, *topics: str) -> Query:
+    """The same question about one or some of its topics, by their full names.
+
+    If the question is about several recordings, tables of each topic name them.
+    """
+    session, question = query.session, query.question
+    several = question.names_recording or len(session.chosen(question)) > 1
+    names, chosen = session.having(topics, question.recordings)
+    question = replace(question, topics=names, recordings=chosen, names_recording=several)
+    return Query(query.source, question, query.conditions)
+
+
+def channels_of(query: Query) -> list[RecordedChannel]:
+    """Every channel of a question."""
+    return Planner(query.session, query.question, query.counters).channels()
+
+
+def field_types(query: Query) -> dict[str, str] | None:
+    """Paths that can be queried and their types; None when a topic has no fixed fields."""
+    return query.session.field_types(query.topics, query.question.recordings)
+
+
+def spans_of(query: Query) -> dict[str, Span]:
+    """Log time `[begin, end)` of the messages of each recording, ns; by id, oldest first.
+
+    It is known without reading messages: those at its ends may not satisfy the predicate,
+    or a range of another clock.
+    """
+    found: dict[str, Span] = {}
+    for part in Planner(query.session, query.question).split():
+        extent = part.extent
+        if extent is not None:
+            low, high = found.get(part.recording.id, extent)
+            found[part.recording.id] = min(low, extent[0]), max(high, extent[1])
     return found
 
 

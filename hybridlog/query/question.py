@@ -1,9 +1,11 @@
-"""The values that describe a question: `Question`, and the `Part`s it is split into."""
+"""The values that describe a question: `Question`, the `Part`s it is split into, its cost."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+import time
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -11,7 +13,7 @@ import numpy as np
 from hybridlog.query.times import TimeLike
 from hybridlog.schema.states import State, encoding_of, state_of
 from hybridlog_storage.lazy import lazy
-from hybridlog_storage.times import END, span_of
+from hybridlog_storage.times import BEGIN, END, span_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -20,7 +22,8 @@ if TYPE_CHECKING:
     from hybridlog.query.predicate.tree import Predicate
     from hybridlog.schema.codec import Codec
     from hybridlog_storage.catalog import ChannelStats, RecordingEntry
-    from hybridlog_storage.messages import Channel
+    from hybridlog_storage.messages import Batch, Channel
+    from hybridlog_storage.segments.chunk import StoredChunk
 
 Clock = Literal["log", "publish", "header"]
 Span = tuple[int, int]
@@ -122,8 +125,6 @@ class Part:
     Attributes:
         bounds: `[begin, end)` of `clock`, ns; None for all times.
         windows: int64[n, 2], `[begin, end)` of log time, disjoint, in order; None for all times.
-        undecodable: Further channels of the topic, whose messages the predicate cannot test because
-            they have no fields.
     """
 
     recording: RecordingEntry
@@ -133,7 +134,6 @@ class Part:
     clock: Clock
     windows: NDArray[np.int64] | None
     predicate: Predicate | None
-    undecodable: tuple[RecordedChannel, ...] = ()
 
     @property
     def is_unbounded(self) -> bool:
@@ -166,27 +166,27 @@ class Part:
         return self.predicate is not None and bool(self.predicate.filters)
 
     @property
+    def has_fields(self) -> bool:
+        """True if all of its channels have fields: not without a definition, for example."""
+        return all(channel.codec.indexed for channel in self.channels)
+
+    @property
     def lacks_fields(self) -> bool:
         """True if the predicate asks fields that documents may lack: those of unreadable ones."""
         if self.predicate is None or not self.predicate.asks_fields:
             return False
-        return self.recording.status == "open" or any(stats.unreadable for stats in self.stats)
+        is_open = self.recording.status == "open"
+        return is_open or not self.has_fields or any(stats.unreadable for stats in self.stats)
 
     @lazy
     def field_types(self) -> Mapping[str, str] | None:
         """Types of the fields by path; None where a definition does not fix them."""
-        return field_types(self.channels)
+        return field_types(tuple(one for one in self.channels if one.codec.indexed))
 
     @lazy
     def log_windows(self) -> NDArray[np.int64]:
         """int64[n, 2]: the log time of the part; bounds of another clock do not restrict it."""
-        low, high = self.bounds if self.bounds and self.clock == "log" else (0, END)
-        if self.windows is None:
-            return np.array([[low, high]] if low < high else [], np.int64).reshape(-1, 2)
-        if self.bounds is None:
-            return self.windows
-        cut = np.clip(self.windows, low, high)
-        return cut[cut[:, 1] > cut[:, 0]]
+        return windows_in(self.windows, self.bounds if self.clock == "log" else None)
 
     @property
     def log_span(self) -> Span:
@@ -194,16 +194,12 @@ class Part:
         windows = self.log_windows
         return (int(windows[0, 0]), int(windows[-1, 1])) if len(windows) else (0, 0)
 
-    @lazy
+    @property
     def share(self) -> float:
         """Fraction of the topic's time in the part, 0 to 1."""
-        whole = self.span
-        if whole is None:
-            return 0.0
-        if self.is_unbounded:
-            return 1.0
-        cut = np.clip(self.log_windows, *whole)
-        return float((cut[:, 1] - cut[:, 0]).sum()) / (whole[1] - whole[0])
+        low, high = self.span or (0, 0)
+        cut = self._cut
+        return float((cut[:, 1] - cut[:, 0]).sum()) / (high - low) if len(cut) else 0.0
 
     @property
     def extent(self) -> Span | None:
@@ -211,12 +207,14 @@ class Part:
 
         Bounds of another clock do not restrict it.
         """
-        whole = self.span
-        if whole is None:
-            return None
-        cut = np.clip(self.log_windows, *whole)
-        cut = cut[cut[:, 1] > cut[:, 0]]
+        cut = self._cut
         return (int(cut[0, 0]), int(cut[-1, 1])) if len(cut) else None
+
+    @lazy
+    def _cut(self) -> NDArray[np.int64]:
+        """`log_windows`, cut to the topic's messages."""
+        cut = np.clip(self.log_windows, *(self.span or (0, 0)))
+        return cut[cut[:, 1] > cut[:, 0]]
 
     @lazy
     def span(self) -> Span | None:
@@ -224,6 +222,104 @@ class Part:
         firsts = [s.first for s in self.stats if s.first is not None]
         lasts = [s.last for s in self.stats if s.last is not None]
         return span_of(min(firsts), max(lasts)) if firsts else None
+
+
+@dataclass(slots=True)
+class Counters:
+    """The cost of an answer, and what is missing from it.
+
+    Attributes:
+        messages: Messages in the answer.
+        latched: Latched messages in front of it, which are not in `messages`.
+        frames: Frames of video in front of it, from the key frame on; not in `messages`.
+        payload_bytes: Bytes of their payloads.
+        bytes_read: Bytes read from segments and tables.
+        chunks_read: Chunks read and decompressed.
+        documents_read: Index documents received from MongoDB.
+        reduced: Messages left out because only their fields are there.
+        expired: Those of them whose payloads were deleted to make room.
+        not_copied: Those of them whose payloads were not copied yet.
+        lacking: Messages in the answer whose arrays are null, since only summaries are left.
+        unreadable: Messages of the predicate's topics that do not fit their definition, or lack
+            arrays that it asks for.
+        without_arrays: Those of them that lack arrays, since their payloads are gone.
+        not_indexed: Names of recordings with the number of messages that the index lacks, if it
+            has answered; several.
+        no_transform: The frame asked for with a reason why points or poses are not in it, and
+            the number of messages; several.
+        elapsed_s: Wall time, seconds.
+    """
+
+    messages: int = 0
+    latched: int = 0
+    frames: int = 0
+    payload_bytes: int = 0
+    bytes_read: int = 0
+    chunks_read: int = 0
+    documents_read: int = 0
+    reduced: int = 0
+    expired: int = 0
+    not_copied: int = 0
+    lacking: int = 0
+    unreadable: int = 0
+    without_arrays: int = 0
+    not_indexed: tuple[tuple[str, int], ...] = ()
+    no_transform: tuple[tuple[str, int], ...] = ()
+    elapsed_s: float = 0.0
+
+    @property
+    def unindexed(self) -> int:
+        """Messages that the index lacks, if it has answered."""
+        return sum(number for _, number in self.not_indexed)
+
+    def reset(self) -> None:
+        """Set every counter to zero."""
+        for each in fields(self):
+            setattr(self, each.name, each.default)
+
+    def copy(self) -> Counters:
+        """The same counts."""
+        return replace(self)
+
+    def add(self, other: Counters) -> None:
+        """Add the counts of a part of the answer; the wall time is unchanged."""
+        for each in fields(self):
+            if each.name != "elapsed_s":
+                total = getattr(self, each.name) + getattr(other, each.name)
+                setattr(self, each.name, total)
+
+    def add_chunk(self, chunk: StoredChunk) -> None:
+        """Count a chunk that was read."""
+        self.chunks_read += 1
+        self.bytes_read += chunk.length + chunk.trailer
+
+    def add_messages(self, batch: Batch) -> None:
+        """Count messages of the answer."""
+        self.messages += len(batch)
+        self.payload_bytes += batch.payload_bytes
+
+    def leave_out(self, messages: int, state: State) -> None:
+        """Count messages that are left out since their payloads are gone."""
+        self.reduced += messages
+        self.expired += messages * (state == "expired")
+        self.not_copied += messages * (state == "not_copied")
+
+    @contextmanager
+    def timed(self) -> Iterator[None]:
+        """Set every counter to zero and measure the wall time of the block."""
+        self.reset()
+        started = time.monotonic()
+        try:
+            yield
+        finally:
+            self.elapsed_s = time.monotonic() - started
+
+
+def windows_in(windows: NDArray[np.int64] | None, bounds: Span | None) -> NDArray[np.int64]:
+    """int64[n, 2]: what windows and bounds have in common; None for all times."""
+    found = np.array([[BEGIN, END]], np.int64) if windows is None else windows
+    found = found if bounds is None else np.clip(found, *bounds)
+    return found[found[:, 1] > found[:, 0]]
 
 
 def field_types(channels: tuple[RecordedChannel, ...]) -> dict[str, str] | None:

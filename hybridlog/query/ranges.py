@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from hybridlog.query.question import windows_in
 from hybridlog.query.times import (
     format_time,
     is_early,
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     from hybridlog.query.intervals import Intervals
     from hybridlog.query.question import Question, RecordedChannel, Span
     from hybridlog.session import Session
-    from hybridlog.snapshot import Snapshot
     from hybridlog_storage.catalog import ChannelStats
     from hybridlog_storage.summary import RecordingSummary
 
@@ -46,45 +46,6 @@ class Resolved(NamedTuple):
     windows: NDArray[np.int64] | None
 
 
-class Ranges(Sequence[Resolved]):
-    """The recordings that a question asks, oldest first; each is made when it is needed.
-
-    Their bounds, as of `Resolved`, are `shared` by all, or those of `each`.
-
-    Attributes:
-        places: intp[n], positions of the recordings in the snapshot.
-        first: int64[n], log time from which on each recording may have messages, ns.
-        last: int64[n], log time after which it has none, ns.
-    """
-
-    def __init__(
-        self,
-        snapshot: Snapshot,
-        places: NDArray[np.intp],
-        shared: Span | None,
-        each: Sequence[Span] | None,
-        during: Intervals | None,
-    ) -> None:
-        self._snapshot = snapshot
-        self._summaries = snapshot.summaries
-        self.places = places
-        self._shared = shared
-        self._each = each
-        self._during = during
-        self.first: NDArray[np.int64] = snapshot.begin[places]
-        self.last: NDArray[np.int64] = np.where(snapshot.is_open[places], END, snapshot.end[places])
-
-    def __len__(self) -> int:
-        return len(self.places)
-
-    def __getitem__(self, row: int) -> Resolved:  # type: ignore[override]
-        """The recording in a row."""
-        summary = self._summaries[self.places[row]]
-        bounds = self._shared if self._each is None else self._each[row]
-        windows = None if self._during is None else self._during.of_recording(summary.id)
-        return Resolved(summary, bounds, windows)
-
-
 class RangeResolver:
     """Turns relative and absolute times into nanoseconds, one recording at a time."""
 
@@ -92,25 +53,30 @@ class RangeResolver:
         self._session = session
         self._question = question
 
-    def resolve(self) -> Ranges:
+    def resolve(self) -> list[Resolved]:
         """The recordings to ask, oldest first; without reading their entries."""
         question = self._question
         places = self._session.chosen(question)
         snapshot = self._session.snapshot()
         if question.during is not None:
             places = self._in_intervals(places, question.during)
-        shared, each = None, None
+        bounds: list[Span | None] = [None] * len(places)
         if question.bounds is not None:
             shared = self._shared_bounds()
             if shared is not None:
                 inside = snapshot.between(places, *shared)
+                bounds = [shared] * len(inside)
             else:
-                each, inside = self._bounds_of(places)
+                bounds, inside = self._bounds_of(places)
             if len(places) and not len(inside) and question.during is None:
                 self._refuse(places)
             self._check_begin(snapshot.begin[inside])
             places = inside
-        return Ranges(snapshot, places, shared, each, question.during)
+        during = question.during
+        return [
+            Resolved(one, span, None if during is None else during.of_recording(one.id))
+            for one, span in zip(map(snapshot.summaries.__getitem__, places), bounds, strict=True)
+        ]
 
     def _check_begin(self, first: NDArray[np.int64]) -> None:
         """Refuse a range that begins far before any first message of the recordings, ns."""
@@ -127,7 +93,7 @@ class RangeResolver:
         own = [by_id.get(name, -1) for name in during.recordings]
         return np.intersect1d(places, np.array(own, np.intp))
 
-    def _bounds_of(self, places: NDArray[np.intp]) -> tuple[list[Span], NDArray[np.intp]]:
+    def _bounds_of(self, places: NDArray[np.intp]) -> tuple[list[Span | None], NDArray[np.intp]]:
         """A range that is relative to each recording, and the recordings that it overlaps."""
         summaries = self._session.snapshot().summaries
         found = [(place, self.bounds_in(summaries[place])) for place in places.tolist()]
@@ -154,20 +120,9 @@ class RangeResolver:
             )
         found: list[tuple[RecordingSummary, Span]] = []
         for recording, bounds, windows in self.resolve():
-            if recording.span is None:
-                continue
-            start, end = recording.extent
-            if bounds is not None:
-                start, end = max(start, bounds[0]), min(end, bounds[1])
-            if windows is None:
-                if start < end:
-                    found.append((recording, (start, end)))
-                continue
-            found.extend(
-                (recording, (max(start, low), min(end, high)))
-                for low, high in windows.tolist()
-                if low < end and high > start
-            )
+            if recording.span is not None:
+                inside = windows_in(windows_in(windows, bounds), recording.extent)
+                found += [(recording, (low, high)) for low, high in inside.tolist()]
         return found
 
     def beginnings(self) -> Iterator[tuple[RecordingSummary, int]]:

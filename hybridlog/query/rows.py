@@ -30,9 +30,8 @@ if TYPE_CHECKING:
 
     from hybridlog.columns.topic_table import TableRows, TopicTable
     from hybridlog.query.chunk_scan import MessageRun
-    from hybridlog.query.counters import Counters
     from hybridlog.query.message_filter import MessageFilter
-    from hybridlog.query.question import Part, RecordedChannel
+    from hybridlog.query.question import Counters, Part, RecordedChannel
     from hybridlog.schema.left import LeftFields
     from hybridlog.session import Session
 
@@ -92,37 +91,20 @@ class Rows:
     def __init__(self, session: Session, counters: Counters) -> None:
         self.session = session
         self._counters = counters
-        self._candidates: dict[Part, Tabled | None] = {}
         self._tabled: dict[Part, Tabled | None] = {}
-        self._answered: set[Part] = set()
         self._counts: dict[Part, tuple[int, int]] = {}  # matching ones, and unreadable ones
 
     # The rule.
 
     def tabled(self, part: Part, fields: Collection[str] | None = ()) -> Tabled | None:
-        """The part with its table, if that has the fields (None: all) and decides the predicate."""
+        """The part with its table, if that has the fields (None: all).
+
+        Whether it decides the predicate shows when it is read.
+        """
         if part not in self._tabled:
-            self._tabled[part] = self._confirmed(part)
+            self._tabled[part] = self._find(part)
         found = self._tabled[part]
         return found if found is not None and _holds(found, fields) else None
-
-    def _confirmed(self, part: Part) -> Tabled | None:
-        """The part with its table, if that decides the predicate."""
-        found = self._candidate(part)
-        if found is not None and part.predicate is not None:
-            try:
-                self._count_of(found)
-            except TABLE_ERRORS:
-                return None
-        return found
-
-    def _answering(self, part: Part, fields: Collection[str] | None = ()) -> Tabled | None:
-        """The same of a part that is answered; counts its unreadable messages once."""
-        found = self.tabled(part, fields)
-        if found is not None and part.predicate is not None and part not in self._answered:
-            self._answered.add(part)
-            self._counters.unreadable += self._count_of(found)[1]
-        return found
 
     def leave_table(self, part: Part) -> bool:
         """Read a part from chunks from now on; False if it is read from them already."""
@@ -130,14 +112,9 @@ class Rows:
         self._tabled[part] = None
         return had
 
-    def _candidate(self, part: Part) -> Tabled | None:
-        """The part with its table, if there is one with the columns."""
-        if part not in self._candidates:
-            self._candidates[part] = self._find(part)
-        return self._candidates[part]
-
     def _find(self, part: Part) -> Tabled | None:
-        if not part.is_by_log_time or part.undecodable:
+        asks_fields = part.predicate is not None and part.predicate.asks_fields
+        if not part.is_by_log_time or (asks_fields and not part.has_fields):
             return None
         asks_publish = part.predicate is not None and "_meta.pub" in part.predicate.fields()
         if asks_publish and len({c.channel.has_publish_time for c in part.channels}) > 1:
@@ -181,28 +158,15 @@ class Rows:
         """Number of matching messages in all parts."""
         total = 0
         in_chunks: list[Part] = []
-        asked: list[Part] = []
+        self._count_by_file([part for part in parts if part.predicate is not None])
         for part in parts:
-            if part.predicate is not None:
-                asked.append(part)
-            elif part.is_unbounded:
-                total += part.messages
-            elif not part.is_by_log_time:
-                in_chunks.append(part)
-            else:
-                try:
-                    total += self._count_by_time(part)
-                except SegmentError:
-                    in_chunks.append(part)
-        self._count_by_file(asked)
-        for part in asked:
-            found = self._answering(part)
-            if found is None:
-                in_chunks.append(part)
-                continue
-            total += self._count_of(found)[0]
-            if found.rest is not None:
-                in_chunks.append(found.rest)
+            number: int = 0
+            left: Part | None = part
+            with suppress(*TABLE_ERRORS):
+                number, left = self._count_of(part)
+            total += number
+            if left is not None:
+                in_chunks.append(left)
         return total + (self.count_in_chunks(in_chunks) if in_chunks else 0)
 
     def fitting(self, parts: Sequence[Part]) -> list[Part]:
@@ -213,10 +177,10 @@ class Rows:
 
     def outcomes(self, part: Part) -> Iterator[MatchColumns]:
         """For each message of the part's topic and time, whether it matches."""
-        found = self._answering(part)
+        found = self.tabled(part)
         left: Part | None = part
         if found is not None:
-            for rows, holds in self._in_table(found):
+            for rows, holds in self._answers(found):
                 yield MatchColumns(rows.t, rows.seq, holds)
             left = found.rest
         if left is None:
@@ -232,7 +196,7 @@ class Rows:
 
     def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
         """Fields of the matching messages."""
-        for found, _ in self._values(part, self._answering(part, fields), fields):
+        for found, _ in self._values(part, self.tabled(part, fields), fields):
             yield found
 
     def columns(
@@ -246,7 +210,7 @@ class Rows:
         from hybridlog.schema.arrow_columns import structs
 
         summaries = summaries_in(fields, part.field_types)
-        found = self._answering(part, None if fields is None else {*fields} - summaries)
+        found = self.tabled(part, None if fields is None else {*fields} - summaries)
         if found is not None and not all(map(found.table.has, summaries)):
             found = None
         for (times, seq, records), left in self._values(
@@ -271,7 +235,7 @@ class Rows:
         rest: Part | None = part
         if found is not None:
             kind = None if fields is None else found.table.fields(fields)
-            for rows, holds in self._in_table(found, fields):
+            for rows, holds in self._answers(found, fields):
                 chosen = rows if holds.all() else rows.take(np.flatnonzero(holds))
                 if len(chosen):
                     # Without the columns that only the predicate needs.
@@ -300,16 +264,31 @@ class Rows:
 
     # Tables.
 
-    def _count_of(self, found: Tabled) -> tuple[int, int]:
-        """Number of matching and of unreadable messages in a table, if its columns can decide."""
-        part = found.part
-        if part not in self._counts:
-            matched = unreadable = 0
-            for rows, holds in self._in_table(found):
-                matched += int(holds.sum())
-                unreadable += int(rows.is_unreadable().sum())
-            self._counts[part] = matched, unreadable
-        return self._counts[part]
+    def _count_of(self, part: Part) -> tuple[int, Part | None]:
+        """Number of matching messages without reading chunks, and what is left to read."""
+        if part.predicate is None:
+            if part.is_unbounded:
+                return part.messages, None
+            return (self._count_by_time(part), None) if part.is_by_log_time else (0, part)
+        found = self.tabled(part)
+        if found is None:
+            return 0, part
+        if found.part not in self._counts:
+            counts = [
+                (int(h.sum()), int(r.is_unreadable().sum())) for r, h in self._in_table(found)
+            ]
+            self._counts[found.part] = sum(m for m, _ in counts), sum(n for _, n in counts)
+        matched, unreadable = self._counts[found.part]
+        self._counters.unreadable += unreadable
+        return matched, found.rest
+
+    def _answers(
+        self, found: Tabled, fields: Collection[str] | None = (), own: Collection[str] = ()
+    ) -> Iterator[tuple[TableRows, NDArray[np.bool_]]]:
+        """Rows of a table with the outcome for each; those that are unreadable are counted."""
+        for rows, holds in self._in_table(found, fields, own):
+            self._counters.unreadable += int(rows.is_unreadable().sum())
+            yield rows, holds
 
     def _count_by_file(self, parts: Sequence[Part]) -> None:
         """Count whole parts that lie in one file: the predicate is evaluated once for all rows."""
@@ -319,7 +298,7 @@ class Rows:
             is_whole = part not in self._counts and part.is_unbounded
             if not is_whole or any(map(is_meta, part.predicate.fields())):
                 continue  # known of the part, not of a row
-            found = self._candidate(part)
+            found = self.tabled(part)
             if found is not None and found.segments is None and len(found.table.files) == 1:
                 by_file[found.table.files[0].number, found.table.has_arrays].append(found)
         for group in by_file.values():
@@ -414,15 +393,17 @@ class Rows:
         self, part: Part, offsets: dict[ChunkKey, list[NDArray[np.int64]]]
     ) -> Tabled | None:
         """The part with its table, which has added the places of its matching messages."""
-        found = self._answering(part)
+        found = self.tabled(part)
         if found is None:
             return None
+        unreadable = self._counters.unreadable
         try:
             places = [
                 places_of(rows.own["ref"])[holds]
-                for rows, holds in self._in_table(found, own=("ref",))
+                for rows, holds in self._answers(found, own=("ref",))
             ]
         except TABLE_ERRORS:
+            self._counters.unreadable = unreadable
             self.leave_table(part)
             return None
         if places:
@@ -446,7 +427,7 @@ class Rows:
     def count_in_chunks(self, parts: Sequence[Part]) -> int:
         """Read the messages of some parts and count those that match."""
         scan = ChunkScan(self.plan(parts), self.session)
-        return sum(len(run.batch) for run in scan.unordered())
+        return sum(len(run.batch) for _, run, _ in scan.loaded())
 
     def _outcomes_in_chunks(self, part: Part) -> Iterator[MatchColumns]:
         """Read the messages in order and decide on each."""

@@ -31,7 +31,7 @@ import math
 import re
 import time
 from datetime import UTC, date, datetime, timedelta
-from decimal import ROUND_HALF_EVEN, Decimal
+from fractions import Fraction
 from numbers import Integral, Real
 from typing import TYPE_CHECKING, TypeAlias, TypeGuard
 
@@ -93,15 +93,6 @@ _UNITS: tuple[tuple[str, int], ...] = (
     ("ns", 1),
 )
 _DURATION = re.compile("".join(_PART.format(unit) for unit, _ in _UNITS), re.IGNORECASE)
-_DATETIME64_UNITS = {
-    "D": 86_400 * _SECOND,
-    "h": 3_600 * _SECOND,
-    "m": 60 * _SECOND,
-    "s": _SECOND,
-    "ms": 10**6,
-    "us": 10**3,
-    "ns": 1,
-}
 
 
 def parse_time(text: TimeLike, *, start: int | None, end: int | None) -> int:
@@ -191,7 +182,7 @@ def parse_duration(text: DurationLike) -> int:
     elif isinstance(text, Integral):
         ns = int(text) * _SECOND
     else:
-        ns = _rounded(Decimal(repr(float(text))) * _SECOND)
+        ns = round(Fraction(repr(float(text))) * _SECOND)
     if not 0 <= ns < TIME_LIMIT:
         raise TimeError(f"{_shown(text)} is out of range for a duration: {DURATIONS}")
     is_bare = _NUMBER.fullmatch(text.strip()) if isinstance(text, str) else isinstance(text, Real)
@@ -273,8 +264,16 @@ def _parse_text(text: str, start: int | None, end: int | None) -> int:
 
 def _absolute(word: str) -> int | None:
     """A date or a number since the epoch; None if the word is neither."""
-    if number := _NUMBER.fullmatch(word):
-        return _scaled(int(number[1]), number[2] or "", word)
+    if _NUMBER.fullmatch(word):
+        number = Fraction(word)
+        if number < _NANOSECONDS_FROM:
+            return _exact(number * _SECOND, word)
+        if number.denominator != 1:
+            raise TimeError(
+                f"{_shown(word)} has a fraction of a nanosecond (numbers from 10**14 are "
+                f"nanoseconds): {ACCEPTED}"
+            )
+        return number.numerator
     if nanoseconds := _NS.fullmatch(word):
         return int(nanoseconds[1])
     if iso := _ISO.fullmatch(word):
@@ -300,25 +299,12 @@ def _base(base: int | None, word: str) -> int:
     return base
 
 
-def _scaled(whole: int, fraction: str, word: str = "") -> int:
-    """A number since the epoch: seconds if small, nanoseconds if large."""
-    if whole >= _NANOSECONDS_FROM:
-        if fraction.strip("0"):
-            raise TimeError(
-                f"{_shown(word)} has a fraction of a nanosecond (numbers from 10**14 are "
-                f"nanoseconds): {ACCEPTED}"
-            )
-        return whole
-    return whole * _SECOND + _nanoseconds(fraction, word)
-
-
-def _nanoseconds(digits: str | None, word: str) -> int:
-    digits = (digits or "").rstrip("0")
-    if len(digits) > 9:
+def _exact(ns: Fraction, word: str) -> int:
+    if ns.denominator != 1:
         raise TimeError(
             f"{_shown(word)} is finer than a nanosecond: at most nine digits of a second"
         )
-    return int(digits.ljust(9, "0")) if digits else 0
+    return ns.numerator
 
 
 def _from_iso(iso: re.Match[str], word: str) -> int:
@@ -329,40 +315,27 @@ def _from_iso(iso: re.Match[str], word: str) -> int:
     except ValueError as error:
         raise TimeError(f"{_shown(word)} is no valid date: {error}") from None
     seconds = (moment - _EPOCH) // timedelta(seconds=1)
-    return seconds * _SECOND + _nanoseconds(iso["fraction"], word)
+    return _exact((seconds + Fraction(f"0.{iso['fraction'] or 0}")) * _SECOND, word)
 
 
 def _duration(word: str) -> int | None:
     """Nanoseconds of an unsigned duration; None if the word is no duration."""
-    if number := _NUMBER.fullmatch(word):
-        return int(number[1]) * _SECOND + _nanoseconds(number[2], word)
+    if _NUMBER.fullmatch(word):
+        return _exact(Fraction(word) * _SECOND, word)
     match = _DURATION.fullmatch(word)
     if not word or match is None:
         return None
-    total = 0
-    for index, (_, size) in enumerate(_UNITS):
-        whole, fraction = match[2 * index + 1], match[2 * index + 2]
-        if whole is None:
-            continue
-        total += int(whole) * size
-        if fraction:
-            part, rest = divmod(int(fraction) * size, 10 ** len(fraction))
-            if rest:
-                raise TimeError(f"{_shown(word)} is finer than a nanosecond")
-            total += part
-    return total
+    parts = zip(match.groups("0")[::2], match.groups("0")[1::2], _UNITS, strict=True)
+    found = [Fraction(f"{whole}.{part}") * size for whole, part, (_, size) in parts]
+    return _exact(sum(found, Fraction(0)), word)
 
 
 def _from_float(number: float) -> int:
     if not math.isfinite(number) or not -TIME_LIMIT <= number < TIME_LIMIT:
         raise TimeError(f"{number!r} is not a time: {ACCEPTED}")
     # The shortest decimal of this float is the text that the user typed.
-    exact = Decimal(repr(number))
-    return _rounded(exact if abs(exact) >= _NANOSECONDS_FROM else exact * _SECOND)
-
-
-def _rounded(number: Decimal) -> int:
-    return int(number.to_integral_value(rounding=ROUND_HALF_EVEN))
+    exact = Fraction(repr(number))
+    return round(exact if abs(exact) >= _NANOSECONDS_FROM else exact * _SECOND)
 
 
 def _timedelta(delta: timedelta) -> int:
@@ -385,14 +358,11 @@ def _from_datetime64(moment: object) -> int:
 
     if not isinstance(moment, np.datetime64) or np.isnat(moment):
         raise TimeError(f"{_shown(moment)} is not a time: {ACCEPTED}")
-    value = np.asarray(moment)
-    unit, count = np.datetime_data(value.dtype)
-    if unit in {"Y", "M", "W"}:
-        value, unit, count = value.astype("datetime64[D]"), "D", 1
-    number = int(value.astype(np.int64)) * count
-    if unit in _DATETIME64_UNITS:
-        return number * _DATETIME64_UNITS[unit]
-    return number // {"ps": 10**3, "fs": 10**6, "as": 10**9}[unit]
+    ns = moment.astype("datetime64[ns]")
+    is_finer = np.datetime_data(moment.dtype)[0] in {"ps", "fs", "as"}
+    if not is_finer and ns.astype(moment.dtype) != moment:
+        return TIME_LIMIT  # numpy has gone beyond 64 bits
+    return int(ns.astype(np.int64))
 
 
 def _checked(ns: int, source: object) -> int:

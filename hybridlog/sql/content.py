@@ -20,7 +20,6 @@ from hybridlog.columns.recordings_file import (
     times,
 )
 from hybridlog.query.answers.marks import marks_in
-from hybridlog.query.counters import Counters
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.snapshot import UNFINISHED
 from hybridlog.sql.columns import OWN, ViewColumn, merged, sql_type, view_columns
@@ -277,7 +276,7 @@ def _losses(content: StoreContent) -> Iterator[Mapping[str, Any]]:
 
 def _marks(content: StoreContent) -> Iterator[Mapping[str, Any]]:
     names = {one.id: one.name for one in content.summaries}
-    for mark in marks_in(content.session, [*names], Counters()):
+    for mark in marks_in(content.session, [*names]):
         window = content.window(mark.recording)
         if window is not None and not window[0] <= mark.begin < window[1]:
             continue

@@ -32,8 +32,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.message import Message
-    from hybridlog.query.counters import Counters
-    from hybridlog.query.question import Question
+    from hybridlog.query.question import Counters, Question
     from hybridlog.session import Session
     from hybridlog.tf.tree import FrameTree
 

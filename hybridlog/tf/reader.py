@@ -14,9 +14,8 @@ import pyarrow.compute as pc
 from hybridlog.frames.answer import stream, to_arrow
 from hybridlog.frames.columns import flat
 from hybridlog.query.answers.lost import completeness_of
-from hybridlog.query.counters import Counters
 from hybridlog.query.planner import Planner, match_times
-from hybridlog.query.question import Question
+from hybridlog.query.question import Counters, Question
 from hybridlog.tf import is_of_transforms
 from hybridlog.tf.transform import Transform
 from hybridlog.tf.tree import Frame, FrameTree
@@ -42,7 +41,7 @@ def frame_tree(session: Session, recording: RecordingSummary, topics: Sequence[s
     question = Question(tuple(topics), (recording.id,))
     types = {
         one.channel.topic: one.channel.schema.name
-        for one in Planner(session, question, Counters()).channels()
+        for one in Planner(session, question).channels()
         if one.channel.schema
     }
     names = [topic for topic, name in types.items() if is_of_transforms(name)]
@@ -54,7 +53,7 @@ def frame_tree(session: Session, recording: RecordingSummary, topics: Sequence[s
     found = [
         _transforms_of(table, is_static=topic.endswith(_STATIC))
         for topic in names
-        for table in stream(Planner(session, replace(question, topics=(topic,)), Counters()))
+        for table in stream(Planner(session, replace(question, topics=(topic,))))
     ]
     lacks = completeness_of(session, replace(question, topics=tuple(names))).sentences
     invalid = Counter[str]()

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 from hybridlog.arrays.message_arrays import IMAGES, plain_type
 from hybridlog.formats.yaml_values import YamlError, parse_yaml, read_yaml
-from hybridlog.query.asked import narrowed
+from hybridlog.query.query import narrowed
 from hybridlog.wording import listed
 from hybridlog_storage.errors import TopicError, UsageError
 

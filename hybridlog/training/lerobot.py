@@ -24,8 +24,8 @@ from hybridlog import __version__
 from hybridlog.arrays.video import pyav
 from hybridlog.formats.slices import fingerprint
 from hybridlog.formats.writing import failures
-from hybridlog.query.asked import narrowed
 from hybridlog.query.pieces import pieces
+from hybridlog.query.query import narrowed
 from hybridlog.training.episodes import episodes
 from hybridlog.training.feature_map import IMAGE_PREFIX
 from hybridlog.training.lerobot_episodes import WrittenEpisode, write_episode, write_text

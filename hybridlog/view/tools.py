@@ -17,10 +17,9 @@ from hybridlog.arrays.message_arrays import IMAGES, plain_type
 from hybridlog.drawing.images import Picture, picture
 from hybridlog.query.answers.completeness import coverage
 from hybridlog.query.answers.infer_fields import infer_fields
-from hybridlog.query.asked import field_types
-from hybridlog.query.counters import Counters
 from hybridlog.query.planner import match_times
 from hybridlog.query.predicate.tokens import MAX_TEXT
+from hybridlog.query.query import field_types
 from hybridlog.query.times import format_duration, format_time
 from hybridlog.record.losses import losses_of
 from hybridlog.schema.text import without_nan
@@ -139,7 +138,7 @@ def ask(
     count = query.count()
     values: dict[str, Any] = {"count": count, **_lacks(query, count)}
     with suppress(TimeError):  # the range is outside all recordings
-        parts = match_times(query.session, query.question, Counters())
+        parts = match_times(query.session, query.question)
         times = chain.from_iterable(part.log_time.tolist() for part in parts)
         values["first_times"] = [*map(format_time, islice(times, 10))]
     rows = []

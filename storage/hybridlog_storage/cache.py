@@ -9,7 +9,9 @@ from typing import Any, Final, Literal, TypeAlias, TypeVar, cast
 
 MAX_BYTES: Final = 224 << 20
 
-Kind: TypeAlias = Literal["chunk", "column", "matches", "rebuilt", "table", "times", "videos"]
+Kind: TypeAlias = Literal[
+    "chunk", "chunks", "column", "matches", "rebuilt", "table", "times", "videos"
+]
 Value = TypeVar("Value")
 
 

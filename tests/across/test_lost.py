@@ -159,7 +159,6 @@ def test_the_commands(damaged: Damaged) -> None:
     for command in (
         ("intervals", "-t", "n", "--where", "v == 1"),
         ("stats", "-t", "n", "--fields", "v"),
-        ("stats", "-t", "n", "--rate"),
         ("align", "--to", "other", "-t", "n"),
     ):
         run(*command, "--strict", store=damaged.path, code=11)
@@ -177,7 +176,6 @@ def test_python_says_what_the_commands_say(damaged: Damaged) -> None:
     for remarks, command in (
         (lambda: topic.count() and topic.remarks(), ("fetch", "--count", "-t", "n")),
         (lambda: topic.to_arrow() and topic.remarks(), ("fetch", "-t", "n")),
-        (lambda: topic.rate() and topic.remarks(), ("stats", "-t", "n", "--rate")),
         (lambda: topic.stats("v") and topic.remarks(), ("stats", "-t", "n", "--fields", "v")),
         (lambda: topic.intervals() and topic.remarks(), ("intervals", "-t", "n")),
         (topic.resample("1s").remarks, ("align", "-t", "n", "--step", "1s")),

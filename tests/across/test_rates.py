@@ -36,41 +36,6 @@ def ends(logs: Logs, label: str) -> tuple[int, int]:
 
 
 @pytest.mark.parametrize(
-    ("window", "between", "where"),
-    [("100ms", None, None), ("70ms", ("+95ms", "+800ms"), None), ("250ms", None, "on == true")],
-)
-def test_rates_by_window(
-    logs: Logs, window: str, between: tuple[str, str] | None, where: str | None
-) -> None:
-    query = logs.store.topic("left/pose")
-    query = query if between is None else query.between(*between)
-    query = query if where is None else query.where(where)
-    size = int(window.removesuffix("ms")) * MS
-    want = []
-    for label in logs.said:
-        low, high = ends(logs, label)
-        if between is not None:
-            low, high = low + 95 * MS, low + 800 * MS
-        for begin in range(low, high, size):
-            end = min(begin + size, high)
-            inside = [
-                m
-                for m in logs.of(label, "/left/pose")
-                if begin <= m.time < end and (where is None or m.fields["on"])
-            ]
-            want.append((label, begin, end, len(inside), len(inside) / ((end - begin) / 1e9)))
-    rows = [
-        (r["recording"], r["begin"].value, r["end"].value, r["messages"], r["rate"])
-        for r in query.rate(window).to_pylist()
-    ]
-    assert [row[:4] for row in rows] == [row[:4] for row in want]
-    assert [row[4] for row in rows] == pytest.approx([row[4] for row in want])
-    assert sum(row[3] for row in rows) == query.count()
-    # Message indexes or columns of the table, and no payload.
-    assert query.counters.chunks_read == 0
-
-
-@pytest.mark.parametrize(
     ("longer", "periods"), [("12ms", None), (None, 2.5), (None, None), ("9ms", 2.0), ("0s", None)]
 )
 @pytest.mark.parametrize("between", [None, ("+100ms", "+700ms")])
@@ -149,8 +114,6 @@ def test_a_topic_that_fell_silent(tmp_path: Path) -> None:
         none = store.topic("shy").where("v == 0")
         assert len(none.gaps("100ms")) == 1
         assert len(none.gaps()) == 0
-        shy = store.topic("shy").rate().to_pylist()
-        assert shy[0]["rate"] == pytest.approx(50)
         (v,) = store.topic("shy").stats("v")
         assert (v.count, v.min, v.std) == (4, 1e300, 0.0)
         (w,) = store.topic("shy").stats("w")
@@ -204,19 +167,15 @@ def test_what_is_refused(logs: Logs) -> None:
     store = logs.store
     base = store.topic("base")
     for query in (base.limit(3), base.every(2), base.reverse()):
-        for ask in (query.rate, query.gaps, query.stats):
+        for ask in (query.gaps, query.stats, query.check):
             with pytest.raises(UsageError, match="limit, every"):
                 ask()
     with pytest.raises(UsageError, match="one topic's"):
         store.topic("**/pose").gaps()
     with pytest.raises(UsageError, match="more than 0"):
         base.gaps(periods=0)
-    with pytest.raises(UsageError, match="window of 0"):
-        base.rate("0s")
-    with pytest.raises(UsageError, match="longer one"):
-        base.rate("10ns")
     with pytest.raises(UsageError, match="log time"):
-        base.between("+1ms", None).clock("header").rate()
+        base.between("+1ms", None).clock("header").gaps()
     with pytest.raises(TopicError, match="no field"):
         base.stats("nothing")
     with pytest.raises(UsageError, match="no field with numbers"):

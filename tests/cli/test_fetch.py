@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from hybridlog.cli.answers import print_end
-from hybridlog.query.counters import Counters
+from hybridlog.query.question import Counters
 from tests.independent import Seen, read_bag, read_mcap
 
 from . import odd_log

@@ -31,7 +31,6 @@ def test_a_topic_is_named(store: Path) -> None:
     [
         ("intervals", "scan", "-r", "robot", "--where", "ranges.min < 5"),
         ("stats", "scan", "odom", "-r", "robot"),
-        ("stats", "scan", "odom", "-r", "robot", "--rate"),
         ("check", "scan", "odom", "-r", "robot"),
         ("diff", "robot", "torn"),
     ],

@@ -16,7 +16,7 @@ from rosbags.highlevel import AnyReader
 import hybridlog as hl
 from benchmarks.simulator.write import write_bag
 from hybridlog.drawing.track import Grid, Position, fix_of, pose_of, position_of, track
-from hybridlog.query.asked import field_types
+from hybridlog.query.query import field_types
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.messages import Channel, Schema
 from tests.ros_values import ROS1

@@ -37,7 +37,7 @@ from hybridlog_storage.messages import Channel, Schema
 
 with hl.open(sys.argv[1], create=True) as store:
     store.record(sys.argv[2])
-    half = store["/half"]
+    half = store.topic("/half")
     where = half.where("r.max > 24 and x >= 49").count()
     ((x, r),) = store.sql("select max(x), sum(list_sum(r)) from half").rows()
     (mean,) = half.resample("1s", "mean").to_arrow()["x"].to_pylist()

@@ -13,7 +13,7 @@ from ruamel.yaml import YAML
 
 import hybridlog as hl
 from hybridlog.formats.rosbag2.writer import STORAGES, Rosbag2Writer
-from hybridlog.query.asked import channels_of
+from hybridlog.query.query import channels_of
 from hybridlog_storage.errors import DiskFullError, UsageError
 from tests.cli.running import run
 from tests.data import DATA, needs_data

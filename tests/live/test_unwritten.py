@@ -100,7 +100,7 @@ def test_every_command_tells_it(live: hl.Store, tmp_path: Path) -> None:
     for words in (
         ["fetch", "-t", "/a", "--count"],
         ["fetch", "-t", "/a", "--where", "data == '1'"],
-        ["stats", "-t", "/a", "--rate"],
+        ["check", "-t", "/a"],
         ["intervals", "-t", "/a", "--gaps"],
         ["intervals", "-t", "/a", "--where", "data == '1'"],
         ["intervals", "-t", "/a", "--changes", "data"],

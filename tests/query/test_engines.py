@@ -22,11 +22,10 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import hybridlog as hl
-from hybridlog.query.asked import field_types
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.to_mask import mask_of_objects
-from hybridlog.query.query import Query
+from hybridlog.query.query import Query, field_types
 from hybridlog.query.rows import Rows
 from hybridlog_storage.errors import DatabaseError, TimeError
 from hybridlog_storage.messages import Channel, Schema

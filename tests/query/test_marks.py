@@ -18,7 +18,6 @@ from starlette.testclient import TestClient
 
 import hybridlog as hl
 from hybridlog.query.answers.marks import marks_in
-from hybridlog.query.counters import Counters
 from hybridlog.record.marks import mark_channel, mark_payload
 from hybridlog.view.loopback import Admission
 from hybridlog.view.server import make_app
@@ -227,7 +226,7 @@ def test_an_odd_event_is_a_mark_where_its_message_is(tmp_path: Path) -> None:
             channel.log(json.dumps(value).encode(), log_time=(BEGIN + number) * S)
     with hl.open(tmp_path / "store", create=True, mongo="none") as store:
         (recording,) = [store.record(tmp_path / "odd.mcap", name="odd").entry.id]
-        found = [*marks_in(store.session, [recording], Counters())]
+        found = [*marks_in(store.session, [recording])]
     assert [(one.begin, one.end) for one in found] == [
         ((BEGIN + number) * S, None) for number in range(len(odd))
     ]

@@ -26,7 +26,6 @@ from tests.running.methods import (
     in_force,
     numbers,
     ranged,
-    rates,
     regular,
     silent,
 )
@@ -322,11 +321,6 @@ COMMANDS: dict[str, list[Asked]] = {
             "stats -t said --fields x --json",
             listed("topic", "field", "count", "nan", "infinite", "min", "max", "mean", "std"),
             lambda k: numbers(k, "/said", "x"),
-        ),
-        asked(
-            "stats said arm --rate -F jsonl",
-            lines("begin_ns", "end_ns", "topic", "messages", "rate"),
-            lambda k: rates(k, "/arm", "/said"),
         ),
     ],
     "check": [

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import statistics
 from bisect import bisect_right
 from collections.abc import Callable, Iterable, Sequence
@@ -16,8 +15,8 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.attachments import Extras, extras_of
-from hybridlog.query.asked import channels_of, field_types, narrowed, spans_of
 from hybridlog.query.intervals import Intervals
+from hybridlog.query.query import channels_of, field_types, narrowed, spans_of
 from hybridlog_storage.errors import HybridlogError, IncompleteError, PayloadError
 from tests.running.sequence import CHANNELS, MS, SECOND, START, STEP, Known, Sent
 
@@ -162,29 +161,11 @@ def numbers(known: Known, topic: str, name: str) -> Any:
     return [(topic, name, len(values), 0, 0, least, most, mean, deviation)]
 
 
-def rates(known: Known, *topics: str) -> Any:
-    found = []
-    for topic in sorted(topics):
-        times = [one.log_time for one in known.of(topic)]
-        rate = (len(times) - 1) * 1e9 / (times[-1] - times[0]) if len(times) > 1 else math.nan
-        found.append((times[0], times[-1] + 1, topic, len(times), rate))
-    return found
-
-
 def _checked(known: Known, topic: str) -> Any:
     times = [one.log_time for one in known.of(topic)]
     gap = max(b - a for a, b in pairwise(times))
     lost = 3 if topic == "/said" else 0
     return topic, len(times), gap, times[0] - known.span[0], lost
-
-
-def by_window(known: Known, topic: str, size: int) -> Any:
-    first, last = known.span
-    times = [one.log_time for one in known.of(topic)]
-    return [
-        (begin, min(begin + size, last + 1), sum(begin <= t < begin + size for t in times))
-        for begin in range(first, last + 1, size)
-    ]
 
 
 def current(known: Known, topic: str, time: int) -> Sent:
@@ -330,8 +311,8 @@ def _extras(store: hl.Store) -> Extras:
 
 METHODS: dict[str, Rule] = {
     "__iter__": Rule(lambda s: rows(s.all_topics()), lambda k: sent(k.of())),
-    "__eq__": Rule(lambda s: s.topic("arm") == s["/arm"], lambda _: True),
-    "__hash__": Rule(lambda s: len({s.topic("arm"), s["/arm"]}), lambda _: 1),
+    "__eq__": Rule(lambda s: s.topic("arm") == s.topic("/arm"), lambda _: True),
+    "__hash__": Rule(lambda s: len({s.topic("arm"), s.topic("/arm")}), lambda _: 1),
     "__repr__": Rule(
         lambda s: repr(s.topic("said")), lambda _: f"<Query /said; recording {LABEL}>"
     ),
@@ -470,20 +451,6 @@ METHODS: dict[str, Rule] = {
         lambda k: [in_force(k, FIRST_S), in_force(k, k.span[1] + 1 - 200 * MS)],
     ),
     "limit": Rule(lambda s: seqs(s.all_topics().limit(23)), lambda k: seqs(k.of()[:23])),
-    "rate": Rule(
-        lambda s: (
-            _table(
-                s.topic("said", "arm", "opaque").rate().sort_by("topic"),
-                "begin",
-                "end",
-                "topic",
-                "messages",
-                "rate",
-            ),
-            _table(s.topic("arm").rate("0.5s"), "begin", "end", "messages"),
-        ),
-        lambda k: (rates(k, "/said", "/arm", "/opaque"), by_window(k, "/arm", SECOND // 2)),
-    ),
     "recordings": Rule(
         lambda s: [s.entry(one).name for one in s.topic("arm").recordings], lambda _: [LABEL]
     ),
@@ -623,10 +590,6 @@ STORE: dict[str, Rule] = {
     ),
     "__repr__": Rule(lambda s: "<Store " in repr(s), lambda _: True),
     "_repr_html_": Rule(lambda s: LABEL in s._repr_html_(), lambda _: True),
-    "_ipython_key_completions_": Rule(
-        lambda s: s._ipython_key_completions_(), lambda _: sorted(CHANNELS)
-    ),
-    "__getitem__": Rule(lambda s: s["/arm"].count(), lambda k: len(k.of("/arm"))),
     "align": Rule(
         lambda s: _aligned(s.align("arm", "said", fields={"arm": ["n"], "said": ["n"]})),
         lambda k: beside(k, "/arm", "/said"),

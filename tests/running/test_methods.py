@@ -117,7 +117,6 @@ CALLS: dict[str, Callable[[hl.Store], list[int]]] = {
     "intervals": lambda s: [
         *range(sum(one.messages for one in s.topic("said").where("n >= 0").intervals()))
     ],
-    "rate": lambda s: [*range(s.topic("said").rate().column("messages").to_pylist()[0])],
     "stats": lambda s: [*range(s.topic("said").stats("n")[0].count)],
     "resample": lambda s: [
         *range(sum(s.topic("said").resample("1s", "count").to_arrow().column("count").to_pylist()))

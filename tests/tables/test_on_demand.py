@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 
 import hybridlog as hl
-from hybridlog.follow import follower
+from hybridlog.query.rows import Rows
 from hybridlog_storage.messages import Channel, Schema
 
 SECOND = 10**9
@@ -42,14 +41,22 @@ def store(tmp_path: Path) -> Iterator[hl.Store]:
         yield opened
 
 
-def test_a_topic_without_a_table_is_tried_once(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    made: list[set[str]] = []
-    monkeypatch.setattr(follower, "make_tables", lambda *_, topics, until: made.append(topics))
-    shutil.rmtree(store.directory.path / "tables")
-    store.refresh()
-    for _ in range(2):
-        assert store.topic("/imu").where("x > 1").count() > 0
-        store.mend()
-    assert made == [{"/imu", "/mixed"}]  # which share their chunks
+def test_frames_come_from_tables(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    for query in (
+        store.topic("/imu"),
+        store.topic("/imu").fields("n", "s"),
+        store.topic("/imu").where("x > 100").fields("a", "n"),
+        store.topic("/imu").between(10 * SECOND, 20 * SECOND).fields("x"),
+        store.topic("/imu").where("s ~ '^m1[0-9]$'").reverse(),
+    ):
+        table, frame = query.to_arrow(), query.to_pandas()
+        assert query.counters.chunks_read == 0
+        assert query.counters.messages == table.num_rows == len(frame) == query.count()
+        streamed = sum(part.num_rows for part in query.to_tables())
+        assert streamed == table.num_rows
+        with monkeypatch.context() as patch:
+            patch.setattr(Rows, "tabled", lambda *_: None)
+            decoded = query.to_arrow()
+            assert query.counters.chunks_read > 0
+        assert table.schema == decoded.schema
+        assert repr(table.to_pylist()) == repr(decoded.to_pylist())  # NaN is NaN

@@ -17,8 +17,7 @@ from hybridlog.wording import counted, listed, unfit
 from hybridlog_storage.errors import IncompleteError
 
 if TYPE_CHECKING:
-    from hybridlog.query.counters import Counters
-    from hybridlog.query.question import Question
+    from hybridlog.query.question import Counters, Question
     from hybridlog.schema.states import State
     from hybridlog_storage.catalog import RecordingEntry
 

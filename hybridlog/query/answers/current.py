@@ -18,9 +18,9 @@ import numpy as np
 from hybridlog.message import messages_in
 from hybridlog.query.answers.video import picture_of
 from hybridlog.query.chunk_scan import ChunkScan, MessageRun, RecordingScan, ScanPlan, with_payloads
-from hybridlog.query.counters import Counters
 from hybridlog.query.latching import depth_of, is_key_frame, is_video, publisher_of
 from hybridlog.query.planner import Planner
+from hybridlog.query.question import Counters, Question
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import TimeLike, is_relative, parse_time
 from hybridlog_storage.errors import SegmentError
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from hybridlog.message import Message
     from hybridlog.query.chunk_columns import Chunk
-    from hybridlog.query.question import Question, RecordedChannel, Span
+    from hybridlog.query.question import RecordedChannel, Span
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.messages import Batch
@@ -179,7 +179,7 @@ def _beginnings(session: Session, question: Question) -> Iterator[tuple[Recordin
     for summary, _, _ in RangeResolver(session, question).resolve():
         if _latching(session, question, session.entry_of(summary)):
             first = replace(question, recordings=(summary.id,), limit=1, every=1, reverse=False)
-            for run in Planner(session, first, Counters()).runs():
+            for run in Planner(session, first).runs():
                 yield summary, int(run.batch.log_time[0])
 
 
@@ -291,8 +291,7 @@ def _merged_scan(scans: Sequence[RecordingScan]) -> RecordingScan:
 def next_time(session: Session, recording: RecordingEntry, topic: str, moment: int) -> int | None:
     """The least log time of a topic's messages that is not before a time, ns; None without any.
 
-    Chunk tables tell it, and the message indexes of chunks that hold the time itself. Damaged
-    ones are left out.
+    No payload is read for it. A time with a damaged chunk is left out.
 
     Args:
         session: The open store.
@@ -300,24 +299,16 @@ def next_time(session: Session, recording: RecordingEntry, topic: str, moment: i
         topic: Full name.
         moment: The time, ns.
     """
-    channels = [channel.channel_id for channel in session.channels_of(recording, [topic])]
-    if recording.span is None or not channels:
+    planner = Planner(session, Question((topic,), (recording.id,)))
+    if recording.span is None or not session.channels_of(recording, [topic]):
         return None
-    first, last = recording.span
-    moment = max(moment, first)
-    width = _FIRST_LOOK
-    while True:
-        end = moment + width
-        parts = session.parts(recording, channels, (moment, end))
-        found = parts["first"][parts["first"] >= moment].tolist()
-        cut = parts[(parts["first"] < moment) & (parts["last"] >= moment)]
-        for segment, chunk, channel in cut[["segment", "chunk", "channel"]].tolist():
+    begin, width, stop = max(moment, recording.span[0]), _FIRST_LOOK, span_of(*recording.span)[1]
+    for part in planner.split():
+        while begin < stop:
+            end = min(begin + width, END)
             with suppress(SegmentError):
-                times = session.times(recording, segment, chunk)[channel]
-                found.append(int(times[np.searchsorted(times, moment)]))
-        # Chunks that were not looked at hold nothing before the end.
-        if found and min(found) < end:
-            return int(min(found))
-        if end > last:
-            return None
-        width *= 4
+                times = planner.times(replace(part, bounds=(begin, end)))
+                if len(times):
+                    return int(times[0])
+            begin, width = end, 4 * width
+    return None

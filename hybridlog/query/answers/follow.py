@@ -30,8 +30,7 @@ if TYPE_CHECKING:
     from hybridlog.message import Message
     from hybridlog.query.chunk_columns import Chunk
     from hybridlog.query.chunk_scan import MessageRun
-    from hybridlog.query.counters import Counters
-    from hybridlog.query.question import Part, Question, Span
+    from hybridlog.query.question import Counters, Part, Question, Span
     from hybridlog.session import Asked, Session
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.summary import RecordingSummary
@@ -85,7 +84,6 @@ class Arrivals(Planner):
             bounds = self._bounds.get(one.id)
             self._arrived.chunks[one.id] = chunks = [*self._arrivals(entry, bounds)]
             parts += self.parts_in(one, bounds, None) if chunks else ()
-        self._counted.clear()
         return ChunkScan(self.plan(parts), session).runs(), any(map(self._goes_on, summaries))
 
     def _goes_on(self, one: RecordingSummary) -> bool:
@@ -189,14 +187,6 @@ class _Arrived(Rows):
 
     def tabled(self, part: Part, fields: Collection[str] | None = ()) -> None:
         """No tables: they have older messages, too."""
-
-    def fitting(self, parts: Sequence[Part]) -> list[Part]:
-        """All of them."""
-        return [*parts]
-
-    def count(self, parts: Sequence[Part]) -> int:
-        """Count what has come."""
-        return self.count_in_chunks(parts)
 
     def _scan(self, part: Part, indexes: dict[int, int]) -> RecordingScan:
         new = self.chunks[part.recording.id]

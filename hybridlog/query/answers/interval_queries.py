@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import groupby, islice
+from itertools import groupby
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -26,8 +26,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from numpy.typing import NDArray
 
-    from hybridlog.query.counters import Counters
-    from hybridlog.query.question import Part, Question, Span
+    from hybridlog.query.question import Counters, Part, Question, Span
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.summary import RecordingSummary
@@ -57,12 +56,8 @@ class IntervalQueries:
         gap = None if max_gap is None else parse_duration(max_gap)
         if gap == 0:
             raise UsageError("max_gap is 0; a state needs a gap of more than 0.")
-        spans = [*self._spans()]
-        asked = [[*_just_before(part, span), _bounded(part, span)] for part, span in spans]
-        decided = iter(self._planner.decided([part for own in asked for part in own]))
-        for (part, span), own in zip(spans, asked, strict=True):
-            *before, inner = (next(decided) for _ in own)
-            yield part.recording.id, self._states_in(part, span, gap, inner, before)
+        for part, span in self._spans():
+            yield part.recording.id, self._states_in(part, span, gap)
 
     def _certain(self, max_gap: DurationLike | None, state: str) -> Intervals:
         """The time in which a state is certain, or the time in which none is."""
@@ -146,7 +141,7 @@ class IntervalQueries:
                 for index in np.unique(run.batch.channel).tolist():
                     yield entry_of[index], run.batch.log_time[run.batch.channel == index]
             return
-        for part in self._planner.decided(self._planner.parts()):
+        for part in self._planner.parts():
             yield part.recording, self._planner.times(part)
 
     def _spans(self) -> Iterator[tuple[Part, Span]]:
@@ -158,35 +153,31 @@ class IntervalQueries:
                 for _, span in spans:
                     yield part, span
 
-    def _states_in(
-        self, part: Part, span: Span, gap: int | None, inner: Part, before: Sequence[Part]
-    ) -> NDArray[np.int64]:
+    def _states_in(self, part: Part, span: Span, gap: int | None) -> NDArray[np.int64]:
         # The last message before the range determines the state at its beginning.
-        last = self._last_before(part, span, self._planner.outcomes, before)
-        found = [(one.log_time, one.holds) for one in self._planner.outcomes(inner)]
+        last = self._last_before(part, span, self._planner.outcomes)
+        outcomes = self._planner.outcomes(_bounded(part, span))
+        found = [(one.log_time, one.holds) for one in outcomes]
         begun = (last.log_time[-1:], last.holds[-1:]) if last else (_NONE, _NONE.astype(np.bool_))
         time, holds = (np.concatenate(column) for column in zip(begun, *found, strict=True))
         end = extent_of(part.recording)[1]
         return clipped(holding(time, holds, end, gap, before=len(begun[0])), span)
 
     def _last_before(
-        self,
-        part: Part,
-        span: Span,
-        ask: Callable[[Part], Iterator[_Rows]],
-        first: Sequence[Part] = (),
+        self, part: Part, span: Span, ask: Callable[[Part], Iterator[_Rows]]
     ) -> _Rows | None:
         """The last rows before a span, if there are any; unreadable messages do not count.
 
-        Rows begin with the column of log times; `first` are those of `_just_before`, if at hand.
+        Rows begin with the column of log times.
         """
         counters = self._planner.counters
         unreadable = counters.unreadable, counters.without_arrays
-        begins = islice(_earlier(part, span), len(first), None)
-        further = (_bounded(part, (begin, span[0])) for begin in begins)
-        for before in (*first, *further):
+        recorded = part.recording.span
+        if recorded is None or span[0] <= recorded[0]:
+            return None
+        for begin in earlier(span[0], recorded[0]):
             last = None
-            for found in ask(before):
+            for found in ask(_bounded(part, (begin, span[0]))):
                 last = found if len(found[0]) else last
             counters.unreadable, counters.without_arrays = unreadable
             if last is not None:
@@ -218,19 +209,6 @@ class IntervalQueries:
             raise UsageError(
                 f"{subject} uses all messages; it cannot be combined with limit, every or reverse."
             )
-
-
-def _earlier(part: Part, span: Span) -> Iterator[int]:
-    """Starts of ever longer spans that end where a span begins; the last is the recording's."""
-    entry_span = part.recording.span
-    if entry_span is None or span[0] <= entry_span[0]:
-        return iter(())
-    return earlier(span[0], entry_span[0])
-
-
-def _just_before(part: Part, span: Span) -> list[Part]:
-    """The part in the first of the earlier spans, if there is one."""
-    return [_bounded(part, (begin, span[0])) for begin in islice(_earlier(part, span), 1)]
 
 
 def _bounded(part: Part, span: Span) -> Part:

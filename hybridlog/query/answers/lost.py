@@ -19,9 +19,9 @@ from hybridlog.query.answers.completeness import (
     not_indexed,
     not_written,
 )
-from hybridlog.query.counters import Counters
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.planner import Planner
+from hybridlog.query.question import Counters, windows_in
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.record.losses import CRASH, Cause, losses_of
 from hybridlog.schema.states import CAUSES, GONE, State
@@ -128,7 +128,7 @@ def _expired(session: Session, question: Question) -> Counter[State]:
     if not any(one.expired or one.not_copied or one.status in UNFINISHED for one in summaries):
         return Counter()
     with suppress(TimeError, TopicError):  # nothing is in the range, or has this clock
-        return Planner(session, question, Counters()).count_expired()
+        return Planner(session, question).count_expired()
     return Counter()
 
 
@@ -167,7 +167,7 @@ def _losses_in(
         entry = doubtful.get(summary.id)
         if entry is None:
             continue
-        chosen = _chosen_windows(bounds if question.clock == "log" else None, windows)
+        chosen = windows_in(windows, bounds if question.clock == "log" else None)
         for row in _ledger(entry):
             if row["count"] == 0:
                 continue
@@ -176,13 +176,6 @@ def _losses_in(
             span = _span_of(entry, row)
             if span is None or bool(((chosen[:, 0] <= span[1]) & (span[0] < chosen[:, 1])).any()):
                 yield entry, row
-
-
-def _chosen_windows(bounds: Span | None, windows: NDArray[np.int64] | None) -> NDArray[np.int64]:
-    chosen = np.array([[BEGIN, END]], np.int64) if windows is None else windows
-    if bounds is not None:
-        chosen = np.clip(chosen, *bounds)
-    return chosen[chosen[:, 1] > chosen[:, 0]]
 
 
 def _ledger(entry: RecordingEntry) -> list[dict[str, Any]]:
@@ -204,8 +197,7 @@ def _unwritten(session: Session, questions: Sequence[Question]) -> tuple[int | N
     """Messages that are not written yet, if questions reach past the last flush.
 
     Returns:
-        The number of messages of the first question, None if a recorder does not answer; and
-        a sentence for each recording.
+        Their number, None if a recorder does not answer; and a sentence for each recording.
     """
     snapshot = session.snapshot()
     topics: dict[int, set[str]] = defaultdict(set)
@@ -221,10 +213,7 @@ def _unwritten(session: Session, questions: Sequence[Question]) -> tuple[int | N
         one = snapshot.summaries[place]
         late = _taken(session, one)
         number = None if late is None else sum(late.get(topic, 0) for topic in names)
-        if late is None or missing is None:
-            missing = None
-        else:
-            missing += sum(late.get(topic, 0) for topic in names & {*questions[0].topics})
+        missing = None if number is None or missing is None else missing + number
         if number != 0:
             sentences.append(not_written(one.name, number, flush_interval_ns(one)))
     return missing, sentences
@@ -267,7 +256,7 @@ def _unindexed(
     if question.predicate is None or not question.predicate.filters:
         return ()
     with suppress(TimeError):  # nothing is in the range
-        return Planner(session, question, Counters()).not_indexed()
+        return Planner(session, question).not_indexed()
     return ()
 
 

@@ -15,7 +15,7 @@ from hybridlog_storage.errors import HybridlogError
 
 if TYPE_CHECKING:
     from hybridlog.message import Message
-    from hybridlog.query.counters import Counters
+    from hybridlog.query.question import Counters
     from hybridlog.session import Session
 
 EVENT: Final = "foxglove.Event"
@@ -54,29 +54,30 @@ def mark_topics(session: Session, recordings: Collection[str] | None = None) -> 
     return session.snapshot().topics_with(wanted)
 
 
-def marks(session: Session, question: Question, counters: Counters) -> Iterator[Mark]:
+def marks(session: Session, question: Question, counters: Counters | None = None) -> Iterator[Mark]:
     """The marks among the messages of a question, in their order.
 
     Unreadable ones are left out; `counters.unreadable` counts them.
     """
-    for run in Planner(session, question, counters).runs():
+    planner = Planner(session, question, counters)
+    for run in planner.runs():
         for message in messages_in(run):
             if plain_type(message.type) not in {MARK, EVENT}:
                 continue
             try:
                 yield _mark_of(message)
             except HybridlogError:
-                counters.unreadable += 1
+                planner.counters.unreadable += 1
 
 
-def marks_in(session: Session, recordings: Collection[str], counters: Counters) -> Iterator[Mark]:
+def marks_in(session: Session, recordings: Collection[str]) -> Iterator[Mark]:
     """All marks of some recordings, in order of log time."""
     topics = mark_topics(session, recordings)
     places = session.snapshot().having(topics)
     having = {session.snapshot().summaries[place].id for place in places.tolist()}
     chosen = tuple(one for one in recordings if one in having)
     if chosen:
-        yield from marks(session, Question(topics, chosen), counters)
+        yield from marks(session, Question(topics, chosen))
 
 
 def _mark_of(message: Message) -> Mark:

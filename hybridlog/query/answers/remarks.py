@@ -9,7 +9,6 @@ from dataclasses import replace
 from itertools import islice
 from typing import TYPE_CHECKING, Any
 
-from hybridlog.query.counters import Counters
 from hybridlog.query.planner import Planner
 from hybridlog.query.predicate.tree import Exists, is_meta
 from hybridlog.query.question import Question, field_types
@@ -57,9 +56,7 @@ def _about_stamps(session: Session, question: Question) -> Iterator[str]:
     """Header stamps of another epoch than the log times, and messages without a stamp."""
     is_noted = False
     missing = 0
-    summaries = session.look(question.recordings).summaries
-    places = session.chosen(question)[:_MAX_RECORDINGS].tolist()
-    entries = (session.entry_of(summaries[place]) for place in places)
+    entries = map(session.entry_of, session.summaries_of(question)[:_MAX_RECORDINGS])
     topics = {*question.topics}
     for channel in (one for entry in entries for one in session.channels_of(entry, topics)):
         stats = channel.stats
@@ -92,7 +89,7 @@ def _missing_fields(session: Session, question: Question, *, is_empty: bool) -> 
     if not paths:
         return
     by_topic: dict[str, list[RecordedChannel]] = defaultdict(list)
-    for channel in Planner(session, question, Counters()).examples:
+    for channel in Planner(session, question).examples:
         by_topic[channel.channel.topic].append(channel)
     for topic, channels in by_topic.items():
         if not any(channel.codec.indexed for channel in channels):
@@ -134,12 +131,11 @@ def _is_near(path: str, name: str) -> bool:
 
 def _fields_in_tables(session: Session, question: Question, topic: str) -> set[str] | None:
     """Fields of messages of a topic that no definition describes; None if they are not known."""
-    summaries = session.look(question.recordings).summaries
-    places = session.chosen(replace(question, topics=(topic,))).tolist()
+    summaries = session.summaries_of(replace(question, topics=(topic,)))
     found: set[str] = set()
-    for place in places:
-        table = session.table(session.entry_of(summaries[place]), topic)
-        if table is None or len(places) > _MAX_RECORDINGS:
+    for summary in summaries:
+        table = session.table(session.entry_of(summary), topic)
+        if table is None or len(summaries) > _MAX_RECORDINGS:
             return None
         found.update(_names_in(table.fields(None), ""))
     return found

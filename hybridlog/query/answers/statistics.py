@@ -1,4 +1,4 @@
-"""Statistics of numeric fields, and rates, gaps and regularity of topics.
+"""Statistics of numeric fields, and gaps and regularity of topics.
 
 The times of a topic in a recording are in memory at once, 8 bytes a message.
 """
@@ -10,12 +10,12 @@ from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import groupby
-from operator import attrgetter
-from typing import TYPE_CHECKING, Any, NamedTuple
+from operator import itemgetter
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hybridlog.query.intervals import MAX_PIECES, Intervals
+from hybridlog.query.intervals import Intervals
 from hybridlog.query.periods import GAP_PERIODS, mean_rate, usual_period
 from hybridlog.query.planner import Planner
 from hybridlog.query.question import field_types
@@ -26,14 +26,12 @@ from hybridlog.record.losses import topics_of
 from hybridlog.schema.kinds import NUMBERS
 from hybridlog.wording import listed
 from hybridlog_storage.errors import DefinitionError, UsageError
-from hybridlog_storage.times import END, placed
 
 if TYPE_CHECKING:
     import pyarrow as pa
     from numpy.typing import NDArray
 
-    from hybridlog.query.counters import Counters
-    from hybridlog.query.question import Part, Question, RecordedChannel, Span
+    from hybridlog.query.question import Counters, Part, Question, RecordedChannel, Span
     from hybridlog.session import Session
     from hybridlog_storage.summary import RecordingSummary
 
@@ -74,7 +72,7 @@ class _Running:
         self.count = self.nan = self.infinite = 0
         self.least: int | float | None = None
         self.most: int | float | None = None
-        self._total = self._squares = np.longdouble(0)
+        self._mean = self._squares = np.longdouble(0)  # which no square of a double overflows
 
     def add(self, column: pa.Array[Any]) -> None:
         values = column.drop_null().to_numpy(zero_copy_only=False)
@@ -89,23 +87,17 @@ class _Running:
         low, high = values.min().item(), values.max().item()
         self.least = low if self.least is None else min(self.least, low)
         self.most = high if self.most is None else max(self.most, high)
-        numbers, count = values.astype(np.longdouble), len(values)  # in which no sum overflows
-        total = numbers.sum()
-        mean = total / count
-        self._squares += np.square(numbers - mean).sum()
-        if self.count:
-            step = mean - self._total / self.count
-            self._squares += step * step * self.count * count / (self.count + count)
-        self._total += total
+        numbers, count = values.astype(np.longdouble), len(values)
+        mean = numbers.mean()
+        step, share = mean - self._mean, count / (self.count + count)
+        self._squares += np.square(numbers - mean).sum() + step * step * self.count * share
+        self._mean += step * share
         self.count += count
-
-    @property
-    def _std(self) -> float:
-        with np.errstate(over="ignore"):  # it may be greater than the greatest double
-            return float(np.sqrt(self._squares / (self.count - 1)))
 
     def result(self, topic: str, field: str) -> FieldStatistics:
         few = self.count < 2
+        with np.errstate(over="ignore"):  # it may be greater than the greatest double
+            std = float(np.sqrt(self._squares / max(self.count - 1, 1)))
         return FieldStatistics(
             topic,
             field,
@@ -114,15 +106,14 @@ class _Running:
             self.infinite,
             self.least,
             self.most,
-            float(self._total / self.count) if self.count else None,
-            None if few else self._std,
+            float(self._mean) if self.count else None,
+            None if few else std,
         )
 
 
 def statistics(session: Session, question: Question, counters: Counters) -> list[FieldStatistics]:
     """Statistics of numeric fields; see `Query.stats`."""
-    if not question.returns_all or question.reverse:
-        raise UsageError("Statistics are of all messages: leave out limit, every and reverse.")
+    _check_all(question)
     planner = Planner(session, question, counters)
     found: dict[str, dict[str, _Running]] = {topic: {} for topic in question.topics}
     blind: DefinitionError | None = None
@@ -133,8 +124,8 @@ def statistics(session: Session, question: Question, counters: Counters) -> list
             blind = error
     if blind is not None and (question.fields is not None or len(question.topics) == 1):
         raise blind  # otherwise, those of the topics that have fields
-    for part in planner.decided(planner.parts()):
-        if not all(channel.codec.indexed for channel in part.channels):
+    for part in planner.parts():
+        if part.predicate is None and not part.has_fields:
             continue
         fields = _numbers(part.field_types) if question.fields is None else question.fields
         if fields == []:
@@ -233,166 +224,100 @@ class TopicCheck:
         return max(self.gap_ns or 0, *ends) / self.period_ns if self.period_ns else 0.0
 
 
-class Stretch(NamedTuple):
-    """The messages of one topic in one span of one recording.
+def gaps(
+    session: Session,
+    question: Question,
+    counters: Counters,
+    longer_than: DurationLike | None,
+    periods: float | None,
+) -> Intervals:
+    """Times without messages; see `Query.gaps`."""
+    _check_all(question)
+    if len(question.topics) != 1:
+        raise UsageError(
+            f"A gap is one topic's; this question has {len(question.topics)}: name one "
+            f"of {listed(question.topics)}."
+        )
+    least = 0 if longer_than is None else parse_duration(longer_than)
+    if periods is None and longer_than is None:
+        periods = GAP_PERIODS
+    if periods is not None and not 0 < periods < float("inf"):
+        raise UsageError(f"A number of periods is more than 0, not {periods}.")
+    planner = Planner(session, question, counters)
+    found: list[tuple[str, Times]] = []
+    for summary, rows in groupby(RangeResolver(session, question).spans(), itemgetter(0)):
+        own = [(span, planner.times(p)) for _, span in rows for p in _parts(planner, summary, span)]
+        limit = float(least)
+        if periods is not None:
+            steps = (np.diff(times) for _, times in own)
+            usual = usual_period(np.concatenate([np.empty(0, np.int64), *steps]))
+            if not usual:
+                continue  # one message does not tell when the next one was due
+            limit = max(limit, periods * usual)
+        for span, times in own:
+            edges = np.concatenate([span[:1], times, [_end(summary, span)]])
+            places = np.flatnonzero(np.diff(edges) > limit)
+            none = np.zeros(len(places), np.int64)
+            found.append((summary.id, np.stack([edges[places], edges[places + 1], none], axis=1)))
+    return Intervals.of(found)
 
-    Attributes:
-        summary: The recording.
-        span: Log time `[begin, end)`, ns.
-        part: The part of the question, without a range where that is the whole recording.
-    """
 
-    summary: RecordingSummary
-    span: Span
-    part: Part
+def check(
+    session: Session, question: Question, counters: Counters | None = None
+) -> list[TopicCheck]:
+    """Regularity of topics, the worst first; see `Query.check`."""
+    from hybridlog.query.answers.lost import completeness_of
+    from hybridlog.query.latching import depth_of
 
-
-class Regularity:
-    """Answers about the times of messages."""
-
-    def __init__(self, session: Session, question: Question, counters: Counters) -> None:
-        if not question.returns_all or question.reverse:
-            raise UsageError(
-                "A rate is of all messages; it cannot be combined with limit, every or reverse."
-            )
-        self._session = session
-        self._question = question
-        self._planner = Planner(session, question, counters)
-        self._ranges = RangeResolver(session, question)
-
-    def rate(self, window: DurationLike | None) -> pa.Table:
-        """Messages and their rate; see `Query.rate`."""
-        size = None if window is None else parse_duration(window)
-        if size == 0:
-            raise UsageError("A window of 0 holds nothing: name a duration, such as 1s.")
-        stretches = [
-            stretch
-            for summary, span in self._ranges.spans()
-            for stretch in self._stretches(summary, span)
-        ]
-        rows = 0
-        for low, high in (one.span for one in stretches):
-            rows += 1 if size is None else -(-(high - low) // size)
-            if rows > MAX_PIECES:
-                raise UsageError(f"There are {rows} windows; use a longer one or a time range.")
-        made = [
-            self._overall(one) if size is None else self._by_window(one, size) for one in stretches
-        ]
-        return _table(stretches, made)
-
-    def gaps(self, longer_than: DurationLike | None, periods: float | None) -> Intervals:
-        """Times without messages; see `Query.gaps`."""
-        if len(self._question.topics) != 1:
-            raise UsageError(
-                f"A gap is one topic's; this question has {len(self._question.topics)}: name one "
-                f"of {listed(self._question.topics)}."
-            )
-        least = 0 if longer_than is None else parse_duration(longer_than)
-        if periods is None and longer_than is None:
-            periods = GAP_PERIODS
-        if periods is not None and not 0 < periods < float("inf"):
-            raise UsageError(f"A number of periods is more than 0, not {periods}.")
-        found: list[tuple[str, Times]] = []
-        for recording, spans in groupby(self._ranges.spans(), lambda row: row[0].id):
-            stretches = [one for row in spans for one in self._stretches(*row)]
-            times = [self._planner.times(one.part) for one in stretches]
-            limit = float(least)
-            if periods is not None:
-                usual = usual_period(np.concatenate([np.empty(0, np.int64), *map(np.diff, times)]))
-                if not usual:
-                    continue  # one message does not tell when the next one was due
-                limit = max(limit, periods * usual)
-            for stretch, own in zip(stretches, times, strict=True):
-                edges = np.concatenate(
-                    [stretch.span[:1], own, [_end(stretch.summary, stretch.span)]]
+    _check_all(question)
+    planner, ranges = Planner(session, question, counters), RangeResolver(session, question)
+    lost: dict[tuple[str, str], list[int | None]] = defaultdict(list)
+    for row in completeness_of(session, question).rows:
+        lost[row["recording"], row["topic"]].append(row["count"])
+    silent = (
+        (recording, (0, 0))
+        for recording, bounds, windows in ranges.resolve()
+        if recording.span is None and bounds is None and windows is None
+    )
+    found = []
+    for summary, span in [*ranges.spans(), *silent]:
+        parts = {part.topic: part for part in _parts(planner, summary, span)}
+        entry = session.entry_of(summary)
+        for topic in sorted({*question.topics} & topics_of(entry)):
+            part, counts = parts.get(topic), lost[summary.name, topic]
+            times = np.empty(0, np.int64) if part is None else planner.times(part)
+            channels = [one.channel for one in session.channels_of(entry, [topic])]
+            types = {one.schema.name for one in channels if one.schema is not None}
+            found.append(
+                TopicCheck(
+                    summary.name,
+                    topic,
+                    ", ".join(sorted(types)),
+                    span[0],
+                    lost=None if None in counts else sum(count or 0 for count in counts),
+                    is_latched=any(map(depth_of, channels)),
+                    **_measured(times, summary, span),
                 )
-                rows = np.flatnonzero(np.diff(edges) > limit)
-                none = np.zeros(len(rows), np.int64)
-                found.append((recording, np.stack([edges[rows], edges[rows + 1], none], axis=1)))
-        return Intervals.of(found)
-
-    def check(self) -> list[TopicCheck]:
-        """Regularity of topics, the worst first; see `Query.check`."""
-        from hybridlog.query.answers.lost import completeness_of
-        from hybridlog.query.latching import depth_of
-
-        session, question = self._session, self._question
-        lost: dict[tuple[str, str], list[int | None]] = defaultdict(list)
-        for row in completeness_of(session, question).rows:
-            lost[row["recording"], row["topic"]].append(row["count"])
-        silent = (
-            (recording, (0, 0))
-            for recording, bounds, windows in self._ranges.resolve()
-            if recording.span is None and bounds is None and windows is None
-        )
-        found = []
-        for summary, span in [*self._ranges.spans(), *silent]:
-            parts = {one.part.topic: one.part for one in self._stretches(summary, span)}
-            entry = session.entry_of(summary)
-            for topic in sorted({*question.topics} & topics_of(entry)):
-                part, counts = parts.get(topic), lost[summary.name, topic]
-                times = np.empty(0, np.int64) if part is None else self._planner.times(part)
-                channels = [one.channel for one in session.channels_of(entry, [topic])]
-                types = {one.schema.name for one in channels if one.schema is not None}
-                found.append(
-                    TopicCheck(
-                        summary.name,
-                        topic,
-                        ", ".join(sorted(types)),
-                        span[0],
-                        lost=None if None in counts else sum(count or 0 for count in counts),
-                        is_latched=any(map(depth_of, channels)),
-                        **_measured(times, summary, span),
-                    )
-                )
-        return sorted(
-            found,
-            key=lambda one: (one.silent_periods, one.lost is None, one.lost or 0),
-            reverse=True,
-        )
-
-    def _stretches(self, summary: RecordingSummary, span: Span) -> list[Stretch]:
-        """The topics of the question that have messages in a recording, by name."""
-        is_whole = self._question.is_unbounded
-        return [
-            Stretch(summary, span, part if is_whole else replace(part, bounds=span, clock="log"))
-            for part in sorted(self._planner.parts_in(summary, None, None), key=attrgetter("topic"))
-        ]
-
-    def _overall(self, stretch: Stretch) -> _Columns:
-        """First and last time, messages and mean rate."""
-        part = stretch.part
-        if part.predicate is None and part.is_unbounded:
-            count = part.messages
-            firsts = [one.first for one in part.stats if one.first is not None]
-            lasts = [one.last for one in part.stats if one.last is not None]
-            first, last = min(firsts, default=0), max(lasts, default=0)
-        else:
-            times = self._planner.times(part)
-            count = len(times)
-            first, last = (int(times[0]), int(times[-1])) if count else (0, 0)
-        if not count:
-            first, last = stretch.span[0], stretch.span[1] - 1
-        rate = mean_rate(count, first, last)
-        return (
-            np.array([first], np.int64),
-            np.array([min(last + 1, END)], np.int64),
-            np.array([count], np.int64),
-            np.array([(np.nan if rate is None else rate) if count else 0.0]),
-        )
-
-    def _by_window(self, stretch: Stretch, size: int) -> _Columns:
-        low, high = stretch.span
-        begin = np.arange(low, high, size, dtype=np.int64)
-        end = np.append(begin[1:], high)
-        times = placed(self._planner.times(stretch.part))
-        inside = times[(times >= low) & (times < high)]
-        messages = np.bincount((inside - low) // size, minlength=len(begin))
-        return begin, end, messages, messages * 1e9 / (end - begin)
+            )
+    return sorted(
+        found,
+        key=lambda one: (one.silent_periods, one.lost is None, one.lost or 0),
+        reverse=True,
+    )
 
 
-_Columns = tuple["Times", "Times", "Times", "NDArray[np.float64]"]
-"""Begin, end, messages and rate of windows."""
+def _check_all(question: Question) -> None:
+    """Refuse a question about some messages only."""
+    if not question.returns_all or question.reverse:
+        raise UsageError("Statistics are of all messages: leave out limit, every and reverse.")
+
+
+def _parts(planner: Planner, summary: RecordingSummary, span: Span) -> list[Part]:
+    """The topics of a question that have messages in a recording, in a span of it."""
+    parts = [*planner.parts_in(summary, None, None)]
+    if planner.question.is_unbounded:  # then the catalog knows their numbers
+        return parts
+    return [replace(part, bounds=span, clock="log") for part in parts]
 
 
 def _end(summary: RecordingSummary, span: Span) -> int:
@@ -420,30 +345,3 @@ def _measured(times: Times, summary: RecordingSummary, span: Span) -> dict[str, 
         found["jitter_ns"] = float(np.std(steps)) if len(steps) > 1 else None
         found["gap_ns"], found["gap_begin_ns"] = int(steps[longest]), int(times[longest])
     return found
-
-
-def _table(stretches: list[Stretch], made: list[_Columns]) -> pa.Table:
-    import pyarrow as pa
-
-    from hybridlog.schema.arrow_columns import numbers
-
-    none = np.empty(0, np.int64)
-    begin, end, messages, rate = (
-        np.concatenate([none, *(columns[place] for columns in made)]) for place in range(4)
-    )
-    row = np.repeat(np.arange(len(made)), [len(columns[0]) for columns in made])
-
-    def texts(names: list[str]) -> pa.Array[Any]:
-        sound = [name.encode("utf-8", "replace").decode() for name in names]
-        return pa.array(sound, pa.string()).take(numbers(row.astype(np.int64)))
-
-    return pa.table(
-        {
-            "begin": numbers(begin, "time"),
-            "end": numbers(end, "time"),
-            "recording": texts([one.summary.name for one in stretches]),
-            "topic": texts([one.part.topic for one in stretches]),
-            "messages": numbers(messages),
-            "rate": pa.array(rate, pa.float64(), mask=np.isnan(rate)),
-        }
-    )

@@ -13,7 +13,6 @@ from hybridlog.arrays.bitstream import frame_of, is_key_frame
 from hybridlog.arrays.video import VideoDecoder
 from hybridlog.message import messages_in
 from hybridlog.query.answers.lost import lost_times
-from hybridlog.query.counters import Counters
 from hybridlog.query.planner import Planner
 from hybridlog.query.question import Question
 from hybridlog.schema.states import CAUSES
@@ -60,7 +59,7 @@ def summary_of(session: Session, recording: str, topic: str) -> VideoSummary:
     question = Question((topic,), (recording,), limit=_MAX_LOOKED)
     formats: set[str] = set()
     frames = keys = unreadable = 0
-    for run in Planner(session, question, Counters()).runs():
+    for run in Planner(session, question).runs():
         for message in messages_in(run):
             if message.is_reduced:
                 continue
@@ -81,7 +80,7 @@ def frames_in_front(session: Session, question: Question) -> list[Message]:
     There are none before a key frame, nor before messages that are no frames.
     """
     of_first = replace(question, limit=1)
-    runs = Planner(session, of_first, Counters()).runs()
+    runs = Planner(session, of_first).runs()
     first = next((message for run in runs for message in messages_in(run)), None)
     if first is None or not is_video_type(first.type):
         return []
@@ -112,7 +111,7 @@ def back_to_key(
     bounds = (None, message.log_time_ns + 1)
     question = Question((message.topic,), (message.recording,), bounds, reverse=True)
     size = 0
-    for run in Planner(session, question, Counters()).runs():
+    for run in Planner(session, question).runs():
         for each in messages_in(run, picture):
             if _place(each) > last:
                 continue

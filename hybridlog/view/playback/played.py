@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from hybridlog.query.asked import channels_of, narrowed, spans_of
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.latching import depth_of, is_video
-from hybridlog.query.query import Query
+from hybridlog.query.query import Query, channels_of, narrowed, spans_of
 from hybridlog_storage.errors import TimeError, TopicError
 
 if TYPE_CHECKING:

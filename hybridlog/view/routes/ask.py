@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 from hybridlog.drawing.times import Match, Matches
 from hybridlog.query.answers.infer_fields import infer_fields
-from hybridlog.query.asked import field_types
 from hybridlog.query.predicate.completion import complete
 from hybridlog.query.predicate.tokens import MAX_TEXT
+from hybridlog.query.query import field_types
 from hybridlog.query.topics import resolve
 from hybridlog.view.context import SQL_MEMORY, Context, route, start_of
 from hybridlog.view.question import program, question_of

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any, Final
 from starlette.responses import FileResponse
 
 from hybridlog.formats.slices import cached_slice, fingerprint, write_mcap
-from hybridlog.query.asked import channels_of, spans_of
 from hybridlog.query.choice import Choice
 from hybridlog.query.predicate.tokens import MAX_TEXT
+from hybridlog.query.query import channels_of, spans_of
 from hybridlog.query.times import format_time
 from hybridlog.schema.completion import with_nested
 from hybridlog.view.context import Context, route

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from hybridlog.drawing.log import LEVELS, Kind, Line, filtered, kind_of, lines
 from hybridlog.drawing.tree import MAX_SHOWN, tree
-from hybridlog.query.asked import channels_of
+from hybridlog.query.query import channels_of
 from hybridlog.query.times import format_time
 from hybridlog.schema.states import CAUSES
 from hybridlog.view.context import current, route, start_of

@@ -11,7 +11,6 @@ import numpy as np
 from hybridlog.query.answers.lost import lost_parts
 from hybridlog.query.answers.marks import marks_in
 from hybridlog.query.choice import Choice
-from hybridlog.query.counters import Counters
 from hybridlog.record.losses import losses_of
 from hybridlog.schema.states import encoding_of, shown_channels
 from hybridlog.view.context import Context, extent, route, start_of
@@ -80,7 +79,7 @@ def recording(context: Context, params: RequestParams) -> dict[str, Any]:
         "notes": [note["text"] for note in entry.notes],
         "marks": [
             {"at": one.begin - start, "end": (one.end or one.begin) - start, "text": one.text}
-            for one in islice(marks_in(context.store.session, [entry.id], Counters()), MAX_MARKS)
+            for one in islice(marks_in(context.store.session, [entry.id]), MAX_MARKS)
         ],
         "losses": [_loss(loss, start) for loss in losses_of(entry)],
         "topics": _topics(entry, start),

@@ -11,7 +11,7 @@ from starlette.responses import Response
 from hybridlog.drawing.images import picture
 from hybridlog.drawing.points import MAX_POINTS, bounds, points
 from hybridlog.drawing.track import Position, fix_of, pose_of, position_of, track
-from hybridlog.query.asked import field_types
+from hybridlog.query.query import field_types
 from hybridlog.view.context import current, json_response, packed_response, route, start_of
 from hybridlog_storage.errors import DefinitionError, MissingDependencyError, PayloadError
 

@@ -11,7 +11,7 @@ from hybridlog.drawing.series import fields_of
 from hybridlog.drawing.series import series as read_series
 from hybridlog.drawing.times import aligned, lane_of
 from hybridlog.query.answers.infer_fields import SAMPLE
-from hybridlog.query.asked import field_types
+from hybridlog.query.query import field_types
 from hybridlog.view.context import Context, extent, packed_response, route, start_of
 from hybridlog_storage.errors import UsageError
 
