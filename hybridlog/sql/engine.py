@@ -21,7 +21,6 @@ from hybridlog.schema.states import without_fields
 from hybridlog.sql.content import StoreContent, store_schema, store_table
 from hybridlog.sql.duck import MEMORY, Worker, explained, open_duckdb, shortage_of
 from hybridlog.sql.names import TABLES
-from hybridlog.sql.pieces import DamagedTableError
 from hybridlog.sql.plan import Reading
 from hybridlog.sql.usage import EVERYTHING, Usage, usage_of
 from hybridlog.wording import listed
@@ -102,10 +101,9 @@ class SqlEngine:
                 known = self._content = StoreContent(session, scope)
             return known
 
-    def reject(self, damaged: DamagedTableError) -> None:
-        """Drop a damaged table; the next query makes it again."""
+    def forget(self) -> None:
+        """Look at the tables again for the next query: some have changed or were damaged."""
         with self._lock:
-            self._source.now().reject_table(damaged.source.entry, damaged.source.topic)
             self._content = None
 
     def close(self) -> None:
@@ -452,9 +450,8 @@ class SqlAnswer:
             try:
                 with self._explained():
                     return call()
-            except (ChangedError, DamagedTableError) as error:
-                if isinstance(error, DamagedTableError):
-                    self._connection.engine.reject(error)
+            except ChangedError:
+                self._connection.engine.forget()
                 self._connection.register(self._connection.content)
                 self._prepare()
         with self._explained():
