@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from itertools import chain
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -19,7 +18,7 @@ from hybridlog.query.answers.lost import lost_times
 from hybridlog.query.intervals import joined
 from hybridlog.query.planner import Planner
 from hybridlog.query.question import Counters
-from hybridlog.schema.arrow_types import common_type, converted
+from hybridlog.schema.arrow_types import column_of, common_schema
 from hybridlog.schema.column import STAMP
 from hybridlog.tf.in_frame import stream
 from hybridlog.wording import listed
@@ -228,22 +227,11 @@ def _ns(column: pa.ChunkedArray[Any]) -> NDArray[np.int64]:
 
 def concatenated(tables: Sequence[pa.Table]) -> pa.Table:
     """Tables one after the other; a column has the common exact type of all of them."""
-    if len(tables) == 1:
-        return tables[0]
     if all(table.schema == tables[0].schema for table in tables):
         return pa.concat_tables(tables)
-    columns: dict[str, Any] = {}
-    for name in dict.fromkeys(chain.from_iterable(table.column_names for table in tables)):
-        arrays = [
-            pa.concat_arrays(table[name].chunks or [pa.nulls(0, table[name].type)])
-            if name in table.column_names
-            else table.num_rows
-            for table in tables
-        ]
-        kind = common_type([array for array in arrays if not isinstance(array, int)])
-        parts = [
-            pa.nulls(array, kind) if isinstance(array, int) else converted(array, kind)
-            for array in arrays
-        ]
-        columns[name] = pa.chunked_array(parts, kind)
-    return pa.table(columns)
+    schema = common_schema(tables)
+    columns = [
+        pa.chunked_array([c for table in tables for c in column_of(table, one).chunks], one.type)
+        for one in schema
+    ]
+    return pa.Table.from_arrays(columns, schema=schema)

@@ -13,7 +13,10 @@ from copy import copy
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
+from hybridlog.attachments import extras_of
 from hybridlog.formats import OUTPUTS
+from hybridlog.formats.answer import Answer
+from hybridlog.query.planner import Planner
 from hybridlog_storage.disk.files import user_directory
 from hybridlog_storage.errors import UsageError
 
@@ -21,7 +24,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from hybridlog.attachments import Extras
-    from hybridlog.formats.answer import Answer
     from hybridlog.query.query import Query
     from hybridlog_storage.messages import Batch, Channel
 
@@ -60,8 +62,6 @@ def fingerprint(query: Query) -> str:
 
 def payload_bytes(query: Query) -> int:
     """Bytes of payload of a slice, about."""
-    from hybridlog.query.planner import Planner
-
     question = query.question
     if not question.is_by_log_time:
         question = replace(question, bounds=None)
@@ -71,8 +71,6 @@ def payload_bytes(query: Query) -> int:
 
 def profile_of(query: Query) -> str:
     """The MCAP profile of a slice: `ros1` or `ros2`, empty for others and for a mixture."""
-    from hybridlog.query.planner import Planner
-
     examples = Planner(query.session, query.question).examples
     spoken = [channel for channel in examples if channel.stats.messages] or examples
     encodings = {channel.channel.message_encoding for channel in spoken}
@@ -81,15 +79,11 @@ def profile_of(query: Query) -> str:
 
 def log_of(query: Query, front: Front = IN_FORCE, extras: Extras | None = None) -> Answer:
     """A slice as a log."""
-    from hybridlog.formats.answer import Answer
-
     return Answer(batches=batches_of(query, front), extras=extras, profile=profile_of(query))
 
 
 def write_mcap(query: Query, path: Path) -> None:
     """Write a slice as an MCAP file, as `hybridlog export` does; all of it or nothing."""
-    from hybridlog.attachments import extras_of
-
     OUTPUTS["mcap"].write(log_of(query, extras=extras_of(query.session, query.question)), path)
 
 

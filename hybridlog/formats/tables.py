@@ -26,7 +26,7 @@ from hybridlog.formats.json_text import (
 )
 from hybridlog.formats.jsonl import rows_within
 from hybridlog.formats.writing import Sink, Target
-from hybridlog.schema.arrow_types import common_schema, converted, is_bytes
+from hybridlog.schema.arrow_types import column_of, common_schema, is_bytes
 from hybridlog_storage.errors import UsageError
 
 HELD_BYTES = 32 << 20
@@ -145,20 +145,15 @@ def _fitted(table: pa.Table, schema: pa.Schema, form: str, before: int) -> pa.Ta
             )
     columns = []
     for field in schema:
-        index = table.schema.get_field_index(field.name)
-        if index < 0:
-            columns.append(pa.nulls(table.num_rows, field.type))
-            continue
-        column = table.column(index)
         try:
-            arrays = [converted(chunk, field.type) for chunk in column.chunks]
+            columns.append(column_of(table, field))
         except pa.ArrowException as error:
             raise UsageError(
-                f"column {field.name!r} is {field.type} at first and {column.type} later, "
+                f"column {field.name!r} is {field.type} at first and "
+                f"{table.schema.field(field.name).type} later, "
                 f"which does not fit ({error}); leave it out with --fields, or write each "
                 "part into a file of its own with --between"
             ) from error
-        columns.append(pa.chunked_array(arrays, type=field.type))
     return pa.Table.from_arrays(columns, schema=schema)
 
 

@@ -7,13 +7,11 @@ share one value, and merge keys are ordinary keys, so nothing grows beyond the t
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from hybridlog_storage.errors import UsageError
-
-if TYPE_CHECKING:
-    from collections.abc import Collection
 
 MAX_BYTES: Final = 1 << 20
 """Most bytes of a file that a user writes by hand."""
@@ -22,7 +20,6 @@ MAX_EVENTS = 2_000_000
 
 _INTEGER = re.compile(r"[-+]?[0-9]{1,20}")
 _WORDS = {"": None, "~": None, "null": None, "true": True, "false": False}
-_NO_KEY = object()
 
 
 class YamlError(ValueError):
@@ -41,103 +38,63 @@ def read_yaml(path: str | Path, what: str) -> bytes:
     return text
 
 
-def parse_yaml(
-    text: str | bytes,
-    wanted: Collection[str] | None = None,
-    *,
-    lines: dict[tuple[int, object], int] | None = None,
-) -> object:
+def parse_yaml(text: str | bytes, *, lines: dict[tuple[int, object], int] | None = None) -> object:
     """Parse the first document of a text; fractions are strings.
 
-    Only `wanted` keys of mappings are kept, at any depth; None for all. `lines` gets the line of
-    each key, by the `id` of its mapping and the key. A key that is not a single word or is repeated
-    raises YamlError, as too much text does.
+    `lines` gets the line of each key, by the `id` of its mapping and the key. A key that is not a
+    single word or is repeated raises YamlError, as too much text does.
     """
     import yaml
 
-    values = _Values(wanted, {} if lines is None else lines)
-    starts = {yaml.MappingStartEvent: dict, yaml.SequenceStartEvent: list}
-    ends = {yaml.MappingEndEvent, yaml.SequenceEndEvent}
-    skipped = 0  # depth within an unwanted value
+    numbered = enumerate(yaml.parse(text, Loader=yaml.CSafeLoader))
+
+    def take() -> Any:
+        number, event = next(numbered)
+        if number > MAX_EVENTS:
+            raise YamlError(f"it has more than {MAX_EVENTS} keys and values")
+        return event
+
     try:
-        for number, event in enumerate(yaml.parse(text, Loader=yaml.CSafeLoader)):
-            kind = type(event)
-            if number > MAX_EVENTS:
-                raise YamlError(f"it has more than {MAX_EVENTS} keys and values")
-            values.line = event.start_mark.line + 1
-            if skipped:
-                skipped += (kind in starts) - (kind in ends)
-            elif kind in starts:
-                skipped += not values.start(starts[kind](), event.anchor)
-            elif kind in ends:
-                values.end()
-            elif kind is yaml.ScalarEvent:
-                values.add(_scalar(event), event.anchor)
-            elif kind is yaml.AliasEvent:
-                values.alias(event.anchor)
-            elif kind is yaml.DocumentEndEvent:
-                break
+        take()
+        if isinstance(take(), yaml.StreamEndEvent):
+            return None
+        return _value(take(), take, {}, {} if lines is None else lines)
     except (yaml.YAMLError, UnicodeEncodeError) as error:
         raise YamlError(" ".join(str(error).split())[:200]) from error
-    return values.root[0] if values.root else None
+    except RecursionError:
+        raise YamlError("its nesting depth is too great") from None
 
 
-class _Values:
-    """Makes values of events."""
+def _value(
+    event: Any,
+    take: Callable[[], Any],
+    anchors: dict[str | None, object],
+    lines: dict[tuple[int, object], int],
+) -> Any:
+    """The value that begins with an event, of this and the next ones."""
+    import yaml
 
-    def __init__(
-        self, wanted: Collection[str] | None, lines: dict[tuple[int, object], int]
-    ) -> None:
-        self.root: list[object] = []
-        self.line = 0
-        self._lines = lines
-        self._wanted = wanted
-        self._open: list[Any] = [self.root]
-        self._keys: list[object] = [_NO_KEY]  # of the open mappings, each waiting for a value
-        self._anchors: dict[str, object] = {}
-
-    def start(self, value: Any, anchor: str | None) -> bool:
-        """Start a list or mapping; False if it is unwanted."""
-        if not self.add(value, anchor):
-            return False
-        self._open.append(value)
-        self._keys.append(_NO_KEY)
-        return True
-
-    def end(self) -> None:
-        self._open.pop()
-        self._keys.pop()
-
-    def alias(self, anchor: str) -> None:
-        self._place(self._anchors.get(anchor))
-
-    def add(self, value: object, anchor: str | None) -> bool:
-        """Add a value; False if it is unwanted."""
-        if not self._place(value):
-            return False
-        if anchor is not None:
-            self._anchors[anchor] = value
-        return True
-
-    def _place(self, value: object) -> bool:
-        """Add a value to the innermost list or mapping; False if it is unwanted."""
-        holder, key = self._open[-1], self._keys[-1]
-        if isinstance(holder, list):
-            holder.append(value)
-            return True
-        if key is _NO_KEY:
-            if isinstance(value, dict | list):
-                raise YamlError("a key is a list or a mapping")
-            self._keys[-1] = value
-            self._lines[id(holder), value] = self.line
-            return True
-        self._keys[-1] = _NO_KEY
-        if self._wanted is not None and key not in self._wanted:
-            return False
-        if key in holder:
+    if isinstance(event, yaml.AliasEvent):
+        return anchors.get(event.anchor)
+    if isinstance(event, yaml.ScalarEvent):
+        anchors[event.anchor] = text = _scalar(event)
+        return text
+    is_list = isinstance(event, yaml.SequenceStartEvent)
+    found: Any = [] if is_list else {}
+    anchors[event.anchor] = found
+    while not isinstance(item := take(), yaml.CollectionEndEvent):
+        if is_list:
+            found.append(_value(item, take, anchors, lines))
+            continue
+        is_word = isinstance(item, yaml.ScalarEvent | yaml.AliasEvent)
+        key = _value(item, take, anchors, lines) if is_word else found
+        if isinstance(key, dict | list):
+            raise YamlError("a key is a list or a mapping")
+        if key in found:
             raise YamlError(f"the key {key!r} is repeated")
-        holder[key] = value
-        return True
+        lines[id(found), key] = item.start_mark.line + 1
+        found[key] = _value(take(), take, anchors, lines)
+    return found
 
 
 def _scalar(event: Any) -> object:

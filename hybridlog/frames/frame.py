@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
 
 _types = pa.types
-_NAT = np.iinfo(np.int64).min
 _NOTHING: NDArray[Any] = np.empty(0)
 
 
@@ -52,7 +51,7 @@ def _array(column: pa.ChunkedArray[Any]) -> Any:
     if _types.is_timestamp(kind):
         return _times(column)
     if _types.is_duration(kind):
-        return _integers(column).view("m8[ns]")
+        return column.to_numpy()
     if kind == pa.json_():
         column = pa.chunked_array([chunk.storage for chunk in column.chunks], pa.string())
         kind = column.type
@@ -84,15 +83,6 @@ def _numbers(column: pa.ChunkedArray[Any]) -> Any:
 
 def _times(column: pa.ChunkedArray[Any]) -> Any:
     return pd.DatetimeTZDtype("ns", "UTC").__from_arrow__(column)
-
-
-def _integers(column: pa.ChunkedArray[Any]) -> NDArray[np.int64]:
-    """Durations as nanoseconds, NaT for missing ones."""
-    values = column.cast(pa.int64())
-    if values.null_count:
-        values = values.fill_null(_NAT)
-    numbers: NDArray[np.int64] = values.to_numpy()
-    return numbers
 
 
 def _is_plain(chunk: pa.Array[Any]) -> bool:

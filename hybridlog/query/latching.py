@@ -30,7 +30,6 @@ KEEP_ALL: Final = 1 << 62
 
 _TRANSIENT_LOCAL = re.compile(r"durability\W+(?:1|\w*transient_local)\b", re.IGNORECASE)
 _MAX_TEXT = 32 << 10  # characters; profiles of more than a hundred publishers are counted only
-_POLICIES = frozenset({"durability", "history", "depth"})
 
 MAX_HELD: Final = 256 << 20
 """Payload bytes that are held; the last message of each publisher is held in any case."""
@@ -84,9 +83,9 @@ def _offered_depth(text: str) -> int:
     if len(text) > _MAX_TEXT:
         return len(_TRANSIENT_LOCAL.findall(text))
     try:
-        profiles = parse_yaml(text, _POLICIES)
+        profiles = parse_yaml(text)
         if isinstance(profiles, str):  # the list itself was quoted
-            profiles = parse_yaml(profiles, _POLICIES)
+            profiles = parse_yaml(profiles)
     except YamlError:
         return len(_TRANSIENT_LOCAL.findall(text))
     listed = profiles if isinstance(profiles, list) else [profiles]

@@ -280,6 +280,15 @@ def common_schema(tables: Iterable[pa.Table]) -> pa.Schema:
     )
 
 
+def column_of(table: pa.Table, field: pa.Field) -> pa.ChunkedArray:
+    """The values of a table for a field, in its type; null where the table lacks it."""
+    place = table.schema.get_field_index(field.name)
+    if place < 0:
+        return pa.chunked_array([pa.nulls(table.num_rows, field.type)])
+    chunks = [converted(chunk, field.type) for chunk in table.column(place).chunks]
+    return pa.chunked_array(chunks, field.type)
+
+
 def extremes(array: Array) -> Array:
     """Two rows that determine the same common type as all rows."""
     kind = array.type

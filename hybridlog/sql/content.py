@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 import pyarrow as pa
@@ -25,8 +25,9 @@ from hybridlog.snapshot import UNFINISHED
 from hybridlog.sql.columns import OWN, ViewColumn, merged, sql_type, view_columns
 from hybridlog.sql.names import ViewNames
 from hybridlog.sql.pieces import TopicOfRecording
-from hybridlog.sql.plan import Chooser, Plan, RecordingChooser, in_window, within
+from hybridlog.sql.plan import Plan, in_window
 from hybridlog_storage.catalog import ChannelStats
+from hybridlog_storage.times import BEGIN, END
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -112,7 +113,6 @@ class TopicView:
         self.topic = topic
         self._content = content
         self._known: dict[str, TopicOfRecording] = {}
-        self._choosers: dict[str, Chooser] = {}
         having = {*content.having([topic])}
         known = content.summaries_of(topic)
         self._summaries = [one for one in known if one.id in having]
@@ -128,13 +128,6 @@ class TopicView:
         some = [self._of(one) for one in self._summaries[:_SAMPLED]]
         messages = sum(c.stats.messages for one in some for c in one.channels.values())
         self.size = messages * len(self._summaries) // max(len(some), 1)
-        # The end of a recording is one more than its last time: for messages at the end of time.
-        spans = (one.extent for one in self._summaries)
-        self._chooser = RecordingChooser(
-            self.schema,
-            [one.name for one in self._summaries],
-            [(first, end) if first < end else None for first, end in spans],
-        )
 
     def _of(self, summary: RecordingSummary) -> TopicOfRecording:
         if summary.id not in self._known:
@@ -161,22 +154,45 @@ class TopicView:
         return merged(kinds) if kinds else None
 
     def rows(
-        self, columns: Sequence[str], where: Any, reading: Reading
+        self, columns: Sequence[str], where: Any, may_hold: MayHold, reading: Reading
     ) -> Iterator[pa.RecordBatch]:
         """Rows for a query: those columns, where an expression holds (None for all)."""
         plans: dict[Span | None, Plan] = {}
-        for number in self._chooser.chosen(where):
+        # The end of a recording is one more than its last time: for messages at the end of time.
+        spans = ((one.name, one.extent) for one in self._summaries)
+        bounds = _bounds((name, span if span[0] < span[1] else None) for name, span in spans)
+        for number in np.flatnonzero(may_hold(bounds)).tolist():
             summary = self._summaries[number]
             recording, window = self._of(summary), self._content.window(summary.id)
             if window not in plans:
                 holds = in_window(where, window)
                 plans[window] = Plan(self.schema, self._columns, columns, holds, reading)
-            if summary.id not in self._choosers:
-                spans = [within(source.span) for source in recording.sources]
-                self._choosers[summary.id] = Chooser(self.schema, spans)
             reading.remarks.add(recording)
-            for place in self._choosers[summary.id].chosen(plans[window].where):
+            bounds = _bounds((summary.name, source.span) for source in recording.sources)
+            chosen = may_hold(bounds)
+            if window is not None:
+                first, last = bounds["t"]
+                chosen &= (first < window[1]) & (last >= window[0])
+            for place in np.flatnonzero(chosen).tolist():
                 yield from plans[window].read(recording, recording.sources[place])
+
+
+Bounds: TypeAlias = "Mapping[str, tuple[NDArray[Any], NDArray[Any]]]"
+"""Least and greatest values in parts of a view, by column."""
+MayHold: TypeAlias = Callable[[Bounds], "NDArray[np.bool_]"]
+"""Tells which of some parts may have rows that a query asks for."""
+
+
+def _bounds(parts: Iterable[tuple[str, Span | None]]) -> Bounds:
+    """The bounds of parts, by their recordings and log times, ns, None where these are unknown."""
+    names, spans = [], []
+    for name, span in parts:
+        names.append(name)
+        spans.append(span or (BEGIN, END))
+    recording = np.array(names, object)
+    first, last = np.array(spans, np.int64).reshape(-1, 2).T
+    micros = first // 1000, last // 1000
+    return {"t": (first, last), "log_time": micros, "recording": (recording, recording)}
 
 
 _TOPICS: Final = pa.schema(

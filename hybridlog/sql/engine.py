@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 from difflib import get_close_matches
-from functools import lru_cache, partial
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import pyarrow as pa
@@ -21,7 +21,6 @@ from hybridlog.schema.states import without_fields
 from hybridlog.sql.content import StoreContent, store_schema, store_table
 from hybridlog.sql.duck import MEMORY, Worker, explained, open_duckdb, shortage_of
 from hybridlog.sql.names import TABLES
-from hybridlog.sql.pieces import DamagedTableError
 from hybridlog.sql.plan import Reading
 from hybridlog.sql.usage import EVERYTHING, Usage, usage_of
 from hybridlog.wording import listed
@@ -49,7 +48,6 @@ _NAMES: Final = (
     "select unnest(?::varchar[]) as name union select table_name from duckdb_tables() "
     "union select view_name from duckdb_views() where not internal order by name"
 )
-_MAX_TREES: Final = 64  # syntax trees that are kept
 _NO_TABLE: Final = re.compile(r"Catalog Error: Table with name (.+?) does not exist")
 _MAX_TRIES: Final = 10  # tables that may be damaged in one query
 _T = TypeVar("_T")
@@ -62,7 +60,6 @@ class SqlEngine:
         self._source = source
         self._bases: dict[int, Any] = {}
         self._content: StoreContent | None = None
-        self.tree = lru_cache(_MAX_TREES)(self._tree)
         self._lock = threading.RLock()
 
     def connect(
@@ -104,17 +101,9 @@ class SqlEngine:
                 known = self._content = StoreContent(session, scope)
             return known
 
-    def _tree(self, text: str) -> str:
-        """The syntax tree of a query as JSON; `tree` keeps those of the last queries."""
+    def forget(self) -> None:
+        """Look at the tables again for the next query: some have changed or were damaged."""
         with self._lock:
-            base = next(iter(self._bases.values()))
-            ((found,),) = base.cursor().execute(_TREE, [text]).fetchall()
-        return str(found)
-
-    def reject(self, damaged: DamagedTableError) -> None:
-        """Drop a damaged table; the next query makes it again."""
-        with self._lock:
-            self._source.now().reject_table(damaged.source.entry, damaged.source.topic)
             self._content = None
 
     def close(self) -> None:
@@ -251,7 +240,8 @@ class SqlConnection:
         if self._has_own:
             return EVERYTHING
         text = statement.query.strip().rstrip(";")
-        return usage_of(self.engine.tree(text), {name.casefold() for name in self._names})
+        ((tree,),) = self.cursor.execute(_TREE, [text]).fetchall()
+        return usage_of(tree, {name.casefold() for name in self._names})
 
     def close(self) -> None:
         """Close the connection."""
@@ -460,9 +450,8 @@ class SqlAnswer:
             try:
                 with self._explained():
                     return call()
-            except (ChangedError, DamagedTableError) as error:
-                if isinstance(error, DamagedTableError):
-                    self._connection.engine.reject(error)
+            except ChangedError:
+                self._connection.engine.forget()
                 self._connection.register(self._connection.content)
                 self._prepare()
         with self._explained():

@@ -28,7 +28,7 @@ from hybridlog.schema.arrow_types import has_empty
 from hybridlog.schema.left import LeftFields
 from hybridlog.schema.states import GONE, State
 from hybridlog.sql.columns import whole_message
-from hybridlog_storage.errors import StoreError
+from hybridlog_storage.errors import ChangedError, StoreError
 from hybridlog_storage.lazy import lazy
 from hybridlog_storage.messages import EXPIRED_IDS
 
@@ -89,14 +89,6 @@ class Rows(NamedTuple):
     own: Mapping[str, Any]
     records: Any
     size: int
-
-
-class DamagedTableError(StoreError):
-    """A table turned out to be damaged while it was read."""
-
-    def __init__(self, source: TopicOfRecording, problem: str) -> None:
-        super().__init__(f"{problem} It is made again when you ask again.")
-        self.source = source
 
 
 class TopicOfRecording:
@@ -262,7 +254,8 @@ class _TableRows:
             raise self._damaged(error) from error
 
     def _damaged(self, error: StoreError) -> StoreError:
-        return DamagedTableError(self._source, str(error))
+        self._source.session.reject_table(self._source.entry, self._source.topic)
+        return ChangedError(f"{error} It is made again when you ask again.")
 
     def read(self, paths: Paths, own: Collection[str], counts: ScanCounts) -> Iterator[Rows]:
         counts.add_group(self._part.file.path, self._part.group)

@@ -6,14 +6,12 @@ import re
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from math import isqrt
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.dataset as ds
-from pyarrow import acero, fs
+from pyarrow import acero
 
 from hybridlog.columns.layout import POINTS
 from hybridlog.query.rows import offsets_by_chunk, places_of
@@ -35,8 +33,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.catalog import RecordingEntry
 
 _TABLE_OWN: Final = frozenset({"log_time", "t", "seq", "pub", "stamp", "state", "error"})
-_FORMAT: Final = ds.ParquetFileFormat()
-_PLACES: Final = fs.LocalFileSystem()
 _WORD: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
@@ -72,83 +68,6 @@ class Reading:
     counts: ScanCounts = field(default_factory=ScanCounts)
     remarks: Remarks = field(default_factory=Remarks)
     error: Exception | None = None
-
-
-class Chooser:
-    """Chooses parts that may have rows for which an expression holds.
-
-    The guarantee of each part is an expression that holds for all of its rows.
-    """
-
-    def __init__(self, schema: Any, guarantees: Sequence[Any]) -> None:
-        self._count = len(guarantees)
-        self._parts = ds.FileSystemDataset(
-            [
-                _FORMAT.make_fragment(str(number), _PLACES, partition_expression=guarantee)
-                for number, guarantee in enumerate(guarantees)
-            ],
-            schema,
-            _FORMAT,
-            _PLACES,
-        )
-
-    def chosen(self, where: Any) -> list[int]:
-        """Numbers of the parts, in order."""
-        if where is None:
-            return list(range(self._count))
-        return sorted(int(part.path) for part in self._parts.get_fragments(filter=where))
-
-
-class RecordingChooser:
-    """Chooses recordings as `Chooser` chooses parts: first groups of them, then among these.
-
-    Spans are first and last log time of each, ns; None if unknown.
-    """
-
-    def __init__(
-        self, schema: Any, names: Sequence[str], spans: Sequence[tuple[int, int] | None]
-    ) -> None:
-        self._schema = schema
-        self._names = names
-        self._spans = spans
-        count, size = len(names), max(isqrt(len(names)), 1)
-        self._groups = [range(at, min(at + size, count)) for at in range(0, count, size)]
-        self._chooser = Chooser(schema, [self._guarantee(group) for group in self._groups])
-        self._inside: dict[int, Chooser] = {}
-
-    def chosen(self, where: Any) -> Iterator[int]:
-        """Numbers of the recordings, in order."""
-        for number in self._chooser.chosen(where):
-            group = self._groups[number]
-            if where is None:
-                yield from group
-                continue
-            if number not in self._inside:
-                alone = [self._guarantee(range(one, one + 1)) for one in group]
-                self._inside[number] = Chooser(self._schema, alone)
-            yield from (group[place] for place in self._inside[number].chosen(where))
-
-    def _guarantee(self, group: range) -> Any:
-        """An expression that holds for all rows of some recordings."""
-        names = self._names[group.start : group.stop]
-        spans = [span for span in self._spans[group.start : group.stop] if span is not None]
-        is_inside = within(None)
-        if len(spans) == len(group):
-            is_inside = within((min(first for first, _ in spans), max(last for _, last in spans)))
-        recording, low, high = pc.field("recording"), min(names), max(names)
-        if low == high:
-            return (recording == low) & is_inside
-        return (recording >= low) & (recording <= high) & is_inside
-
-
-def within(span: tuple[int, int] | None) -> Any:
-    """An expression that holds for the log times of a span, both ends included."""
-    if span is None:
-        return pc.scalar(True)
-    first, last = span
-    low, high = (pa.scalar(bound // 1000, pa.timestamp("us", "UTC")) for bound in span)
-    t, log_time = pc.field("t"), pc.field("log_time")
-    return (t >= first) & (t <= last) & (log_time >= low) & (log_time <= high)
 
 
 def in_window(where: Any, window: tuple[int, int] | None) -> Any:

@@ -2,18 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial, reduce
+from typing import Any, Final
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.dataset as ds
-from duckdb._sources.nodes import Untranslatable
+from duckdb._sources.nodes import Binary, Col, In, Lit, Node, Untranslatable
 from duckdb._sources.pyarrow import PyArrowDatasetSource
 from duckdb._sources.to_arrow import to_arrow
+from numpy.typing import NDArray
 
-from hybridlog.sql.content import TopicView
+from hybridlog.sql.content import Bounds, TopicView
 from hybridlog.sql.plan import Reading
+
+_COMPARED: Final[Mapping[str, Callable[..., NDArray[np.bool_]]]] = {
+    "=": lambda low, high, value: (low <= value) & (value <= high),
+    "!=": lambda low, high, value: (low != value) | (high != value),
+    "<": lambda low, _, value: low < value,
+    "<=": lambda low, _, value: low <= value,
+    ">": lambda _, high, value: high > value,
+    ">=": lambda _, high, value: high >= value,
+}
+"""Whether a comparison may hold for values between two bounds."""
 
 
 class TopicDataset(ds.Dataset, PyArrowDatasetSource):  # type: ignore[misc] # without types
@@ -48,29 +60,33 @@ class TopicDataset(ds.Dataset, PyArrowDatasetSource):  # type: ignore[misc] # wi
             return False
         return True
 
-    def scanner(
-        self,
-        columns: Sequence[str] | None = None,
-        filter: Any = None,  # noqa: A002
-        **_: Any,
-    ) -> _Scanner:
-        """A scanner, whose reader DuckDB takes."""
-        names = self.schema.names if columns is None else list(columns)
-        schema = pa.schema([self.schema.field(name) for name in names])
-        reading = self._reading()
-        batches = _told(self.view.rows(names, filter, reading), reading)
-        return _Scanner(pa.RecordBatchReader.from_batches(schema, batches))
+    def stream(self, columns: Sequence[int] | None, filters: Sequence[Node]) -> tuple[object, bool]:
+        """The rows for which the filters hold, as a stream of record batches."""
+        schema, reading = self.schema, self._reading()
+        if columns is not None:
+            schema = pa.schema([schema.field(place) for place in columns])
+        whole = reduce(partial(Binary, "AND"), filters) if filters else Node()
+        where = to_arrow(whole, self.schema) if filters else None
+        rows = self.view.rows(schema.names, where, partial(_may_hold, whole), reading)
+        reader = pa.RecordBatchReader.from_batches(schema, _told(rows, reading))
+        return reader.__arrow_c_stream__(), columns is not None
 
 
-@dataclass
-class _Scanner:
-    """Taken for a scanner by DuckDB."""
-
-    reader: pa.RecordBatchReader
-
-    def to_reader(self) -> pa.RecordBatchReader:
-        """The rows as a stream of record batches."""
-        return self.reader
+def _may_hold(node: Node, bounds: Bounds) -> NDArray[np.bool_]:
+    """Which parts may have rows for which a filter holds."""
+    match node:
+        case Binary(op="AND", left=left, right=right):
+            return _may_hold(left, bounds) & _may_hold(right, bounds)
+        case Binary(op="OR", left=left, right=right):
+            return _may_hold(left, bounds) | _may_hold(right, bounds)
+        case Binary(op=op, left=Col(parts=(name,)), right=Lit(value=value)) if (
+            op in _COMPARED and name in bounds
+        ):
+            return _COMPARED[op](*bounds[name], value)
+        case In(operand=Col() as column, values=values):
+            each = (_may_hold(Binary("=", column, one), bounds) for one in values)
+            return reduce(np.logical_or, each)
+    return np.ones(len(bounds["t"][0]), np.bool_)
 
 
 def _told(batches: Iterator[pa.RecordBatch], reading: Reading) -> Iterator[pa.RecordBatch]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
+from operator import eq
 from typing import Any, Final
 
 Path = tuple[str, ...]
@@ -33,14 +34,9 @@ class Usage:
         """True if the query may use a field: its column, and fields in it, folded."""
         if self.chains is None:
             return True
-        for chain in self.chains:
-            for start, name in enumerate(chain):
-                if name == path[0]:
-                    rest = chain[start:]
-                    shared = min(len(rest), len(path))
-                    if rest[:shared] == path[:shared]:
-                        return True
-        return False
+        named = (chain[start:] for chain in self.chains for start in range(len(chain)))
+        # As far as both go, so above it and below it, too.
+        return any(all(map(eq, rest, path)) for rest in named)
 
 
 EVERYTHING: Final = Usage()

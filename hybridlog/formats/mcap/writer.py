@@ -10,15 +10,14 @@ from mcap.writer import CompressionType, Writer
 from hybridlog.formats.answer import Answer, LogWriter
 from hybridlog.formats.writing import Sink, Target
 from hybridlog.schema.completion import with_nested
+from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_format import OUR_NAMES
 
 if TYPE_CHECKING:
     from mcap.records import AttachmentIndex, Statistics
 
-    from hybridlog_storage.messages import Batch, Channel, Schema
+    from hybridlog_storage.messages import Batch, Schema
     from hybridlog_storage.segments.attachments import Attachment
-
-_ChannelKey = tuple[str, str, int, tuple[tuple[str, str], ...]]
 
 
 def source_metadata(channel: Channel) -> dict[str, str]:
@@ -53,7 +52,6 @@ class McapWriter(LogWriter):
     def __init__(self, target: Target, *, profile: str = "") -> None:
         self._sink = Sink(target)
         self._schemas: dict[Schema, int] = {}
-        self._ids: dict[_ChannelKey, int] = {}
         self._known: dict[Channel, int] = {}
         try:
             self._writer = _Writer(
@@ -101,20 +99,15 @@ class McapWriter(LogWriter):
         self._writer.note_attachment(attachment.index(offset, self._sink.tell() - offset))
 
     def _channel(self, channel: Channel) -> int:
-        number = self._known.get(channel)
-        if number is None:
-            number = self._known[channel] = self._register(channel)
-        return number
-
-    def _register(self, channel: Channel) -> int:
-        metadata = source_metadata(channel)
-        schema = self._schema(channel.schema)
-        key = (channel.topic, channel.message_encoding, schema, tuple(sorted(metadata.items())))
-        if key not in self._ids:
-            self._ids[key] = self._writer.register_channel(
-                channel.topic, channel.message_encoding, schema, metadata
-            )
-        return self._ids[key]
+        if channel not in self._known:
+            metadata = source_metadata(channel)
+            plain = Channel(channel.topic, channel.message_encoding, channel.schema, metadata)
+            if plain not in self._known:
+                self._known[plain] = self._writer.register_channel(
+                    plain.topic, plain.message_encoding, self._schema(plain.schema), metadata
+                )
+            self._known[channel] = self._known[plain]
+        return self._known[channel]
 
     def _schema(self, schema: Schema | None) -> int:
         if schema is None:

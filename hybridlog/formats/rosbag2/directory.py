@@ -72,16 +72,6 @@ MAX_BYTES = 64 << 20
 MAX_FILES = 100_000
 
 _NO_FILES = {"", ".", ".."}
-# Keys at any depth; the rest, such as the list of topics, is skipped.
-_WANTED = frozenset(
-    {
-        "files",
-        "message_count",
-        "path",
-        "relative_file_paths",
-        "rosbag2_bagfile_information",
-    }
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +93,7 @@ def parse_metadata(text: str) -> BagMetadata:
     """Parse the metadata of a bag."""
     if len(text) > MAX_BYTES:
         raise YamlError(f"it has more than {MAX_BYTES >> 20} MiB")
-    bag = _mapping(parse_yaml(text, _WANTED))
+    bag = _mapping(parse_yaml(text))
     bag = _mapping(bag.get("rosbag2_bagfile_information"))
     if not bag:
         raise YamlError("it does not describe a bag")

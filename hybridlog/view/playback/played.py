@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 import numpy as np
 
@@ -46,6 +46,9 @@ class Block:
 
     batch: Batch
     channels: Sequence[int]
+
+
+Blocks: TypeAlias = Generator[Block, None, None]
 
 
 class PlayedLog:
@@ -104,7 +107,7 @@ class PlayedLog:
         later = self._begin[self._begin > position]
         return position if is_covered.any() or not len(later) else int(later.min())
 
-    def after(self, topics: Collection[str], position: int) -> Iterator[Block]:
+    def after(self, topics: Collection[str], position: int) -> Blocks:
         """All messages of some topics behind a log time, ns, in order."""
         if not topics or position >= self.end:
             return
@@ -112,7 +115,7 @@ class PlayedLog:
         for batch, channels in query.batches():
             yield self._block(batch, channels)
 
-    def current(self, topics: Collection[str], position: int) -> Iterator[Block]:
+    def current(self, topics: Collection[str], position: int) -> Blocks:
         """The messages of some topics that are current at a log time, ns.
 
         They are the latched ones that a subscriber receives which joins then, the frames of

@@ -12,7 +12,7 @@ import asyncio
 import contextlib
 import secrets
 import time
-from collections.abc import Callable, Collection, Coroutine, Iterator, Sequence
+from collections.abc import Callable, Collection, Coroutine, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from http import HTTPStatus
@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from websockets.http11 import Response
     from websockets.typing import Subprotocol
 
-    from hybridlog.view.playback.played import PlayedLog
+    from hybridlog.view.playback.played import Blocks, PlayedLog
 
 _WITH_PLAYBACK: Final = SUBPROTOCOLS[0]
 _MAX_CLIENTS: Final = 32
@@ -102,26 +102,21 @@ class _Client:
 
 
 class _Reading:
-    """Reads blocks of messages in a thread of their own, one ahead."""
+    """Reads blocks of messages in a thread of their own."""
 
-    def __init__(self, blocks: Iterator[Block], executor: ThreadPoolExecutor) -> None:
+    def __init__(self, blocks: Blocks, executor: ThreadPoolExecutor) -> None:
         self._blocks = blocks
         self._executor = executor
-        self._ahead = executor.submit(next, blocks, None)
         self._block: Block | None = None
         self._row = 0
-        self._is_over = False
 
     async def next_time(self) -> int | None:
         """Log time of the next message, ns; None at the end."""
         while self._block is None or self._row == len(self._block.batch):
-            if self._is_over:
-                return None
-            self._block, self._row = await asyncio.wrap_future(self._ahead), 0
+            read = self._executor.submit(next, self._blocks, None)
+            self._block, self._row = await asyncio.wrap_future(read), 0
             if self._block is None:
-                self._is_over = True
-            else:
-                self._ahead = self._executor.submit(next, self._blocks, None)
+                return None
         return int(self._block.batch.log_time[self._row])
 
     def take(self, until: int) -> tuple[Block, int]:
@@ -140,11 +135,7 @@ class _Reading:
 
     def close(self) -> None:
         """Read no more."""
-        self._ahead.cancel()
-        self._is_over, self._block = True, None
-        close = getattr(self._blocks, "close", None)
-        if close is not None:
-            self._executor.submit(close)
+        self._executor.submit(self._blocks.close)
 
 
 class PlaybackServer:

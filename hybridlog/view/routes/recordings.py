@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Final
@@ -14,6 +15,7 @@ from hybridlog.query.choice import Choice
 from hybridlog.record.losses import losses_of
 from hybridlog.schema.states import encoding_of, shown_channels
 from hybridlog.view.context import Context, extent, route, start_of
+from hybridlog_storage.catalog import ChannelStats
 from hybridlog_storage.manifest import MAX_MARKS
 
 if TYPE_CHECKING:
@@ -143,28 +145,21 @@ def _loss(loss: Mapping[str, Any], start: int) -> dict[str, Any]:
 
 def _topics(entry: RecordingEntry, start: int) -> list[dict[str, Any]]:
     found: dict[str, dict[str, Any]] = {}
+    totals: dict[str, ChannelStats] = defaultdict(ChannelStats)
     for channel in shown_channels(entry.channels):
-        stats = channel.stats
-        row = found.setdefault(
-            channel.topic,
-            {
-                "topic": channel.topic,
-                "type": channel.type,
-                "encoding": encoding_of(channel.message_encoding, channel.metadata),
-                "messages": 0,
-                "bytes": 0,
-                "first": None,
-                "last": None,
-            },
+        total = totals[channel.topic]
+        total.add(channel.stats)
+        row = {
+            "topic": channel.topic,
+            "type": channel.type,
+            "encoding": encoding_of(channel.message_encoding, channel.metadata),
+        }
+        found.setdefault(channel.topic, row).update(
+            messages=total.messages,
+            bytes=total.payload_bytes,
+            first=None if total.first is None else str(total.first - start),
+            last=None if total.last is None else str(total.last - start),
         )
-        row["messages"] += stats.messages
-        row["bytes"] += stats.payload_bytes
-        if stats.first is not None and stats.last is not None:
-            first, last = stats.first - start, stats.last - start
-            row["first"] = first if row["first"] is None else min(row["first"], first)
-            row["last"] = last if row["last"] is None else max(row["last"], last)
-    for row in found.values():
-        row |= {end: str(row[end]) for end in ("first", "last") if row[end] is not None}
     return [found[topic] for topic in sorted(found)]
 
 
