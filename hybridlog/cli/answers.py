@@ -162,15 +162,21 @@ class Listing(Tabular):
     usual: ClassVar[tuple[str, str]] = SCREEN, SCREEN
     form: str | None = format_option(_LISTING_FORMATS, "")
 
-    def answer(
-        self, rows: Iterable[Mapping[str, Any]], columns: Sequence[Column], titles: int = 1
+    def show(
+        self,
+        rows: Iterable[Any],
+        columns: Sequence[Column],
+        without: str = "",
+        plain: Callable[[Any], Any] = lambda row: row,
+        **how: Any,
     ) -> None:
-        """Print or write rows; see `print_table`."""
+        """Print or write rows; see `AsJson.show`."""
         to, limited = self.to, islice(rows, self.limit)
         if to.form != SCREEN:
-            answer_tables(_tables_of(limited), to)
-        elif first := list(islice(limited, 1)):
-            print_table(columns, chain(first, limited), titles=titles)
+            answer_tables(_tables_of(map(plain, limited)), to)
+        elif not print_table(columns, limited, **how):
+            output.remarks(filter(None, [without]))
+        sys.stdout.flush()
 
 
 def _tables_of(rows: Iterable[Mapping[str, Any]]) -> Iterator[pa.Table]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -89,8 +88,7 @@ def check_command(given: _Given) -> None:
                 order=0 if has_losses else 4,
             ),
         ]
-        given.answer(map(asdict, found), columns)
-        output.remarks([] if found else ["No topic."])
+        given.show(map(asdict, found), columns, "No topic.")
 
 
 def _duration(ns: float | None) -> str:
@@ -113,8 +111,7 @@ def _show_verdict(results: Sequence[Result], recordings: int, given: _Given) -> 
         write_bytes(given.junit, junit_of(results).encode())
     bad = broken(results)
     names = ("recording", "topic", "rule", "wanted", "found")
-    given.answer(map(asdict, results if given.as_json else bad), [*map(Column, names)])
-    sys.stdout.flush()
+    given.show(map(asdict, results if given.as_json else bad), [*map(Column, names)])
     output.remarks([verdict(results, f" in {output.counted(recordings, 'recording')}")])
     if bad:
         raise click.exceptions.Exit(DIFFERENT)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -60,8 +59,7 @@ def diff_command(given: _Given) -> None:
             if rules is not None
         ]
     columns = [Column("topic"), Column("what"), Column("a", _side("a")), Column("b", _side("b"))]
-    given.answer(map(asdict, found), columns, titles=2)
-    sys.stdout.flush()
+    given.show(map(asdict, found), columns, titles=2)
     if not given.as_json:
         total = f"{output.counted(len(found), 'difference')}." if found else "No difference."
         is_cut = given.limit is not None and given.limit < len(found)

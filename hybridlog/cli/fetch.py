@@ -113,15 +113,15 @@ def fetch_command(choices: _Choices) -> None:
                 raise
         if choices.strict:
             query.completeness().check(payloads=not choices.count)
+        lost: list[str] = []
         if choices.count:
             count = query.count()
+            completeness = query.completeness()
             if choices.strict:
-                query.completeness().check()
+                completeness.check()
             output.say(str(count))
-            _print_end(query, choices, started)
-            lost = query.completeness()
-            if lost.has_losses:
-                output.remarks([lost.describe(count, query.question.limit)])
+            if completeness.has_losses:
+                lost = [completeness.describe(count, query.question.limit)]
         else:
             front = choices.front
             if choices.at is not None and to.form != "mp4":  # the answer is one message
@@ -130,16 +130,11 @@ def fetch_command(choices: _Choices) -> None:
                 _write_pieces(query, choices, to, front)
                 return
             query = answer_query(query, to, front=front, strict=choices.strict)
-            _print_end(query, choices, started)
-
-
-def _print_end(query: Query, choices: _Choices, started: float) -> None:
-    """Print the cost of an answer, with that of conditions on other topics, and what it lacks."""
-    cost = query.counters.copy()
-    for condition in query.conditions:
-        cost.add(condition.counters)
-    print_end(cost, started, verbose=choices.verbose, count=choices.count)
-    output.remarks(query.remarks())
+        cost = query.counters.copy()
+        for condition in query.conditions:
+            cost.add(condition.counters)
+        print_end(cost, started, verbose=choices.verbose, count=choices.count)
+        output.remarks((*query.remarks(), *lost))
 
 
 def _write_pieces(query: Query, choices: _Choices, to: Destination, front: Front) -> None:

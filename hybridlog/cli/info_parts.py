@@ -30,7 +30,7 @@ _MAX_NAMES = 5  # recordings in a note
 _READABLE = {"ros1msg", "ros2msg", "ros2idl", "jsonschema"}
 
 
-def show_topics(store: Store, query: Query, topics: Sequence[str], *, as_json: bool) -> None:
+def show_topics(store: Store, query: Query, *, as_json: bool) -> None:
     """Print the definition and the fields of topics, those of each type once."""
     from hybridlog.query.asked import channels_of
 
@@ -46,9 +46,7 @@ def show_topics(store: Store, query: Query, topics: Sequence[str], *, as_json: b
         else:
             seen[key] = _topic_as_dict(store, recorded)
     if not seen:
-        raise TopicError(
-            f"No chosen recording has {' or '.join(topics)}: `hybridlog info` lists the topics."
-        )
+        raise TopicError(f"No chosen recording has {' or '.join(query.topics)}.")
     if as_json:
         output.print_json(list(seen.values()))
         return
@@ -64,7 +62,7 @@ def _print_topic(item: dict[str, Any]) -> None:
     if item["definition"]:
         for line in str(item["definition"]).splitlines():
             is_rule = sys.stdout.isatty() and {*line} == {"="}
-            output.say("  " + (line[: output.console().width - 2] if is_rule else line))
+            output.say("  " + (line[: output.screen_width() - 2] if is_rule else line))
     if item["not_indexed"]:
         output.say(f"not indexed: {item['not_indexed']}")
     if item["arrays"]:
@@ -263,7 +261,9 @@ def show_tables(store: Store, query: Query, *, as_json: bool) -> None:
     from hybridlog.record.marks import MARKS
     from hybridlog.snapshot import UNFINISHED
 
-    (topic,) = query.topics
+    topic, *others = query.topics
+    if others:
+        raise UsageError(f"--tables is about one topic: name one of {listed(query.topics)}.")
     channels = channels_of(query)
     recordings = {one.recording.id: one.recording for one in channels}.values()
     ended = [one for one in recordings if one.status not in UNFINISHED]

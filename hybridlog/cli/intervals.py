@@ -76,8 +76,7 @@ def intervals_command(given: _Given) -> None:
         if given.count:
             output.say(str(len(found)))
         else:
-            _show(given, found, asked)
-            output.remarks([f"No {noun}."] if asked.is_empty else [])
+            _show(given, found, asked, f"No {noun}.")
 
 
 def _intervals(given: _Given, query: Query) -> Intervals:
@@ -92,7 +91,7 @@ def _intervals(given: _Given, query: Query) -> Intervals:
     return found if given.at_least is None else found.at_least(given.at_least)
 
 
-def _show(given: _Given, found: Intervals, asked: Answering) -> None:
+def _show(given: _Given, found: Intervals, asked: Answering, without: str) -> None:
     from hybridlog.query.times import format_duration
 
     names = {recording.id: recording.name for recording in asked.store.summaries()}
@@ -111,4 +110,4 @@ def _show(given: _Given, found: Intervals, asked: Answering) -> None:
         Column("duration", lambda row: format_duration(row["end_ns"] - row["begin_ns"]), "right"),
         Column("messages", side="right"),
     ]
-    given.answer(rows, columns)
+    given.show(rows, columns, without)

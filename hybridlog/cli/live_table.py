@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Final, Self
 
 from hybridlog.cli import output
 from hybridlog.cli.render import Column, table_lines
-from hybridlog.cli.signals import restore_echo, stop_echo
 from hybridlog.record.losses import Cause
 
 if TYPE_CHECKING:
@@ -29,14 +28,12 @@ class LiveTable:
 
     def __enter__(self) -> Self:
         """Begin to draw."""
-        stop_echo(self._live.console.file.fileno())
         self._live.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         """Remove the table."""
         self._live.stop()
-        restore_echo()
 
     def note(self, text: str) -> None:
         """Print a line above the table."""

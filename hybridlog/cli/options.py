@@ -82,12 +82,8 @@ class AsJson:
         """Print rows as a table or as JSON (`plain` gives that of a row)."""
         if self.as_json:
             output.print_json([plain(row) for row in rows])
-        elif output.is_quiet():
-            return
-        elif rows:
-            print_table(columns, rows, **how)
-        elif without:
-            output.note(without)
+        elif not (output.is_quiet() or print_table(columns, rows, **how)):
+            output.notes(filter(None, [without]))
 
 
 @dataclass(frozen=True, kw_only=True)

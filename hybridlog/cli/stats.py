@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from hybridlog.cli import output
 from hybridlog.cli.answers import Listing, answering
 from hybridlog.cli.binder import command, option
 from hybridlog.cli.completion import complete_path
@@ -54,12 +53,11 @@ def stats_command(given: _Given) -> None:
         else:
             stats = asked.query.stats(*([] if given.fields is None else parse_fields(given.fields)))
             found = [asdict(row) for row in stats]
-            if not found and not given.as_json:
-                output.note("No field is a number.")
             columns = _of_fields(found)
         if given.strict:
             asked.query.completeness().check()
-        given.answer(found, columns, titles=2)
+        without = "No message." if given.rate else "No field is a number."
+        given.show(found, columns, without, titles=2)
 
 
 def _of_rates(*, has_windows: bool) -> list[Column]:

@@ -450,7 +450,7 @@ def test_triggers_have_a_process_that_ends_with_the_recorder(
     ("arguments", "said"),
     [
         ("", "Nothing to record"),
-        ("--replay {bag} {bag}", "not both"),
+        ("--replay {bag} {bag}", "--replay and PATH exclude"),
         ("--replay {bag} --between +1s +2s", "--replay and --between exclude"),
         ("--replay {bag} --no-latched", "--replay and --no-latched exclude"),
         ("--replay {bag} --throttle /a fast", "is no rate"),
