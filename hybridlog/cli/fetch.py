@@ -13,12 +13,12 @@ import click
 from hybridlog.cli import output
 from hybridlog.cli.answers import (
     SCREEN,
-    Destination,
+    SCREEN_ROWS,
     Tabular,
-    answer_query,
     format_option,
     output_option,
     print_end,
+    write_answer,
     write_following,
 )
 from hybridlog.cli.binder import command, option
@@ -30,6 +30,8 @@ from hybridlog_storage.errors import TopicError, UsageError
 from hybridlog_storage.stopping import at_safe_points
 
 if TYPE_CHECKING:
+    import pyarrow as pa
+
     from hybridlog.formats.slices import Front
     from hybridlog.query.query import Query
     from hybridlog.store import Store
@@ -90,6 +92,19 @@ class _Choices(Asking, Tabular, Slices):
         "Write to this file (raw: a directory; png and jpg: a directory, or one picture)"
     )
 
+    def check(self) -> None:
+        """Refuse what makes no sense, or cannot be written."""
+        assert self.topics
+        form = self.to_form
+        as_it_came = form in OUTPUTS and OUTPUTS[form].content in {"log", "pictures", "video"}
+        if self.frame is not None and (as_it_came or form == "raw"):
+            raise UsageError(f"{form} has messages as they came: --in-frame is for tables and ply.")
+        if self.follow and not (form in OUTPUTS and OUTPUTS[form].is_text and form != "json"):
+            raise UsageError(f"--follow prints lines, such as jsonl or csv: {form} has an end.")
+        self.settings(form)
+        if not self.count and (self.split is None or form == SCREEN):
+            super().check()
+
 
 @command(_Choices)
 def fetch_command(choices: _Choices) -> None:
@@ -98,12 +113,11 @@ def fetch_command(choices: _Choices) -> None:
     Without --format and -o: a table on a terminal, JSON lines elsewhere. What the answer may
     lack is printed on standard error.
     """
-    to = _destination(choices)
     started = time.monotonic()
     with choices.opened(snapshot=not choices.follow) as store:
         query = _query(store, choices)
         if choices.follow:
-            _follow(query, choices, to.form)
+            _follow(query, choices)
             return
         if choices.at is not None:
             try:
@@ -124,12 +138,12 @@ def fetch_command(choices: _Choices) -> None:
                 lost = [completeness.describe(count, query.question.limit)]
         else:
             front = choices.front
-            if choices.at is not None and to.form != "mp4":  # the answer is one message
+            if choices.at is not None and choices.to_form != "mp4":  # the answer is one message
                 front = replace(front, latched=False)
             if choices.split is not None:
-                _write_pieces(query, choices, to, front)
+                _write_pieces(query, choices, front)
                 return
-            query = answer_query(query, to, front=front, strict=choices.strict)
+            query = _answer(query, choices, front)
         cost = query.counters.copy()
         for condition in query.conditions:
             cost.add(condition.counters)
@@ -137,27 +151,59 @@ def fetch_command(choices: _Choices) -> None:
         output.remarks((*query.remarks(), *lost))
 
 
-def _write_pieces(query: Query, choices: _Choices, to: Destination, front: Front) -> None:
+def _answer(query: Query, choices: _Choices, front: Front) -> Query:
+    """Print the first messages of a query, or write all; gives the query that was answered.
+
+    Strict: nothing is written if a pose has no transform, which shows only at the end.
+    """
+    form, strict = choices.to_form, choices.strict
+    if form != SCREEN:
+        settings = choices.settings(form)
+        write_answer(query, form, choices.place, front=front, strict=strict, settings=settings)
+        return query
+    from hybridlog.record.marks import MARKS
+
+    answered = query if query.question.limit is not None else query.limit(SCREEN_ROWS + 1)
+    tables = answered.to_tables()
+    if answered.topics == (MARKS,):
+        tables = map(_with_times, tables)
+    completeness = answered.completeness if strict else None
+    answered.counters.messages = choices.answer(
+        tables, completeness=completeness, topics=answered.topics
+    )
+    return answered
+
+
+def _with_times(marks: pa.Table) -> pa.Table:
+    """Marks for people: their ends are times, as their beginnings are."""
+    import pyarrow as pa
+
+    if "end" not in marks.column_names:
+        return marks
+    end = marks["end"].cast(pa.timestamp("ns", "UTC"))
+    return marks.set_column(marks.column_names.index("end"), "end", end)
+
+
+def _write_pieces(query: Query, choices: _Choices, front: Front) -> None:
     """Write a file for each part of the answer, and a line about each."""
     from hybridlog.cli.export import pieces, print_written
 
-    assert to.path is not None
-    folder = is_directory(to.form, to.path)
-    how = choices.split or ""
-    for path, one in pieces(query, how, to.path, force=to.force, is_directory=folder):
-        answer_query(one, replace(to, path=path), front=front, strict=choices.strict)
+    assert choices.output is not None
+    folder, how = is_directory(choices.to_form, choices.output), choices.split or ""
+    for path, one in pieces(query, how, choices.output, force=choices.force, is_directory=folder):
+        _answer(one, replace(choices, output=path), front)
         print_written(path, one)
         output.remarks(one.completeness().sentences)
 
 
-def _follow(query: Query, choices: _Choices, form: str) -> None:
+def _follow(query: Query, choices: _Choices) -> None:
     """Print messages as they come, then what they may lack."""
     started = time.monotonic()
     following = query.follow(*choices.topics)
     stopped: Stopped | None = None
     try:
         with at_safe_points():
-            write_following(following, form)
+            write_following(following, choices.to_form)
     except Stopped as error:
         stopped = error
     print_end(query.counters, started, verbose=choices.verbose)
@@ -202,19 +248,3 @@ def _query(store: Store, choices: _Choices) -> Query:
     if choices.reverse:
         query = query.reverse()
     return query if choices.limit is None else query.limit(choices.limit)
-
-
-def _destination(choices: _Choices) -> Destination:
-    """Format and place of the answer; refuses what makes no sense before a store is opened."""
-    assert choices.topics
-    to = choices.destination()
-    form = to.form
-    to = replace(to, settings=choices.settings(form))
-    as_it_came = form in OUTPUTS and OUTPUTS[form].content in {"log", "pictures", "video"}
-    if choices.frame is not None and (as_it_came or form == "raw"):
-        raise UsageError(f"{form} has messages as they came: --in-frame is for tables and ply.")
-    if choices.follow and not (form in OUTPUTS and OUTPUTS[form].is_text and form != "json"):
-        raise UsageError(f"--follow prints lines, such as jsonl or csv: {form} has an end.")
-    if not choices.count and (choices.split is None or form == SCREEN):
-        to.check()
-    return to

@@ -107,8 +107,10 @@ def info_command(given: _Given) -> None:
             show_losses([*given.recordings_in(store)], given.topic, given)
         elif given.topic:
             query = query_of(store, given.topic, given.choice)
-            show = show_tables if given.tables else show_topics
-            show(store, query, as_json=given.as_json)
+            if given.tables:
+                show_tables(store, query)
+            else:
+                show_topics(store, query, as_json=given.as_json)
         elif given.sizes is not None:
             sizes = store.sizes(given.recordings_in(store))
             show_sizes(sizes, given.sizes, given, store.session.when_empty)

@@ -254,7 +254,7 @@ _ATTACHMENTS = [
 ]
 
 
-def show_tables(store: Store, query: Query, *, as_json: bool) -> None:
+def show_tables(store: Store, query: Query) -> None:
     """Print the Parquet files with the rows of a topic, and SQL for DuckDB."""
     from hybridlog.maintenance.tables import missing
     from hybridlog.query.asked import channels_of
@@ -271,12 +271,8 @@ def show_tables(store: Store, query: Query, *, as_json: bool) -> None:
     found = _tables_of(store, [one for one in channels if one.recording.status not in UNFINISHED])
     tables = store.session.tables
     lacking = [one.name for one in ended if topic in missing(store.directory, one, tables)]
-    if as_json:
-        output.print_json({"tables": found, "missing": lacking})
-        return
-    for item in found:
-        for line in (*item["files"], "", f"{item['statement']};", ""):
-            output.say(line)
+    shown = ((*one["files"], "", f"{one['statement']};", "") for one in found)
+    output.tell({"tables": found, "missing": lacking}, [line for each in shown for line in each])
     marks = sum(len(one.marks) for one in recordings) if topic == MARKS else 0
     without = {
         f"{listed(lacking, _MAX_NAMES)}, whose rows are missing: `hybridlog verify --repair` "

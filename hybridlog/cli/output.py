@@ -90,14 +90,10 @@ def quoted(text: str) -> str:
     return f"'{printable(raw.decode('utf-8', 'backslashreplace'))}'"
 
 
-def print_json(value: object) -> None:
-    """Print a value as JSON."""
-    print(json.dumps(value, default=_plain, indent=2, ensure_ascii=False))  # noqa: T201
-
-
-def print_json_line(value: object) -> None:
-    """Print a value as JSON on one line, at once."""
-    print(json.dumps(value, default=_plain, ensure_ascii=False), flush=True)  # noqa: T201
+def print_json(value: object, *, at_once: bool = False) -> None:
+    """Print a value as JSON; with `at_once` on a line."""
+    text = json.dumps(value, default=_plain, indent=None if at_once else 2, ensure_ascii=False)
+    print(text, flush=at_once)  # noqa: T201
 
 
 def note(text: str) -> None:
@@ -115,16 +111,10 @@ def remarks(lines: Iterable[str]) -> None:
 def tell(value: object, lines: Iterable[str], *, at_once: bool = False) -> None:
     """Print a result as JSON, with `at_once` on a line; or in lines, which --quiet leaves out."""
     if _manner["as_json"]:
-        (print_json_line if at_once else print_json)(value)
+        print_json(value, at_once=at_once)
     elif not is_quiet():
         for line in lines:
-            say_folded(line)
-
-
-def say_folded(text: str) -> None:
-    """A long line of the answer, which a terminal shows without broken words."""
-    for line in folded(text, sys.stdout).split("\n"):
-        say(line)
+            print(folded(line, sys.stdout))  # noqa: T201
 
 
 def folded(text: str, stream: TextIO | None = None) -> str:
@@ -150,12 +140,6 @@ def not_indexed(report: RecordReport) -> str:
         f"{report.failure} {stored(report.missed)} but not in the index; the next command that "
         "opens the store catches up."
     )
-
-
-def without_documents(messages: int) -> str:
-    """The end of a line that names messages of topics recorded with `--no-index`, if any."""
-    verb = "has" if messages == 1 else "have"
-    return f"; {counted(messages, 'message')} {verb} no documents (--no-index)" if messages else ""
 
 
 def surpluses(channels: Sequence[ChannelEntry]) -> Iterator[str]:

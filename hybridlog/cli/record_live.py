@@ -75,7 +75,7 @@ def record_live(choices: RecordChoices) -> None:
     except HybridlogError as error:
         if choices.as_json:  # the last line is a report in any case
             report = {"error": str(error), "exit_code": error.exit_code}
-            output.print_json_line({"report": report})
+            output.print_json({"report": report}, at_once=True)
         raise
 
 
@@ -149,7 +149,7 @@ def _finish(
     if choices.as_json:
         about = _as_dict(reports, state, recorder.reason)
         about |= {"broken": [asdict(one) for one in broken], "exit_code": code}
-        output.print_json_line({"report": about})
+        output.print_json({"report": about}, at_once=True)
     elif not output.is_quiet():
         _print(reports, state, recorder.reason)
     silent, unfitting = recorder.silent(), recorder.unfitting()
@@ -357,7 +357,7 @@ class _Display:
             from hybridlog.live.state import summary_of
 
             with suppress(BrokenPipeError):  # who reads it may go; the recording goes on
-                output.print_json_line({"state": summary_of(state)})
+                output.print_json({"state": summary_of(state)}, at_once=True)
 
 
 def notify_service(*assignments: str) -> None:

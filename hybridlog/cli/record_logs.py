@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -23,6 +23,7 @@ from hybridlog.cli.signals import if_stopped
 from hybridlog.cli.watching import watch
 from hybridlog.query.answers.completeness import coverage
 from hybridlog.record.losses import losses_of
+from hybridlog.wording import listed
 from hybridlog_storage.errors import (
     AlreadyRecordedError,
     DatabaseError,
@@ -40,8 +41,6 @@ if TYPE_CHECKING:
     from hybridlog.formats.reading import Source
     from hybridlog.record.recorder import RecordReport
     from hybridlog.store import Store
-
-_MAX_UNFINISHED = 10
 
 
 def record_logs(choices: RecordChoices) -> None:
@@ -78,10 +77,9 @@ def record_watched(choices: RecordChoices) -> None:
         places = ", ".join(map(str, choices.paths))
         watch(places, look, report=partial(recorder.fail, None))
         left = [path for one in watches for path in one.unfinished()]
-        for path in left[:_MAX_UNFINISHED]:
-            output.note(f"{path} is not complete; `hybridlog record {path}` records what it has.")
-        if more := left[_MAX_UNFINISHED:]:
-            output.note(f"and {len(more)} more that are not complete")
+        if left:
+            paths = listed(map(str, left))
+            output.note(f"Not complete: {paths}. `hybridlog record PATH` records what is there.")
 
 
 def _look(
@@ -323,20 +321,15 @@ class LogRecorder:
         if self._choices.as_json and self._rows:
             output.print_json(self._rows)
         elif not self._choices.as_json and not output.is_quiet():
-            _print([row for row in self._rows if "messages" in row])
+            recorded = [row for row in self._rows if "messages" in row]
+            if len(recorded) == 1:
+                print_fields(fields_of(recorded[0]))
+            else:
+                print_table(COLUMNS, recorded)
         if self._is_search:
-            recorded = output.counted(counts["recorded"], "log")
+            many = output.counted(counts["recorded"], "log")
             left = f"{counts['known']} in the store already, {counts['error']} not recorded"
-            output.remarks([f"{recorded} recorded, {left}."])
-
-
-def _print(rows: Sequence[Mapping[str, Any]]) -> None:
-    if len(rows) < 2:
-        print_fields([pair for row in rows for pair in fields_of(row)])
-        return
-    summed = [key for key, value in rows[0].items() if isinstance(value, int | float)]
-    total = {key: sum(row[key] for row in rows) for key in summed}
-    print_table(COLUMNS, [*rows, {**total, "recording": "total", "path": "", "topics": None}])
+            output.remarks([f"{many} recorded, {left}."])
 
 
 def _problems(path: Path, report: RecordReport) -> Iterator[HybridlogError]:

@@ -50,9 +50,8 @@ def verify_command(given: _Given) -> None:
     started = time.monotonic()
     with given.opened(verifies=True) as store:
         chosen, unreadable = _chosen(given, store)
-        total = sum(entry.stored_bytes for entry in chosen)
         names = None if given.choice.is_everything else [*(one.id for one in chosen), *unreadable]
-        with Bar("verify", total) as bar:
+        with Bar("verify") as bar:
             result = store.verify(names, bar.part, repair=given.repair)
         why = store.shared.index.unavailable
     elapsed = time.monotonic() - started
@@ -95,12 +94,14 @@ def _print(result: Verification, elapsed: float) -> None:
     verdict = "all is well" if result.index else "all is well in the files"
     if result.findings:
         verdict = output.counted(len(result.findings), "problem")
+    if result.without_documents:
+        without = output.counted(result.without_documents, "message")
+        verdict += f"; {without} without documents (--no-index)"
     told = (
         f"{output.counted(result.recordings, 'recording')}, "
         f"{output.counted(result.chunks, 'chunk')}, "
         f"{output.counted(result.messages, 'message')}, "
         f"{output.size(result.bytes_read)} read in {elapsed:.2f} s: {verdict}"
-        f"{output.without_documents(result.without_documents)}"
     )
     output.tell(None, [told])
 
