@@ -130,18 +130,15 @@ class Tabular(Forced, AsJson):
         tables: Iterable[pa.Table],
         schema: Callable[[], pa.Schema | None] = lambda: None,
         completeness: Callable[[], Completeness] | None = None,
-        topics: Sequence[str] = (),
+        noun: str = "row",
     ) -> int:
-        """Print or write tables, at least one, all rows or nothing; returns how many are printed.
-
-        Those of messages are about some topics.
-        """
+        """Print or write tables, at least one, all rows or nothing; returns the printed number."""
         form, limit = self.to_form, self.limit
         if limit is not None or form == SCREEN:
             tables = _limited(tables, SCREEN_ROWS + 1 if limit is None else limit)
         tables = _checked(tables, completeness)
         if form == SCREEN:
-            return _print_rows(tables, limit, "message" if topics else "row", topics)
+            return _print_rows(tables, limit, noun)
         with writing(self.output), Bar(form, quiet=self.output is None) as bar:
             answer = _rows(_with_progress(tables, bar))
             if OUTPUTS[form].content == "table":
@@ -175,13 +172,12 @@ class Listing(Tabular):
         columns: Sequence[Column],
         without: str = "",
         plain: Callable[[Any], Any] = lambda row: row,
-        **how: Any,
     ) -> None:
         """Print or write rows; see `AsJson.show`."""
         limited = islice(rows, self.limit)
         if self.to_form != SCREEN:
             self.answer(_tables_of(map(plain, limited)))
-        elif not print_table(columns, limited, **how):
+        elif not print_table(columns, limited):
             output.remarks(filter(None, [without]))
         sys.stdout.flush()
 
@@ -407,9 +403,7 @@ def _limited(tables: Iterable[pa.Table], limit: int) -> Iterator[pa.Table]:
             return
 
 
-def _print_rows(
-    tables: Iterable[pa.Table], limit: int | None, noun: str, topics: Sequence[str] = ()
-) -> int:
+def _print_rows(tables: Iterable[pa.Table], limit: int | None, noun: str) -> int:
     """Print rows for people to read, and whether there are none or more; gives their number."""
     from hybridlog.frames.cells import MAX_CELL, MAX_LINE, cells
     from hybridlog.schema.arrow_types import is_text
@@ -434,9 +428,6 @@ def _print_rows(
                 for n, (name, is_cut) in enumerate(columns)
             ],
             map(itemgetter(1), alike),
-            # The first column is the time, the second the topic.
-            titles=2 if len(topics) > 1 else 1,
-            about=topics if len(topics) == 1 else (),
         )
     if not read:
         output.note(f"No {noun}.")

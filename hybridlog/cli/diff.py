@@ -59,7 +59,7 @@ def diff_command(given: _Given) -> None:
             if rules is not None
         ]
     columns = [Column("topic"), Column("what"), Column("a", _side("a")), Column("b", _side("b"))]
-    given.show(map(asdict, found), columns, titles=2)
+    given.show(map(asdict, found), columns)
     if not given.as_json:
         total = f"{output.counted(len(found), 'difference')}." if found else "No difference."
         is_cut = given.limit is not None and given.limit < len(found)

@@ -168,9 +168,7 @@ def _answer(query: Query, choices: _Choices, front: Front) -> Query:
     if answered.topics == (MARKS,):
         tables = map(_with_times, tables)
     completeness = answered.completeness if strict else None
-    answered.counters.messages = choices.answer(
-        tables, completeness=completeness, topics=answered.topics
-    )
+    answered.counters.messages = choices.answer(tables, completeness=completeness, noun="message")
     return answered
 
 

@@ -128,5 +128,4 @@ def _index(state: RecorderState) -> str:
 def _in_short(reason: str) -> str:
     """The beginning of a reason, for a place with little room."""
     line = output.printable(reason.partition("\n")[0])
-    sentence = line.partition(". ")[0].rstrip(".")
-    return sentence if len(sentence) <= _SHORT else f"{sentence[: _SHORT - 1]}…"
+    return output.cut(line.partition(". ")[0].rstrip("."), _SHORT)

@@ -77,12 +77,11 @@ class AsJson:
         columns: Sequence[Column],
         without: str = "",
         plain: Callable[[Any], object] = lambda row: row,
-        **how: Any,
     ) -> None:
         """Print rows as a table or as JSON (`plain` gives that of a row)."""
         if self.as_json:
             output.print_json([plain(row) for row in rows])
-        elif not (output.is_quiet() or print_table(columns, rows, **how)):
+        elif not (output.is_quiet() or print_table(columns, rows)):
             output.notes(filter(None, [without]))
 
 

@@ -57,7 +57,7 @@ def stats_command(given: _Given) -> None:
         if given.strict:
             asked.query.completeness().check()
         without = "No message." if given.rate else "No field is a number."
-        given.show(found, columns, without, titles=2)
+        given.show(found, columns, without)
 
 
 def _of_rates(*, has_windows: bool) -> list[Column]:

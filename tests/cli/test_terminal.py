@@ -208,7 +208,7 @@ def test_an_answer_is_a_block_a_message_when_it_does_not(store: Path) -> None:
     code, shown = on_terminal("fetch", "-t", "scan", "-r", "robot", "-n", "2", "--store", store)
     assert code == 0
     text = plain(shown)
-    assert len(re.findall(r"(?m)^\d{4}-\S+Z  /base/scan$", text)) == 2
+    assert len(re.findall(r"(?m)^\d{4}-\S+Z$", text)) == 2
     assert len(re.findall(r"(?m)^  header\.frame_id +\S", text)) == 2
     assert re.search(r"ranges +\[\S+, \S+, … \d+ in all\]", text)
 
