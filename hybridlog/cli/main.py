@@ -19,7 +19,7 @@ __all__ = ["EXIT_CODES", "main"]
 def main() -> NoReturn:
     """Run the command line and exit with one of `EXIT_CODES`."""
     signals.install()
-    block_imports()
+    sys.meta_path.insert(0, _WithoutPandas())
     # A shell may have closed them: `hybridlog ls >&-`.
     # What is written then fails, so that no answer is lost in silence.
     if sys.stdout is None:
@@ -130,20 +130,14 @@ def _discard(stream: TextIO) -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
-_BLOCKED = frozenset({"pandas"})
-"""pyarrow imports pandas to see whether it is given one of its objects; no command has one.
-The import takes three tenths of a short command's time."""
+class _WithoutPandas:
+    """A finder of modules to which pandas is not installed.
 
-
-class _Blocker:
-    """A finder of modules that reports the blocked ones as not installed."""
+    pyarrow imports pandas to see whether it is given one of its objects; no command has one. The
+    import takes three tenths of a short command's time.
+    """
 
     @staticmethod
     def find_spec(fullname: str, *_: object) -> None:
-        if fullname in _BLOCKED:
-            raise ModuleNotFoundError(f"No command needs {fullname}.", name=fullname)
-
-
-def block_imports() -> None:
-    """Block the imports in this process from now on."""
-    sys.meta_path.insert(0, _Blocker())
+        if fullname == "pandas":
+            raise ModuleNotFoundError("No command needs pandas.", name=fullname)

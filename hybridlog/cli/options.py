@@ -18,7 +18,6 @@ from hybridlog.cli.completion import (
     complete_frame,
     complete_path,
     complete_recording,
-    complete_running,
     complete_tag,
     complete_topic,
     complete_type,
@@ -298,18 +297,6 @@ class Served:
         "URL",
         name="--allow-origin",
         needs=("viewer=websocket", "mcap"),
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
-class Running(InStore, Quiet):
-    """Options of commands to a recorder."""
-
-    recording: tuple[str, ...] = option(
-        "Only this recorder (id or name of its recording, or the beginning of the id).",
-        "RECORDING",
-        short="-r",
-        shell_complete=complete_running,
     )
 
 
