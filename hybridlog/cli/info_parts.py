@@ -59,10 +59,8 @@ def show_topics(store: Store, query: Query, *, as_json: bool) -> None:
 def _print_topic(item: dict[str, Any]) -> None:
     encoding = f"{item['message_encoding']}, {item['schema_encoding'] or 'no schema'}"
     output.say(f"{item['topic']}  {item['type'] or '(no type)'}  ({encoding})")
-    if item["definition"]:
-        for line in str(item["definition"]).splitlines():
-            is_rule = sys.stdout.isatty() and {*line} == {"="}
-            output.say("  " + (line[: output.screen_width() - 2] if is_rule else line))
+    for line in (item["definition"] or "").splitlines():
+        output.say(line)
     if item["not_indexed"]:
         output.say(f"not indexed: {item['not_indexed']}")
     if item["arrays"]:
