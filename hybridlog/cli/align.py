@@ -100,20 +100,18 @@ def align_command(given: _Given) -> None:
         raise UsageError("Name the rows: --to TOPIC for its messages, or --step for times.")
     started = time.monotonic()
     with given.opened(snapshot=True) as store:
-        rows = _resampled(store, given) if given.base is None else _aligned(store, given)
+        if given.base is None:
+            query = given.query(store)
+            if given.fields:
+                query = query.fields(*parse_fields(",".join(given.fields)))
+            rows = query.resample(given.step or 0, given.how, given.tolerance)
+        else:
+            rows = _aligned(store, given)
         # That there is a transform shows only at the end.
         completeness = rows.completeness if given.strict else None
         given.answer(rows.to_tables(given.most), rows.schema, completeness)
         print_end(rows.counters, started, verbose=given.verbose)
         remarks(rows.remarks())
-
-
-def _resampled(store: Store, given: _Given) -> Aligned:
-    """Rows at regular times."""
-    query = given.query(store)
-    if given.fields:
-        query = query.fields(*parse_fields(",".join(given.fields)))
-    return query.resample(given.step or 0, given.how, given.tolerance)
 
 
 def _aligned(store: Store, given: _Given) -> Aligned:

@@ -25,8 +25,7 @@ if TYPE_CHECKING:
 _RUNNING: Final = frozenset({"open", "unfinished"})
 
 
-def _parse_rate(text: str) -> int:
-    return parse_size(text.removesuffix("/s"))
+_RATE: Final = Amount(lambda text: parse_size(text.removesuffix("/s")), "1B/s")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,9 +41,7 @@ class _Copy(Choosing, InStore, AsJson, Quiet):
     then_expire: bool = option(
         "Delete payloads here once their copy is proved there; pinned ones stay."
     )
-    limit_rate: float | None = option(
-        "Bytes a second at most, such as 5MB/s.", "RATE", type=Amount(_parse_rate, "1B/s")
-    )
+    limit_rate: float | None = option("Bytes a second at most, such as 5MB/s.", "RATE", type=_RATE)
     check: bool = option("Read copies that are there already, too, and mend them.")
     watch: bool = option("Go on with what ends later, until Ctrl-C.")
     ssh: str | None = option(

@@ -24,7 +24,6 @@ from hybridlog.cli.answers import (
 from hybridlog.cli.binder import command, option
 from hybridlog.cli.completion import complete_path
 from hybridlog.cli.options import Asking, Slices, in_frame, parse_fields, query_of
-from hybridlog.cli.signals import Stopped
 from hybridlog.formats import OUTPUTS, formats_of, is_directory
 from hybridlog_storage.errors import TopicError, UsageError
 from hybridlog_storage.stopping import at_safe_points
@@ -196,27 +195,21 @@ def _write_pieces(query: Query, choices: _Choices, front: Front) -> None:
 
 def _follow(query: Query, choices: _Choices) -> None:
     """Print messages as they come, then what they may lack."""
+    from hybridlog.cli.ls import status_text
+    from hybridlog.query.query import Query
+
     started = time.monotonic()
     following = query.follow(*choices.topics)
-    stopped: Stopped | None = None
     try:
         with at_safe_points():
             write_following(following, choices.to_form)
-    except Stopped as error:
-        stopped = error
-    print_end(query.counters, started, verbose=choices.verbose)
-    if not choices.quiet:
-        from hybridlog.cli.ls import status_text
-        from hybridlog.query.query import Query
-
+    finally:
+        print_end(query.counters, started, verbose=choices.verbose)
         asked = Query(query.session, following.question)
         asked.counters = query.counters
-        output.notes(asked.remarks())
-        for one in asked.summaries():
-            if one.status != "open":
-                output.note(f"{one.name} has ended: {status_text(one)}.")
-    if stopped is not None:
-        raise stopped
+        ended = (one for one in asked.summaries() if one.status != "open")
+        output.remarks(asked.remarks())
+        output.remarks(f"{one.name} has ended: {status_text(one)}." for one in ended)
 
 
 def _query(store: Store, choices: _Choices) -> Query:
