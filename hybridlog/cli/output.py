@@ -6,8 +6,7 @@ import json
 import shutil
 import sys
 import textwrap
-from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import asdict, is_dataclass
 from typing import TYPE_CHECKING, TextIO
@@ -18,7 +17,6 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from hybridlog.record.recorder import RecordReport
-    from hybridlog_storage.catalog import ChannelEntry
 
 _manner = {"quiet": False, "as_json": False}
 
@@ -140,21 +138,6 @@ def not_indexed(report: RecordReport) -> str:
         f"{report.failure} {stored(report.missed)} but not in the index; the next command that "
         "opens the store catches up."
     )
-
-
-def surpluses(channels: Sequence[ChannelEntry]) -> Iterator[str]:
-    """A line for each topic with messages that are longer than their type."""
-    counts: Counter[str] = Counter()
-    for channel in channels:
-        counts[channel.topic] += channel.stats.surplus
-    for topic, messages in counts.items():
-        if messages:
-            types = {channel.type for channel in channels if channel.topic == topic}
-            verb = "has" if messages == 1 else "have"
-            yield (
-                f"{topic}: {counted(messages, 'message')} {verb} bytes left over behind the last "
-                f"field of {', '.join(sorted(types))}; the fields are read"
-            )
 
 
 def time_text(ns: int | None, step: int = 1) -> str:

@@ -20,7 +20,7 @@ from hybridlog.cli.live_table import LiveTable, summary
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.options import parse_tags
 from hybridlog.cli.record import DEFAULT_CHUNK, OF_ENVIRONMENT, RecordChoices
-from hybridlog.cli.record_summary import fields_of, row_of
+from hybridlog.cli.record_summary import fields_of, remarks_on, row_of
 from hybridlog.cli.render import print_fields
 from hybridlog.cli.signals import handled, write_note
 from hybridlog.query.answers.completeness import coverage, in_words
@@ -156,7 +156,7 @@ def _finish(
     output.remarks(f"{topic}: has a publisher that sent nothing" for topic in silent)
     output.remarks(f"no topic fits {text}" for text in unfitting)
     for report in reports:
-        output.remarks(output.surpluses(report.entry.channels))
+        output.remarks(remarks_on(report.entry))
     if choices.exclude and not (unfitting or silent or state.topics):
         output.remarks(["no topic is left: --exclude takes away all that --topic names"])
     errors = [

@@ -17,7 +17,7 @@ from hybridlog.cli.ls import with_misfits
 from hybridlog.cli.options import parse_tags
 from hybridlog.cli.progress import Bar
 from hybridlog.cli.record import RecordChoices
-from hybridlog.cli.record_summary import COLUMNS, fields_of, row_of
+from hybridlog.cli.record_summary import COLUMNS, fields_of, remarks_on, row_of
 from hybridlog.cli.render import print_fields, print_table
 from hybridlog.cli.signals import if_stopped
 from hybridlog.cli.watching import watch
@@ -334,25 +334,12 @@ class LogRecorder:
 
 def _problems(path: Path, report: RecordReport) -> Iterator[HybridlogError]:
     """Print problems; gives an error for each that sets the exit code."""
-    for channel in report.entry.channels:
-        if channel.is_indexed and channel.reason is not None:
-            output.remarks([f"{channel.topic}: not indexed beyond time: {channel.reason}"])
-        if channel.stats.unreadable:
-            output.note(
-                f"{channel.topic}: {output.unfit(channel.stats.unreadable)}; stored, without "
-                "fields in the index"
-            )
     if report.latched_left_out:
         output.note(
             f"{path}: {output.counted(report.latched_left_out, 'latched message')} from before "
             "the time range did not fit in memory."
         )
-    output.remarks((*output.surpluses(report.entry.channels), *report.remarks))
-    for damage in report.damage:
-        place = "" if damage.offset is None else f" at byte {damage.offset}"
-        count = damage.messages_lost
-        lost = f"; {output.counted(count, 'message')} lost" if count else ""
-        output.note(f"{damage.file}{place}: {damage.reason}{lost}")
+    output.remarks((*remarks_on(report.entry), *report.remarks))
     if report.failure is not None:
         output.note(f"hybridlog: {output.not_indexed(report)}")
         yield DatabaseError(str(report.failure))
@@ -360,6 +347,6 @@ def _problems(path: Path, report: RecordReport) -> Iterator[HybridlogError]:
         entry = report.entry
         output.note(
             f"{path} is damaged: {output.stored(entry.messages)}; "
-            f"{coverage(entry, losses_of(entry))}."
+            f"{coverage(entry, losses_of(entry))}; `hybridlog info --losses` says where."
         )
         yield SourceDamagedError(str(path))

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any, Final
 
 from hybridlog.cli.render import Column, bytes_of, numbers
 from hybridlog.record.losses import losses_of
+from hybridlog.wording import counted, unfit
 
 if TYPE_CHECKING:
     from hybridlog.record.recorder import RecordReport
+    from hybridlog_storage.catalog import RecordingEntry
 
 
 def row_of(report: RecordReport, path: object) -> dict[str, Any]:
@@ -76,3 +78,18 @@ def fields_of(row: Mapping[str, Any]) -> list[tuple[str, object]]:
     """What is told to people of one recording."""
     cells = [(one, one.cell(row)) for one in COLUMNS]
     return [(one.name, cell) for one, cell in cells if not (one.varies and cell == "0")]
+
+
+def remarks_on(recording: RecordingEntry) -> Iterator[str]:
+    """A line for each topic with messages whose fields are not all there, or not all they hold."""
+    for channel in recording.channels:
+        unreadable, surplus = channel.stats.unreadable, channel.stats.surplus
+        if channel.is_indexed and channel.reason is not None:
+            yield f"{channel.topic}: not indexed beyond time: {channel.reason}"
+        if unreadable:
+            yield f"{channel.topic}: {unfit(unreadable)}; stored, without fields in the index"
+        if surplus:
+            yield (
+                f"{channel.topic}: {counted(surplus, 'message')} with bytes left over behind the "
+                "last field; the fields are read"
+            )
