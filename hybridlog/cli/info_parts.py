@@ -266,7 +266,7 @@ def show_tables(store: Store, query: Query) -> None:
     recordings = {one.recording.id: one.recording for one in channels}.values()
     ended = [one for one in recordings if one.status not in UNFINISHED]
     going = [one.name for one in recordings if one.status in UNFINISHED]
-    found = _tables_of(store, [one for one in channels if one.recording.status not in UNFINISHED])
+    found = _tables_of(store, query, [one for one in channels if one.recording in ended])
     tables = store.session.tables
     lacking = [one.name for one in ended if topic in missing(store.directory, one, tables)]
     shown = ((*one["files"], "", f"{one['statement']};", "") for one in found)
@@ -282,36 +282,32 @@ def show_tables(store: Store, query: Query) -> None:
     output.notes(f"Without {what}." for what, applies in without.items() if applies)
 
 
-def _tables_of(store: Store, channels: Collection[RecordedChannel]) -> list[dict[str, Any]]:
+def _tables_of(
+    store: Store, query: Query, channels: Collection[RecordedChannel]
+) -> list[dict[str, Any]]:
     """Folders with rows of a topic in some recordings: files, rows, statement."""
     from glob import escape
 
     from hybridlog.columns.folders import files_of
     from hybridlog.columns.layout import type_prefix
 
-    topics = {one.channel.topic for one in channels}
-    recordings = {one.recording.id for one in channels}
+    (topic,), recordings = query.topics, {one.recording.id for one in channels}
     schemas = [one.channel.schema for one in channels]
     prefixes = {type_prefix("" if schema is None else schema.name) for schema in schemas}
-    (name,) = topics or {""}
+    where = f"topic = {_quoted(topic)}"
+    if query.question.recordings is not None:
+        where += f" and recording in ({', '.join(map(_quoted, sorted(recordings)))})"
     folders: dict[Path, dict[str, Any]] = {}
-    others: set[Path] = set()
     for file in files_of(store.directory.path, prefixes) if prefixes else ():
-        sections = [one for one in file.about.sections if one.topic == name]
-        rows = sum(one.rows for one in sections if one.id in recordings)
-        if not all(one.id in recordings for one in sections):
-            others.add(file.path.parent)
-        if rows:
+        own = (one for one in file.about.sections if one.topic == topic and one.id in recordings)
+        if rows := sum(one.rows for one in own):
             folder = file.path.parent
             found = folders.setdefault(folder, {"folder": str(folder), "rows": 0, "files": []})
             found["rows"] += rows
             found["files"].append(str(file.path))
-    chosen = f" and recording in ({', '.join(map(_quoted, sorted(recordings)))})"
-    for folder, found in folders.items():
-        files = _quoted(f"{escape(str(folder))}/*.parquet")
-        # The only texts in it are quoted, and nothing is run here.
-        statement = f"select * from {files} where topic = {_quoted(name)}"  # noqa: S608
-        found["statement"] = statement + (chosen if folder in others else "")
+            files = _quoted(f"{escape(str(folder))}/*.parquet")
+            # The only texts in it are quoted, and nothing is run here.
+            found["statement"] = f"select * from {files} where {where}"  # noqa: S608
     return list(folders.values())
 
 
