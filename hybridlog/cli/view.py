@@ -59,7 +59,7 @@ def view_command(given: _Given) -> None:
                 f"For a remote data loader: {mcap}manifest",
             ]
         output.tell(shown, [url])
-        output.notes(notes)
+        output.notes([] if given.as_json else notes)
         sys.stdout.flush()
         if given.opens:
             threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
