@@ -35,12 +35,6 @@ class LiveTable:
         """Remove the table."""
         self._live.stop()
 
-    def note(self, text: str) -> None:
-        """Print a line above the table."""
-        from rich.text import Text
-
-        self._live.console.print(Text(f"hybridlog: {output.printable(text)}"))
-
     def show(self, state: RecorderState, below: Sequence[str] = ()) -> None:
         """Draw a state, with lines below it."""
         from rich.text import Text

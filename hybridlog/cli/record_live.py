@@ -339,10 +339,7 @@ class _Display:
 
         if output.is_quiet() and PINNED in text:  # no problem
             return
-        if self.table is not None:
-            self.table.note(text)
-        else:
-            output.note(f"hybridlog: {text}")
+        output.note(f"hybridlog: {text}")
 
     def state(self, state: RecorderState) -> None:
         """Show the state, about once a second.

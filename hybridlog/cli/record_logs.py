@@ -222,8 +222,6 @@ class LogRecorder:
         for piece in self._pieces(store, log):
             try:
                 report = self._record_one(store, piece, progress)
-                report.entry = with_misfits(store, report.entry)
-                self._add(piece.path, report)
             except AlreadyRecordedError as error:
                 if self._is_search:
                     self._tell({"path": str(piece.path), "known": str(error)}, "known")
@@ -231,6 +229,16 @@ class LogRecorder:
                     self.fail(piece.path, error)
             except (SourceError, UsageError) as error:
                 self.fail(piece.path, error)
+            else:
+                report.entry = entry = with_misfits(store, report.entry)
+                for problem in _problems(piece.path, report):
+                    self._exit_code = self._exit_code or problem.exit_code
+                many, size = (
+                    output.counted(entry.messages, "message"),
+                    output.size(entry.stored_bytes),
+                )
+                line = f"{entry.name}: {many}, {size}, from {piece.path}"
+                self._tell(row_of(report, piece.path), "recorded", [line])
         self._left.remove(log.path)
 
     def _pieces(self, store: Store, log: LogSet) -> Iterator[LogSet]:
@@ -279,13 +287,6 @@ class LogRecorder:
         for pattern in (p for one in (matcher, no_index) if one is not None for p in one.unused()):
             output.note(f"{log.path}: no topic fits {output.quoted(pattern)}.")
         return report
-
-    def _add(self, path: Path, report: RecordReport) -> None:
-        for error in _problems(path, report):
-            self._exit_code = self._exit_code or error.exit_code
-        entry, many = report.entry, output.counted(report.entry.messages, "message")
-        line = f"{entry.name}: {many}, {output.size(entry.stored_bytes)}, from {path}"
-        self._tell(row_of(report, path), "recorded", [line])
 
     def fail(self, path: Path | None, error: HybridlogError) -> None:
         """Add an error; that of the only log is raised."""
