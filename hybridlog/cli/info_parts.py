@@ -127,13 +127,9 @@ def show_losses(entries: Sequence[RecordingEntry], topics: Sequence[str], given:
         output.note(f"Still being recorded, so later losses are to come: {listed(running)}.")
 
 
-def _lasted(loss: Mapping[str, Any]) -> str:
+def _duration(loss: Mapping[str, Any]) -> str:
     begin, end = loss.get("from"), loss.get("to")
     return "" if begin is None or end is None else output.short_duration(end - begin)
-
-
-def _detail(loss: Mapping[str, Any]) -> str:
-    return ": ".join(filter(None, (loss.get("file"), loss.get("reason"))))
 
 
 _LOSSES = [
@@ -142,8 +138,8 @@ _LOSSES = [
     Column("cause"),
     Column("messages", lambda loss: "unknown" if loss["count"] is None else loss["count"], "right"),
     Column("from", lambda loss: output.short_time(loss.get("from")), "whole"),
-    Column("for", _lasted, "right"),
-    Column("detail", _detail),
+    Column("for", _duration, "right"),
+    Column("detail", lambda loss: ": ".join(filter(None, (loss.get("file"), loss.get("reason"))))),
 ]
 
 

@@ -115,11 +115,6 @@ def summary(state: RecorderState) -> str:
 
 
 def _index(state: RecorderState) -> str:
-    why = f": {_in_short(state.index_failure)}" if state.index_failure else ""
+    sentence = state.index_failure.partition("\n")[0].partition(". ")[0].rstrip(".")
+    why = f": {output.cut(output.printable(sentence), _SHORT)}" if sentence else ""
     return f"index {state.lag} behind{why}" if state.lag or why else "index up to date"
-
-
-def _in_short(reason: str) -> str:
-    """The beginning of a reason, for a place with little room."""
-    line = output.printable(reason.partition("\n")[0])
-    return output.cut(line.partition(". ")[0].rstrip("."), _SHORT)

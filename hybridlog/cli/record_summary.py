@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
+from math import inf
 from typing import TYPE_CHECKING, Any, Final
 
 from hybridlog.cli.render import Column, bytes_of, numbers
@@ -45,31 +45,24 @@ def row_of(report: RecordReport, path: object) -> dict[str, Any]:
     }
 
 
-def _source(row: Mapping[str, Any]) -> str:
-    return f"{row['path']} ({row['kind']})" if row["path"] else ""
-
-
-def _ratio(row: Mapping[str, Any]) -> str:
-    return f"{row['bytes_in'] / (row['bytes_stored'] or math.inf):.2f}"
-
-
-def _rate(row: Mapping[str, Any]) -> str:
-    return f"{row['messages'] / (row['seconds'] or math.inf):,.0f}"
-
-
 COLUMNS: Final = [
     Column("recording"),
-    Column("source", _source, order=1),
+    Column("source", lambda row: f"{row['path']} ({row['kind']})", order=1),
     *numbers("topics", "messages"),
     Column("left out", "messages_skipped", "right", varies=True),
     Column("from before", "messages_latched", "right", varies=True),
     Column("attachments", side="right", varies=True),
     bytes_of("bytes in", "bytes_in", order=3),
     bytes_of("stored", "bytes_stored"),
-    Column("ratio", _ratio, "right"),
+    Column("ratio", lambda row: f"{row['bytes_in'] / (row['bytes_stored'] or inf):.2f}", "right"),
     Column("indexed", "messages_indexed", "right"),
     Column("time", lambda row: f"{row['seconds']:.2f} s", "right"),
-    Column("messages/s", _rate, "right", order=2),
+    Column(
+        "messages/s",
+        lambda row: f"{row['messages'] / (row['seconds'] or inf):,.0f}",
+        "right",
+        order=2,
+    ),
 ]
 """Of a table of the rows of `row_of`."""
 
