@@ -6,8 +6,6 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
-import click
-
 from hybridlog.cli import output
 from hybridlog.cli.binder import command, option
 from hybridlog.cli.completion import complete_condition, complete_topic
@@ -73,7 +71,7 @@ class _Given(Choosing, InStore, AsJson, Quiet):
 
 
 @command(_Given)
-def keep_command(given: _Given) -> None:
+def keep_command(given: _Given) -> int:
     """Keep the store within a quota; pin what never goes.
 
     Payloads go, fields and counts stay. Without options for rules, those of [retention] in
@@ -96,7 +94,8 @@ def keep_command(given: _Given) -> None:
             rows = [{"recording": entry.name, **pin} for entry in chosen for pin in entry.pins]
             given.show(rows, [Column("pin", "id"), Column("recording"), *_PIN])
         else:
-            _keep(store, rules, given)
+            return _keep(store, rules, given)
+    return 0
 
 
 def _rules(given: _Given) -> dict[str, Any]:
@@ -182,7 +181,7 @@ def pin_cells(pin: dict[str, Any]) -> list[str]:
     return [column.cell(pin) for column in _PIN]
 
 
-def _keep(store: Store, rules: dict[str, Any], given: _Given) -> None:
+def _keep(store: Store, rules: dict[str, Any], given: _Given) -> int:
     from hybridlog.maintenance.retention import Rules
 
     wanted = rules or store.directory.settings.retention
@@ -218,8 +217,7 @@ def _keep(store: Store, rules: dict[str, Any], given: _Given) -> None:
         if not any(map(rule.fits, topics))
     )
     output.notes((*found.problems, *plan.warnings, *useless))
-    if found.problems or plan.is_short:
-        raise click.exceptions.Exit(1)
+    return 1 if found.problems or plan.is_short else 0
 
 
 _STEPS = [

@@ -73,7 +73,7 @@ def _run_command() -> int:
         return shell_complete(app, {}, "hybridlog", VARIABLE, os.environ[VARIABLE])
     try:
         with app.make_context("hybridlog", sys.argv[1:]) as context:
-            code = app.invoke(context)
+            app.invoke(context)
     except click.exceptions.Exit as leaving:
         return leaving.exit_code
     except click.exceptions.NoArgsIsHelpError as error:
@@ -88,7 +88,7 @@ def _run_command() -> int:
     except click.Abort:
         _complain("aborted.")
         return HybridlogError.exit_code
-    return code if isinstance(code, int) else 0
+    return 0
 
 
 def _complain(text: str) -> None:

@@ -12,8 +12,6 @@ from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any, Final
 
-import click
-
 from hybridlog.cli import output
 from hybridlog.cli.app import DIFFERENT
 from hybridlog.cli.live_table import LiveTable, summary
@@ -68,10 +66,10 @@ class _Stop(Flag):
         return None if self.number == signal.SIGINT else _FOLLOWER_S
 
 
-def record_live(choices: RecordChoices) -> None:
-    """Record until a bound is reached, the replay has ended, or Ctrl-C."""
+def record_live(choices: RecordChoices) -> int:
+    """Record until a bound is reached, the replay has ended, or Ctrl-C; returns the exit code."""
     try:
-        _record(choices)
+        return _record(choices)
     except HybridlogError as error:
         if choices.as_json:  # the last line is a report in any case
             report = {"error": str(error), "exit_code": error.exit_code}
@@ -79,7 +77,7 @@ def record_live(choices: RecordChoices) -> None:
         raise
 
 
-def _record(choices: RecordChoices) -> None:
+def _record(choices: RecordChoices) -> int:
     from hybridlog.live.memory import frozen_objects
     from hybridlog.live.recorder import Recorder, make_room
 
@@ -124,7 +122,7 @@ def _record(choices: RecordChoices) -> None:
 
             results = (store.judge(options.contract, one.entry.id) for one in reports)
             broken = judge.broken([one for each in results for one in each])
-        _finish(choices, reports, recorder, sources, broken)
+        return _finish(choices, reports, recorder, sources, broken)
 
 
 def _finish(
@@ -133,8 +131,8 @@ def _finish(
     recorder: Recorder,
     sources: Sequence[LiveSource],
     broken: Sequence[Result],
-) -> None:
-    """Print what was recorded; exits with the code of the worst problem, if there is one."""
+) -> int:
+    """Print what was recorded; returns the exit code of the worst problem."""
     state = recorder.look()
     unreached = [one.address for one in sources if not one.was_reached]
     failed = [one for one in reports if one.failure is not None]
@@ -170,8 +168,7 @@ def _finish(
     if rows := [row for row in losses if row["cause"] == Cause.UNREADABLE]:
         errors.append(f"{in_words(rows)} that cannot be read; `hybridlog info --losses` lists them")
     output.notes(f"hybridlog: {line}" for line in (*errors, *map(output.not_indexed, failed)))
-    if code:
-        raise click.exceptions.Exit(code)
+    return code
 
 
 def _print(reports: Sequence[RecordReport], state: RecorderState, reason: str) -> None:

@@ -10,8 +10,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import click
-
 from hybridlog.cli import output
 from hybridlog.cli.ls import with_misfits
 from hybridlog.cli.options import parse_tags
@@ -43,7 +41,7 @@ if TYPE_CHECKING:
     from hybridlog.store import Store
 
 
-def record_logs(choices: RecordChoices) -> None:
+def record_logs(choices: RecordChoices) -> int:
     """Record each path, and each log below a directory; an error does not stop the others."""
     logs, walked = _find(choices)
     if choices.name is not None and len(logs) > 1:
@@ -64,9 +62,10 @@ def record_logs(choices: RecordChoices) -> None:
             name = f"{log.path.name}: " if len(logs) > 1 else ""
             recorder.record(store, log, partial(_shown, bar, before, name))
             before += log.size
+    return recorder.exit_code
 
 
-def record_watched(choices: RecordChoices) -> None:
+def record_watched(choices: RecordChoices) -> int:
     """Record what lies in directories, and what comes into them, until a signal ends it."""
     from hybridlog.formats.find import Watch
 
@@ -80,6 +79,7 @@ def record_watched(choices: RecordChoices) -> None:
         if left:
             paths = listed(map(str, left))
             output.note(f"Not complete: {paths}. `hybridlog record PATH` records what is there.")
+    return recorder.exit_code
 
 
 def _look(
@@ -200,20 +200,18 @@ class LogRecorder:
         self._logs, self._is_search = logs, is_search
         self._left = [log.path for log in logs]
         self._counts: Counter[str] = Counter()  # of what came of logs
-        self._exit_code = 0
+        self.exit_code = 0
         self._rows: list[dict[str, Any]] = []  # those that are shown at the end
 
     @contextmanager
     def opened(self) -> Iterator[Store]:
-        """The store; at the end the results are shown, and an error sets the exit code."""
+        """The store; at the end the results are shown."""
         _check_new_store(self._choices, self._logs)
         try:
             with if_stopped(self._on_stop), self._choices.opened_to_record() as store:
                 yield store
         finally:
             self._show()
-        if self._exit_code:
-            raise click.exceptions.Exit(self._exit_code)
 
     def record(self, store: Store, log: LogSet, progress: Callable[[int, int], None]) -> None:
         """Record a log, or the parts that the store lacks; raises if the only log cannot be."""
@@ -232,7 +230,7 @@ class LogRecorder:
             else:
                 report.entry = entry = with_misfits(store, report.entry)
                 for problem in _problems(piece.path, report):
-                    self._exit_code = self._exit_code or problem.exit_code
+                    self.exit_code = self.exit_code or problem.exit_code
                 many, size = (
                     output.counted(entry.messages, "message"),
                     output.size(entry.stored_bytes),
@@ -293,7 +291,7 @@ class LogRecorder:
         if len(self._logs) == 1 and not self._is_search:
             raise error
         output.note(f"hybridlog: {error}")
-        self._exit_code = self._exit_code or error.exit_code
+        self.exit_code = self.exit_code or error.exit_code
         about = {} if path is None else {"path": str(path)}
         self._tell({**about, "error": str(error), "exit_code": error.exit_code}, "error")
 

@@ -8,8 +8,6 @@ from dataclasses import asdict, dataclass, replace
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING
 
-import click
-
 from hybridlog.cli import output
 from hybridlog.cli.binder import command, option
 from hybridlog.cli.options import AsJson, InStore, Named, Quiet, recordings_of
@@ -34,7 +32,7 @@ class _Given(Named, InStore, AsJson, Quiet):
 
 
 @command(_Given)
-def verify_command(given: _Given) -> None:
+def verify_command(given: _Given) -> int:
     """Read everything, check checksums and references.
 
     Exits with 1 when it finds a problem, and prints a cure for each. With --repair, it restores
@@ -65,10 +63,9 @@ def verify_command(given: _Given) -> None:
     is_wanted = not isinstance(why, WithoutMongoError)
     if not result.index and is_wanted and (result.findings or why is None):
         output.note(f"The index was not compared: {why}")
-    if result.findings:
-        raise click.exceptions.Exit(1)
-    if not result.index and is_wanted and why is not None:
+    elif not result.index and is_wanted:
         raise DatabaseError(f"The index was not compared: {why}")
+    return 1 if result.findings else 0
 
 
 def _chosen(given: _Given, store: Store) -> tuple[Sequence[RecordingSummary], list[str]]:
