@@ -8,7 +8,6 @@ import re
 import shlex
 import signal
 import socket
-import struct
 import subprocess
 import sys
 import time
@@ -21,7 +20,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from mcap.writer import Writer
 
 import hybridlog as hl
 from hybridlog.cli import record_live
@@ -31,7 +29,6 @@ from hybridlog.live.state import RecorderState
 from hybridlog.live.statistics import TopicState
 from hybridlog_storage.errors import UsageError
 from tests import places
-from tests.cli import odd_log
 from tests.cli.running import BACKGROUND, COMMAND, complete, environment, run
 from tests.cli.within import answer
 from tests.independent import read
@@ -40,13 +37,6 @@ from tests.live.speaker import Speaker, text, text_channel
 from tests.waiting import wait_for
 
 pytestmark = pytest.mark.mongo
-
-CLOCK = b"""builtin_interfaces/Time clock
-================================================================================
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
-"""
 
 
 @contextmanager
@@ -241,39 +231,6 @@ def test_what_is_thinned_out_is_told(logs: Path, tmp_path: Path) -> None:
     assert run("info", "--losses", "--json", "-t", "/joint_states", store=store).json == []
     assert "left out by a throttle" in run("fetch", "-t", "imu/data", "--count", store=store).err
     assert "/imu/data" in run("info", "--losses", store=store).out
-
-
-def test_a_simulation_is_recorded_by_its_clock(tmp_path: Path) -> None:
-    second = 10**9
-    with (tmp_path / "simulation.mcap").open("wb") as file:
-        writer = Writer(file)
-        writer.start(profile="ros2")
-        kinds = [
-            ("/words", "std_msgs/msg/String", b"string data\n"),
-            ("/clock", "rosgraph_msgs/msg/Clock", CLOCK),
-        ]
-        words, clock = (
-            writer.register_channel(topic, "cdr", writer.register_schema(kind, "ros2msg", text))
-            for topic, kind, text in kinds
-        )
-        for at in range(6):
-            log_time = 10**18 + at * second
-            writer.add_message(words, log_time, odd_log.text(f"{at}"), log_time)
-            payload = b"\0\1\0\0" + struct.pack("<iI", at // 2, 5)
-            writer.add_message(clock, log_time + second // 2, payload, log_time)
-        writer.finish()
-    store = tmp_path / "store"
-    arguments = ("--speed", 50, "--reserve", 0, "--use-sim-time", "-t", "/words")
-    done = run("record", "--replay", tmp_path / "simulation.mcap", *arguments, store=store)
-    assert re.search(r"(?m)^source .*simulation\.mcap \(replay, by /clock\)$", done.out)
-    assert re.search(r"(?m)^coverage +complete$", done.out)
-    assert "sent nothing" not in done.err
-    found = [
-        (row["log_time_ns"], row["data"])
-        for row in map(json.loads, run("fetch", "-t", "/words", "-F", "jsonl", store=store).lines)
-    ]
-    assert [word for _, word in found] == list("012345")
-    assert {at for at, _ in found} == {5, second + 5, 2 * second + 5}
 
 
 @pytest.mark.parametrize("stream", ["stdout", "stderr"])
