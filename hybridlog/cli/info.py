@@ -273,11 +273,11 @@ def _coverage(entry: RecordingEntry, words: str) -> list[tuple[str, str]]:
     """The row about coverage; on a terminal with a bar."""
     if entry.span is None or not sys.stdout.isatty():
         return [("coverage", words)]
-    from hybridlog.cli.sparkline import bar
     from hybridlog.query.answers.lost import lost_parts
     from hybridlog.record.losses import extent_of
 
-    return [("coverage", bar(lost_parts(entry, extent_of(entry), _LETTERS))), ("", words)]
+    lost = lost_parts(entry, extent_of(entry), _LETTERS).tolist()
+    return [("coverage", "".join("░" if one else "█" for one in lost)), ("", words)]
 
 
 def _sparklines(store: Store, entry: RecordingEntry) -> dict[str, str]:
