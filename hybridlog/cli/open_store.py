@@ -61,10 +61,10 @@ def opened_store(
             named = " or ".join(f"--store {quote(str(one))}" for one in near[:_MAX_LISTED])
             error.add_note(f"Below this folder: {named}.")
         raise
-    doing = "so the files answer"
-    if records and recover:  # else beside the recorder
-        doing = store.shared.index.index_to_record("Recording").without
     with store:
+        doing = "so the files answer"
+        if records and recover:  # else beside the recorder
+            doing = store.shared.index.index_to_record("Recording").without
         told = _repairs(store, doing, verifies=verifies)
         notes(told if recover else ())
         try:
