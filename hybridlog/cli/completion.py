@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
     _Complete = Callable[[click.Context, click.Parameter, str], list[str]]
 
-VARIABLE: Final = "_HYBRIDLOG_COMPLETE"
-"""Environment variable in which a shell asks for completions, and for the script that does."""
 _TRANSFORMS: Final = 100
 """Messages of a topic that are read to complete frames."""
 
