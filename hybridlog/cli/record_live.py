@@ -17,7 +17,7 @@ from hybridlog.cli.app import DIFFERENT
 from hybridlog.cli.live_table import LiveTable, summary
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.options import parse_tags
-from hybridlog.cli.record import DEFAULT_CHUNK, OF_ENVIRONMENT, RecordChoices
+from hybridlog.cli.record_choices import DEFAULT_CHUNK, OF_ENVIRONMENT, RecordChoices
 from hybridlog.cli.record_summary import fields_of, remarks_on, row_of
 from hybridlog.cli.render import print_fields
 from hybridlog.cli.signals import handled, write_note

@@ -14,7 +14,7 @@ from hybridlog.cli import output
 from hybridlog.cli.ls import with_misfits
 from hybridlog.cli.options import parse_tags
 from hybridlog.cli.progress import Bar
-from hybridlog.cli.record import RecordChoices
+from hybridlog.cli.record_choices import RecordChoices
 from hybridlog.cli.record_summary import COLUMNS, fields_of, remarks_on, row_of
 from hybridlog.cli.render import print_fields, print_table
 from hybridlog.cli.signals import if_stopped

@@ -1,0 +1,222 @@
+"""The options of `hybridlog record`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, cast
+
+import click
+
+from hybridlog.cli.binder import (
+    SECONDS,
+    SIZE,
+    SOME_SECONDS,
+    Amount,
+    argument,
+    option,
+    parse_seconds,
+)
+from hybridlog.cli.completion import complete_topic
+from hybridlog.cli.options import (
+    AsJson,
+    Between,
+    InStore,
+    Latched,
+    Quiet,
+    cache_size,
+)
+from hybridlog.wording import parse_size
+from hybridlog_storage.errors import UsageError
+
+if TYPE_CHECKING:
+    from contextlib import AbstractContextManager
+
+    from hybridlog.query.topics import TopicMatcher
+    from hybridlog.store import Store
+    from hybridlog_storage.segments.segment_writer import SegmentSettings
+
+DEFAULT_CHUNK: Final = 2 << 20
+"""Bytes of a chunk."""
+
+
+OF_ENVIRONMENT: Final = "ROS_MASTER_URI"
+"""The master of ROS 1 that is meant without a URI."""
+_LIVE: Final = ("ros1", "ros2", "foxglove", "replay")
+"""Parameters that name a source of live messages."""
+_OF_LOGS: Final = ("paths", "between", "again", "watch", "no_latched", "original_times")
+
+
+def _live(help: str, metavar: str | None = None, **settings: Any) -> Any:  # noqa: A002
+    """An option for live recording."""
+    return option(help, metavar, **{"needs": _LIVE, "section": "Live recording", **settings})
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordChoices(Between, Latched, InStore, AsJson, Quiet):
+    """The parameters as typed."""
+
+    paths: tuple[Path, ...] = argument(
+        "ROS 1 bags, ROS 2 bags (files or directories), MCAP files, and directories with any "
+        "of them.",
+        "[PATH]...",
+    )
+    topics: tuple[str, ...] = option(
+        "Only these: name, glob, or re:REGEX.", "TOPIC", name="--topic", short="-t"
+    )
+    exclude: tuple[str, ...] = option("Not these.", "TOPIC", short="-x")
+    no_index: tuple[str, ...] = option(
+        "No documents in MongoDB for these: questions about them read tables.", "TOPIC"
+    )
+    name: str | None = option("Name of the recording; without, the file's.", "NAME")
+    again: bool = option("Record it even if its content is in the store.")
+    watch: bool = option(
+        "Go on recording logs that come into the directories, when they are complete, until "
+        "Ctrl-C.",
+        excludes=("name",),
+    )
+    settle: float = option(
+        "With --watch: a file that does not say so is complete when unchanged for this time.",
+        "TIME",
+        type=SECONDS,
+        default="60s",
+        needs=("watch",),
+    )
+    chunk_size: int | None = option(
+        "Uncompressed size of a chunk, such as 512KiB; without, 2MiB, less where --budget is "
+        "small.",
+        "SIZE",
+        type=Amount(parse_size, "1KiB"),
+    )
+    compression: str = option(
+        "Compression of chunks.", type=click.Choice(["zstd", "lz4", "none"]), default="zstd"
+    )
+    level: int = option("zstd level, 1 to 19.", "N", type=click.IntRange(1, 19), default=3)
+    ros1: str | None = option(
+        "Record a running ROS 1 robot; the URI of a master may follow, else ROS_MASTER_URI "
+        "names it.",
+        "[URI]",
+        is_flag=False,
+        flag_value=OF_ENVIRONMENT,
+        excludes=_OF_LOGS,
+    )
+    ros2: bool = option("Record a running ROS 2 robot; needs rclpy.", excludes=_OF_LOGS)
+    qos: Path | None = _live(
+        "With --ros2: YAML file of QoS overrides, as for rosbag2.", "FILE", needs=("ros2",)
+    )
+    foxglove: str | None = option(
+        "Record what a Foxglove WebSocket server sends.", "URL", excludes=_OF_LOGS
+    )
+    replay: Path | None = option(
+        "Play a log at the speed of a robot, and record that.", "FILE", excludes=_OF_LOGS
+    )
+    speed: float = _live(
+        "With --replay: N times as fast.",
+        "N",
+        type=click.FloatRange(min=0.01),
+        default=1.0,
+        needs=("replay",),
+    )
+    duration: float | None = _live("Stop after this time, such as 10m.", "TIME", type=SOME_SECONDS)
+    max_messages: int | None = _live(
+        "Stop after this number of messages.", "N", type=click.IntRange(min=1)
+    )
+    max_size: int | None = _live(
+        "Stop after this size of payloads, such as 10GB.", "SIZE", type=Amount(parse_size, "1B")
+    )
+    split_size: int = _live(
+        "Start a new segment file after this size.",
+        "SIZE",
+        type=Amount(parse_size, "1MiB"),
+        default="1GiB",
+    )
+    split_duration: float = _live(
+        "Start a new segment file after this time.", "TIME", type=SOME_SECONDS, default="10m"
+    )
+    use_sim_time: bool = _live("Log times are those of /clock, the time of a simulation.")
+    throttle: tuple[tuple[str, str], ...] = _live(
+        "At most this rate of messages, such as /camera 5Hz.",
+        "TOPIC RATE",
+        nargs=2,
+        shell_complete=complete_topic,
+    )
+    priority: tuple[tuple[str, str], ...] = _live(
+        "low, normal or high: when more arrives than can be written, payloads of the lowest "
+        "priority are dropped first.",
+        "TOPIC WORD",
+        nargs=2,
+        shell_complete=complete_topic,
+    )
+    budget: int | None = _live(
+        "Size of payloads in memory; without, a sixteenth of all memory.",
+        "SIZE",
+        type=Amount(parse_size, "1MiB"),
+    )
+    reserve: int = _live(
+        "Stop when the disk has less than this free.", "SIZE", type=SIZE, default="1GB"
+    )
+    flush_interval: float = _live(
+        "The most that a killed recorder can lose.",
+        "TIME",
+        type=Amount(parse_seconds, "1ns", "1h"),
+        default="1s",
+    )
+    ring: float | None = _live(
+        "Keep only the last TIME, and what is pinned.", "TIME", type=SOME_SECONDS
+    )
+    trigger: tuple[str, ...] = _live(
+        "Mark and pin what is around such a message: '/diagnostics: status[*].level >= 2'.",
+        "TOPIC: PREDICATE",
+    )
+    before: float | None = _live(
+        "Pin so much before a trigger or SIGUSR1; without, all that the ring has.",
+        "TIME",
+        type=SECONDS,
+    )
+    after: float | None = _live("Pin so much after it.", "TIME", type=SECONDS)
+    contract: Path | None = _live(
+        "Tell and mark topics that are silent for longer than the rules in this file allow, "
+        "and judge the recording at its end.",
+        "FILE",
+    )
+    set_tag: tuple[str, ...] = option("Store KEY=VALUE with it.", "K=V")
+    cache_size: int | None = cache_size()
+
+    @property
+    def is_live(self) -> bool:
+        """True when a source of live messages is given."""
+        return self.ros2 or (self.ros1, self.foxglove, self.replay) != (None, None, None)
+
+    def matchers(self) -> tuple[TopicMatcher | None, TopicMatcher | None]:
+        """The topics, and those without index documents; new ones, as each counts its uses."""
+        from hybridlog.query.topics import matcher
+
+        chosen = matcher(self.topics, self.exclude) if self.topics or self.exclude else None
+        return chosen, matcher(self.no_index) if self.no_index else None
+
+    def segment_settings(self, chunk_size: int = DEFAULT_CHUNK) -> SegmentSettings:
+        """Chunks and compression."""
+        from hybridlog_storage.segments.segment_writer import SegmentSettings
+
+        return SegmentSettings(
+            chunk_size=self.chunk_size or chunk_size,
+            compression=cast(Any, self.compression),
+            level=self.level,
+        )
+
+    def opened_to_record(self, *, recover: bool = True) -> AbstractContextManager[Store]:
+        """The store, which is made if there is none; see `opened_store`."""
+        return self.opened(create=True, cache_mb=self.cache_size, records=True, recover=recover)
+
+
+def check_choices(choices: RecordChoices) -> None:
+    """Refuse parameters that do not fit together."""
+    if choices.ros1 is not None and not choices.ros1.strip():
+        raise UsageError("A ROS master's URI looks like http://host:11311; this one is empty.")
+    if not choices.paths and not choices.is_live:
+        raise UsageError(
+            "Nothing to record: give a log, or --ros1, --ros2, --foxglove URL or --replay FILE."
+        )
+    for path in choices.paths if choices.watch else ():
+        if not path.is_dir():
+            raise UsageError(f"--watch takes directories, and {path} is none.")
