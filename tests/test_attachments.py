@@ -138,7 +138,6 @@ def test_a_slice_has_the_attachments_from_before_its_end(store: hl.Store, tmp_pa
     path = store.directory.path
     done = run("export", tmp_path / "a.mcap", "-t", "/n", "--between", "+2s", "+5s", store=path)
     assert "3 messages" in done.err
-    assert "3 attachments, 3 metadata records" in done.err
     assert "2 attachments from behind the time range: left out." in done.err
     found = contents(tmp_path / "a.mcap")
     assert [a[2] for a in found["attachments"]] == [a[1] for a in ATTACHMENTS[:3]]
@@ -294,7 +293,7 @@ def test_bags_keep_connections_and_say_what_they_cannot_hold(tmp_path: Path) -> 
         writer.finish()
     run("record", tmp_path / "c.mcap", store=store)
     done = run("export", tmp_path / "c.bag", "-r", "c", store=store)
-    assert "A bag cannot hold 1 attachment of the log; an MCAP file can." in done.err
+    assert "A bag has no attachments and metadata records of the log" in done.err
 
 
 def test_names_become_file_names_in_one_folder() -> None:

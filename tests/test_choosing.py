@@ -198,7 +198,7 @@ def test_all_commands_choose_alike(store: hl.Store) -> None:
 @pytest.mark.mongo
 def test_the_index_of_chosen_recordings_is_made_anew(store: hl.Store) -> None:
     done = call(store, "index", "rebuild", "--tag", "robot=7", "--with", "scan: n > 3")
-    assert done.out.startswith("1 recording,")
+    assert len(done.out.splitlines()) == 2
     assert call(store, "index", "rebuild", "--tag", "robot=9").code == 2
 
 

@@ -152,7 +152,7 @@ def test_one_byte_too_many(tmp_path: Path) -> None:
     folder = tmp_path / "store"
     told = run("record", path, store=folder).err
     assert told.count("bytes left over") == 1
-    assert f"{topic}: 5 messages have bytes left over behind" in told
+    assert f"{topic}: 5 messages with bytes left over behind" in told
     again = run("record", path, "--again", "--json", store=folder)
     assert again.json[0]["messages_surplus"] == 5
     assert "bytes left over" not in run("record", path, "--again", "--quiet", store=folder).err

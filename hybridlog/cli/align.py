@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import click
 
-from hybridlog.cli.answers import Tabular, answer_tables, print_end
+from hybridlog.cli.answers import Tabular, print_end
 from hybridlog.cli.binder import command, option
 from hybridlog.cli.completion import (
     complete_condition,
@@ -98,22 +98,20 @@ def align_command(given: _Given) -> None:
     """
     if given.base is None and given.step is None:
         raise UsageError("Name the rows: --to TOPIC for its messages, or --step for times.")
-    to, started = given.to, time.monotonic()
+    started = time.monotonic()
     with given.opened(snapshot=True) as store:
-        rows = _resampled(store, given) if given.base is None else _aligned(store, given)
+        if given.base is None:
+            query = given.query(store)
+            if given.fields:
+                query = query.fields(*parse_fields(",".join(given.fields)))
+            rows = query.resample(given.step or 0, given.how, given.tolerance)
+        else:
+            rows = _aligned(store, given)
         # That there is a transform shows only at the end.
         completeness = rows.completeness if given.strict else None
-        answer_tables(rows.to_tables(to.shown), to, rows.schema, completeness)
+        given.answer(rows.to_tables(given.most), rows.schema, completeness)
         print_end(rows.counters, started, verbose=given.verbose)
         remarks(rows.remarks())
-
-
-def _resampled(store: Store, given: _Given) -> Aligned:
-    """Rows at regular times."""
-    query = given.query(store)
-    if given.fields:
-        query = query.fields(*parse_fields(",".join(given.fields)))
-    return query.resample(given.step or 0, given.how, given.tolerance)
 
 
 def _aligned(store: Store, given: _Given) -> Aligned:

@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import chain, groupby, islice
 from operator import itemgetter
 from pathlib import Path
@@ -55,38 +55,6 @@ _LISTING_FORMATS: Final = [name for name in TABLE_FORMATS if not OUTPUTS[name].i
 _T = TypeVar("_T")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Destination:
-    """Format (a name of `OUTPUTS`, or `SCREEN`) and place of an answer; no path is stdout."""
-
-    form: str
-    path: Path | None
-    force: bool
-    limit: int | None = None
-    settings: Mapping[str, Any] = field(default_factory=dict)
-
-    @property
-    def shown(self) -> int | None:
-        """Maximum number of rows of a table that are printed or written; None for all."""
-        return SCREEN_ROWS if self.limit is None and self.form == SCREEN else self.limit
-
-    @property
-    def target(self) -> Target:
-        """The path or stream that a writer takes."""
-        return self.path or sys.stdout.buffer
-
-    def check(self) -> None:
-        """Refuse what cannot be written, before a store is opened."""
-        if self.path is None:
-            if self.form != SCREEN and not OUTPUTS[self.form].is_text and sys.stdout.isatty():
-                raise UsageError(f"{self.form} is no text for a terminal: name its place with -o.")
-        elif self.form == SCREEN:
-            raise UsageError("A table is for the screen: use --format csv or parquet with -o.")
-        else:
-            folder = is_directory(self.form, self.path)
-            check_room(self.path, force=self.force, is_directory=folder)
-
-
 def format_option(formats: Sequence[str], piped: str = " on a terminal, else jsonl") -> Any:
     """The option `--format` of a command with these formats."""
     return option(
@@ -122,26 +90,62 @@ class Tabular(Forced, AsJson):
     output: Path | None = output_option("Write to this file")
     limit: int | None = option("At most so many.", "N", short="-n", type=click.IntRange(min=0))
 
-    @property
-    def to(self) -> Destination:
-        """Format and place of the answer, which can be written."""
-        to = self.destination()
-        to.check()
-        return to
+    def __post_init__(self) -> None:
+        """Refuse what cannot be written, before a store is opened."""
+        self.check()
 
-    def destination(self) -> Destination:
-        """Format and place, which are yet to be checked."""
-        form = "json" if self.as_json else self.form
-        if form is None and self.output is None:
-            form = self.usual[not sys.stdout.isatty()]
-        elif form is None and self.output is not None:
-            form = form_of(self.output, suffixes_of(self.formats))
-        return Destination(
-            form=form or SCREEN,
-            path=self.output,
-            force=self.force,
-            limit=self.limit,
-        )
+    @property
+    def to_form(self) -> str:
+        """The format of the answer: a name of `OUTPUTS`, or `SCREEN`."""
+        if self.as_json:
+            return "json"
+        if self.form is None and self.output is not None:
+            return form_of(self.output, suffixes_of(self.formats))
+        return self.form or self.usual[not sys.stdout.isatty()]
+
+    @property
+    def place(self) -> Target:
+        """The path or stream that a writer takes."""
+        return self.output or sys.stdout.buffer
+
+    @property
+    def most(self) -> int | None:
+        """Greatest number of rows that are printed or written; None for all."""
+        return SCREEN_ROWS if self.limit is None and self.to_form == SCREEN else self.limit
+
+    def check(self) -> None:
+        """Refuse what cannot be written."""
+        form = self.to_form
+        if self.output is None:
+            if form != SCREEN and not OUTPUTS[form].is_text and sys.stdout.isatty():
+                raise UsageError(f"{form} is no text for a terminal: name its place with -o.")
+        elif form == SCREEN:
+            raise UsageError("A table is for the screen: use --format csv or parquet with -o.")
+        else:
+            folder = is_directory(form, self.output)
+            check_room(self.output, force=self.force, is_directory=folder)
+
+    def answer(
+        self,
+        tables: Iterable[pa.Table],
+        schema: Callable[[], pa.Schema | None] = lambda: None,
+        completeness: Callable[[], Completeness] | None = None,
+        noun: str = "row",
+    ) -> int:
+        """Print or write tables, at least one, all rows or nothing; returns the printed number."""
+        form, limit = self.to_form, self.limit
+        if limit is not None or form == SCREEN:
+            tables = _limited(tables, SCREEN_ROWS + 1 if limit is None else limit)
+        tables = _checked(tables, completeness)
+        if form == SCREEN:
+            return _print_rows(tables, limit, noun)
+        with writing(self.output), Bar(form, quiet=self.output is None) as bar:
+            answer = _rows(_with_progress(tables, bar))
+            if OUTPUTS[form].content == "table":
+                answer.schema = schema()
+            OUTPUTS[form].write(answer, self.place)
+        output.notes(answer.notes)
+        return 0
 
 
 def form_of(path: Path, suffixes: Mapping[str, str]) -> str:
@@ -162,15 +166,20 @@ class Listing(Tabular):
     usual: ClassVar[tuple[str, str]] = SCREEN, SCREEN
     form: str | None = format_option(_LISTING_FORMATS, "")
 
-    def answer(
-        self, rows: Iterable[Mapping[str, Any]], columns: Sequence[Column], titles: int = 1
+    def show(
+        self,
+        rows: Iterable[Any],
+        columns: Sequence[Column],
+        without: str = "",
+        plain: Callable[[Any], Any] = lambda row: row,
     ) -> None:
-        """Print or write rows; see `print_table`."""
-        to, limited = self.to, islice(rows, self.limit)
-        if to.form != SCREEN:
-            answer_tables(_tables_of(limited), to)
-        elif first := list(islice(limited, 1)):
-            print_table(columns, chain(first, limited), titles=titles)
+        """Print or write rows; see `AsJson.show`."""
+        limited = islice(rows, self.limit)
+        if self.to_form != SCREEN:
+            self.answer(_tables_of(map(plain, limited)))
+        elif not print_table(columns, limited):
+            output.remarks(filter(None, [without]))
+        sys.stdout.flush()
 
 
 def _tables_of(rows: Iterable[Mapping[str, Any]]) -> Iterator[pa.Table]:
@@ -201,55 +210,6 @@ def answering(given: Topics) -> Iterator[Answering]:
         output.remarks(asked.query.remarks(is_empty=asked.is_empty))
 
 
-def answer_query(query: Query, to: Destination, *, front: Front, strict: bool = False) -> Query:
-    """Print the first messages of a query, or write all; gives the query that was answered.
-
-    Strict: nothing is written if a pose has no transform, which shows only at the end.
-    """
-    if to.form != SCREEN:
-        write_answer(query, to.form, to.target, front=front, strict=strict, settings=to.settings)
-        return query
-    from hybridlog.record.marks import MARKS
-
-    limit = query.question.limit
-    answered = query if limit is not None else query.limit(SCREEN_ROWS + 1)
-    tables = _checked(answered.to_tables(), answered.completeness if strict else None)
-    if answered.topics == (MARKS,):
-        tables = map(_with_times, tables)
-    answered.counters.messages = _print_rows(tables, limit, "message", answered.topics)
-    return answered
-
-
-def _with_times(marks: pa.Table) -> pa.Table:
-    """Marks for people: their ends are times, as their beginnings are."""
-    import pyarrow as pa
-
-    if "end" not in marks.column_names:
-        return marks
-    end = marks["end"].cast(pa.timestamp("ns", "UTC"))
-    return marks.set_column(marks.column_names.index("end"), "end", end)
-
-
-def answer_tables(
-    tables: Iterable[pa.Table],
-    to: Destination,
-    schema: Callable[[], pa.Schema | None] = lambda: None,
-    completeness: Callable[[], Completeness] | None = None,
-) -> None:
-    """Print or write tables that are no messages, at least one, all rows or nothing."""
-    limit = SCREEN_ROWS + 1 if to.limit is None and to.form == SCREEN else to.limit
-    limited = _checked(tables if limit is None else _limited(tables, limit), completeness)
-    if to.form == SCREEN:
-        _print_rows(limited, to.limit, "row")
-        return
-    with writing(to.path), Bar(to.form, None, quiet=to.path is None) as bar:
-        answer = _rows(_with_progress(limited, bar))
-        if OUTPUTS[to.form].content == "table":
-            answer.schema = schema()
-        OUTPUTS[to.form].write(answer, to.target)
-    output.notes(answer.notes)
-
-
 def write_answer(
     query: Query,
     form: str,
@@ -259,8 +219,8 @@ def write_answer(
     extras: Extras | None = None,
     strict: bool = False,
     settings: Mapping[str, Any] | None = None,
-) -> int:
-    """Write an answer, all or nothing; returns how many messages do not fit their definition."""
+) -> None:
+    """Write an answer, all or nothing; its counters are about what was written."""
     from hybridlog.formats.slices import IN_FORCE, payload_bytes
 
     counters, written = query.counters, 0
@@ -291,7 +251,8 @@ def write_answer(
         for name in json_columns(answer.schema):
             notes.append(f"{name} has values of several types: it is written as JSON text.")
     output.notes(notes)
-    return counters.messages - counters.reduced - written if counts else 0
+    if counts:
+        counters.messages = written + counters.reduced
 
 
 def _answer_of(
@@ -441,9 +402,7 @@ def _limited(tables: Iterable[pa.Table], limit: int) -> Iterator[pa.Table]:
             return
 
 
-def _print_rows(
-    tables: Iterable[pa.Table], limit: int | None, noun: str, topics: Sequence[str] = ()
-) -> int:
+def _print_rows(tables: Iterable[pa.Table], limit: int | None, noun: str) -> int:
     """Print rows for people to read, and whether there are none or more; gives their number."""
     from hybridlog.frames.cells import MAX_CELL, MAX_LINE, cells
     from hybridlog.schema.arrow_types import is_text
@@ -468,9 +427,6 @@ def _print_rows(
                 for n, (name, is_cut) in enumerate(columns)
             ],
             map(itemgetter(1), alike),
-            # The first column is the time, the second the topic.
-            titles=2 if len(topics) > 1 else 1,
-            about=topics if len(topics) == 1 else (),
         )
     if not read:
         output.note(f"No {noun}.")

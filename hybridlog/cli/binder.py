@@ -212,16 +212,17 @@ def check(kind: type, context: click.Context) -> None:
 
 def command(
     kind: type[_Kind], name: str | None = None, to: click.Group | None = None, **settings: Any
-) -> Callable[[Callable[..., Any]], click.Command]:
-    """Make a function a command; it gets an instance of the dataclass of its options."""
+) -> Callable[[Callable[[_Kind], int | None]], click.Command]:
+    """Make a function a command: it gets its options, and may give an exit code."""
 
-    def bound(function: Callable[..., Any]) -> click.Command:
+    def bound(function: Callable[[_Kind], int | None]) -> click.Command:
         @wraps(function)
-        def call(**values: Any) -> Any:
+        def call(**values: Any) -> None:
             check(kind, click.get_current_context())
             given = kind(**values)
             output.begin(given)
-            return function(given)
+            if code := function(given):
+                raise click.exceptions.Exit(code)
 
         call.__click_params__ = parameters_of(kind)[::-1]  # type: ignore[attr-defined]
         make: Any = click.command(name, **{"cls": Command, **settings})

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-import click
 
 from hybridlog.cli import output
 from hybridlog.cli.answers import Listing, answering, check_room, write_bytes
@@ -44,7 +41,7 @@ class _Given(Strict, Verbose, Topics, Listing):
 
 
 @command(_Given)
-def check_command(given: _Given) -> None:
+def check_command(given: _Given) -> int:
     """Show how regularly topics came, the worst first.
 
     Rate, jitter, longest gap and where it begins, late start, early stop and losses of each
@@ -60,8 +57,7 @@ def check_command(given: _Given) -> None:
         with given.opened(snapshot=True) as store:
             chosen = given.recordings_in(store)
             results = [one for name in chosen.ids for one in store.judge(rules, name)]
-        _show_verdict(results, len(chosen), given)
-        return
+        return _show_verdict(results, len(chosen), given)
     with answering(given) as asked:
         asked.is_empty = False
         found = asked.query.check()
@@ -69,7 +65,7 @@ def check_command(given: _Given) -> None:
             if len({one.recording for one in found}) != 1:
                 raise UsageError("A contract is made from one good recording: name it with -r.")
             write_bytes(make, contract_of(found).encode())
-            return
+            return 0
         # Losses are left out only where there are none; a late start may be why a topic is bad.
         has_losses = any(one.lost != 0 for one in found)
         columns = [
@@ -89,8 +85,8 @@ def check_command(given: _Given) -> None:
                 order=0 if has_losses else 4,
             ),
         ]
-        given.answer(map(asdict, found), columns)
-        output.remarks([] if found else ["No topic."])
+        given.show(map(asdict, found), columns, "No topic.")
+    return 0
 
 
 def _duration(ns: float | None) -> str:
@@ -106,18 +102,16 @@ def _gap_begin(row: Mapping[str, Any]) -> str:
     return "" if begin is None else f"+{(begin - row['begin_ns']) / 1e9:.3f}s"
 
 
-def _show_verdict(results: Sequence[Result], recordings: int, given: _Given) -> None:
+def _show_verdict(results: Sequence[Result], recordings: int, given: _Given) -> int:
     from hybridlog.contract.judge import broken, junit_of
 
     if given.junit is not None:
         write_bytes(given.junit, junit_of(results).encode())
     bad = broken(results)
     names = ("recording", "topic", "rule", "wanted", "found")
-    given.answer(map(asdict, results if given.as_json else bad), [*map(Column, names)])
-    sys.stdout.flush()
+    given.show(map(asdict, results if given.as_json else bad), [*map(Column, names)])
     output.remarks([verdict(results, f" in {output.counted(recordings, 'recording')}")])
-    if bad:
-        raise click.exceptions.Exit(DIFFERENT)
+    return DIFFERENT if bad else 0
 
 
 def verdict(results: Sequence[Result], where: str = "") -> str:

@@ -17,13 +17,10 @@ if TYPE_CHECKING:
     import click
 
     from hybridlog.session import Session
-    from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.summary import RecordingSummary
 
     _Complete = Callable[[click.Context, click.Parameter, str], list[str]]
 
-VARIABLE: Final = "_HYBRIDLOG_COMPLETE"
-"""Environment variable in which a shell asks for completions, and for the script that does."""
 _TRANSFORMS: Final = 100
 """Messages of a topic that are read to complete frames."""
 
@@ -33,11 +30,17 @@ def _of_store(complete: Callable[[Session, click.Context, str], Iterable[str]]) 
 
     @wraps(complete)
     def found(context: click.Context, _: click.Parameter, incomplete: str) -> list[str]:
-        try:
-            directory = _store(context)
-            from hybridlog.store import Store
+        from hybridlog_storage.lazy import import_numpy_late
 
-            with closing(Store(directory, mongo="none", recover=False).shared) as shared:
+        import_numpy_late()
+        from hybridlog.store import Store, store_path
+        from hybridlog_storage.remote import directory_of
+
+        try:
+            value: Path | None = context.params.get("store")
+            # The shell has not expanded the tilde of the line that is being completed.
+            path = store_path(None if value is None else os.path.expanduser(value))  # noqa: PTH111
+            with closing(Store(directory_of(path), mongo="none", recover=False).shared) as shared:
                 names = [*complete(shared.now(), context, incomplete)]
         except (HybridlogError, OSError):
             return []
@@ -67,15 +70,10 @@ def complete_type(session: Session, _: click.Context, incomplete: str) -> Iterab
     return sorted(names | {name.rpartition("/")[2] for name in names if incomplete})
 
 
-def complete_running(context: click.Context, _: click.Parameter, incomplete: str) -> list[str]:
-    """Names of running recorders that begin with what was typed."""
-    from hybridlog.live.state import running
-
-    try:
-        names = running(_store(context)).values()
-    except (HybridlogError, OSError):
-        return []
-    return [name for name in names if name.startswith(incomplete)]
+@_of_store
+def complete_running(session: Session, _: click.Context, __: str) -> Iterable[str]:
+    """Names of recordings in progress that begin with what was typed."""
+    return (one.name for one in session.look().summaries if one.status == "open")
 
 
 @_of_store
@@ -149,19 +147,6 @@ def complete_frame(session: Session, context: click.Context, _: str) -> Iterable
                 asked = Question((channel.topic,), (one.id,), limit=_TRANSFORMS)
                 found.update(*(frames_named(each.fields) for each in Query(session, asked)))
     return sorted(found)
-
-
-def _store(context: click.Context) -> StoreDirectory:
-    from hybridlog_storage.lazy import import_numpy_late
-
-    import_numpy_late()
-    from hybridlog.store import store_path
-    from hybridlog_storage.remote import directory_of
-
-    value: Path | None = context.params.get("store")
-    # The shell has not expanded the tilde of the line that is being completed.
-    path = store_path(None if value is None else os.path.expanduser(value))  # noqa: PTH111
-    return directory_of(path)
 
 
 def _chosen(context: click.Context, session: Session) -> list[RecordingSummary]:

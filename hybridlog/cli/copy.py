@@ -25,8 +25,7 @@ if TYPE_CHECKING:
 _RUNNING: Final = frozenset({"open", "unfinished"})
 
 
-def _parse_rate(text: str) -> int:
-    return parse_size(text.removesuffix("/s"))
+_RATE: Final = Amount(lambda text: parse_size(text.removesuffix("/s")), "1B/s")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,9 +41,7 @@ class _Copy(Choosing, InStore, AsJson, Quiet):
     then_expire: bool = option(
         "Delete payloads here once their copy is proved there; pinned ones stay."
     )
-    limit_rate: float | None = option(
-        "Bytes a second at most, such as 5MB/s.", "RATE", type=Amount(_parse_rate, "1B/s")
-    )
+    limit_rate: float | None = option("Bytes a second at most, such as 5MB/s.", "RATE", type=_RATE)
     check: bool = option("Read copies that are there already, too, and mend them.")
     watch: bool = option("Go on with what ends later, until Ctrl-C.")
     ssh: str | None = option(
@@ -83,7 +80,9 @@ def copy_command(given: _Copy) -> None:
             watch(store.directory.place, look)
             return
         report = _copied(store, given, given.choice, how)
-    _check(report)
+    if left := [*report.refused.values(), *report.problems]:
+        sys.stdout.flush()
+        raise StoreError(" ".join(left))
 
 
 def _from_elsewhere(given: _Copy, source: Path) -> _Copy:
@@ -115,11 +114,15 @@ def _copied(
     try:
         with Bar("copy") as bar:
             store.copy(given.to, chosen, how, bar.part, report)
-    except BaseException:
-        if report != CopyReport():
-            _print(report, there, is_short=is_short)
-        raise
-    _print(report, there, is_short=is_short)
+    finally:
+        if sys.exception() is None or report != CopyReport():
+            lines = [f"copied {name}" for name in report.copied]
+            for name in () if is_short else report.known:
+                more = f"; payloads that were deleted {there} were not copied"
+                lines.append(f"{name} is {there} already{more if name in report.lacking else ''}")
+            if report.freed_bytes > 0:  # of a few messages, fields may take more than payloads
+                lines.append(f"{output.size(report.freed_bytes)} freed")
+            output.tell(asdict(report), lines, at_once=is_short)
     return report
 
 
@@ -140,23 +143,3 @@ def _look(store: Store, given: _Copy, how: CopyOptions, done: set[str]) -> Itera
     if report.held:
         raise StoreError(" ".join(problems))
     yield from map(StoreError, problems)
-
-
-def _print(report: CopyReport, there: str, *, is_short: bool) -> None:
-    """Print what was copied."""
-    lines = [f"copied {name}" for name in report.copied]
-    for name in () if is_short else report.known:
-        lacks = name in report.lacking
-        more = f"; payloads that were deleted {there} were not copied" if lacks else ""
-        lines.append(f"{name} is {there} already{more}")
-    if report.freed_bytes > 0:  # of a few messages, fields may take more than payloads
-        lines.append(f"{output.size(report.freed_bytes)} freed")
-    output.tell(asdict(report), lines, at_once=is_short)
-
-
-def _check(report: CopyReport) -> None:
-    """Fail if something was not copied, or did not expire."""
-    left = [*report.refused.values(), *report.problems]
-    if left:
-        sys.stdout.flush()
-        raise StoreError(" ".join(left))

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
-
-import click
 
 from hybridlog.cli import output
 from hybridlog.cli.answers import Listing
@@ -35,7 +32,7 @@ class _Given(Between, InStore, Quiet, Listing):
 
 
 @command(_Given)
-def diff_command(given: _Given) -> None:
+def diff_command(given: _Given) -> int:
     """Show what differs between two recordings.
 
     First what only one has: times and topics. Then types, messages, rates, gaps, losses, and
@@ -60,14 +57,12 @@ def diff_command(given: _Given) -> None:
             if rules is not None
         ]
     columns = [Column("topic"), Column("what"), Column("a", _side("a")), Column("b", _side("b"))]
-    given.answer(map(asdict, found), columns, titles=2)
-    sys.stdout.flush()
+    given.show(map(asdict, found), columns)
     if not given.as_json:
         total = f"{output.counted(len(found), 'difference')}." if found else "No difference."
         is_cut = given.limit is not None and given.limit < len(found)
         output.remarks([*verdicts, f"The first {given.limit} of {total}" if is_cut else total])
-    if found:
-        raise click.exceptions.Exit(DIFFERENT)
+    return DIFFERENT if found else 0
 
 
 def _side(name: str) -> Callable[[Mapping[str, Any]], str]:

@@ -26,6 +26,5 @@ def edit_command(given: _Given) -> None:
     if given.name is None and given.note is None:
         raise UsageError("Say what to change: --name NAME or --note TEXT.")
     with given.opened() as store:
-        (entry,) = store.select([given.recording])
-        entry = store.edit(entry.id, name=given.name, note=given.note)
+        entry = store.edit(given.recording, name=given.name, note=given.note)
     output.tell(None, [] if given.name is None else [f"renamed to {entry.name}"])

@@ -101,15 +101,13 @@ def _write_log(
     if given.no_attachments:
         extras = extras._replace(attachments=[], left_out=0)
     write_answer(query, form, path, front=given.front, extras=extras, settings=settings)
-    has_extras = form == "mcap" or settings.get("storage") == "mcap"
-    counts = (len(extras.attachments), "attachment"), (len(extras.metadata), "metadata record")
-    beside = "".join(f", {output.counted(count, what)}" for count, what in counts if count)
-    print_written(path, query, beside=beside if has_extras else "")
-    if beside and not has_extras:
-        output.note(f"A bag cannot hold {beside[2:]} of the log; an MCAP file can.")
-    if extras.left_out and has_extras:
-        left_out = output.counted(extras.left_out, "attachment")
-        output.note(f"{left_out} from behind the time range: left out.")
+    print_written(path, query)
+    if form == "mcap" or settings.get("storage") == "mcap":
+        if extras.left_out:
+            left_out = output.counted(extras.left_out, "attachment")
+            output.note(f"{left_out} from behind the time range: left out.")
+    elif extras.attachments or extras.metadata:
+        output.note("A bag has no attachments and metadata records of the log; an MCAP file has.")
 
 
 def _write_tables(query: Query, form: str, directory: Path, given: _Given) -> None:
@@ -134,13 +132,13 @@ def _write_tables(query: Query, form: str, directory: Path, given: _Given) -> No
         for topic, path in paths.items():
             one = narrowed(query, topic)
             try:
-                missing = write_answer(one, form, path, front=given.front)
+                write_answer(one, form, path, front=given.front)
             except (DefinitionError, PayloadError, TimeError, UsageError) as error:
                 is_named = isinstance(error, DefinitionError) or topic in str(error)
                 output.note(f"{'' if is_named else f'{topic}: '}{error}")
                 left_out.append(error)
                 continue
-            print_written(path, one, missing)
+            print_written(path, one)
             query.counters.add(one.counters)
         if len(left_out) == len(paths):
             raise left_out[0]
@@ -162,17 +160,12 @@ def _image_topics(query: Query) -> list[str]:
     return [topic for topic in query.topics if topic in found]
 
 
-def print_written(path: Path, query: Query, missing: int = 0, beside: str = "") -> None:
-    """Print a line about a file; --quiet leaves it out, unless messages are missing."""
-    left_out = f" (left out: {output.unfit(missing)})" if missing else ""
-    if missing or not output.is_quiet():
-        written = query.counters.messages - query.counters.reduced - missing
-        files = path.iterdir() if path.is_dir() else [path]
-        output.note(
-            f"{path}: {output.counted(written, 'message')}{left_out}"
-            f"{latched(query.counters)}{beside}, "
-            f"{output.size(sum(one.stat().st_size for one in files))}"
-        )
+def print_written(path: Path, query: Query) -> None:
+    """Print a line about a file."""
+    files = path.iterdir() if path.is_dir() else [path]
+    size = output.size(sum(one.stat().st_size for one in files))
+    many = output.counted(query.counters.messages - query.counters.reduced, "message")
+    output.remarks([f"{path}: {many}{latched(query.counters)}, {size}"])
 
 
 def pieces(

@@ -13,23 +13,24 @@ import click
 from hybridlog.cli import output
 from hybridlog.cli.answers import (
     SCREEN,
-    Destination,
+    SCREEN_ROWS,
     Tabular,
-    answer_query,
     format_option,
     output_option,
     print_end,
+    write_answer,
     write_following,
 )
 from hybridlog.cli.binder import command, option
 from hybridlog.cli.completion import complete_path
 from hybridlog.cli.options import Asking, Slices, in_frame, parse_fields, query_of
-from hybridlog.cli.signals import Stopped
 from hybridlog.formats import OUTPUTS, formats_of, is_directory
 from hybridlog_storage.errors import TopicError, UsageError
 from hybridlog_storage.stopping import at_safe_points
 
 if TYPE_CHECKING:
+    import pyarrow as pa
+
     from hybridlog.formats.slices import Front
     from hybridlog.query.query import Query
     from hybridlog.store import Store
@@ -90,6 +91,19 @@ class _Choices(Asking, Tabular, Slices):
         "Write to this file (raw: a directory; png and jpg: a directory, or one picture)"
     )
 
+    def check(self) -> None:
+        """Refuse what makes no sense, or cannot be written."""
+        assert self.topics
+        form = self.to_form
+        as_it_came = form in OUTPUTS and OUTPUTS[form].content in {"log", "pictures", "video"}
+        if self.frame is not None and (as_it_came or form == "raw"):
+            raise UsageError(f"{form} has messages as they came: --in-frame is for tables and ply.")
+        if self.follow and not (form in OUTPUTS and OUTPUTS[form].is_text and form != "json"):
+            raise UsageError(f"--follow prints lines, such as jsonl or csv: {form} has an end.")
+        self.settings(form)
+        if not self.count and (self.split is None or form == SCREEN):
+            super().check()
+
 
 @command(_Choices)
 def fetch_command(choices: _Choices) -> None:
@@ -98,12 +112,11 @@ def fetch_command(choices: _Choices) -> None:
     Without --format and -o: a table on a terminal, JSON lines elsewhere. What the answer may
     lack is printed on standard error.
     """
-    to = _destination(choices)
     started = time.monotonic()
     with choices.opened(snapshot=not choices.follow) as store:
         query = _query(store, choices)
         if choices.follow:
-            _follow(query, choices, to.form)
+            _follow(query, choices)
             return
         if choices.at is not None:
             try:
@@ -113,71 +126,90 @@ def fetch_command(choices: _Choices) -> None:
                 raise
         if choices.strict:
             query.completeness().check(payloads=not choices.count)
+        lost: list[str] = []
         if choices.count:
             count = query.count()
+            completeness = query.completeness()
             if choices.strict:
-                query.completeness().check()
+                completeness.check()
             output.say(str(count))
-            _print_end(query, choices, started)
-            lost = query.completeness()
-            if lost.has_losses:
-                output.remarks([lost.describe(count, query.question.limit)])
+            if completeness.has_losses:
+                lost = [completeness.describe(count, query.question.limit)]
         else:
             front = choices.front
-            if choices.at is not None and to.form != "mp4":  # the answer is one message
+            if choices.at is not None and choices.to_form != "mp4":  # the answer is one message
                 front = replace(front, latched=False)
             if choices.split is not None:
-                _write_pieces(query, choices, to, front)
+                _write_pieces(query, choices, front)
                 return
-            query = answer_query(query, to, front=front, strict=choices.strict)
-            _print_end(query, choices, started)
+            query = _answer(query, choices, front)
+        cost = query.counters.copy()
+        for condition in query.conditions:
+            cost.add(condition.counters)
+        print_end(cost, started, verbose=choices.verbose, count=choices.count)
+        output.remarks((*query.remarks(), *lost))
 
 
-def _print_end(query: Query, choices: _Choices, started: float) -> None:
-    """Print the cost of an answer, with that of conditions on other topics, and what it lacks."""
-    cost = query.counters.copy()
-    for condition in query.conditions:
-        cost.add(condition.counters)
-    print_end(cost, started, verbose=choices.verbose, count=choices.count)
-    output.remarks(query.remarks())
+def _answer(query: Query, choices: _Choices, front: Front) -> Query:
+    """Print the first messages of a query, or write all; gives the query that was answered.
+
+    Strict: nothing is written if a pose has no transform, which shows only at the end.
+    """
+    form, strict = choices.to_form, choices.strict
+    if form != SCREEN:
+        settings = choices.settings(form)
+        write_answer(query, form, choices.place, front=front, strict=strict, settings=settings)
+        return query
+    from hybridlog.record.marks import MARKS
+
+    answered = query if query.question.limit is not None else query.limit(SCREEN_ROWS + 1)
+    tables = answered.to_tables()
+    if answered.topics == (MARKS,):
+        tables = map(_with_times, tables)
+    completeness = answered.completeness if strict else None
+    answered.counters.messages = choices.answer(tables, completeness=completeness, noun="message")
+    return answered
 
 
-def _write_pieces(query: Query, choices: _Choices, to: Destination, front: Front) -> None:
+def _with_times(marks: pa.Table) -> pa.Table:
+    """Marks for people: their ends are times, as their beginnings are."""
+    import pyarrow as pa
+
+    if "end" not in marks.column_names:
+        return marks
+    end = marks["end"].cast(pa.timestamp("ns", "UTC"))
+    return marks.set_column(marks.column_names.index("end"), "end", end)
+
+
+def _write_pieces(query: Query, choices: _Choices, front: Front) -> None:
     """Write a file for each part of the answer, and a line about each."""
     from hybridlog.cli.export import pieces, print_written
 
-    assert to.path is not None
-    folder = is_directory(to.form, to.path)
-    how = choices.split or ""
-    for path, one in pieces(query, how, to.path, force=to.force, is_directory=folder):
-        answer_query(one, replace(to, path=path), front=front, strict=choices.strict)
+    assert choices.output is not None
+    folder, how = is_directory(choices.to_form, choices.output), choices.split or ""
+    for path, one in pieces(query, how, choices.output, force=choices.force, is_directory=folder):
+        _answer(one, replace(choices, output=path), front)
         print_written(path, one)
         output.remarks(one.completeness().sentences)
 
 
-def _follow(query: Query, choices: _Choices, form: str) -> None:
+def _follow(query: Query, choices: _Choices) -> None:
     """Print messages as they come, then what they may lack."""
+    from hybridlog.cli.ls import status_text
+    from hybridlog.query.query import Query
+
     started = time.monotonic()
     following = query.follow(*choices.topics)
-    stopped: Stopped | None = None
     try:
         with at_safe_points():
-            write_following(following, form)
-    except Stopped as error:
-        stopped = error
-    print_end(query.counters, started, verbose=choices.verbose)
-    if not choices.quiet:
-        from hybridlog.cli.ls import status_text
-        from hybridlog.query.query import Query
-
+            write_following(following, choices.to_form)
+    finally:
+        print_end(query.counters, started, verbose=choices.verbose)
         asked = Query(query.session, following.question)
         asked.counters = query.counters
-        output.notes(asked.remarks())
-        for one in asked.summaries():
-            if one.status != "open":
-                output.note(f"{one.name} has ended: {status_text(one)}.")
-    if stopped is not None:
-        raise stopped
+        ended = (one for one in asked.summaries() if one.status != "open")
+        output.remarks(asked.remarks())
+        output.remarks(f"{one.name} has ended: {status_text(one)}." for one in ended)
 
 
 def _query(store: Store, choices: _Choices) -> Query:
@@ -207,19 +239,3 @@ def _query(store: Store, choices: _Choices) -> Query:
     if choices.reverse:
         query = query.reverse()
     return query if choices.limit is None else query.limit(choices.limit)
-
-
-def _destination(choices: _Choices) -> Destination:
-    """Format and place of the answer; refuses what makes no sense before a store is opened."""
-    assert choices.topics
-    to = choices.destination()
-    form = to.form
-    to = replace(to, settings=choices.settings(form))
-    as_it_came = form in OUTPUTS and OUTPUTS[form].content in {"log", "pictures", "video"}
-    if choices.frame is not None and (as_it_came or form == "raw"):
-        raise UsageError(f"{form} has messages as they came: --in-frame is for tables and ply.")
-    if choices.follow and not (form in OUTPUTS and OUTPUTS[form].is_text and form != "json"):
-        raise UsageError(f"--follow prints lines, such as jsonl or csv: {form} has an end.")
-    if not choices.count and (choices.split is None or form == SCREEN):
-        to.check()
-    return to

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -119,37 +118,24 @@ def rebuild(given: _Rebuild) -> None:
     Without -r it is emptied first. After an interruption, the next command that needs the
     index makes the rest.
     """
-    started = time.monotonic()
     with given.opened(require_database=True, cache_mb=given.cache_size) as store:
         chosen = given.recordings_in(store)
-        total = sum(entry.stored_bytes for entry in chosen.summaries)
         with (
             if_stopped(
                 "Finished recordings stay indexed; the next command that needs the index makes "
                 "the rest."
             ),
-            Bar("index rebuild", total) as bar,
+            Bar("index rebuild") as bar,
         ):
             done = store.index.rebuild(None if given.choice.is_everything else chosen, bar.part)
+    rows = [
+        {"recording": one.name, "messages": one.messages, "documents": one.documents}
+        for one in done
+    ]
+    given.show(rows, [Column("recording"), *numbers("messages", "documents")])
     made = {entry.id for entry in done}
-    left = [entry.name for entry in chosen.summaries if entry.id not in made]
-    if left:
+    if left := [entry.name for entry in chosen.summaries if entry.id not in made]:
         output.note(f"In use, and left as they are: {listed(left)}.")
-    messages = sum(r.documents for r in done)
-    without = sum(r.messages - len(r.marks) for r in done) - messages
-    elapsed = time.monotonic() - started
-    about = {
-        "recordings": len(done),
-        "messages": messages,
-        "messages_without_documents": without,
-        "left": left,
-        "seconds": round(elapsed, 3),
-    }
-    line = (
-        f"{output.counted(len(done), 'recording')}, {output.counted(messages, 'message')} indexed "
-        f"in {elapsed:.2f} s{output.without_documents(without)}"
-    )
-    output.tell(about, [line])
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -36,14 +36,13 @@ from hybridlog.cli.render import Column, numbers, print_fields, print_table
 from hybridlog.query.answers.completeness import coverage, line_of
 from hybridlog.query.topics import resolve
 from hybridlog.record.losses import losses_of
-from hybridlog.wording import listed
-from hybridlog_storage.errors import SegmentError, StoreError, UsageError
+from hybridlog_storage.errors import SegmentError, StoreError
 
 if TYPE_CHECKING:
     from hybridlog.attachments import StoredAttachment, StoredMetadata
     from hybridlog.query.answers.video import VideoSummary
     from hybridlog.store import Store
-    from hybridlog_storage.catalog import ChannelStats, RecordingEntry
+    from hybridlog_storage.catalog import RecordingEntry
 
 
 _MAX_DRAWN = 20  # recordings with sparklines; for more, reading their chunk tables takes long
@@ -102,33 +101,25 @@ def info_command(given: _Given) -> None:
         show_segment(Path(given.names[0]), as_json=given.as_json)
         return
     with given.opened(snapshot=True) as store:
-        if not _show_part(store, given):
-            _show(store, given)
-
-
-def _show_part(store: Store, given: _Given) -> bool:
-    """Show what options ask for instead of everything; returns whether they do."""
-    if given.losses:
-        if given.topic:
-            resolve(given.topic, store.topics())  # refuses a name that fits no topic
-        show_losses([*given.recordings_in(store)], given.topic, given)
-    elif given.topic:
-        query = query_of(store, given.topic, given.choice)
-        if not given.tables:
-            show_topics(store, query, given.topic, as_json=given.as_json)
-        elif len(query.topics) > 1:
-            raise UsageError(f"--tables is about one topic: name one of {listed(query.topics)}.")
+        if given.losses:
+            if given.topic:
+                resolve(given.topic, store.topics())  # refuses a name that fits no topic
+            show_losses([*given.recordings_in(store)], given.topic, given)
+        elif given.topic:
+            query = query_of(store, given.topic, given.choice)
+            if given.tables:
+                show_tables(store, query)
+            else:
+                show_topics(store, query, as_json=given.as_json)
+        elif given.sizes is not None:
+            sizes = store.sizes(given.recordings_in(store))
+            show_sizes(sizes, given.sizes, given, store.session.when_empty)
+        elif given.attachments or given.attachment is not None:
+            entries = given.recordings_in(store)
+            found = [one for entry in entries for one in store.attachments(entry)]
+            show_attachments(found, given.attachment, given.output, given, force=given.force)
         else:
-            show_tables(store, query, as_json=given.as_json)
-    elif given.sizes is not None:
-        sizes = store.sizes(given.recordings_in(store))
-        show_sizes(sizes, given.sizes, given, store.session.when_empty)
-    elif given.attachments or given.attachment is not None:
-        found = [one for entry in given.recordings_in(store) for one in store.attachments(entry)]
-        show_attachments(found, given.attachment, given.output, given, force=given.force)
-    else:
-        return False
-    return True
+            _show(store, given)
 
 
 def _show(store: Store, given: _Given) -> None:
@@ -159,13 +150,10 @@ def _videos(store: Store, entry: RecordingEntry) -> dict[str, VideoSummary]:
     """Codec and key frames of video topics, by topic; none of those that cannot be read."""
     from hybridlog.arrays import is_video_type
 
-    topics = dict.fromkeys(one.topic for one in entry.channels if is_video_type(one.type))
-    if not topics:
-        return {}
-    from hybridlog.query.answers.video import summary_of
-
     found: dict[str, VideoSummary] = {}
-    for topic in topics:
+    for topic in dict.fromkeys(one.topic for one in entry.channels if is_video_type(one.type)):
+        from hybridlog.query.answers.video import summary_of
+
         try:
             found[topic] = summary_of(store.session, entry.id, topic)
         except SegmentError as error:
@@ -206,7 +194,9 @@ def _as_dict(
                 "rate_hz": mean_rate(c.stats.messages, c.stats.first or 0, c.stats.last or 0),
                 "first_ns": c.stats.first,
                 "last_ns": c.stats.last,
-                "skew_ns": _skew(c.stats),
+                "skew_ns": None
+                if c.stats.mean_skew is None
+                else {"mean": c.stats.mean_skew, "min": c.stats.skew_min, "max": c.stats.skew_max},
                 "unset_stamps": c.stats.unset if entry.is_decoded else None,
                 "unreadable": c.stats.unreadable if entry.is_decoded else None,
                 "surplus": c.stats.surplus if entry.is_decoded else None,
@@ -217,13 +207,6 @@ def _as_dict(
             for c in shown_channels(entry.channels)
         ],
     }
-
-
-def _skew(stats: ChannelStats) -> dict[str, float | int | None] | None:
-    """Log time minus header stamp, ns; None if no stamp was set."""
-    if stats.mean_skew is None:
-        return None
-    return {"mean": stats.mean_skew, "min": stats.skew_min, "max": stats.skew_max}
 
 
 def _print_recording(
@@ -264,7 +247,14 @@ def _print_recording(
                 ("pin", f"{pin['id']}: {', '.join(filter(None, pin_cells(pin)))}")
                 for pin in entry.pins
             ),
-            *(("attachment", f"{one['name']} ({_content(one)})") for one in about["attachments"]),
+            *(
+                (
+                    "attachment",
+                    f"{one['name']} "
+                    f"({', '.join(filter(None, (one['media_type'], output.size(one['bytes']))))})",
+                )
+                for one in about["attachments"]
+            ),
             *(
                 ("metadata", f"{one['name']} ({', '.join(one['values'])})")
                 for one in about["metadata_records"]
@@ -283,11 +273,11 @@ def _coverage(entry: RecordingEntry, words: str) -> list[tuple[str, str]]:
     """The row about coverage; on a terminal with a bar."""
     if entry.span is None or not sys.stdout.isatty():
         return [("coverage", words)]
-    from hybridlog.cli.sparkline import bar
     from hybridlog.query.answers.lost import lost_parts
     from hybridlog.record.losses import extent_of
 
-    return [("coverage", bar(lost_parts(entry, extent_of(entry), _LETTERS))), ("", words)]
+    lost = lost_parts(entry, extent_of(entry), _LETTERS).tolist()
+    return [("coverage", "".join("░" if one else "█" for one in lost)), ("", words)]
 
 
 def _sparklines(store: Store, entry: RecordingEntry) -> dict[str, str]:
@@ -308,11 +298,6 @@ def _sparklines(store: Store, entry: RecordingEntry) -> dict[str, str]:
     except SegmentError as error:
         output.note(f"{entry.name}: {error}")
         return {}
-
-
-def _content(attachment: Mapping[str, Any]) -> str:
-    size = output.size(attachment["bytes"])
-    return f"{attachment['media_type']}, {size}" if attachment["media_type"] else size
 
 
 def _kind(channel: Mapping[str, Any]) -> str:

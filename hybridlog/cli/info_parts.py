@@ -30,7 +30,7 @@ _MAX_NAMES = 5  # recordings in a note
 _READABLE = {"ros1msg", "ros2msg", "ros2idl", "jsonschema"}
 
 
-def show_topics(store: Store, query: Query, topics: Sequence[str], *, as_json: bool) -> None:
+def show_topics(store: Store, query: Query, *, as_json: bool) -> None:
     """Print the definition and the fields of topics, those of each type once."""
     from hybridlog.query.query import channels_of
 
@@ -46,9 +46,7 @@ def show_topics(store: Store, query: Query, topics: Sequence[str], *, as_json: b
         else:
             seen[key] = _topic_as_dict(store, recorded)
     if not seen:
-        raise TopicError(
-            f"No chosen recording has {' or '.join(topics)}: `hybridlog info` lists the topics."
-        )
+        raise TopicError(f"No chosen recording has {' or '.join(query.topics)}.")
     if as_json:
         output.print_json(list(seen.values()))
         return
@@ -61,10 +59,8 @@ def show_topics(store: Store, query: Query, topics: Sequence[str], *, as_json: b
 def _print_topic(item: dict[str, Any]) -> None:
     encoding = f"{item['message_encoding']}, {item['schema_encoding'] or 'no schema'}"
     output.say(f"{item['topic']}  {item['type'] or '(no type)'}  ({encoding})")
-    if item["definition"]:
-        for line in str(item["definition"]).splitlines():
-            is_rule = sys.stdout.isatty() and {*line} == {"="}
-            output.say("  " + (line[: output.console().width - 2] if is_rule else line))
+    for line in (item["definition"] or "").splitlines():
+        output.say(line)
     if item["not_indexed"]:
         output.say(f"not indexed: {item['not_indexed']}")
     if item["arrays"]:
@@ -131,13 +127,9 @@ def show_losses(entries: Sequence[RecordingEntry], topics: Sequence[str], given:
         output.note(f"Still being recorded, so later losses are to come: {listed(running)}.")
 
 
-def _lasted(loss: Mapping[str, Any]) -> str:
+def _duration(loss: Mapping[str, Any]) -> str:
     begin, end = loss.get("from"), loss.get("to")
     return "" if begin is None or end is None else output.short_duration(end - begin)
-
-
-def _detail(loss: Mapping[str, Any]) -> str:
-    return ": ".join(filter(None, (loss.get("file"), loss.get("reason"))))
 
 
 _LOSSES = [
@@ -146,8 +138,8 @@ _LOSSES = [
     Column("cause"),
     Column("messages", lambda loss: "unknown" if loss["count"] is None else loss["count"], "right"),
     Column("from", lambda loss: output.short_time(loss.get("from")), "whole"),
-    Column("for", _lasted, "right"),
-    Column("detail", _detail),
+    Column("for", _duration, "right"),
+    Column("detail", lambda loss: ": ".join(filter(None, (loss.get("file"), loss.get("reason"))))),
 ]
 
 
@@ -256,27 +248,25 @@ _ATTACHMENTS = [
 ]
 
 
-def show_tables(store: Store, query: Query, *, as_json: bool) -> None:
+def show_tables(store: Store, query: Query) -> None:
     """Print the Parquet files with the rows of a topic, and SQL for DuckDB."""
     from hybridlog.maintenance.tables import missing
     from hybridlog.query.query import channels_of
     from hybridlog.record.marks import MARKS
     from hybridlog.snapshot import UNFINISHED
 
-    (topic,) = query.topics
+    topic, *others = query.topics
+    if others:
+        raise UsageError(f"--tables is about one topic: name one of {listed(query.topics)}.")
     channels = channels_of(query)
     recordings = {one.recording.id: one.recording for one in channels}.values()
     ended = [one for one in recordings if one.status not in UNFINISHED]
     going = [one.name for one in recordings if one.status in UNFINISHED]
-    found = _tables_of(store, [one for one in channels if one.recording.status not in UNFINISHED])
+    found = _tables_of(store, query, [one for one in channels if one.recording in ended])
     tables = store.session.tables
     lacking = [one.name for one in ended if topic in missing(store.directory, one, tables)]
-    if as_json:
-        output.print_json({"tables": found, "missing": lacking})
-        return
-    for item in found:
-        for line in (*item["files"], "", f"{item['statement']};", ""):
-            output.say(line)
+    shown = ((*one["files"], "", f"{one['statement']};", "") for one in found)
+    output.tell({"tables": found, "missing": lacking}, [line for each in shown for line in each])
     marks = sum(len(one.marks) for one in recordings) if topic == MARKS else 0
     without = {
         f"{listed(lacking, _MAX_NAMES)}, whose rows are missing: `hybridlog verify --repair` "
@@ -288,36 +278,32 @@ def show_tables(store: Store, query: Query, *, as_json: bool) -> None:
     output.notes(f"Without {what}." for what, applies in without.items() if applies)
 
 
-def _tables_of(store: Store, channels: Collection[RecordedChannel]) -> list[dict[str, Any]]:
+def _tables_of(
+    store: Store, query: Query, channels: Collection[RecordedChannel]
+) -> list[dict[str, Any]]:
     """Folders with rows of a topic in some recordings: files, rows, statement."""
     from glob import escape
 
     from hybridlog.columns.folders import files_of
     from hybridlog.columns.layout import type_prefix
 
-    topics = {one.channel.topic for one in channels}
-    recordings = {one.recording.id for one in channels}
+    (topic,), recordings = query.topics, {one.recording.id for one in channels}
     schemas = [one.channel.schema for one in channels]
     prefixes = {type_prefix("" if schema is None else schema.name) for schema in schemas}
-    (name,) = topics or {""}
+    where = f"topic = {_quoted(topic)}"
+    if query.question.recordings is not None:
+        where += f" and recording in ({', '.join(map(_quoted, sorted(recordings)))})"
     folders: dict[Path, dict[str, Any]] = {}
-    others: set[Path] = set()
     for file in files_of(store.directory.path, prefixes) if prefixes else ():
-        sections = [one for one in file.about.sections if one.topic == name]
-        rows = sum(one.rows for one in sections if one.id in recordings)
-        if not all(one.id in recordings for one in sections):
-            others.add(file.path.parent)
-        if rows:
+        own = (one for one in file.about.sections if one.topic == topic and one.id in recordings)
+        if rows := sum(one.rows for one in own):
             folder = file.path.parent
             found = folders.setdefault(folder, {"folder": str(folder), "rows": 0, "files": []})
             found["rows"] += rows
             found["files"].append(str(file.path))
-    chosen = f" and recording in ({', '.join(map(_quoted, sorted(recordings)))})"
-    for folder, found in folders.items():
-        files = _quoted(f"{escape(str(folder))}/*.parquet")
-        # The only texts in it are quoted, and nothing is run here.
-        statement = f"select * from {files} where topic = {_quoted(name)}"  # noqa: S608
-        found["statement"] = statement + (chosen if folder in others else "")
+            files = _quoted(f"{escape(str(folder))}/*.parquet")
+            # The only texts in it are quoted, and nothing is run here.
+            found["statement"] = f"select * from {files} where {where}"  # noqa: S608
     return list(folders.values())
 
 

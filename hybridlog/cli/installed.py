@@ -37,10 +37,8 @@ def print_installed() -> None:
     """Print the versions of hybridlog, Python, MongoDB and all packages, and missing extras."""
     here = f"{platform.system()} {platform.machine()}"
     output.say(f"hybridlog {__version__}, Python {platform.python_version()}, {here}")
-    output.say_folded(f"MongoDB: {mongodb()}")
     own = (f"{name} {version}" for name, version in packages() if version)
-    output.say_folded(f"Packages: {', '.join(own)}")
-    output.say()
+    output.tell(None, [f"MongoDB: {mongodb()}", f"Packages: {', '.join(own)}", ""])
     rows: list[tuple[str, ...]] = []
     for extra, purpose in NEEDED_FOR.items():
         found = list(packages(extra))

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 import click
 
 from hybridlog.cli import output
-from hybridlog.cli.answers import Answering, Listing, answering
+from hybridlog.cli.answers import Listing, answering
 from hybridlog.cli.binder import command, option
 from hybridlog.cli.options import Asking, parse_fields
 from hybridlog.cli.render import Column, times
@@ -76,8 +77,17 @@ def intervals_command(given: _Given) -> None:
         if given.count:
             output.say(str(len(found)))
         else:
-            _show(given, found, asked)
-            output.remarks([f"No {noun}."] if asked.is_empty else [])
+            names = {recording.id: recording.name for recording in asked.store.summaries()}
+            rows = (
+                {
+                    "recording": names[row.recording],
+                    "begin_ns": row.begin_ns,
+                    "end_ns": row.end_ns,
+                    "messages": row.messages,
+                }
+                for row in found
+            )
+            given.show(rows, _COLUMNS, f"No {noun}.")
 
 
 def _intervals(given: _Given, query: Query) -> Intervals:
@@ -92,23 +102,15 @@ def _intervals(given: _Given, query: Query) -> Intervals:
     return found if given.at_least is None else found.at_least(given.at_least)
 
 
-def _show(given: _Given, found: Intervals, asked: Answering) -> None:
+def _duration(row: Mapping[str, int]) -> str:
     from hybridlog.query.times import format_duration
 
-    names = {recording.id: recording.name for recording in asked.store.summaries()}
-    rows = (
-        {
-            "recording": names[row.recording],
-            "begin_ns": row.begin_ns,
-            "end_ns": row.end_ns,
-            "messages": row.messages,
-        }
-        for row in found
-    )
-    columns = [
-        Column("recording"),
-        *times(),
-        Column("duration", lambda row: format_duration(row["end_ns"] - row["begin_ns"]), "right"),
-        Column("messages", side="right"),
-    ]
-    given.answer(rows, columns)
+    return format_duration(row["end_ns"] - row["begin_ns"])
+
+
+_COLUMNS = [
+    Column("recording"),
+    *times(),
+    Column("duration", _duration, "right"),
+    Column("messages", side="right"),
+]

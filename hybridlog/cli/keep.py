@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
-
-import click
 
 from hybridlog.cli import output
 from hybridlog.cli.binder import command, option
@@ -73,15 +71,18 @@ class _Given(Choosing, InStore, AsJson, Quiet):
 
 
 @command(_Given)
-def keep_command(given: _Given) -> None:
+def keep_command(given: _Given) -> int:
     """Keep the store within a quota; pin what never goes.
 
     Payloads go, fields and counts stay. Without options for rules, those of [retention] in
     hybridlog.toml hold. Above 80 % of the quota payloads of the topics of --topic go, above
     90 % whole segments, the oldest first. Exits with 1 when not enough may go.
     """
-    rules = {} if given.pin else _rules(given)
-    _check(given)
+    rules, is_all = {} if given.pin else _rules(given), given.choice.is_everything
+    if given.pin and is_all:
+        raise UsageError("Choose the recordings to pin: -r 'monday*', --tag robot=7, -r '*'.")
+    if not (given.pin or given.pins or given.unpin or is_all):
+        raise UsageError("Rules are for the whole store; --never-tag leaves recordings out.")
     with given.opened() as store:
         if given.pin:
             found = _pin(store, given)
@@ -89,9 +90,12 @@ def keep_command(given: _Given) -> None:
         elif given.unpin:
             store.unpin(*given.unpin)
         elif given.pins:
-            _show_pins(store, given)
+            chosen = given.recordings_in(store)
+            rows = [{"recording": entry.name, **pin} for entry in chosen for pin in entry.pins]
+            given.show(rows, [Column("pin", "id"), Column("recording"), *_PIN])
         else:
-            _keep(store, rules, given)
+            return _keep(store, rules, given)
+    return 0
 
 
 def _rules(given: _Given) -> dict[str, Any]:
@@ -100,29 +104,18 @@ def _rules(given: _Given) -> dict[str, Any]:
         name: getattr(given, name.replace("-", "_"))
         for name in ("quota", "min-free", "max-age", "fields-age")
     }
-    named["never-tag"] = [*given.never_tag]
-    topics = [word.rpartition("=") for word in given.topic]
-    for word, (pattern, _, age) in zip(given.topic, topics, strict=True):
+    named |= {"never-tag": [*given.never_tag], "topic": {}}
+    for word in given.topic:
+        pattern, _, age = word.rpartition("=")
         if not pattern or not age:
             raise UsageError(f"--topic takes TOPIC=AGE, such as '/camera/**=7d', not {word!r}.")
-    named["topic"] = {pattern: age for pattern, _, age in topics}
+        named["topic"][pattern] = age
     return {key: value for key, value in named.items() if value}
-
-
-def _check(given: _Given) -> None:
-    """Refuse options that do not go together."""
-    is_all = given.choice.is_everything
-    if given.pin and is_all:
-        raise UsageError("Choose the recordings to pin: -r 'monday*', --tag robot=7, -r '*'.")
-    if not (given.pin or given.pins or given.unpin or is_all):
-        raise UsageError("Rules are for the whole store; --never-tag leaves recordings out.")
 
 
 def _pin(store: Store, given: _Given) -> list[str]:
     """Pin what is asked for; returns the names of the pins."""
-    topics = None
-    if given.topic:
-        topics = query_of(store, given.topic, given.choice).topics
+    topics = query_of(store, given.topic, given.choice).topics if given.topic else None
     spans = [*_spans(store, given)]
     if len(spans) > _MAX_PINS:
         raise UsageError(
@@ -139,6 +132,7 @@ def _pin(store: Store, given: _Given) -> list[str]:
 def _spans(store: Store, given: _Given) -> Iterator[tuple[str, int | None, int | None]]:
     """Id of a recording, begin and end of what is to be pinned of it; None for all."""
     from hybridlog.maintenance.keep import may_hold
+    from hybridlog.query.answers.marks import mark_topics
     from hybridlog.query.times import parse_duration, parse_time
     from hybridlog.query.topics import split_topic
     from hybridlog.record.losses import extent_of
@@ -157,24 +151,13 @@ def _spans(store: Store, given: _Given) -> Iterator[tuple[str, int | None, int |
         pattern, predicate = split_topic(condition)
         query = query_of(store, [pattern], given.choice)
         query = query.where(predicate) if predicate else query
-        if predicate and not _are_marks(store, query.topics):
+        are_marks = {*query.topics} <= {*mark_topics(store.session)}
+        if predicate and not are_marks:
             found = query.intervals().widened(before, after)
         else:
             found = query.windows(before, after)
         # A moment is a range of one nanosecond.
         yield from ((one.recording, one.begin_ns, one.end_ns + 1) for one in found)
-
-
-def _are_marks(store: Store, topics: Sequence[str]) -> bool:
-    from hybridlog.query.answers.marks import mark_topics
-
-    return {*topics} <= {*mark_topics(store.session)}
-
-
-def _show_pins(store: Store, given: _Given) -> None:
-    chosen = given.recordings_in(store)
-    rows = [{"recording": entry.name, **pin} for entry in chosen for pin in entry.pins]
-    given.show(rows, [Column("pin", "id"), Column("recording"), *_PIN])
 
 
 def _time(key: str) -> Column:
@@ -198,7 +181,7 @@ def pin_cells(pin: dict[str, Any]) -> list[str]:
     return [column.cell(pin) for column in _PIN]
 
 
-def _keep(store: Store, rules: dict[str, Any], given: _Given) -> None:
+def _keep(store: Store, rules: dict[str, Any], given: _Given) -> int:
     from hybridlog.maintenance.retention import Rules
 
     wanted = rules or store.directory.settings.retention
@@ -222,12 +205,10 @@ def _keep(store: Store, rules: dict[str, Any], given: _Given) -> None:
         given.show(plan.steps, _STEPS)
     size = output.size
     freed = sum(step.bytes for step in plan.steps) if dry_run else found.freed_bytes
-    parts = [
-        f"{size(plan.used_bytes)} used",
-        *([f"{size(plan.pinned_bytes)} pinned"] if plan.pinned_bytes else []),
-        *([] if plan.free_bytes is None else [f"{size(plan.free_bytes)} free"]),
-    ]
-    told = f"{', '.join(parts)}: {size(freed)} {'would become free' if dry_run else 'freed'}"
+    pinned = f", {size(plan.pinned_bytes)} pinned" if plan.pinned_bytes else ""
+    free = "" if plan.free_bytes is None else f", {size(plan.free_bytes)} free"
+    what = "would become free" if dry_run else "freed"
+    told = f"{size(plan.used_bytes)} used{pinned}{free}: {size(freed)} {what}"
     output.tell({**asdict(found), "dry_run": dry_run}, [told])
     topics = store.topics()
     useless = (
@@ -236,8 +217,7 @@ def _keep(store: Store, rules: dict[str, Any], given: _Given) -> None:
         if not any(map(rule.fits, topics))
     )
     output.notes((*found.problems, *plan.warnings, *useless))
-    if found.problems or plan.is_short:
-        raise click.exceptions.Exit(1)
+    return 1 if found.problems or plan.is_short else 0
 
 
 _STEPS = [

@@ -60,9 +60,19 @@ class Training:
 
 
 def export_set(store: Store, query: Query, target: Path, given: Training, *, force: bool) -> None:
-    """Write a training set, or propose a map for one."""
+    """Write a training set, or propose a map for one, with rare topics in comments."""
+    from hybridlog.query.query import narrowed
+    from hybridlog.training.feature_map import nearly_empty, proposed
+
     if given.propose_map:
-        _write_map(_proposed(query), target, force=force)
+        check_room(target, force=force)
+        empty = nearly_empty(narrowed(query, *proposed(query).topics))
+        left_out = (
+            f"# left out: {topic} has {output.counted(count, 'message')}\n"
+            for topic, count in empty.items()
+        )
+        write_bytes(target, "".join([proposed(query, empty).to_yaml(), *left_out]).encode())
+        output.remarks([f"{target}: look at it, then add --map {target}."])
         return
     if given.features is None:
         raise UsageError(
@@ -93,24 +103,6 @@ def export_set(store: Store, query: Query, target: Path, given: Training, *, for
             progress=tell,
         )
     _print_report(report, given.fps)
-
-
-def _proposed(query: Query) -> str:
-    """A map for the topics that are there; those with few messages are in comments."""
-    from hybridlog.query.query import narrowed
-    from hybridlog.training.feature_map import nearly_empty, proposed
-
-    empty = nearly_empty(narrowed(query, *proposed(query).topics))
-    return proposed(query, empty).to_yaml() + "".join(
-        f"# left out: {topic} has {output.counted(count, 'message')}\n"
-        for topic, count in empty.items()
-    )
-
-
-def _write_map(text: str, target: Path, *, force: bool) -> None:
-    check_room(target, force=force)
-    write_bytes(target, text.encode())
-    output.remarks([f"{target}: look at it, then add --map {target}."])
 
 
 def _print_report(report: LerobotReport, fps: int | None) -> None:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Final, Self
 
 from hybridlog.cli import output
 from hybridlog.cli.render import Column, table_lines
-from hybridlog.cli.signals import restore_echo, stop_echo
 from hybridlog.record.losses import Cause
 
 if TYPE_CHECKING:
@@ -29,20 +28,12 @@ class LiveTable:
 
     def __enter__(self) -> Self:
         """Begin to draw."""
-        stop_echo(self._live.console.file.fileno())
         self._live.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         """Remove the table."""
         self._live.stop()
-        restore_echo()
-
-    def note(self, text: str) -> None:
-        """Print a line above the table."""
-        from rich.text import Text
-
-        self._live.console.print(Text(f"hybridlog: {output.printable(text)}"))
 
     def show(self, state: RecorderState, below: Sequence[str] = ()) -> None:
         """Draw a state, with lines below it."""
@@ -124,12 +115,6 @@ def summary(state: RecorderState) -> str:
 
 
 def _index(state: RecorderState) -> str:
-    why = f": {_in_short(state.index_failure)}" if state.index_failure else ""
+    sentence = state.index_failure.partition("\n")[0].partition(". ")[0].rstrip(".")
+    why = f": {output.cut(output.printable(sentence), _SHORT)}" if sentence else ""
     return f"index {state.lag} behind{why}" if state.lag or why else "index up to date"
-
-
-def _in_short(reason: str) -> str:
-    """The beginning of a reason, for a place with little room."""
-    line = output.printable(reason.partition("\n")[0])
-    sentence = line.partition(". ")[0].rstrip(".")
-    return sentence if len(sentence) <= _SHORT else f"{sentence[: _SHORT - 1]}…"

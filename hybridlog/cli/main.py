@@ -9,17 +9,22 @@ import traceback
 from pathlib import Path
 from typing import NoReturn, TextIO
 
+import click
+
 from hybridlog.cli import signals
-from hybridlog.cli.app import EXIT_CODES, INTERNAL, of_os_error
+from hybridlog.cli.app import EXIT_CODES, INTERNAL, app, of_os_error
 from hybridlog_storage.errors import HybridlogError
 
 __all__ = ["EXIT_CODES", "main"]
+
+_COMPLETE = "_HYBRIDLOG_COMPLETE"
+"""Environment variable in which a shell asks for completions, and for the script that does."""
 
 
 def main() -> NoReturn:
     """Run the command line and exit with one of `EXIT_CODES`."""
     signals.install()
-    block_imports()
+    sys.meta_path.insert(0, _WithoutPandas())
     # A shell may have closed them: `hybridlog ls >&-`.
     # What is written then fails, so that no answer is lost in silence.
     if sys.stdout is None:
@@ -33,65 +38,51 @@ def main() -> NoReturn:
         code = _run()
     except signals.Stopped as stopped:
         signals.undo_unfinished()
-        _complain(f"interrupted. {stopped.consequence}".rstrip())
-        code = stopped.exit_code
+        code = _complain(f"interrupted. {stopped.consequence}".rstrip(), stopped.exit_code)
     _leave(_flushed(code))
 
 
 def _run() -> int:
+    code = 0
     try:
-        return _run_command()
-    except HybridlogError as error:
-        _complain("\n".join([str(error), *getattr(error, "__notes__", ())]))
-        return error.exit_code
-    except BrokenPipeError:
-        _discard(sys.stdout)
-        return 0
-    except OSError as error:
-        # The library maps most of these; the rest are such as a failing disk.
-        where = "standard output, or a temporary file, cannot be written: "
-        _complain(str(error) if error.filename else f"{where}{error.strerror or error}")
-        return of_os_error(error)
-    except MemoryError:
-        _complain("there is not enough memory for this: ask for less at a time.")
-        return HybridlogError.exit_code
-    except Exception:
-        traceback.print_exc()
-        _complain("this is an error in hybridlog: please report it with the lines above.")
-        return INTERNAL
+        if _COMPLETE in os.environ:
+            from click.shell_completion import shell_complete
 
-
-def _run_command() -> int:
-    import click
-
-    from hybridlog.cli.app import app
-    from hybridlog.cli.completion import VARIABLE
-
-    if VARIABLE in os.environ:
-        from click.shell_completion import shell_complete
-
-        return shell_complete(app, {}, "hybridlog", VARIABLE, os.environ[VARIABLE])
-    try:
+            return shell_complete(app, {}, "hybridlog", _COMPLETE, os.environ[_COMPLETE])
         with app.make_context("hybridlog", sys.argv[1:]) as context:
-            code = app.invoke(context)
+            app.invoke(context)
     except click.exceptions.Exit as leaving:
-        return leaving.exit_code
+        code = leaving.exit_code
     except click.exceptions.NoArgsIsHelpError as error:
         error.show()
-        return error.exit_code
+        code = error.exit_code
     except click.ClickException as error:
         lines = [error.format_message()]
         if isinstance(error, click.UsageError) and error.ctx is not None:
             lines.append(f"`{error.ctx.command_path} --help` shows what there is.")
-        _complain("\n".join(lines))
-        return error.exit_code
+        code = _complain("\n".join(lines), error.exit_code)
     except click.Abort:
-        _complain("aborted.")
-        return HybridlogError.exit_code
-    return code if isinstance(code, int) else 0
+        code = _complain("aborted.")
+    except HybridlogError as error:
+        code = _complain("\n".join([str(error), *getattr(error, "__notes__", ())]), error.exit_code)
+    except BrokenPipeError:
+        _discard(sys.stdout)
+    except OSError as error:
+        # The library maps most of these; the rest are such as a failing disk.
+        where = "standard output, or a temporary file, cannot be written: "
+        said = str(error) if error.filename else f"{where}{error.strerror or error}"
+        code = _complain(said, of_os_error(error))
+    except MemoryError:
+        code = _complain("there is not enough memory for this: ask for less at a time.")
+    except Exception:
+        traceback.print_exc()
+        said = "this is an error in hybridlog: please report it with the lines above."
+        code = _complain(said, INTERNAL)
+    return code
 
 
-def _complain(text: str) -> None:
+def _complain(text: str, code: int = HybridlogError.exit_code) -> int:
+    """Print an error; gives the exit code."""
     from hybridlog.cli.output import folded
 
     lines = "\n".join(map(folded, f"hybridlog: {text}".split("\n")))
@@ -99,6 +90,7 @@ def _complain(text: str) -> None:
         print(lines, file=sys.stderr, flush=True)  # noqa: T201
     except OSError:
         _discard(sys.stderr)
+    return code
 
 
 def _flushed(code: int) -> int:
@@ -110,8 +102,9 @@ def _flushed(code: int) -> int:
         _discard(sys.stdout)
     except OSError as error:
         _discard(sys.stdout)
-        _complain(f"standard output cannot be written: {error.strerror}")
-        return code or of_os_error(error)
+        said = f"standard output cannot be written: {error.strerror}"
+        failed = _complain(said, of_os_error(error))
+        return code or failed
     return code
 
 
@@ -130,20 +123,14 @@ def _discard(stream: TextIO) -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
-_BLOCKED = frozenset({"pandas"})
-"""pyarrow imports pandas to see whether it is given one of its objects; no command has one.
-The import takes three tenths of a short command's time."""
+class _WithoutPandas:
+    """A finder of modules to which pandas is not installed.
 
-
-class _Blocker:
-    """A finder of modules that reports the blocked ones as not installed."""
+    pyarrow imports pandas to see whether it is given one of its objects; no command has one. The
+    import takes three tenths of a short command's time.
+    """
 
     @staticmethod
     def find_spec(fullname: str, *_: object) -> None:
-        if fullname in _BLOCKED:
-            raise ModuleNotFoundError(f"No command needs {fullname}.", name=fullname)
-
-
-def block_imports() -> None:
-    """Block the imports in this process from now on."""
-    sys.meta_path.insert(0, _Blocker())
+        if fullname == "pandas":
+            raise ModuleNotFoundError("No command needs pandas.", name=fullname)

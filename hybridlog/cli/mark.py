@@ -6,16 +6,22 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 
 from hybridlog.cli import options, output
 from hybridlog.cli.binder import argument, command, option
-from hybridlog.cli.options import Running
+from hybridlog.cli.completion import complete_running
+from hybridlog.cli.options import InStore, Quiet
 from hybridlog_storage.errors import StoreError, UsageError
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Given(Running):
+class _Given(InStore, Quiet):
+    recording: tuple[str, ...] = option(
+        "Only this recorder (id or name of its recording, or the beginning of the id).",
+        "RECORDING",
+        short="-r",
+        shell_complete=complete_running,
+    )
     text: str = argument("What happened.", "TEXT")
     tags: tuple[str, ...] = option("Add KEY=VALUE to it.", "K=V", name="--set-tag")
     at: str | None = option(
@@ -52,38 +58,30 @@ def mark_command(given: _Given) -> None:
             store.unmark(given.recording[0], given.text, at)
         return
     if at is None:
-        from hybridlog.query.times import parse_duration
-
-        before, after = map(parse_duration, given.pin or ("0s", "0s"))
-        around = None if given.pin is None else (before, after)
-        marked = _mark_running(given.text, tags, around, given.recording, given.store)
+        marked = _mark_running(given, tags)
     else:
-        (recording,) = given.recording
         with given.opened() as store:
-            marked = iter([store.mark(recording, at, given.text, tags, until=given.until).name])
+            entry = store.mark(given.recording[0], at, given.text, tags, until=given.until)
+        marked = iter([entry.name])
     for name in marked:
         output.remarks([f"Marked in {name}."])
 
 
-def _mark_running(
-    text: str,
-    tags: dict[str, str],
-    around: tuple[int, int] | None,
-    recordings: tuple[str, ...],
-    store: Path | None,
-) -> Iterator[str]:
+def _mark_running(given: _Given, tags: dict[str, str]) -> Iterator[str]:
     """Mark what recorders write at this moment, and pin the time around it; yields their names."""
     from hybridlog.live.clocks import CLOCK
     from hybridlog.live.state import choose, read
     from hybridlog.maintenance.edit import mark_now
+    from hybridlog.query.times import parse_duration
     from hybridlog.store import store_path
     from hybridlog_storage.remote import directory_of
 
-    now, directory = time.time_ns(), directory_of(store_path(store))
-    for recording in choose(directory, recordings):
+    around = given.pin and (parse_duration(given.pin[0]), parse_duration(given.pin[1]))
+    now, directory = time.time_ns(), directory_of(store_path(given.store))
+    for recording in choose(directory, given.recording):
         simulated: int | None = None
         with suppress(StoreError):  # it has just begun
             simulated = read(directory.path, recording).sim_time
         if simulated == 0:
             raise UsageError(f"There is no time of {CLOCK} yet: mark again when it has come.")
-        yield mark_now(directory, recording, simulated or now, text, tags, around=around)
+        yield mark_now(directory, recording, simulated or now, given.text, tags, around=around)

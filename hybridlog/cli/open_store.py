@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import chain, islice
 from pathlib import Path
@@ -64,20 +64,16 @@ def opened_store(
     with store:
         doing = "so the files answer"
         if records and recover:  # else beside the recorder
-            target = store.shared.index.index_to_record("Recording")
-            doing = target.without
-        if recover:
-            notes(_recovered(store, verifies=verifies))
-        _print_rebuilt(store, doing)
-        told = {*store.repairs.unreadable}
+            doing = store.shared.index.index_to_record("Recording").without
+        told = _repairs(store, doing, verifies=verifies)
+        notes(told if recover else ())
         try:
             yield store.snapshot() if snapshot else store
             store.mend()
             _print_left(store)
         finally:
-            new = store.repairs.unreadable.keys() - told
-            notes(_unreadable(store, new, verifies=verifies))
-            _print_rebuilt(store, "" if records else doing)
+            later = _repairs(store, "" if records else doing, verifies=verifies)
+            notes(one for one in later if one not in told)
 
 
 def _stores_near() -> list[Path]:
@@ -101,49 +97,41 @@ def _reads() -> bool:
     return context is not None and any(context.info_name in GROUPS[one] for one in _READING)
 
 
-def _recovered(store: Store, *, verifies: bool) -> Iterator[str]:
-    """Sentences about recordings that were repaired, or cannot be, when the store was opened."""
-    repairs = store.repairs
+def _repairs(store: Store, doing: str, *, verifies: bool) -> list[str]:
+    """What was repaired since the last call, what cannot be, and what is not there."""
+    repairs, found = store.repairs, list[str]()
     for recording, segments in repairs.recovered.items():
         kept = counted(sum(one.messages for one in segments), "message")
-        yield f"Recording {recording} was cut short by a crash: {kept} of it are recovered."
-        yield from (f"  damaged: {damage}" for one in segments for damage in one.damage)
-    yield from _unreadable(store, repairs.unreadable, verifies=verifies)
+        found.append(f"Recording {recording} was cut short by a crash: {kept} of it are recovered.")
+        found += (f"  damaged: {damage}" for one in segments for damage in one.damage)
+    found += (
+        f"Recording {recording} cannot be read: {reason}"
+        for recording, reason in repairs.unreadable.items()
+        if not (verifies and "`hybridlog verify --repair`" in reason)
+    )
     if repairs.disk_full is not None:
-        yield (
+        found.append(
             "The disk of the store is full, so nothing in it is repaired or noted. Remove "
             f"recordings with `hybridlog rm`, or make room. {repairs.disk_full}"
         )
     elif not (store.directory.is_writable or store.directory.is_remote):
-        yield f"The store {store.directory.path} is read-only; its segments answer."
-
-
-def _unreadable(store: Store, recordings: Iterable[str], *, verifies: bool) -> Iterator[str]:
-    for recording in recordings:
-        reason = store.repairs.unreadable[recording]
-        if not (verifies and "`hybridlog verify --repair`" in reason):
-            yield f"Recording {recording} cannot be read: {reason}"
-
-
-def _print_rebuilt(store: Store, doing: str) -> None:
-    """Report what was made again since the last report, and why MongoDB is unavailable."""
-    repairs = store.repairs
+        found.append(f"The store {store.directory.path} is read-only; its segments answer.")
     if repairs.tables:
-        note(f"{counted(len(repairs.tables), 'table')} made again: missing or damaged.")
-    indexed = {r: n for r, n in repairs.indexed.items() if n and r not in repairs.recovered}
+        found.append(f"{counted(len(repairs.tables), 'table')} made again: missing or damaged.")
     if repairs.damage:
-        note("The data files of the embedded MongoDB were damaged, and were replaced.")
-    if indexed:
+        found.append("The data files of the embedded MongoDB were damaged, and were replaced.")
+    if indexed := {r: n for r, n in repairs.indexed.items() if n and r not in repairs.recovered}:
         added = counted(sum(indexed.values()), "chunk")
-        note(f"{listed(indexed, _MAX_LISTED)}: {added} added to the index.")
+        found.append(f"{listed(indexed, _MAX_LISTED)}: {added} added to the index.")
     if repairs.removed:
-        note(f"{listed(repairs.removed)}: no files any more, so out of the index.")
+        found.append(f"{listed(repairs.removed)}: no files any more, so out of the index.")
     reason = store.shared.index.unavailable
     is_wanted = reason is not None and not isinstance(reason, WithoutMongoError)
     if doing and is_wanted and store.directory.is_writable:
-        note(f"MongoDB is unavailable, {doing}: {reason}")
+        found.append(f"MongoDB is unavailable, {doing}: {reason}")
     for done in (repairs.damage, repairs.tables, repairs.indexed, repairs.removed):
         done.clear()
+    return found
 
 
 def _print_left(store: Store) -> None:

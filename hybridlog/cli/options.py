@@ -18,7 +18,6 @@ from hybridlog.cli.completion import (
     complete_frame,
     complete_path,
     complete_recording,
-    complete_running,
     complete_tag,
     complete_topic,
     complete_type,
@@ -77,17 +76,12 @@ class AsJson:
         columns: Sequence[Column],
         without: str = "",
         plain: Callable[[Any], object] = lambda row: row,
-        **how: Any,
     ) -> None:
         """Print rows as a table or as JSON (`plain` gives that of a row)."""
         if self.as_json:
             output.print_json([plain(row) for row in rows])
-        elif output.is_quiet():
-            return
-        elif rows:
-            print_table(columns, rows, **how)
-        elif without:
-            output.note(without)
+        elif not (output.is_quiet() or print_table(columns, rows)):
+            output.notes(filter(None, [without]))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -303,18 +297,6 @@ class Served:
         "URL",
         name="--allow-origin",
         needs=("viewer=websocket", "mcap"),
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
-class Running(InStore, Quiet):
-    """Options of commands to a recorder."""
-
-    recording: tuple[str, ...] = option(
-        "Only this recorder (id or name of its recording, or the beginning of the id).",
-        "RECORDING",
-        short="-r",
-        shell_complete=complete_running,
     )
 
 

@@ -6,8 +6,7 @@ import json
 import shutil
 import sys
 import textwrap
-from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import asdict, is_dataclass
 from typing import TYPE_CHECKING, TextIO
@@ -18,7 +17,6 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from hybridlog.record.recorder import RecordReport
-    from hybridlog_storage.catalog import ChannelEntry
 
 _manner = {"quiet": False, "as_json": False}
 
@@ -90,14 +88,10 @@ def quoted(text: str) -> str:
     return f"'{printable(raw.decode('utf-8', 'backslashreplace'))}'"
 
 
-def print_json(value: object) -> None:
-    """Print a value as JSON."""
-    print(json.dumps(value, default=_plain, indent=2, ensure_ascii=False))  # noqa: T201
-
-
-def print_json_line(value: object) -> None:
-    """Print a value as JSON on one line, at once."""
-    print(json.dumps(value, default=_plain, ensure_ascii=False), flush=True)  # noqa: T201
+def print_json(value: object, *, at_once: bool = False) -> None:
+    """Print a value as JSON; with `at_once` on a line."""
+    text = json.dumps(value, default=_plain, indent=None if at_once else 2, ensure_ascii=False)
+    print(text, flush=at_once)  # noqa: T201
 
 
 def note(text: str) -> None:
@@ -115,16 +109,10 @@ def remarks(lines: Iterable[str]) -> None:
 def tell(value: object, lines: Iterable[str], *, at_once: bool = False) -> None:
     """Print a result as JSON, with `at_once` on a line; or in lines, which --quiet leaves out."""
     if _manner["as_json"]:
-        (print_json_line if at_once else print_json)(value)
+        print_json(value, at_once=at_once)
     elif not is_quiet():
         for line in lines:
-            say_folded(line)
-
-
-def say_folded(text: str) -> None:
-    """A long line of the answer, which a terminal shows without broken words."""
-    for line in folded(text, sys.stdout).split("\n"):
-        say(line)
+            print(folded(line, sys.stdout))  # noqa: T201
 
 
 def folded(text: str, stream: TextIO | None = None) -> str:
@@ -150,27 +138,6 @@ def not_indexed(report: RecordReport) -> str:
         f"{report.failure} {stored(report.missed)} but not in the index; the next command that "
         "opens the store catches up."
     )
-
-
-def without_documents(messages: int) -> str:
-    """The end of a line that names messages of topics recorded with `--no-index`, if any."""
-    verb = "has" if messages == 1 else "have"
-    return f"; {counted(messages, 'message')} {verb} no documents (--no-index)" if messages else ""
-
-
-def surpluses(channels: Sequence[ChannelEntry]) -> Iterator[str]:
-    """A line for each topic with messages that are longer than their type."""
-    counts: Counter[str] = Counter()
-    for channel in channels:
-        counts[channel.topic] += channel.stats.surplus
-    for topic, messages in counts.items():
-        if messages:
-            types = {channel.type for channel in channels if channel.topic == topic}
-            verb = "has" if messages == 1 else "have"
-            yield (
-                f"{topic}: {counted(messages, 'message')} {verb} bytes left over behind the last "
-                f"field of {', '.join(sorted(types))}; the fields are read"
-            )
 
 
 def time_text(ns: int | None, step: int = 1) -> str:

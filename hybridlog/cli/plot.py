@@ -19,8 +19,6 @@ from hybridlog.cli.render import Column, print_table
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from hybridlog.drawing.figure import Line
     from hybridlog.drawing.series import Series
 
@@ -73,12 +71,14 @@ def plot_command(given: _Given) -> None:
         names = [] if given.fields is None else parse_fields(given.fields)
         width = _WIDTH if shape is None else shape[0]
         found = lines(asked.query, names, pixels=width if form else _MAX_LETTERS)
-        if not form:
-            _print(found)
-        else:
+        if form:
             height = _HEIGHT * max(1, len({line.topic for line in found}))
             size = shape or (width, height)
             write_bytes(path or sys.stdout.buffer, figure(found, size=size, form=form))
+        elif not print_table(
+            _COLUMNS, found if any(len(one.series.times) for one in found) else ()
+        ):
+            output.note("No message.")
         asked.is_empty = not found or not asked.query.counters.messages
 
 
@@ -98,27 +98,6 @@ def _size(text: str) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
-def _print(found: Sequence[Line]) -> None:
-    """A row for each line: its least and greatest value, and a sparkline."""
-    from hybridlog.cli.sparkline import sparkline
-
-    if not any(len(line.series.times) for line in found):
-        output.note("No message.")
-        return
-    columns = [
-        Column("topic", lambda line: line.topic, varies=True),
-        Column("recording", lambda line: line.recording, varies=True),
-        Column("field", lambda line: line.series.field),
-        Column("least", lambda line: _ends(line.series)[0], "right"),
-        Column("greatest", lambda line: _ends(line.series)[1], "right"),
-    ]
-    wide, narrow = (
-        lambda line, width=width: sparkline(line.series.by_column(width))
-        for width in (_LETTERS, _LETTERS // 3)
-    )
-    print_table([*columns, Column("", wide, "whole", narrow)], found)
-
-
 def _ends(series: Series) -> tuple[str, str]:
     """The least and the greatest finite value."""
     import numpy as np
@@ -127,3 +106,20 @@ def _ends(series: Series) -> tuple[str, str]:
     if not len(least) or not len(greatest):
         return "", ""
     return f"{least.min():.6g}", f"{greatest.max():.6g}"
+
+
+def _line(line: Line, width: int = _LETTERS) -> str:
+    from hybridlog.cli.sparkline import sparkline
+
+    return sparkline(line.series.by_column(width))
+
+
+_COLUMNS = [
+    Column("topic", lambda line: line.topic, varies=True),
+    Column("recording", lambda line: line.recording, varies=True),
+    Column("field", lambda line: line.series.field),
+    Column("least", lambda line: _ends(line.series)[0], "right"),
+    Column("greatest", lambda line: _ends(line.series)[1], "right"),
+    Column("", _line, "whole", lambda line: _line(line, _LETTERS // 3)),
+]
+"""Of each line: its least and greatest value, and a sparkline."""

@@ -7,7 +7,7 @@ from hybridlog.cli.record_choices import RecordChoices, check_choices
 
 
 @command(RecordChoices)
-def record_command(choices: RecordChoices) -> None:
+def record_command(choices: RecordChoices) -> int:
     """Record logs, or a running robot, into the store.
 
     Each path becomes a recording: a ROS 1 bag, a ROS 2 bag (its directory or one file), an
@@ -23,12 +23,11 @@ def record_command(choices: RecordChoices) -> None:
     if choices.is_live:
         from hybridlog.cli.record_live import record_live
 
-        record_live(choices)
-    elif choices.watch:
+        return record_live(choices)
+    if choices.watch:
         from hybridlog.cli.record_logs import record_watched
 
-        record_watched(choices)
-    else:
-        from hybridlog.cli.record_logs import record_logs
+        return record_watched(choices)
+    from hybridlog.cli.record_logs import record_logs
 
-        record_logs(choices)
+    return record_logs(choices)

@@ -1,4 +1,4 @@
-"""The parameters of `hybridlog record`, and the rules for giving them together."""
+"""The options of `hybridlog record`."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ OF_ENVIRONMENT: Final = "ROS_MASTER_URI"
 """The master of ROS 1 that is meant without a URI."""
 _LIVE: Final = ("ros1", "ros2", "foxglove", "replay")
 """Parameters that name a source of live messages."""
-_OF_LOGS: Final = ("between", "again", "watch", "no_latched", "original_times")
+_OF_LOGS: Final = ("paths", "between", "again", "watch", "no_latched", "original_times")
 
 
 def _live(help: str, metavar: str | None = None, **settings: Any) -> Any:  # noqa: A002
@@ -191,13 +191,32 @@ class RecordChoices(Between, Latched, InStore, AsJson, Quiet):
         """True when a source of live messages is given."""
         return self.ros2 or (self.ros1, self.foxglove, self.replay) != (None, None, None)
 
+    def matchers(self) -> tuple[TopicMatcher | None, TopicMatcher | None]:
+        """The topics, and those without index documents; new ones, as each counts its uses."""
+        from hybridlog.query.topics import matcher
+
+        chosen = matcher(self.topics, self.exclude) if self.topics or self.exclude else None
+        return chosen, matcher(self.no_index) if self.no_index else None
+
+    def segment_settings(self, chunk_size: int = DEFAULT_CHUNK) -> SegmentSettings:
+        """Chunks and compression."""
+        from hybridlog_storage.segments.segment_writer import SegmentSettings
+
+        return SegmentSettings(
+            chunk_size=self.chunk_size or chunk_size,
+            compression=cast(Any, self.compression),
+            level=self.level,
+        )
+
+    def opened_to_record(self, *, recover: bool = True) -> AbstractContextManager[Store]:
+        """The store, which is made if there is none; see `opened_store`."""
+        return self.opened(create=True, cache_mb=self.cache_size, records=True, recover=recover)
+
 
 def check_choices(choices: RecordChoices) -> None:
     """Refuse parameters that do not fit together."""
     if choices.ros1 is not None and not choices.ros1.strip():
         raise UsageError("A ROS master's URI looks like http://host:11311; this one is empty.")
-    if choices.paths and choices.is_live:
-        raise UsageError("Give either logs to record or a robot (--ros1, --ros2, …), not both.")
     if not choices.paths and not choices.is_live:
         raise UsageError(
             "Nothing to record: give a log, or --ros1, --ros2, --foxglove URL or --replay FILE."
@@ -205,34 +224,3 @@ def check_choices(choices: RecordChoices) -> None:
     for path in choices.paths if choices.watch else ():
         if not path.is_dir():
             raise UsageError(f"--watch takes directories, and {path} is none.")
-
-
-def matchers(choices: RecordChoices) -> tuple[TopicMatcher | None, TopicMatcher | None]:
-    """The topics, and those without index documents; new ones, as each counts its uses."""
-    from hybridlog.query.topics import matcher
-
-    chosen = matcher(choices.topics, choices.exclude) if choices.topics or choices.exclude else None
-    return chosen, matcher(choices.no_index) if choices.no_index else None
-
-
-def segment_settings(choices: RecordChoices, chunk_size: int = DEFAULT_CHUNK) -> SegmentSettings:
-    """Chunks and compression."""
-    from hybridlog_storage.segments.segment_writer import SegmentSettings
-
-    return SegmentSettings(
-        chunk_size=choices.chunk_size or chunk_size,
-        compression=cast(Any, choices.compression),
-        level=choices.level,
-    )
-
-
-def opened_to_record(
-    choices: RecordChoices, *, recover: bool = True
-) -> AbstractContextManager[Store]:
-    """The store, which is made if there is none; see `opened_store`."""
-    return choices.opened(
-        create=True,
-        cache_mb=choices.cache_size,
-        records=True,
-        recover=recover,
-    )

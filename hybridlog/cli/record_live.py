@@ -9,30 +9,34 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
-from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from dataclasses import asdict, replace
+from typing import TYPE_CHECKING, Any, Final
 
 from hybridlog.cli import output
+from hybridlog.cli.app import DIFFERENT
 from hybridlog.cli.live_table import LiveTable, summary
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.options import parse_tags
-from hybridlog.cli.record_choices import (
-    DEFAULT_CHUNK,
-    OF_ENVIRONMENT,
-    RecordChoices,
-    matchers,
-    opened_to_record,
-    segment_settings,
+from hybridlog.cli.record_choices import DEFAULT_CHUNK, OF_ENVIRONMENT, RecordChoices
+from hybridlog.cli.record_summary import fields_of, remarks_on, row_of
+from hybridlog.cli.render import print_fields
+from hybridlog.cli.signals import handled, write_note
+from hybridlog.query.answers.completeness import coverage, in_words
+from hybridlog.record.losses import Cause, losses_of
+from hybridlog_storage.errors import (
+    DatabaseError,
+    DiskFullError,
+    HybridlogError,
+    SourceDamagedError,
+    SourceError,
 )
-from hybridlog.cli.record_summary import LiveSummary
-from hybridlog.cli.signals import handled, restore_echo, write_note
-from hybridlog_storage.errors import HybridlogError
 from hybridlog_storage.settings import NONE
 from hybridlog_storage.stopping import Flag
 
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
 
+    from hybridlog.contract.judge import Result
     from hybridlog.live.recorder import Recorder, RecorderOptions
     from hybridlog.live.sources.base import LiveSource
     from hybridlog.live.state import RecorderState
@@ -62,18 +66,18 @@ class _Stop(Flag):
         return None if self.number == signal.SIGINT else _FOLLOWER_S
 
 
-def record_live(choices: RecordChoices) -> None:
-    """Record until a bound is reached, the replay has ended, or Ctrl-C."""
+def record_live(choices: RecordChoices) -> int:
+    """Record until a bound is reached, the replay has ended, or Ctrl-C; returns the exit code."""
     try:
-        _record(choices)
+        return _record(choices)
     except HybridlogError as error:
         if choices.as_json:  # the last line is a report in any case
             report = {"error": str(error), "exit_code": error.exit_code}
-            output.print_json_line({"report": report})
+            output.print_json({"report": report}, at_once=True)
         raise
 
 
-def _record(choices: RecordChoices) -> None:
+def _record(choices: RecordChoices) -> int:
     from hybridlog.live.memory import frozen_objects
     from hybridlog.live.recorder import Recorder, make_room
 
@@ -85,7 +89,7 @@ def _record(choices: RecordChoices) -> None:
     with ExitStack() as held:
         for source in sources:
             held.enter_context(source).check()
-        store = held.enter_context(opened_to_record(choices, recover=False))
+        store = held.enter_context(choices.opened_to_record(recover=False))
         make_room(store, options.reserve_bytes)
         recorders: list[Recorder] = []
         recovery = threading.Thread(target=_recover, args=(store, recorders), daemon=True)
@@ -100,7 +104,7 @@ def _record(choices: RecordChoices) -> None:
                     display.say(f"the manifest of {full} is full: {recorder.name} goes on")
                 else:
                     recovery.start()
-                with display.table(), _pinned_by_signal(recorder):
+                with display.table or nullcontext(), _pinned_by_signal(recorder):
                     _watch(recorder, stop, display)
                 if stop.is_set or not recorder.is_full:
                     break
@@ -112,14 +116,83 @@ def _record(choices: RecordChoices) -> None:
             reports += recorder.stop(stop.wait_s, _tell_left)
             while recovery.is_alive() and not stop.wait(_RECOVERY_POLL_S):
                 pass
-        rules, results = options.contract, []
-        if rules is not None:
-            from hybridlog.contract.judge import broken  # loads pyarrow
+        broken: list[Result] = []
+        if options.contract is not None:
+            from hybridlog.contract import judge  # loads pyarrow
 
-            judged = [one for each in reports for one in store.judge(rules, each.entry.id)]
-            results = broken(judged)
-        ending = LiveSummary(reports, recorder, recorder.look(), sources, options, results)
-        ending.print_and_exit(as_json=choices.as_json)
+            results = (store.judge(options.contract, one.entry.id) for one in reports)
+            broken = judge.broken([one for each in results for one in each])
+        return _finish(choices, reports, recorder, sources, broken)
+
+
+def _finish(
+    choices: RecordChoices,
+    reports: Sequence[RecordReport],
+    recorder: Recorder,
+    sources: Sequence[LiveSource],
+    broken: Sequence[Result],
+) -> int:
+    """Print what was recorded; returns the exit code of the worst problem."""
+    state = recorder.look()
+    unreached = [one.address for one in sources if not one.was_reached]
+    failed = [one for one in reports if one.failure is not None]
+    worst = {
+        DiskFullError.exit_code: recorder.stopped_for_disk or Cause.DISK in state.lost,
+        DatabaseError.exit_code: failed,
+        SourceError.exit_code: len(unreached) == len(sources) and not state.messages,
+        SourceDamagedError.exit_code: Cause.UNREADABLE in state.lost,
+        DIFFERENT: broken,
+    }
+    code = next((code for code, applies in worst.items() if applies), 0)
+    if choices.as_json:
+        about = _as_dict(reports, state, recorder.reason)
+        about |= {"broken": [asdict(one) for one in broken], "exit_code": code}
+        output.print_json({"report": about}, at_once=True)
+    elif not output.is_quiet():
+        _print(reports, state, recorder.reason)
+    silent, unfitting = recorder.silent(), recorder.unfitting()
+    output.remarks(f"{topic}: has a publisher that sent nothing" for topic in silent)
+    output.remarks(f"no topic fits {text}" for text in unfitting)
+    for report in reports:
+        output.remarks(remarks_on(report.entry))
+    if choices.exclude and not (unfitting or silent or state.topics):
+        output.remarks(["no topic is left: --exclude takes away all that --topic names"])
+    errors = [
+        f"{one.topic or 'the recording'} breaks {one.rule} {one.wanted}: {one.found}"
+        for one in broken
+    ]
+    errors += (f"{one} was never reached, so nothing of it is recorded." for one in unreached)
+    if recorder.stopped_for_disk and (choices.as_json or output.is_quiet()):
+        errors.append(recorder.reason)
+    losses = [row for one in reports for row in one.entry.end.get("losses", [])]
+    if rows := [row for row in losses if row["cause"] == Cause.UNREADABLE]:
+        errors.append(f"{in_words(rows)} that cannot be read; `hybridlog info --losses` lists them")
+    output.notes(f"hybridlog: {line}" for line in (*errors, *map(output.not_indexed, failed)))
+    return code
+
+
+def _print(reports: Sequence[RecordReport], state: RecorderState, reason: str) -> None:
+    if not reports:
+        output.note("Nothing was stored.")
+        return
+    entry = reports[-1].entry
+    row = {**row_of(reports[-1], entry.source["path"]), "bytes_in": state.stored_bytes}
+    let_go = f"{state.let_go}, by the ring" if state.let_go else ""
+    about = [("coverage", coverage(entry, losses_of(entry))), ("let go", let_go), ("ended", reason)]
+    fields = [*fields_of(row), ("received", state.messages)]
+    print_fields([*fields, *(pair for pair in about if pair[1])])
+
+
+def _as_dict(reports: Sequence[RecordReport], state: RecorderState, reason: str) -> dict[str, Any]:
+    return {
+        "ended": reason,
+        "recordings": [row_of(one, one.entry.source["path"]) for one in reports],
+        "messages_received": state.messages,
+        "bytes": state.stored_bytes,
+        # A cause without a number stands for an unknown number.
+        "lost": {cause: count or None for cause, count in state.lost.items()},
+        "topics": {one.topic: {"received": one.messages, "lost": one.lost} for one in state.topics},
+    }
 
 
 def recorder_options(choices: RecordChoices) -> RecorderOptions:
@@ -130,12 +203,12 @@ def recorder_options(choices: RecordChoices) -> RecorderOptions:
     from hybridlog.live.policy import priority_rule, throttle_rule
     from hybridlog.live.recorder import RecorderOptions
 
-    chosen, no_index = matchers(choices)
+    chosen, no_index = choices.matchers()
     budget_bytes = choices.budget or default_budget()
     # Each topic of large messages has an open chunk, and all of them are to fit.
     chunk_size = min(max(budget_bytes >> 8, _MIN_CHUNK), DEFAULT_CHUNK)
     settings = replace(
-        segment_settings(choices, chunk_size),
+        choices.segment_settings(chunk_size),
         segment_size=choices.split_size,
         segment_span_s=choices.split_duration,
     )
@@ -231,7 +304,6 @@ def _stop_flag() -> Iterator[_Stop]:
                 write_note(
                     "\nhybridlog: stopped. Flushed chunks stay; the next command seals them."
                 )
-                restore_echo()
                 os._exit(128 + number)
             stopped.number = number
             stopped.set()
@@ -255,13 +327,9 @@ class _Display:
 
     def __init__(self, *, as_json: bool) -> None:
         self._as_json = as_json
-        self._table: LiveTable | None = None
+        self.table: LiveTable | None = None
         if output.has_bars() and sys.stderr.isatty():
-            self._table = LiveTable()
-
-    def table(self) -> AbstractContextManager[object]:
-        """The table, as a context manager."""
-        return self._table or nullcontext()
+            self.table = LiveTable()
 
     def say(self, text: str) -> None:
         """Print a message of the recorder at once."""
@@ -269,10 +337,7 @@ class _Display:
 
         if output.is_quiet() and PINNED in text:  # no problem
             return
-        if self._table is not None:
-            self._table.note(text)
-        else:
-            output.note(f"hybridlog: {text}")
+        output.note(f"hybridlog: {text}")
 
     def state(self, state: RecorderState) -> None:
         """Show the state, about once a second.
@@ -281,13 +346,13 @@ class _Display:
         """
         told = ["READY=1", f"STATUS={output.printable(summary(state))}"]
         notify_service(*told, *(["WATCHDOG=1"] if state.stalled_s == 0 else ()))
-        if self._table is not None:
-            self._table.show(state)
+        if self.table is not None:
+            self.table.show(state)
         elif self._as_json:
             from hybridlog.live.state import summary_of
 
             with suppress(BrokenPipeError):  # who reads it may go; the recording goes on
-                output.print_json_line({"state": summary_of(state)})
+                output.print_json({"state": summary_of(state)}, at_once=True)
 
 
 def notify_service(*assignments: str) -> None:

@@ -4,25 +4,24 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-import click
 
 from hybridlog.cli import output
 from hybridlog.cli.ls import with_misfits
 from hybridlog.cli.options import parse_tags
 from hybridlog.cli.progress import Bar
-from hybridlog.cli.record_choices import RecordChoices, matchers, opened_to_record, segment_settings
-from hybridlog.cli.record_summary import COLUMNS, fields_of, row_of
+from hybridlog.cli.record_choices import RecordChoices
+from hybridlog.cli.record_summary import COLUMNS, fields_of, remarks_on, row_of
 from hybridlog.cli.render import print_fields, print_table
 from hybridlog.cli.signals import if_stopped
 from hybridlog.cli.watching import watch
 from hybridlog.query.answers.completeness import coverage
 from hybridlog.record.losses import losses_of
+from hybridlog.wording import listed
 from hybridlog_storage.errors import (
     AlreadyRecordedError,
     DatabaseError,
@@ -38,13 +37,11 @@ if TYPE_CHECKING:
     from hybridlog.formats.find import Found, Watch
     from hybridlog.formats.log_set import LogSet
     from hybridlog.formats.reading import Source
-    from hybridlog.record.recorder import RecordOptions, RecordReport
+    from hybridlog.record.recorder import RecordReport
     from hybridlog.store import Store
 
-_MAX_UNFINISHED = 10
 
-
-def record_logs(choices: RecordChoices) -> None:
+def record_logs(choices: RecordChoices) -> int:
     """Record each path, and each log below a directory; an error does not stop the others."""
     logs, walked = _find(choices)
     if choices.name is not None and len(logs) > 1:
@@ -55,7 +52,7 @@ def record_logs(choices: RecordChoices) -> None:
     with (
         recorder.opened() as store,
         at_safe_points(),
-        Bar(_what(logs), total) as bar,
+        Bar(logs[0].path.name if len(logs) == 1 else f"{len(logs)} logs", total) as bar,
     ):
         for problem in walked.problems if walked is not None else ():
             recorder.fail(None, problem)
@@ -65,9 +62,10 @@ def record_logs(choices: RecordChoices) -> None:
             name = f"{log.path.name}: " if len(logs) > 1 else ""
             recorder.record(store, log, partial(_shown, bar, before, name))
             before += log.size
+    return recorder.exit_code
 
 
-def record_watched(choices: RecordChoices) -> None:
+def record_watched(choices: RecordChoices) -> int:
     """Record what lies in directories, and what comes into them, until a signal ends it."""
     from hybridlog.formats.find import Watch
 
@@ -78,10 +76,10 @@ def record_watched(choices: RecordChoices) -> None:
         places = ", ".join(map(str, choices.paths))
         watch(places, look, report=partial(recorder.fail, None))
         left = [path for one in watches for path in one.unfinished()]
-        for path in left[:_MAX_UNFINISHED]:
-            output.note(f"{path} is not complete; `hybridlog record {path}` records what it has.")
-        if more := left[_MAX_UNFINISHED:]:
-            output.note(f"and {len(more)} more that are not complete")
+        if left:
+            paths = listed(map(str, left))
+            output.note(f"Not complete: {paths}. `hybridlog record PATH` records what is there.")
+    return recorder.exit_code
 
 
 def _look(
@@ -136,30 +134,28 @@ def print_stores(stores: Iterable[Path]) -> None:
         )
 
 
-def _what(logs: Sequence[LogSet]) -> str:
-    return logs[0].path.name if len(logs) == 1 else f"{len(logs)} logs"
-
-
 def _shown(bar: Bar, before: int, name: str, read: int, messages: int) -> None:
     bar(before + read, f"{name}{output.counted(messages, 'message')}")
 
 
-def check_new_store(choices: RecordChoices, logs: Sequence[LogSet]) -> None:
+def _check_new_store(choices: RecordChoices, logs: Sequence[LogSet]) -> None:
     """Fail before a store is made, when no log can be read or the server does not answer."""
     from hybridlog.store import store_path
     from hybridlog_storage.settings import NAME, is_uri, with_password
 
-    if os.path.lexists(store_path(choices.store) / NAME):
+    settings = store_path(choices.store) / NAME
+    if os.path.lexists(settings):
         return
-    problems: list[SourceError] = []
+    problem: SourceError | None = None
     for log in logs:
         try:
             log.open().close()
             break
         except SourceError as error:
-            problems.append(error)
-    if problems and len(problems) == len(logs):
-        raise problems[0]
+            problem = problem or error
+    else:
+        if problem is not None:
+            raise problem
     if is_uri(choices.mongo):
         # The new store stores the URI, so it has to be right.
         from hybridlog_storage.mongo.database import Database
@@ -167,21 +163,8 @@ def check_new_store(choices: RecordChoices, logs: Sequence[LogSet]) -> None:
 
         with Database.connect(with_password(choices.mongo)) as database:
             owner = IndexState(database).owner()
-            is_new = not os.path.lexists(store_path(choices.store) / NAME)
-            if owner is not None and is_new:  # nobody has made it meanwhile
+            if owner is not None and not os.path.lexists(settings):  # nobody made it meanwhile
                 raise other_store(database)
-
-
-def _check_not_empty(
-    report: RecordReport, source: Source, store: Store, options: RecordOptions
-) -> None:
-    """Remove an empty recording, and fail: its time range holds no message."""
-    messages = report.entry.messages - report.latched
-    if options.between is None or messages or not report.skipped + report.latched:
-        return
-    store.refresh()
-    store.remove(report.entry.id)
-    raise _outside(source, options.between)
 
 
 def _between(source: Source, log: LogSet, choices: RecordChoices) -> tuple[int, int] | None:
@@ -192,10 +175,7 @@ def _between(source: Source, log: LogSet, choices: RecordChoices) -> tuple[int, 
     if source.time_range is None and any(map(is_relative, choices.between)):
         source.time_range = log.read_time_range()
     start, end = source.time_range or (None, None)
-    between = parse_range(*choices.between, start=start, end=end)
-    if start is not None and end is not None and (between[1] <= start or between[0] >= end):
-        raise _outside(source, between)
-    return between
+    return parse_range(*choices.between, start=start, end=end)
 
 
 def _outside(source: Source, between: tuple[int, int]) -> TimeError:
@@ -214,45 +194,50 @@ class LogRecorder:
 
     def __init__(self, choices: RecordChoices, logs: Sequence[LogSet], *, is_search: bool) -> None:
         self._choices = choices
-        self._settings = segment_settings(choices)
+        self._settings = choices.segment_settings()
         self._tags = parse_tags(choices.set_tag)
-        matchers(choices)
+        choices.matchers()
         self._logs, self._is_search = logs, is_search
-        self._unfinished = [log.path for log in logs]
-        self._current: Path | None = None
+        self._left = [log.path for log in logs]
         self._counts: Counter[str] = Counter()  # of what came of logs
-        self._exit_code = 0
+        self.exit_code = 0
         self._rows: list[dict[str, Any]] = []  # those that are shown at the end
 
     @contextmanager
     def opened(self) -> Iterator[Store]:
-        """The store; at the end the results are shown, and an error sets the exit code."""
-        check_new_store(self._choices, self._logs)
+        """The store; at the end the results are shown."""
+        _check_new_store(self._choices, self._logs)
         try:
-            with if_stopped(self._on_stop), opened_to_record(self._choices) as store:
+            with if_stopped(self._on_stop), self._choices.opened_to_record() as store:
                 yield store
         finally:
             self._show()
-        if self._exit_code:
-            raise click.exceptions.Exit(self._exit_code)
 
     def record(self, store: Store, log: LogSet, progress: Callable[[int, int], None]) -> None:
         """Record a log, or the parts that the store lacks; raises if the only log cannot be."""
+        if not self._logs:
+            self._left = [log.path]
         for piece in self._pieces(store, log):
-            self._current = piece.path
             try:
                 report = self._record_one(store, piece, progress)
-                report.entry = with_misfits(store, report.entry)
-                self._add(piece.path, report)
             except AlreadyRecordedError as error:
-                if not self._is_search:
-                    self.fail(piece.path, error)
-                else:
+                if self._is_search:
                     self._tell({"path": str(piece.path), "known": str(error)}, "known")
+                else:
+                    self.fail(piece.path, error)
             except (SourceError, UsageError) as error:
                 self.fail(piece.path, error)
-        if log.path in self._unfinished:
-            self._unfinished.remove(log.path)
+            else:
+                report.entry = entry = with_misfits(store, report.entry)
+                for problem in _problems(piece.path, report):
+                    self.exit_code = self.exit_code or problem.exit_code
+                many, size = (
+                    output.counted(entry.messages, "message"),
+                    output.size(entry.stored_bytes),
+                )
+                line = f"{entry.name}: {many}, {size}, from {piece.path}"
+                self._tell(row_of(report, piece.path), "recorded", [line])
+        self._left.remove(log.path)
 
     def _pieces(self, store: Store, log: LogSet) -> Iterator[LogSet]:
         """The log; in a search, the missing parts of it if others were recorded on their own."""
@@ -262,13 +247,11 @@ class LogRecorder:
         missing: list[Path] = []
         if self._is_search and not self._choices.again and len(log.files) > 1:
             find = store.session.snapshot().by_fingerprint.get
-            try:
+            with suppress(SourceError):  # which is told when it is recorded
                 prints = fingerprint(log.files)
-            except SourceError:
-                prints = None  # the error is told when it is recorded
-            if prints is not None and find(prints.whole) is None:
-                of_files = zip(log.files, prints.parts, strict=True)
-                missing = [file for file, part in of_files if find(part) is None]
+                if find(prints.whole) is None:
+                    of_files = zip(log.files, prints.parts, strict=True)
+                    missing = [file for file, part in of_files if find(part) is None]
         is_whole = not missing or len(missing) == len(log.files)
         yield from [log] if is_whole else map(LogSet.at, missing)
 
@@ -281,7 +264,7 @@ class LogRecorder:
         with anywhere():
             source = log.open()
         with source:
-            matcher, no_index = matchers(choices)
+            matcher, no_index = choices.matchers()
             options = RecordOptions(
                 name=choices.name or log.name,
                 tags=self._tags,
@@ -294,97 +277,68 @@ class LogRecorder:
                 no_index=no_index,
             )
             report = store.record(source, options, progress)
-            _check_not_empty(report, source, store, options)
+            is_empty = report.entry.messages == report.latched
+            if options.between is not None and is_empty and report.skipped + report.latched:
+                store.refresh()
+                store.remove(report.entry.id)
+                raise _outside(source, options.between)
         for pattern in (p for one in (matcher, no_index) if one is not None for p in one.unused()):
             output.note(f"{log.path}: no topic fits {output.quoted(pattern)}.")
         return report
 
-    def _add(self, path: Path, report: RecordReport) -> None:
-        for error in _problems(path, report):
-            self._exit_code = self._exit_code or error.exit_code
-        self._tell(row_of(report, path), "recorded")
-        if not self._logs and not self._choices.as_json and not output.is_quiet():
-            entry = report.entry
-            output.say(
-                f"{entry.name}: {output.counted(entry.messages, 'message')}, "
-                f"{output.size(entry.stored_bytes)}, from {path}"
-            )
-
     def fail(self, path: Path | None, error: HybridlogError) -> None:
         """Add an error; that of the only log is raised."""
         if len(self._logs) == 1 and not self._is_search:
-            self._current = None
-            self._unfinished.clear()
             raise error
         output.note(f"hybridlog: {error}")
-        self._exit_code = self._exit_code or error.exit_code
+        self.exit_code = self.exit_code or error.exit_code
         about = {} if path is None else {"path": str(path)}
         self._tell({**about, "error": str(error), "exit_code": error.exit_code}, "error")
 
-    def _tell(self, row: dict[str, Any], what: str) -> None:
+    def _tell(self, row: dict[str, Any], what: str, lines: Sequence[str] = ()) -> None:
         """Show what came of a log: at the end; at once while directories are watched."""
-        self._current = None
         self._counts[what] += 1
         if self._logs:
             self._rows.append(row)
-        elif self._choices.as_json:
-            output.print_json_line(row)
+        else:
+            output.tell(row, lines, at_once=True)
 
     def _on_stop(self) -> str:
         """The effect of stopping now on the recordings."""
-        left = list(self._unfinished)
-        if self._current is not None:
-            left[:1] = [self._current]
-        what = str(left[0]) if len(left) == 1 else output.counted(len(left), "log")
-        parts = [f"Nothing of {what} is stored."] if left else []
-        if stored := self._counts["recorded"]:
+        left, stored, parts = self._left, self._counts["recorded"], []
+        if left:
+            what = left[0] if len(left) == 1 else output.counted(len(left), "log")
+            parts.append(f"Nothing of {what} is stored.")
+        if stored:
             before = " before" if left else ""
             parts.append(f"{output.counted(stored, 'recording')} stored{before}.")
         return " ".join(parts)
 
     def _show(self) -> None:
         """Print the finished recordings, and what became of the others."""
-        choices, counts = self._choices, self._counts
-        if choices.as_json and self._rows:
+        counts = self._counts
+        if self._choices.as_json and self._rows:
             output.print_json(self._rows)
-        elif not choices.as_json and not output.is_quiet():
-            _print([row for row in self._rows if "messages" in row])
+        elif not self._choices.as_json and not output.is_quiet():
+            recorded = [row for row in self._rows if "messages" in row]
+            if len(recorded) == 1:
+                print_fields(fields_of(recorded[0]))
+            else:
+                print_table(COLUMNS, recorded)
         if self._is_search:
-            recorded = output.counted(counts["recorded"], "log")
+            many = output.counted(counts["recorded"], "log")
             left = f"{counts['known']} in the store already, {counts['error']} not recorded"
-            output.remarks([f"{recorded} recorded, {left}."])
-
-
-def _print(rows: Sequence[Mapping[str, Any]]) -> None:
-    if len(rows) < 2:
-        print_fields([pair for row in rows for pair in fields_of(row)])
-        return
-    summed = [key for key, value in rows[0].items() if isinstance(value, int | float)]
-    total = {key: sum(row[key] for row in rows) for key in summed}
-    print_table(COLUMNS, [*rows, {**total, "recording": "total", "path": "", "topics": None}])
+            output.remarks([f"{many} recorded, {left}."])
 
 
 def _problems(path: Path, report: RecordReport) -> Iterator[HybridlogError]:
     """Print problems; gives an error for each that sets the exit code."""
-    for channel in report.entry.channels:
-        if channel.is_indexed and channel.reason is not None:
-            output.remarks([f"{channel.topic}: not indexed beyond time: {channel.reason}"])
-        if channel.stats.unreadable:
-            output.note(
-                f"{channel.topic}: {output.unfit(channel.stats.unreadable)}; stored, without "
-                "fields in the index"
-            )
     if report.latched_left_out:
         output.note(
             f"{path}: {output.counted(report.latched_left_out, 'latched message')} from before "
             "the time range did not fit in memory."
         )
-    output.remarks((*output.surpluses(report.entry.channels), *report.remarks))
-    for damage in report.damage:
-        place = "" if damage.offset is None else f" at byte {damage.offset}"
-        count = damage.messages_lost
-        lost = f"; {output.counted(count, 'message')} lost" if count else ""
-        output.note(f"{damage.file}{place}: {damage.reason}{lost}")
+    output.remarks((*remarks_on(report.entry), *report.remarks))
     if report.failure is not None:
         output.note(f"hybridlog: {output.not_indexed(report)}")
         yield DatabaseError(str(report.failure))
@@ -392,6 +346,6 @@ def _problems(path: Path, report: RecordReport) -> Iterator[HybridlogError]:
         entry = report.entry
         output.note(
             f"{path} is damaged: {output.stored(entry.messages)}; "
-            f"{coverage(entry, losses_of(entry))}."
+            f"{coverage(entry, losses_of(entry))}; `hybridlog info --losses` says where."
         )
         yield SourceDamagedError(str(path))

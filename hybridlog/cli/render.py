@@ -148,36 +148,36 @@ def table_lines(columns: Sequence[Column], rows: Sequence[Any], width: int) -> l
 def print_table(
     columns: Sequence[Column],
     rows: Iterable[Any],
-    *,
-    titles: int = 1,
-    about: Sequence[str] = (),
-) -> None:
+) -> bool:
     """Print rows under headings; on a terminal that has no room for them, a block for each row.
 
+    Prints nothing without rows, and returns False.
+
     A long table is printed some rows at a time: memory does not grow with it. Columns become wider
-    where later rows need it. The first `titles` columns are the title of a block, `about` adds
-    words to it.
+    where later rows need it.
     """
     source = iter(rows)
     block = [*islice(source, ROWS_AT_ONCE)]
+    if not block:
+        return False
     is_all = len(block) < ROWS_AT_ONCE
     alike = [one for one in columns if is_all and one.varies and len({*map(one.cell, block)}) < 2]
-    titles = max(titles - sum(one in alike for one in columns[:titles]), 1)
     columns = [one for one in columns if one not in alike]
     shape = _shape(columns, block, screen_width() if sys.stdout.isatty() else None)
     if shape is None:
         for number, row in enumerate(chain(block, source)):
-            named = [(one.name, one.cell(row)) for one in columns]
+            (_, title), *fields = ((one.name, one.cell(row)) for one in columns)
             if number:
                 say()
-            say("  ".join([*(cell for _, cell in named[:titles]), *about]))
-            print_fields([pair for pair in named[titles:] if pair[1]], indent=2)
-        return
+            say(title)
+            print_fields([pair for pair in fields if pair[1]], indent=2)
+        return True
     cells = [[one.name for one in shape.columns], *shape.cells(block)]
     while cells:
         for line in chain.from_iterable(map(shape.lines, cells)):
             print(line)  # noqa: T201
         cells = shape.cells(islice(source, ROWS_AT_ONCE))
+    return True
 
 
 def print_fields(fields: Sequence[tuple[str, object]], indent: int = 0) -> None:

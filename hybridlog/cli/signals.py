@@ -15,7 +15,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from types import FrameType
-from typing import Any, Final, NoReturn
+from typing import Final, NoReturn
 
 from hybridlog.cli.output import printable
 from hybridlog_storage import stopping
@@ -27,9 +27,6 @@ SIGNALS: Final = tuple(
 
 _SHOW_CURSOR: Final = "\r\x1b[K\x1b[?25h"
 """Clears the line of a progress bar."""
-
-_silent: dict[int, Any] = {}
-"""Settings from before, by terminal, while keys are not echoed."""
 
 _consequences: list[str | Callable[[], str]] = []
 
@@ -117,36 +114,9 @@ def ended_by_signal(end: Callable[[], object]) -> Iterator[None]:
 
 def undo_unfinished() -> None:
     """Take back what a command has not completed when it is stopped, such as files."""
-    restore_echo()
     unfinished = sys.modules.get("hybridlog_storage.disk.unfinished")
     if unfinished is not None:
         unfinished.undo_unfinished()
-
-
-def stop_echo(terminal: int) -> None:
-    """Stop showing the keys that are pressed, which would break a drawing that stays in place.
-
-    In the background nothing is changed: the system would stop the process.
-    """
-    import termios
-
-    with contextlib.suppress(OSError):
-        if os.tcgetpgrp(terminal) == os.getpgrp():
-            settings = termios.tcgetattr(terminal)
-            _silent.setdefault(terminal, list(settings))
-            settings[3] &= ~(termios.ECHO | termios.ECHONL)
-            termios.tcsetattr(terminal, termios.TCSANOW, settings)
-
-
-def restore_echo() -> None:
-    """Show the keys again, where that was stopped."""
-    while _silent:
-        import termios
-
-        terminal, settings = _silent.popitem()
-        with contextlib.suppress(OSError):
-            if os.tcgetpgrp(terminal) == os.getpgrp():
-                termios.tcsetattr(terminal, termios.TCSANOW, settings)
 
 
 def write_note(text: str) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,13 +10,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _BLOCKS = "▁▂▃▄▅▆▇█"
-_PLAIN = "_.-:=+*#"
-"""For terminals whose encoding lacks blocks."""
 
 
 def sparkline(values: NDArray[np.float64]) -> str:
     """A letter for each number, from the least to the greatest; a space for NaN."""
-    letters = np.array(list(_letters()))
+    letters = np.array(list(_BLOCKS))
     is_known = np.isfinite(values)
     found = np.full(len(values), " ")
     if is_known.any():
@@ -33,21 +30,7 @@ def sparkline(values: NDArray[np.float64]) -> str:
 
 def densities(counts: NDArray[np.int64]) -> str:
     """A letter for each count, from 0 to the greatest; a space for 0."""
-    letters = np.array([" ", *_letters()])
+    letters = np.array([" ", *_BLOCKS])
     steps = len(letters) - 1
     most = max(int(counts.max(initial=0)), 1)
     return "".join(letters[-(-counts * steps // most)].tolist())
-
-
-def bar(is_lost: NDArray[np.bool_]) -> str:
-    """A bar of what is there, with holes where something is lost."""
-    full, hole = "█░" if _letters() is _BLOCKS else "#."
-    return "".join(hole if lost else full for lost in is_lost.tolist())
-
-
-def _letters() -> str:
-    try:
-        (_BLOCKS + "░").encode(sys.stdout.encoding or "ascii")
-    except UnicodeEncodeError:
-        return _PLAIN
-    return _BLOCKS

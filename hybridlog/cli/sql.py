@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 
-from hybridlog.cli.answers import SCREEN, Tabular, answer_tables
+from hybridlog.cli.answers import SCREEN, Tabular
 from hybridlog.cli.binder import SECONDS, SIZE, argument, command, option
 from hybridlog.cli.options import Ranged, Strict
 from hybridlog.cli.output import remarks
@@ -37,7 +37,7 @@ def sql_command(given: _Given) -> None:
     from hybridlog.query.question import Question
     from hybridlog.sql.duck import limited_memory
 
-    to, query = given.to, given.query
+    query = given.query
     is_prompt = query is None and sys.stdin.isatty()
     if query is None and not is_prompt:
         query = sys.stdin.read()
@@ -53,9 +53,9 @@ def sql_command(given: _Given) -> None:
                 if answer.columns:
                     from pyarrow import Table
 
-                    if to.form != SCREEN:
+                    if given.to_form != SCREEN:
                         answer.check_names()
-                    answer_tables((Table.from_batches([one]) for one in answer.to_batches()), to)
+                    given.answer(Table.from_batches([one]) for one in answer.to_batches())
             sys.stdout.flush()
             remarks(answer.sentences())
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import ClassVar
 
-from hybridlog.cli import output
 from hybridlog.cli.answers import Listing, answering
 from hybridlog.cli.binder import command, option
 from hybridlog.cli.completion import complete_path
@@ -34,12 +33,11 @@ def stats_command(given: _Given) -> None:
     with answering(given) as asked:
         stats = asked.query.stats(*([] if given.fields is None else parse_fields(given.fields)))
         found = [asdict(row) for row in stats]
-        if not found and not given.as_json:
-            output.note("No field is a number.")
         if given.strict:
             asked.query.completeness().check()
         # How many are no numbers is left out only where there are none.
         order = {name: 1 for name in ("nan", "infinite") if not any(row[name] for row in found)}
         order["std"] = 2
         shown = [Column(name, side="right", order=order.get(name, 0)) for name in _NAMES]
-        given.answer(found, [Column("topic", varies=True), Column("field"), *shown], titles=2)
+        columns = [Column("topic", varies=True), Column("field"), *shown]
+        given.show(found, columns, "No field is a number.")

@@ -6,7 +6,7 @@ import sys
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
-from hybridlog.cli.answers import SCREEN, Destination, Tabular, answer_tables
+from hybridlog.cli.answers import SCREEN, Tabular
 from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.completion import complete_frame
 from hybridlog.cli.options import Strict, Topics, Verbose, topics
@@ -66,14 +66,13 @@ def tf_command(given: _Given) -> None:
         raise UsageError("Times are those of a transform: name its TARGET and SOURCE frames.")
     from hybridlog.tf.reader import frames_and_stamps
 
-    to = given.to
     with given.opened(snapshot=True) as store:
         chosen = given.recordings_in(store)
         tree = store.tf(chosen.ids or None)
         if given.strict and tree.remarks:
             raise IncompleteError(" ".join(tree.remarks))
         if target is None:
-            _show_tree(tree, to)
+            _show_tree(tree, given)
             return
         if not topic:
             stamps = _times(tree, given, between)
@@ -89,13 +88,11 @@ def tf_command(given: _Given) -> None:
         found = tree.lookup(target, source, stamps, extrapolate=given.extrapolate)
         if len(found) == 1 and found.missing:
             tree.transform(target, source, int(stamps[0]), extrapolate=given.extrapolate)
-        answer_tables([found.to_arrow()], to)
+        given.answer([found.to_arrow()])
         sys.stdout.flush()
-        remarks(
-            f"{counted(number, 'time')} without a transform: {why}."
-            for why, number in found.missing.items()
-        )
-        remarks(tree.remarks)
+        times = ((counted(n, "time"), why) for why, n in found.missing.items())
+        missing = (f"{many} without a transform: {why}." for many, why in times)
+        remarks((*missing, *tree.remarks))
 
 
 def _times(
@@ -121,9 +118,9 @@ def _times(
     return np.array([tree.latest(target, given.source or target)], np.int64)
 
 
-def _show_tree(tree: FrameTree, to: Destination) -> None:
-    if to.form != SCREEN:
-        answer_tables([tree.to_arrow()], to)
+def _show_tree(tree: FrameTree, given: _Given) -> None:
+    if given.to_form != SCREEN:
+        given.answer([tree.to_arrow()])
         return
     names = ("transforms", "Hz", "longest gap", "from")
     rows = []

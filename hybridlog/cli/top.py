@@ -13,6 +13,7 @@ from hybridlog.cli import output
 from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.completion import complete_field, complete_running
 from hybridlog.cli.options import AsJson, InStore
+from hybridlog.cli.render import Column
 from hybridlog.cli.signals import Stopped
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.stopping import at_safe_points
@@ -72,7 +73,7 @@ def top_command(given: _Given) -> None:
             if opened is not None:
                 values = _values(opened, recorder, state, fields, span)
             if given.as_json:
-                output.print_json_line({**summary_of(state), "fields": values})
+                output.print_json({**summary_of(state), "fields": values}, at_once=True)
             elif table is not None:
                 table.show(state, _lines(values))
             else:
@@ -121,13 +122,8 @@ def _lines(values: Sequence[Mapping[str, Any]]) -> list[str]:
     for row in values:
         said = "nothing yet"
         if row["n"]:
-            parts = [f"{name} {_number(row[name])}" for name in ("least", "mean", "greatest")]
+            names = ("least", "mean", "greatest")  # of texts there is no mean
+            parts = [f"{name} {Column(name).cell(row) or '-'}" for name in names]
             said = f"{', '.join(parts)} ({output.counted(row['n'], 'message')})"
         lines.append(f"{row['topic']} {row['field']}: {said}")
     return lines
-
-
-def _number(value: object) -> str:
-    if value is None:
-        return "-"  # such as the mean of texts
-    return f"{value:.6g}" if isinstance(value, int | float) else str(value)

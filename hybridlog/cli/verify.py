@@ -8,8 +8,6 @@ from dataclasses import asdict, dataclass, replace
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING
 
-import click
-
 from hybridlog.cli import output
 from hybridlog.cli.binder import command, option
 from hybridlog.cli.options import AsJson, InStore, Named, Quiet, recordings_of
@@ -34,7 +32,7 @@ class _Given(Named, InStore, AsJson, Quiet):
 
 
 @command(_Given)
-def verify_command(given: _Given) -> None:
+def verify_command(given: _Given) -> int:
     """Read everything, check checksums and references.
 
     Exits with 1 when it finds a problem, and prints a cure for each. With --repair, it restores
@@ -50,9 +48,8 @@ def verify_command(given: _Given) -> None:
     started = time.monotonic()
     with given.opened(verifies=True) as store:
         chosen, unreadable = _chosen(given, store)
-        total = sum(entry.stored_bytes for entry in chosen)
         names = None if given.choice.is_everything else [*(one.id for one in chosen), *unreadable]
-        with Bar("verify", total) as bar:
+        with Bar("verify") as bar:
             result = store.verify(names, bar.part, repair=given.repair)
         why = store.shared.index.unavailable
     elapsed = time.monotonic() - started
@@ -66,10 +63,9 @@ def verify_command(given: _Given) -> None:
     is_wanted = not isinstance(why, WithoutMongoError)
     if not result.index and is_wanted and (result.findings or why is None):
         output.note(f"The index was not compared: {why}")
-    if result.findings:
-        raise click.exceptions.Exit(1)
-    if not result.index and is_wanted and why is not None:
+    elif not result.index and is_wanted:
         raise DatabaseError(f"The index was not compared: {why}")
+    return 1 if result.findings else 0
 
 
 def _chosen(given: _Given, store: Store) -> tuple[Sequence[RecordingSummary], list[str]]:
@@ -95,12 +91,14 @@ def _print(result: Verification, elapsed: float) -> None:
     verdict = "all is well" if result.index else "all is well in the files"
     if result.findings:
         verdict = output.counted(len(result.findings), "problem")
+    if result.without_documents:
+        without = output.counted(result.without_documents, "message")
+        verdict += f"; {without} without documents (--no-index)"
     told = (
         f"{output.counted(result.recordings, 'recording')}, "
         f"{output.counted(result.chunks, 'chunk')}, "
         f"{output.counted(result.messages, 'message')}, "
         f"{output.size(result.bytes_read)} read in {elapsed:.2f} s: {verdict}"
-        f"{output.without_documents(result.without_documents)}"
     )
     output.tell(None, [told])
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 
-import click
-
 from hybridlog.cli import output
 from hybridlog.cli.binder import command, option
 from hybridlog.cli.open import foxglove
@@ -49,24 +47,21 @@ def view_command(given: _Given) -> None:
             (entry,) = store.select([given.recording])
             name = quote(entry.name, safe="")
             url += f"#recording={name}"
-        if given.as_json:
-            shown = {"url": url, "port": server.port}
-            output.print_json(shown | ({"mcap": f"{server.url}mcap/"} if given.mcap else {}))
-        else:
-            click.echo(url)
-            output.note("Open this address in a browser. Ctrl-C ends the server.")
-            if given.mcap:
-                _print_mcap(f"{server.url}mcap/", name)
+        shown: dict[str, object] = {"url": url, "port": server.port}
+        notes = ["Open this address in a browser. Ctrl-C ends the server."]
+        if given.mcap:
+            mcap = f"{server.url}mcap/"
+            shown["mcap"] = mcap
+            file = f"{mcap}slice.mcap?recording={name or 'RECORDING'}"
+            notes += [
+                f"MCAP file: {file}",
+                f"In Foxglove: {foxglove('remote-file', file)}",
+                f"For a remote data loader: {mcap}manifest",
+            ]
+        output.tell(shown, [url])
+        output.notes([] if given.as_json else notes)
         sys.stdout.flush()
         if given.opens:
             threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
         with ended_by_signal(server.stop):
             server.run()
-
-
-def _print_mcap(url: str, name: str) -> None:
-    """Print where other viewers find selections."""
-    file = f"{url}slice.mcap?recording={name or 'RECORDING'}"
-    output.note(f"MCAP file: {file}")
-    output.note(f"In Foxglove: {foxglove('remote-file', file)}")
-    output.note(f"For a remote data loader: {url}manifest")

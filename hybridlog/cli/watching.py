@@ -38,38 +38,25 @@ def watch(
     """
     if isinstance(sys.stdout, io.TextIOWrapper):  # a file and a pipe show each line at once
         sys.stdout.reconfigure(line_buffering=True)
-    told: set[str] = set()
+    told: set[str] = set()  # problems that last
     try:
         with at_safe_points():
             output.remarks([f"Watching {place}. Ctrl-C ends it."])
             while True:
-                is_away = _look(look, told, report, _LONGER * pause_s)
-                pause(_LONGER * pause_s if is_away else pause_s)
+                met, wait_s = set[str](), pause_s
+                try:
+                    for problem in look():
+                        met.add(str(problem))
+                        if str(problem) not in told:
+                            report(problem)
+                except _AWAY as error:
+                    safe_point()  # Ctrl-C may have ended a program that the other side needs
+                    wait_s = _LONGER * pause_s
+                    if str(error) not in told:
+                        report(error)
+                        output.note(f"The next try is in {wait_s:g} s.")
+                    met |= {*told, str(error)}
+                told = met
+                pause(wait_s)
     except Stopped as stopped:
-        if stopped.consequence:
-            output.note(stopped.consequence)
-
-
-def _look(
-    look: Callable[[], Iterable[HybridlogError]],
-    told: set[str],
-    report: Callable[[HybridlogError], None],
-    longer_s: float,
-) -> bool:
-    """Look once; `told` has the problems that last. True if something is away."""
-    met: set[str] = set()
-    try:
-        for problem in look():
-            met.add(str(problem))
-            if str(problem) not in told:
-                report(problem)
-    except _AWAY as error:
-        safe_point()  # Ctrl-C may have ended a program that the other side needs
-        if str(error) not in told:
-            report(error)
-            output.note(f"The next try is in {longer_s:g} s.")
-        told |= {*met, str(error)}
-        return True
-    told.intersection_update(met)
-    told |= met
-    return False
+        output.notes(filter(None, [stopped.consequence]))

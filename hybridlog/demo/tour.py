@@ -6,7 +6,7 @@ import shlex
 import shutil
 import subprocess
 import sys
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import NamedTuple
 
 from hybridlog_storage.errors import NO_SPACE, DiskFullError, UsageError
@@ -104,19 +104,10 @@ def run(directory: Path) -> int:
             sys.stderr.write(f"error: `{step.command}` failed with exit code {code}\n")
             # A child that was killed by a signal has a negative code, which shells cannot return.
             return code if code > 0 else 128 - code
-    _print(
-        f"\nAll files remain in {directory}; look at them: {_program()} view --store "
-        f"{shlex.quote(str(directory / STORE))}\n"
-    )
+    program = "hybridlog" if shutil.which("hybridlog") else f"{sys.executable} -m hybridlog"
+    place = shlex.quote(str(directory / STORE))
+    _print(f"\nAll files remain in {directory}; look at them: {program} view --store {place}\n")
     return 0
-
-
-def _program() -> str:
-    """The command for this program: its path if the environment is not activated."""
-    if shutil.which("hybridlog"):
-        return "hybridlog"
-    started = sys.argv[0]
-    return started if PurePath(started).name == "hybridlog" else "python -m hybridlog"
 
 
 def _print(text: str) -> None:

@@ -32,21 +32,6 @@ def test_verify_lists_what_is_off(fresh: Path) -> None:
     assert run("verify", "--quiet", store=fresh, code=1).lines == findings
 
 
-def test_no_store(tmp_path: Path) -> None:
-    (tmp_path / "empty").mkdir()
-    (tmp_path / "file").write_text("x")
-    (tmp_path / "other").mkdir()
-    (tmp_path / "other/file").write_text("x")
-    for name, words in (
-        ("nothing", "no such directory"),
-        ("empty", "hybridlog.toml"),
-        ("file", "is a file"),
-    ):
-        for command in (("ls",), ("fetch", "-t", "x"), ("verify",), ("info",)):
-            assert words in run(*command, store=tmp_path / name, code=5).err
-    assert not (tmp_path / "nothing").exists()
-
-
 def test_recording_into_something_else(logs: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
     (tmp_path / "other").mkdir()

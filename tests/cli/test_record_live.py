@@ -8,7 +8,6 @@ import re
 import shlex
 import signal
 import socket
-import struct
 import subprocess
 import sys
 import time
@@ -28,24 +27,15 @@ from hybridlog.cli.live_table import drawn, summary
 from hybridlog.live.sources.base import Sink
 from hybridlog.live.state import RecorderState, TopicState
 from hybridlog_storage.errors import UsageError
-from hybridlog_storage.messages import Channel, Schema
 from tests import places
-from tests.cli import odd_log
 from tests.cli.running import BACKGROUND, COMMAND, complete, environment, run
 from tests.cli.within import answer
-from tests.independent import read, write_mcap
+from tests.independent import read
 from tests.limits import Limit
 from tests.live.speaker import Speaker, text, text_channel
 from tests.waiting import wait_for
 
 pytestmark = pytest.mark.mongo
-
-CLOCK = b"""builtin_interfaces/Time clock
-================================================================================
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
-"""
 
 
 @contextmanager
@@ -242,31 +232,6 @@ def test_what_is_thinned_out_is_told(logs: Path, tmp_path: Path) -> None:
     assert "/imu/data" in run("info", "--losses", store=store).out
 
 
-def test_a_simulation_is_recorded_by_its_clock(tmp_path: Path) -> None:
-    second = 10**9
-    words = Channel("/words", "cdr", Schema("std_msgs/msg/String", "ros2msg", b"string data\n"))
-    clock = Channel("/clock", "cdr", Schema("rosgraph_msgs/msg/Clock", "ros2msg", CLOCK))
-    said: list[tuple[Channel, int, bytes]] = []
-    for at in range(6):
-        log_time = 10**18 + at * second
-        said.append((words, log_time, odd_log.text(f"{at}")))
-        payload = b"\0\1\0\0" + struct.pack("<iI", at // 2, 5)
-        said.append((clock, log_time + second // 2, payload))
-    write_mcap(tmp_path / "simulation.mcap", said)
-    store = tmp_path / "store"
-    arguments = ("--speed", 50, "--reserve", 0, "--use-sim-time", "-t", "/words")
-    done = run("record", "--replay", tmp_path / "simulation.mcap", *arguments, store=store)
-    assert re.search(r"(?m)^source .*simulation\.mcap \(replay, by /clock\)$", done.out)
-    assert re.search(r"(?m)^coverage +complete$", done.out)
-    assert "sent nothing" not in done.err
-    found = [
-        (row["log_time_ns"], row["data"])
-        for row in map(json.loads, run("fetch", "-t", "/words", "-F", "jsonl", store=store).lines)
-    ]
-    assert [word for _, word in found] == list("012345")
-    assert {at for at, _ in found} == {5, second + 5, 2 * second + 5}
-
-
 @pytest.mark.parametrize("stream", ["stdout", "stderr"])
 def test_who_reads_what_it_says_may_go(logs: Path, tmp_path: Path, stream: str) -> None:
     words = ("--replay", logs / "robot.bag", "--speed", 4, "--trigger", "/nothing")
@@ -441,7 +406,7 @@ def test_triggers_have_a_process_that_ends_with_the_recorder(
     ("arguments", "said"),
     [
         ("", "Nothing to record"),
-        ("--replay {bag} {bag}", "not both"),
+        ("--replay {bag} {bag}", "--replay and PATH exclude"),
         ("--replay {bag} --between +1s +2s", "--replay and --between exclude"),
         ("--replay {bag} --no-latched", "--replay and --no-latched exclude"),
         ("--replay {bag} --throttle /a fast", "is no rate"),

@@ -197,8 +197,8 @@ def stop_at(moment: str, *command: str | Path, store: Path) -> subprocess.Comple
     ("moment", "names", "said"),
     [
         ("return opened_store", ["robot.bag"], "Nothing of {robot.bag} is stored."),
-        ("call _what", ["robot.bag"], "Nothing of {robot.bag} is stored."),
-        ("call _what", ["robot.bag", "odd.mcap"], "Nothing of 2 logs is stored."),
+        ("return LogRecorder.opened", ["robot.bag"], "Nothing of {robot.bag} is stored."),
+        ("return LogRecorder.opened", ["robot.bag", "odd.mcap"], "Nothing of 2 logs is stored."),
         (
             "return LogRecorder.record",
             ["odd.mcap", "robot.bag"],

@@ -15,7 +15,7 @@ import pytest
 
 from hybridlog_storage.disk.directory import StoreDirectory
 
-from .running import environment
+from .running import environment, run
 
 
 @pytest.fixture
@@ -50,19 +50,15 @@ def test_it_serves_until_it_is_stopped(store: Path, number: signal.Signals) -> N
         urllib.request.urlopen(said["url"])
 
 
-def test_a_port_that_is_taken_is_refused(store: Path) -> None:
+def test_what_is_refused_before_anything_is_served(store: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
-        running = start("--store", store, "--port", str(other.getsockname()[1]))
-        _, errors = running.communicate(timeout=20)
-    assert running.returncode == 2
-    assert "is in use. Give another one with --port, or 0 for any." in errors
-
-
-def test_an_unknown_recording_is_refused_before_anything_is_served(store: Path) -> None:
-    running = start("--store", store, "monday")
-    output, errors = running.communicate(timeout=20)
-    assert (running.returncode, output) == (2, "")
-    assert "monday" in errors
+        port = other.getsockname()[1]
+        taken = run("view", "--port", port, store=store, code=2)
+    assert "is in use. Give another one with --port, or 0 for any." in taken.err
+    unknown = run("view", "monday", store=store, code=2)
+    assert (unknown.out, "monday" in unknown.err) == ("", True)
+    alone = run("view", "--allow-origin", "http://localhost:8080", store=store, code=2)
+    assert "--allow-origin is for --mcap" in alone.err
 
 
 def test_of_several_stores_none_is_guessed(tmp_path: Path) -> None:
@@ -94,10 +90,3 @@ def test_mcap_for_other_viewers(store: Path) -> None:
         assert answer.headers["Access-Control-Allow-Origin"] == "http://localhost:8080"
     running.send_signal(signal.SIGINT)
     running.communicate(timeout=20)
-
-
-def test_an_origin_without_mcap_is_refused(store: Path) -> None:
-    running = start("--store", store, "--allow-origin", "http://localhost:8080")
-    _, errors = running.communicate(timeout=20)
-    assert running.returncode == 2
-    assert "--allow-origin is for --mcap" in errors

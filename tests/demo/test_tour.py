@@ -64,26 +64,17 @@ def test_a_good_tour(
         tour.run(tmp_path / "new")
 
 
-@pytest.mark.parametrize(
-    ("started", "on_path", "typed"),
-    [
-        (".venv/bin/hybridlog", False, ".venv/bin/hybridlog"),
-        ("/x/hybridlog/__main__.py", False, "python -m hybridlog"),
-        (".venv/bin/hybridlog", True, "hybridlog"),
-    ],
-)
+@pytest.mark.parametrize("on_path", [False, True])
 def test_the_last_line_can_be_typed(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
-    started: str,
     on_path: bool,
-    typed: str,
 ) -> None:
     pretend(monkeypatch)
-    monkeypatch.setattr("sys.argv", [started])
     monkeypatch.setattr("shutil.which", lambda name: f"/usr/bin/{name}" if on_path else None)
     assert tour.run(tmp_path) == 0
+    typed = "hybridlog" if on_path else f"{sys.executable} -m hybridlog"
     place = shlex.quote(str(tmp_path / tour.STORE))
     assert capfd.readouterr().out.endswith(f"look at them: {typed} view --store {place}\n")
 

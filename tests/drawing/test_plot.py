@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import re
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hybridlog.cli.sparkline import bar, densities, sparkline
+from hybridlog.cli.sparkline import densities, sparkline
 from hybridlog.drawing.figure import MAX_LINES, Line, figure, lines
 from hybridlog.drawing.series import Series
 from hybridlog.query.answers.lost import lost_parts
@@ -193,18 +192,13 @@ def test_without_matplotlib(drive: Drive, tmp_path: Path, calls: Calls) -> None:
     assert plot(drive, *ask).lines
 
 
-def test_sparklines(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sparklines() -> None:
     assert sparkline(np.array([0, 1, 2, 3, 4, 5, 6, 7.0])) == "▁▂▃▄▅▆▇█"
     assert sparkline(np.array([NAN, -1.7e308, 1.7e308, np.inf])) == " ▁█ "
     assert sparkline(np.array([3.0, 3.0])) == "▅▅"
     assert sparkline(np.array([])) == ""
     assert densities(np.array([0, 1, 50, 100])) == " ▁▄█"
     assert densities(np.array([0, 0])) == "  "
-    assert bar(np.array([False, True, False])) == "█░█"
-    monkeypatch.setattr("sys.stdout", io.TextIOWrapper(io.BytesIO(), "ascii"))
-    assert sparkline(np.array([0, 7.0])) == "_#"
-    assert densities(np.array([0, 1, 8])) == " _#"
-    assert bar(np.array([False, True])) == "#."
 
 
 def test_parts_with_losses(drive: Drive) -> None:

@@ -95,12 +95,12 @@ def seen(calls: Calls) -> list[dict[str, int]]:
         taken.append(then)
         return then
 
-    def look(store: hl.Store, _: str) -> None:
+    def look(store: hl.Store, *_: object, **__: object) -> None:
         asked = [one for one in taken if one.shared is store.shared] or [store]
         found.append(dict(asked[0].entry(LABEL).messages_by_topic()))
 
     calls.change(hl.Store, "snapshot", keep)
-    calls(open_store, "_print_rebuilt", look)
+    calls(open_store, "_repairs", look)
     return found
 
 
