@@ -531,24 +531,32 @@ class Store:
             raise UsageError(f"query takes a list of names; topic({topics!r}) takes a name.")
         return Query(self._source, Question(*self.session.having(topics, recordings)))
 
-    def tf(self, recording: Texts = None, *, topics: Sequence[str] = ()) -> FrameTree:
+    def tf(
+        self, recording: Texts = None, *, of: str | None = None, topics: Sequence[str] = ()
+    ) -> FrameTree:
         """The coordinate frames of a recording, and the transforms between them.
 
         Args:
             recording: Its name or id; None if the store has one alone.
-            topics: Topics with transforms; empty for all of types of tf, tf2 and Foxglove.
+            of: A topic: the tree is of `tf` and `tf_static` of its innermost namespace that has
+                them, and for frames that these lack, of the root. None for the root's, or the
+                only one.
+            topics: Topics with transforms instead.
 
         Raises:
-            TopicError: No such recording, or several; no topic has transforms.
+            TopicError: No such recording, or several; no topic has transforms, or only those of
+                several namespaces.
         """
-        from hybridlog.tf.reader import frame_tree
+        from hybridlog.tf.reader import Trees, frame_tree
 
         now = self.snapshot()
         chosen = now.recordings(recording).check()
         if len(chosen) > 1:
             raise TopicError(f"Frames belong to one recording: name one of {listed(chosen.names)}.")
-        names = chosen.topic(*topics).topics if topics else chosen.topics()
-        return frame_tree(now.session, chosen.summaries[0], names)
+        if topics:
+            return frame_tree(now.session, chosen.summaries[0], chosen.topic(*topics).topics)
+        trees = Trees(now.session, chosen.summaries[0])
+        return trees.tree(of if of is None else chosen.topic(of).topics[0])
 
     def check(self, recording: Texts = None) -> list[TopicCheck]:
         """Check how regularly the topics of recordings came, the worst first; see `Query.check`.

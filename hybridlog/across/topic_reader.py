@@ -126,12 +126,17 @@ class TopicReader:
         with self._planned(question) as planner:
             for table in stream(planner):
                 if table.num_rows:
-                    yield _ns(table[self._time]), table
+                    yield self._times(table), table
+
+    def _times(self, table: pa.Table) -> NDArray[np.int64]:
+        """Times of messages on the clock, ns; `UNKNOWN` where a stamp is missing or not set."""
+        times = _ns(table[self._time])
+        return np.where(times == 0, UNKNOWN, times) if self._time == STAMP else times
 
     def by_clock(self, recording: str) -> Block:
         """The messages beside a recording that have a time, in memory, by their times."""
         none = self.empty()
-        found = [(_ns(none[self._time]), none), *self.tables(recording)]
+        found = [(self._times(none), none), *self.tables(recording)]
         times = np.concatenate([part for part, _ in found])
         order = np.argsort(times, kind="stable")
         order = order[times[order] != UNKNOWN]

@@ -129,7 +129,7 @@ class _Results:
     Attributes:
         unreadable: Rows of messages that cannot be read.
         surplus: Rows of those with bytes left over.
-        stamped: Rows of those with a header stamp.
+        stamped: Rows of those with a header stamp, which may be zero: not set.
         stamps: The stamps.
     """
 
@@ -162,7 +162,7 @@ class _Results:
             ChannelStats(unreadable=a, surplus=b, stamped=c, unset=d, skew_sum=e)
             for a, b, c, d, e in counts
         ]
-        for place, least, greatest in _bounds(number, stamps):
+        for place, least, greatest in _bounds(number[is_set], stamps[is_set]):
             found[place].first_stamp, found[place].last_stamp = least, greatest
         for place, least, greatest in _bounds(number[is_set], skew):
             found[place].skew_min, found[place].skew_max = least, greatest

@@ -287,9 +287,9 @@ def _windows(part: Part) -> Iterator[Filter]:
 
 
 def _on_clock(clock: str, bounds: Span) -> Filter:
-    name = STAMP if clock == "header" else "_meta.pub"
+    name, unset = (STAMP, {"$ne": 0}) if clock == "header" else ("_meta.pub", {})
     begin, end = bounds
-    return {name: {"$gte": begin, "$lte" if end == END else "$lt": end}}
+    return {name: {"$gte": begin, "$lte" if end == END else "$lt": end, **unset}}
 
 
 def _time_of(part: Part) -> tuple[Span, Span | None]:

@@ -43,6 +43,7 @@ class Question:
         names_recording: Tables have the column `recording` even if there is only one.
         during: Intervals of log time that messages must lie in; None for all times.
         frame: Frame of points and poses in the answer; None for that of each message.
+        tf_topics: Topics whose transforms lead to that frame; empty for those of each tree.
         namesakes: Further topics that end with a short name that chose one of `topics`.
     """
 
@@ -59,6 +60,7 @@ class Question:
     names_recording: bool = False
     during: Intervals | None = None
     frame: str | None = None
+    tf_topics: tuple[str, ...] = ()
     namesakes: tuple[str, ...] = field(default=(), compare=False)
 
     @property

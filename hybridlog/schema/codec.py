@@ -210,7 +210,7 @@ def columns_of(codec: Codec, batch: Batch, fields: Collection[str] | None = None
 
 
 def stamps_of(codec: Codec, batch: Batch) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
-    """Rows of those messages of one channel that have a header stamp, and the stamps, ns."""
+    """Rows of those messages of one channel whose header stamp is set, and the stamps, ns."""
     decoded = columns_of(codec, batch, {STAMP})
     found = stamp_array(decoded.arrow())
     if found is None:
@@ -221,12 +221,19 @@ def stamps_of(codec: Codec, batch: Batch) -> tuple[NDArray[np.intp], NDArray[np.
 
 
 def stamp_array(records: pa.StructArray) -> pa.Array[Any] | None:
-    """The header stamps of decoded messages, timestamp[ns]; None when they have none."""
+    """The header stamps of decoded messages, timestamp[ns]; None when they have none.
+
+    A stamp of zero was not set, and is no time: it is null.
+    """
     import pyarrow as pa
+    import pyarrow.compute as pc
 
     found: pa.Array[Any] = records
     for name in STAMP.split("."):
         if not pa.types.is_struct(found.type) or found.type.get_field_index(name) < 0:
             return None
         found = found.flatten()[found.type.get_field_index(name)]
-    return found if pa.types.is_timestamp(found.type) else None
+    if not pa.types.is_timestamp(found.type):
+        return None
+    is_unset = pc.equal(found.view(pa.int64()), 0)
+    return pc.if_else(is_unset, None, found) if pc.any(is_unset).as_py() else found

@@ -24,7 +24,7 @@ from hybridlog.message import messages_in
 from hybridlog.query.planner import Planner
 from hybridlog.query.times import decoded_time
 from hybridlog.schema.arrow_types import with_values
-from hybridlog.tf.reader import frame_tree
+from hybridlog.tf.reader import Trees, frame_tree
 from hybridlog.tf.transform import Transform, placed
 from hybridlog_storage.errors import DefinitionError, PayloadError, TopicError, UsageError
 
@@ -156,15 +156,33 @@ class _Looked:
         self._session = session
         self._counters = counters
         self.target = str(question.frame)
-        self._trees: dict[str, FrameTree] = {}
+        self._question = question
+        self._trees: dict[str, FrameTree | TopicError] = {}
 
-    def _tree(self, recording: str) -> FrameTree:
+    def _tree(self, recording: str) -> FrameTree | TopicError:
+        """The frames of a recording, or why the one asked for is not there."""
         if recording not in self._trees:
             snapshot = self._session.look([recording])
             summary = snapshot.summaries[snapshot.by_id[recording]]
-            topics = sorted(snapshot.topics_of(summary))
-            self._trees[recording] = frame_tree(self._session, summary, topics)
+            topics = self._question.tf_topics
+            try:
+                tree = (
+                    frame_tree(self._session, summary, topics)
+                    if topics
+                    else Trees(self._session, summary).tree(self._question.topics[0])
+                )
+                tree.check(self.target)
+                self._trees[recording] = tree
+            except TopicError as error:
+                self._trees[recording] = error
         return self._trees[recording]
+
+    def _refuse(self, error: TopicError) -> None:
+        """Refuse a frame that no recording has."""
+        summaries = self._session.look(self._question.recordings).summaries
+        ids = [summaries[n].id for n in self._session.chosen(self._question).tolist()]
+        if all(isinstance(self._tree(recording), TopicError) for recording in ids):
+            raise error
 
     def transforms(
         self, recordings: Sequence[str], frames: Sequence[str], times: NDArray[np.int64]
@@ -176,8 +194,11 @@ class _Looked:
         for pair in dict.fromkeys(pairs):
             recording, frame = pair
             tree = self._tree(recording)
-            tree.check(self.target)
             rows = np.flatnonzero([one == pair for one in pairs])
+            if isinstance(tree, TopicError):
+                self._refuse(tree)
+                missing["no such frame in the recording"] += len(rows)
+                continue
             if frame.removeprefix("/") not in tree.names:
                 missing[f"no frame {frame!r} among the transforms"] += len(rows)
                 continue

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import combinations
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from hybridlog.arrays.message_arrays import plain_type
 from hybridlog.frames.answer import stream, to_arrow
 from hybridlog.frames.columns import flat
 from hybridlog.query.answers.lost import completeness_of
@@ -22,6 +24,7 @@ from hybridlog.tf.transform import Transform
 from hybridlog.tf.tree import Frame, FrameTree
 from hybridlog.wording import listed
 from hybridlog_storage.errors import TopicError
+from hybridlog_storage.times import BEGIN, END
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -29,9 +32,59 @@ if TYPE_CHECKING:
     from hybridlog.session import Session
     from hybridlog_storage.summary import RecordingSummary
 
-_STATIC: Final = "tf_static"
+_NAMES: Final = {"tf", "tf_static"}
 _MAX_NORM_ERROR: Final = 1e-2
 """Greatest distance of a quaternion's norm from 1; that of tf2."""
+
+
+class Trees:
+    """The trees of frames of a recording, each read once it is asked for.
+
+    A tree is of the topics `tf` and `tf_static` of a namespace. What it lacks comes from the
+    root's, to which Foxglove's messages belong, whatever their topic.
+
+    Attributes:
+        topics: Topics of each tree, by its namespace, the root's first; empty is the root's.
+    """
+
+    def __init__(self, session: Session, recording: RecordingSummary) -> None:
+        self._session, self._recording = session, recording
+        names = sorted(session.look([recording.id]).topics_of(recording))
+        found: dict[str, list[str]] = {}
+        for topic, name in _types_of(session, recording, names).items():
+            above, _, last = topic.lstrip("/").rpartition("/")
+            if plain_type(name).startswith("foxglove."):
+                found.setdefault("", []).append(topic)
+            elif is_of_transforms(name) and last in _NAMES:
+                found.setdefault(above, []).append(topic)
+        self.topics: Mapping[str, Sequence[str]] = dict(sorted(found.items()))
+        self._trees: dict[str, FrameTree] = {}
+
+    def tree(self, topic: str | None = None) -> FrameTree:
+        """The tree of a topic: that of its innermost namespace with one, or the only one.
+
+        Without a topic, it is the root's, or the only one.
+
+        Raises:
+            TopicError: No topic has transforms, or only those of other namespaces.
+        """
+        above = (topic or "").lstrip("/")
+        while above and above not in self.topics:
+            above = above.rpartition("/")[0]
+        if above not in self.topics and len(self.topics) == 1:
+            (above,) = self.topics
+        if self.topics and above not in self.topics:
+            what = "No tree of frames is the root's" if topic is None else f"{topic} has no tree"
+            names = listed([topics[0] for topics in self.topics.values()])
+            raise TopicError(f"{what}; choose one of these by its topic (--tf-topic): {names}.")
+        if above not in self._trees:
+            own = frame_tree(self._session, self._recording, self.topics.get(above, ()))
+            if above and "" in self.topics:
+                root = self.tree()
+                frames, lacks = {**root.frames, **own.frames}, [*own.remarks, *root.remarks]
+                own = replace(own, frames=frames, remarks=[*dict.fromkeys(lacks)])
+            self._trees[above] = own
+        return self._trees[above]
 
 
 def frame_tree(session: Session, recording: RecordingSummary, topics: Sequence[str]) -> FrameTree:
@@ -40,26 +93,30 @@ def frame_tree(session: Session, recording: RecordingSummary, topics: Sequence[s
     Those whose names end in `tf_static` hold at all times.
     """
     question = Question(tuple(topics), (recording.id,))
-    types = {
-        one.channel.topic: one.channel.schema.name
-        for one in Planner(session, question, Counters()).channels()
-        if one.channel.schema
-    }
+    types = _types_of(session, recording, topics) if topics else {}
     names = [topic for topic, name in types.items() if is_of_transforms(name)]
     if not names:
         raise TopicError(
-            "No topic has transforms: they are messages of tf2_msgs/TFMessage or "
-            "foxglove.FrameTransform."
+            "No topic has transforms: they are messages of tf2_msgs/TFMessage on topics called tf "
+            "or tf_static, or of foxglove.FrameTransform."
         )
     found = [
-        _transforms_of(table, is_static=topic.endswith(_STATIC))
-        for topic in names
+        _transforms_of(table, place, is_static=topic.endswith("tf_static"))
+        for place, topic in enumerate(names)
         for table in stream(Planner(session, replace(question, topics=(topic,)), Counters()))
     ]
     lacks = completeness_of(session, replace(question, topics=tuple(names))).sentences
     invalid = Counter[str]()
-    frames = _frames(pa.concat_tables(found), invalid) if found else {}
+    frames = _frames(pa.concat_tables(found), names, invalid) if found else {}
     return FrameTree(frames, recording.extent, dict(invalid), [*lacks])
+
+
+def _types_of(
+    session: Session, recording: RecordingSummary, topics: Sequence[str]
+) -> dict[str, str]:
+    """Message types of topics with definitions, by topic."""
+    planner = Planner(session, Question(tuple(topics), (recording.id,)), Counters())
+    return {c.channel.topic: c.channel.schema.name for c in planner.channels() if c.channel.schema}
 
 
 def frames_and_stamps(
@@ -76,7 +133,7 @@ def frames_and_stamps(
     return frames, table["header.stamp"].cast(pa.int64()).to_numpy()
 
 
-def _frames(rows: pa.Table, invalid: Counter[str]) -> dict[str, Frame]:
+def _frames(rows: pa.Table, topics: Sequence[str], invalid: Counter[str]) -> dict[str, Frame]:
     """The frames with a parent, by name; counts transforms that are left out, by reason."""
     rows = rows.take(pa.array(np.argsort(rows["log_time"].to_numpy(), kind="stable")))
     pose = Transform(
@@ -91,7 +148,9 @@ def _frames(rows: pa.Table, invalid: Counter[str]) -> dict[str, Frame]:
     good = _valid(
         np.asarray(known, object)[child], np.asarray(above, object)[parent], pose, invalid
     )
-    stamps, static = rows["stamp"].to_numpy(), rows["is_static"].to_numpy()
+    stamps, static, log_time = (
+        rows[name].to_numpy() for name in ("stamp", "is_static", "log_time")
+    )
     made: dict[str, Frame] = {}
     by_child = np.argsort(child, kind="stable")
     starts = np.searchsorted(child[by_child], np.arange(len(known) + 1))
@@ -100,14 +159,17 @@ def _frames(rows: pa.Table, invalid: Counter[str]) -> dict[str, Frame]:
         own = own[good[own]]
         if not len(own):
             continue
+        conflict = _conflict(name, topics, rows.take(pa.array(own)))
         # As in tf2, the first transform decides whether a frame is static.
         is_static, repeated = bool(static[own[0]]), 0
         if other := int((static[own] != is_static).sum()):
             here, there = ("static", "moving") if is_static else ("moving", "static")
             invalid[f"{there}, while {name} is {here}"] += other
             own = own[static[own] == is_static]
+        times = log_time if is_static else stamps
         if is_static:
-            own = own[-1:]
+            values = np.column_stack([pose.translation, pose.rotation, parent])[own]
+            own = own[np.concatenate(([True], (np.diff(values, axis=0) != 0).any(axis=1)))]
         else:
             own = own[np.argsort(stamps[own], kind="stable")]
             is_first = np.concatenate(([True], np.diff(stamps[own]) != 0))
@@ -119,12 +181,32 @@ def _frames(rows: pa.Table, invalid: Counter[str]) -> dict[str, Frame]:
             name,
             tuple(above[code] for code in codes),
             is_static,
-            stamps[own],
+            times[own],
             np.array([place_of[code] for code in parent[own].tolist()], np.intp),
-            Transform(pose.translation[own], pose.rotation[own]),
+            Transform(pose.translation[own] + (np.nan if conflict else 0), pose.rotation[own]),
             repeated,
+            conflict,
         )
     return made
+
+
+def _conflict(name: str, topics: Sequence[str], rows: pa.Table) -> str:
+    """The parents that two topics give a frame at overlapping times, as words; empty for none."""
+    seen: list[tuple[set[str], str, int, int]] = []
+    for place, topic in enumerate(topics):
+        own = rows.filter(pc.equal(rows["topic"], place))
+        if own.num_rows:
+            parents = set(pc.utf8_ltrim(own["parent"], "/").unique().to_pylist())
+            ends = pc.min_max(own["stamp"]).as_py()
+            span = (BEGIN, END) if own["is_static"][0].as_py() else (ends["min"], ends["max"])
+            seen.append((parents, topic, *span))
+    for (one, here, begin, end), (other, there, first, last) in combinations(seen, 2):
+        if one != other and begin <= last and first <= end:
+            return (
+                f"{name} is below {listed(sorted(one))} by {here}, and at the same time below "
+                f"{listed(sorted(other))} by {there}"
+            )
+    return ""
 
 
 def _valid(
@@ -149,8 +231,8 @@ def _valid(
     return good
 
 
-def _transforms_of(table: pa.Table, *, is_static: bool) -> pa.Table:
-    """The transforms of messages as rows: times, frames, seven numbers, and `is_static`."""
+def _transforms_of(table: pa.Table, topic: int, *, is_static: bool) -> pa.Table:
+    """The transforms of messages as rows: times, frames, seven numbers, topic, `is_static`."""
     times = table["log_time"].combine_chunks().cast(pa.int64())
     columns = {name: table[name].combine_chunks() for name in table.column_names}
     if "transforms" in columns:
@@ -174,6 +256,7 @@ def _transforms_of(table: pa.Table, *, is_static: bool) -> pa.Table:
     for own, name in names.items():
         kind = pa.string() if own in {"parent", "child"} else pa.float64()
         found[own] = columns[name].cast(kind)
+    found["topic"] = pa.repeat(pa.scalar(topic), len(times))
     found["is_static"] = pa.repeat(pa.scalar(is_static), len(times))
     return pa.table(found).drop_null()
 
