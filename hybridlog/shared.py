@@ -50,6 +50,7 @@ class Shared(ABC):
         schemas: Schemas by hash.
         following: Held while running recordings are looked at, and while the newest state changes.
         channels: Channels of recordings by id and topic, and the entry that they are of.
+        epochs: Where header stamps of recordings start again, by id, and the entry they are of.
         columns: Columns of the chunks of a segment, and the table that they are of.
     """
 
@@ -65,6 +66,7 @@ class Shared(ABC):
         self._entries: dict[str, RecordingEntry] = {}  # compared with their files, by id
         self.schemas = {schema_hash(MARK_SCHEMA): MARK_SCHEMA}
         self.channels: dict[str, tuple[RecordingEntry, dict[str, list[RecordedChannel]]]] = {}
+        self.epochs: dict[str, tuple[RecordingEntry, list[int]]] = {}
         self.columns: dict[tuple[str, int, frozenset[int]], tuple[ChunkTable, ChunkColumns]] = {}
         self._segments: dict[tuple[str, str], SegmentReader] = {}
         self._rows: dict[tuple[Path, frozenset[tuple[str, ...]]], RecordingRows] = {}

@@ -35,7 +35,6 @@ from hybridlog.query.times import parse_range, parse_time
 from hybridlog.query.topics import namesakes
 from hybridlog.record.losses import extent_of
 from hybridlog.session import Asked, Session
-from hybridlog.wording import listed
 from hybridlog_storage.catalog import Catalog, RecordingEntry
 from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.errors import (
@@ -547,15 +546,12 @@ class Store:
             TopicError: No such recording, or several; no topic has transforms, or only those of
                 several namespaces.
         """
-        from hybridlog.tf.reader import Trees, frame_tree
+        from hybridlog.tf.reader import trees_in
 
         now = self.snapshot()
         chosen = now.recordings(recording).check()
-        if len(chosen) > 1:
-            raise TopicError(f"Frames belong to one recording: name one of {listed(chosen.names)}.")
-        if topics:
-            return frame_tree(now.session, chosen.summaries[0], chosen.topic(*topics).topics)
-        trees = Trees(now.session, chosen.summaries[0])
+        only = chosen.topic(*topics).topics if topics else ()
+        trees = trees_in(now.session, chosen.summaries, only)
         return trees.tree(of if of is None else chosen.topic(of).topics[0])
 
     def check(self, recording: Texts = None) -> list[TopicCheck]:

@@ -24,7 +24,9 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from numpy.typing import NDArray
 
+    from hybridlog.query.query import Query
     from hybridlog.query.times import TimeLike
+    from hybridlog.tf.reader import Trees
     from hybridlog.tf.tree import FrameTree
 
 
@@ -64,50 +66,57 @@ def tf_command(given: _Given) -> None:
     pitch and yaw in rad; by default at the latest time that has a transform. Rows of times
     without one are empty, and the reasons are printed.
     """
-    target, source, topic = given.target, given.source, given.topic
-    between = given.span if given.step or topic else given.between
-    if target is None and (topic or between):
+    if given.target is None and (given.topic or given.between):
         raise UsageError("Times are those of a transform: name its TARGET and SOURCE frames.")
-    from hybridlog.tf.reader import Trees, frames_and_stamps
+    from hybridlog.tf.reader import trees_in
 
-    to = given.to
     with given.opened(snapshot=True) as store:
-        chosen = given.recordings_in(store)
-        query = given.bounded(chosen.topic(*topic)) if topic else None
+        chosen = given.recordings_in(store).check()
+        query = given.bounded(chosen.topic(*given.topic)) if given.topic else None
         if query is not None and len(query.topics) > 1:
             raise UsageError(f"Times are those of one topic, not of {listed(query.topics)}.")
-        if target is None and not given.tf_topic and len(chosen.check()) == 1:
-            trees = Trees(store.session, chosen.summaries[0])
-            shown = {topics[0]: trees.tree(topics[0]) for topics in trees.topics.values()}
-        else:
-            of = None if query is None else query.topics[0]
-            tree = store.tf(chosen.ids or None, of=of, topics=given.tf_topic)
-            shown = {"": tree}
+        only = chosen.topic(*given.tf_topic).topics if given.tf_topic else ()
+        trees = trees_in(store.session, chosen.summaries, only)
+        names = [topics[0] for topics in trees.topics.values()]
+        if given.target is not None or not names:
+            names = [] if query is None else [*query.topics]
+        shown = {name: trees.tree(name) for name in names} or {"": trees.tree()}
         lacks = [*dict.fromkeys(text for tree in shown.values() for text in tree.remarks)]
         if given.strict and lacks:
             raise IncompleteError(" ".join(lacks))
-        if target is None:
-            _show_trees(shown, to)
-            remarks(lacks)
-            return
-        if query is None:
-            stamps = _times(tree, given, between)
+        if given.target is None:
+            _show_trees(shown, given.to)
         else:
-            frames, stamps = frames_and_stamps(query.session, query.question, query.counters)
-            if source is None and len(frames) == 1:
-                source = frames[0]
-        if source is None:
-            raise UsageError("A transform has two frames: name TARGET and SOURCE.")
-        found = tree.lookup(target, source, stamps, extrapolate=given.extrapolate)
-        if len(found) == 1 and found.missing:
-            tree.transform(target, source, int(stamps[0]), extrapolate=given.extrapolate)
-        answer_tables([found.to_arrow()], to)
-        sys.stdout.flush()
-        remarks(
-            f"{counted(number, 'time')} without a transform: {why}."
-            for why, number in found.missing.items()
-        )
-        remarks(tree.remarks)
+            _show_transforms(given, given.target, trees, query)
+        remarks(lacks)
+
+
+def _show_transforms(given: _Given, target: str, trees: Trees, query: Query | None) -> None:
+    source, extrapolate = given.source, given.extrapolate
+    tree, log_time = trees.tree(None if query is None else query.topics[0]), None
+    if query is None:
+        stamps = _times(tree, given, given.span if given.step else given.between)
+    else:
+        from hybridlog.tf.reader import frames_and_stamps
+
+        asked = query.session, query.question, query.counters
+        frames, stamps, log_time = frames_and_stamps(*asked)
+        source = frames[0] if source is None and len(frames) == 1 else source
+    if source is None:
+        raise UsageError("A transform has two frames: name TARGET and SOURCE.")
+    if query is None or log_time is None:
+        found = tree.lookup(target, source, stamps, extrapolate=extrapolate)
+    else:
+        way = query.topics[0], target, source
+        found = trees.lookup(*way, stamps, log_time, extrapolate=extrapolate)
+    if len(found) == 1 and found.missing:
+        tree.transform(target, source, int(stamps[0]), extrapolate=extrapolate)
+    answer_tables([found.to_arrow()], given.to)
+    sys.stdout.flush()
+    remarks(
+        f"{counted(number, 'time')} without a transform: {why}."
+        for why, number in found.missing.items()
+    )
 
 
 def _times(

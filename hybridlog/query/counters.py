@@ -37,6 +37,7 @@ class Counters:
             has answered; several.
         no_transform: The frame asked for with a reason why points or poses are not in it, and
             the number of messages; several.
+        of_frames: Sentences about the transforms that were used.
         elapsed_s: Wall time, seconds.
     """
 
@@ -55,6 +56,7 @@ class Counters:
     without_arrays: int = 0
     not_indexed: tuple[tuple[str, int], ...] = ()
     no_transform: tuple[tuple[str, int], ...] = ()
+    of_frames: tuple[str, ...] = ()
     elapsed_s: float = 0.0
 
     @property

@@ -24,7 +24,7 @@ from hybridlog.message import messages_in
 from hybridlog.query.planner import Planner
 from hybridlog.query.times import decoded_time
 from hybridlog.schema.arrow_types import with_values
-from hybridlog.tf.reader import Trees, frame_tree
+from hybridlog.tf.reader import Trees
 from hybridlog.tf.transform import Transform, placed
 from hybridlog_storage.errors import DefinitionError, PayloadError, TopicError, UsageError
 
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from hybridlog.query.counters import Counters
     from hybridlog.query.question import Question
     from hybridlog.session import Session
-    from hybridlog.tf.tree import FrameTree
 
 _STAMPS: Final = ("header.stamp", "timestamp")
 _FRAMES: Final = ("header.frame_id", "frame_id", "parent_frame_id")
@@ -140,7 +139,8 @@ def points_of(session: Session, question: Question, counters: Counters) -> Itera
         times = np.array([one.stamp for one, _ in found], np.int64)
         frames = [str(_first_of(fields, _FRAMES) or "") for _, fields in found]
         recordings = [one.message.recording for one, _ in found]
-        poses = looked.transforms(recordings, frames, times)
+        log_time = np.array([one.message.log_time_ns for one, _ in found], np.int64)
+        poses = looked.transforms(recordings, frames, times, log_time)
         for row, (one, fields) in enumerate(found):
             pose = Transform(poses.translation[row], poses.rotation[row])
             own = fields.get("pose")  # of the points, in Foxglove's messages
@@ -157,22 +157,19 @@ class _Looked:
         self._counters = counters
         self.target = str(question.frame)
         self._question = question
-        self._trees: dict[str, FrameTree | TopicError] = {}
+        self._topic = question.topics[0]
+        self._trees: dict[str, Trees | TopicError] = {}
 
-    def _tree(self, recording: str) -> FrameTree | TopicError:
-        """The frames of a recording, or why the one asked for is not there."""
+    def _of(self, recording: str) -> Trees | TopicError:
+        """The trees of a recording, or why the frame asked for is not there."""
         if recording not in self._trees:
             snapshot = self._session.look([recording])
             summary = snapshot.summaries[snapshot.by_id[recording]]
-            topics = self._question.tf_topics
+            trees = Trees(self._session, summary, self._question.tf_topics)
             try:
-                tree = (
-                    frame_tree(self._session, summary, topics)
-                    if topics
-                    else Trees(self._session, summary).tree(self._question.topics[0])
-                )
-                tree.check(self.target)
-                self._trees[recording] = tree
+                trees.check(self._topic, self.target)
+                self._trees[recording] = trees
+                self._counters.of_frames += tuple(trees.tree(self._topic).remarks)
             except TopicError as error:
                 self._trees[recording] = error
         return self._trees[recording]
@@ -181,11 +178,15 @@ class _Looked:
         """Refuse a frame that no recording has."""
         summaries = self._session.look(self._question.recordings).summaries
         ids = [summaries[n].id for n in self._session.chosen(self._question).tolist()]
-        if all(isinstance(self._tree(recording), TopicError) for recording in ids):
+        if all(isinstance(self._of(recording), TopicError) for recording in ids):
             raise error
 
     def transforms(
-        self, recordings: Sequence[str], frames: Sequence[str], times: NDArray[np.int64]
+        self,
+        recordings: Sequence[str],
+        frames: Sequence[str],
+        times: NDArray[np.int64],
+        log_time: NDArray[np.int64],
     ) -> Transform:
         """The transforms from some frames at some times; NaN where there are none."""
         made = Transform(np.full((len(times), 3), np.nan), np.full((len(times), 4), np.nan))
@@ -193,16 +194,18 @@ class _Looked:
         pairs = [*zip(recordings, frames, strict=True)]
         for pair in dict.fromkeys(pairs):
             recording, frame = pair
-            tree = self._tree(recording)
+            trees = self._of(recording)
             rows = np.flatnonzero([one == pair for one in pairs])
-            if isinstance(tree, TopicError):
-                self._refuse(tree)
+            if isinstance(trees, TopicError):
+                self._refuse(trees)
                 missing["no such frame in the recording"] += len(rows)
                 continue
-            if frame.removeprefix("/") not in tree.names:
+            own = times[rows], log_time[rows]
+            try:
+                found = trees.lookup(self._topic, self.target, frame, *own)
+            except TopicError:
                 missing[f"no frame {frame!r} among the transforms"] += len(rows)
                 continue
-            found = tree.lookup(self.target, frame, times[rows])
             made.translation[rows], made.rotation[rows] = found.translation, found.rotation
             missing.update(found.missing)
         self._counters.no_transform += tuple(
@@ -283,12 +286,13 @@ def _tables_of_poses(planner: Planner) -> Iterator[pa.Table]:
         recordings = [ids[name] for name in names]
         frames = [str(name or "") for name in table[frame].to_pylist()]
         times = table[stamp].cast(pa.int64()).fill_null(0).to_numpy()
-        moved = looked.transforms(recordings, frames, times)
+        log_time = table["log_time"].cast(pa.int64()).to_numpy()
+        moved = looked.transforms(recordings, frames, times, log_time)
         columns = {name: table[name].combine_chunks() for name in table.column_names}
         for pose in found.poses:
             columns |= _pose_in_frame(columns, pose, moved)
         for name, inside in found.lists.items():
-            lookup = _Elements(looked, recordings, frames, times, moved)
+            lookup = _Elements(looked, recordings, frames, times, log_time, moved)
             columns[name] = _list_in_frame(columns[name], inside, lookup)
         columns[frame] = pa.array([question.frame] * table.num_rows, pa.string())
         yield pa.table({name: column for name, column in columns.items() if name not in hidden})
@@ -330,6 +334,7 @@ class _Elements(NamedTuple):
     recordings: Sequence[str]
     frames: Sequence[str]
     times: NDArray[np.int64]
+    log_time: NDArray[np.int64]
     moved: Transform
 
     def transforms(self, rows: NDArray[np.int64], frames: Sequence[str | None]) -> Transform:
@@ -341,7 +346,9 @@ class _Elements(NamedTuple):
                 index[place] = len(self.moved) + others.setdefault((row, frame), len(others))
         of = [row for row, _ in others]
         own = [frame for _, frame in others]
-        found = self.looked.transforms([self.recordings[r] for r in of], own, self.times[of])
+        found = self.looked.transforms(
+            [self.recordings[r] for r in of], own, self.times[of], self.log_time[of]
+        )
         return Transform(
             np.concatenate([self.moved.translation, found.translation])[index],
             np.concatenate([self.moved.rotation, found.rotation])[index],

@@ -47,6 +47,7 @@ class Frame:
         parent: intp[n], the place in `parents` of each.
         poses: The n transforms from the frame to its parent.
         repeated: Transforms that were left out because of an equal stamp.
+        late: Transforms more than 100 ms older than one that came before them.
         conflict: The parents that different topics give it at the same time, as words; it has no
             transform then.
     """
@@ -58,6 +59,7 @@ class Frame:
     parent: Places
     poses: Transform
     repeated: int = 0
+    late: int = 0
     conflict: str = ""
 
     @property
