@@ -145,10 +145,10 @@ class Message:
 
     @property
     def header_stamp_ns(self) -> int | None:
-        """The header stamp, nanoseconds; None without a header."""
+        """The header stamp, nanoseconds; None without a header, or if it is zero: not set."""
         header = self.fields.get("header")
         stamp = header.get("stamp") if isinstance(header, dict) else None
-        return stamp if isinstance(stamp, int) else None
+        return stamp if isinstance(stamp, int) and stamp else None
 
     def decode(self) -> Any:
         """The whole message as an object with the fields as attributes.

@@ -49,6 +49,7 @@ class Shared(ABC):
         entries: Entries of ended recordings that were compared with their files, by id.
         following: Held while running recordings are looked at, and while the newest state changes.
         channels: Channels of recordings by id and topic, and the entry that they are of.
+        epochs: Where header stamps of recordings start again, by id, and the entry they are of.
     """
 
     index: Any
@@ -63,6 +64,7 @@ class Shared(ABC):
         self.entries: dict[str, RecordingEntry] = {}
         self.schemas = {schema_hash(MARK_SCHEMA): MARK_SCHEMA}
         self.channels: dict[str, tuple[RecordingEntry, dict[str, list[RecordedChannel]]]] = {}
+        self.epochs: dict[str, tuple[RecordingEntry, list[int]]] = {}
         self._segments: dict[tuple[str, str], SegmentReader] = {}
         self._rows: dict[tuple[Path, frozenset[tuple[str, ...]]], RecordingRows] = {}
         self._opening = threading.Lock()

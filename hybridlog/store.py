@@ -34,7 +34,6 @@ from hybridlog.query.times import parse_range, parse_time
 from hybridlog.query.topics import namesakes
 from hybridlog.record.losses import extent_of
 from hybridlog.session import Asked, Session
-from hybridlog.wording import listed
 from hybridlog_storage.catalog import Catalog, RecordingEntry
 from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.errors import (
@@ -524,24 +523,29 @@ class Store:
             raise UsageError(f"query takes a list of names; topic({topics!r}) takes a name.")
         return Query(self._source, Question(*self.session.having(topics, recordings)))
 
-    def tf(self, recording: Texts = None, *, topics: Sequence[str] = ()) -> FrameTree:
+    def tf(
+        self, recording: Texts = None, *, of: str | None = None, topics: Sequence[str] = ()
+    ) -> FrameTree:
         """The coordinate frames of a recording, and the transforms between them.
 
         Args:
             recording: Its name or id; None if the store has one alone.
-            topics: Topics with transforms; empty for all of types of tf, tf2 and Foxglove.
+            of: A topic: the tree is of `tf` and `tf_static` of its innermost namespace that has
+                them, and for frames that these lack, of the root. None for the root's, or the
+                only one.
+            topics: Topics with transforms instead.
 
         Raises:
-            TopicError: No such recording, or several; no topic has transforms.
+            TopicError: No such recording, or several; no topic has transforms, or only those of
+                several namespaces.
         """
-        from hybridlog.tf.reader import frame_tree
+        from hybridlog.tf.reader import trees_in
 
         now = self.snapshot()
         chosen = now.recordings(recording).check()
-        if len(chosen) > 1:
-            raise TopicError(f"Frames belong to one recording: name one of {listed(chosen.names)}.")
-        names = chosen.topic(*topics).topics if topics else chosen.topics()
-        return frame_tree(now.session, chosen.summaries[0], names)
+        only = chosen.topic(*topics).topics if topics else ()
+        trees = trees_in(now.session, chosen.summaries, only)
+        return trees.tree(of if of is None else chosen.topic(of).topics[0])
 
     def check(self, recording: Texts = None) -> list[TopicCheck]:
         """Check how regularly the topics of recordings came, the worst first; see `Query.check`.

@@ -152,6 +152,7 @@ class Aligned:
             found.append(
                 f"{counted(len(lines) - _MAX_NAMES, 'more column')} are empty in some rows."
             )
+        found += dict.fromkeys(text for one in self._readers for text in one.remarks.values())
         for question in questions:
             others = tuple(topic for topic in question.namesakes if topic not in topics)
             found += remarks(self._session, replace(question, namesakes=others), is_empty=False)
@@ -280,6 +281,7 @@ class _Partner:
         self._recording, self._end = recording, end
         self._reason = self._reader.elsewhere(recording) or self._why
         self._lost = self._reader.lost(recording)
+        self._apart = self._reader.epochs(recording).apart
         self._blocks = None
         self._times, self._table = self._none
         self._is_last = False
@@ -342,7 +344,7 @@ class _Partner:
 
         `empty` counts rows without a message or a value, by name and reason.
         """
-        found = match(times, self._times, self._how, self._tolerance)
+        found = match(times, self._times, self._how, self._tolerance, self._apart)
         table = _taken(self._table, found.before)
         if self._how == "interpolate":
             known = self._times if len(self._times) else times

@@ -57,7 +57,11 @@ class Matched(NamedTuple):
 
 
 def match(
-    times: NDArray[np.int64], rows: NDArray[np.int64], how: How, tolerance: int | None
+    times: NDArray[np.int64],
+    rows: NDArray[np.int64],
+    how: How,
+    tolerance: int | None,
+    apart: int | None = None,
 ) -> Matched:
     """The messages that belong to some times.
 
@@ -65,7 +69,7 @@ def match(
     that one or the first one after the time, and the earlier one if both are equally near.
     `interpolate` finds both, and a message of exactly that time alone. All times are ns, `rows`
     those of the messages, ascending; `UNKNOWN` matches nothing. Without a tolerance, any distance
-    is near enough.
+    is near enough, up to `apart`: times that are farther apart are of different epochs.
     """
     if not len(rows):
         nothing = np.full(len(times), -1, np.int64)
@@ -84,14 +88,16 @@ def match(
         found = has_before | has_after
     elif how == "interpolate":
         is_exact = has_before & (earlier == 0)
-        found = is_exact | (has_before & has_after)
+        near = np.True_ if apart is None else later - earlier <= apart
+        found = is_exact | (has_before & has_after & near)
         distance = np.where(is_exact | (-earlier >= later), earlier, later)
         after = np.where(is_exact, before, after)
     if how != "interpolate":
         after = before
     found = found & (times != UNKNOWN)
-    if tolerance is not None:
-        found = found & (np.abs(distance) <= tolerance)
+    for limit in (tolerance, apart):
+        if limit is not None:
+            found = found & (np.abs(distance) <= limit)
     return Matched(
         np.where(found, before, -1), np.where(found, after, -1), np.where(found, distance, 0)
     )

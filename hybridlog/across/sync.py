@@ -82,13 +82,21 @@ class Synced(Sequence[tuple["Message", ...]]):
         ids: list[str] = []
         # By topic int64[4, n] of each recording, as of `_Times`.
         found = [[np.empty((4, 0), np.int64)] for _ in questions]
+        self._restarts: dict[str, None] = {}
         known = np.zeros((2, len(questions)), np.int64)  # messages, those with a time
         places = sorted(set.intersection(*shared))
         in_range = set.union(*map(partial(_in_range, session), questions))
         for place in sorted(in_range.intersection(places)):
             recording = snapshot.summaries[place].id
-            read = [_times_of(session, q, recording, clock, self.counters) for q in questions]
-            rows = approximate_sets([time[order] for _, time, order in read], limit)
+            readers = [
+                TopicReader(session, replace(q, recordings=(recording,), fields=()), clock)
+                for q in questions
+            ]
+            epochs = readers[0].epochs(recording)
+            self._restarts |= dict.fromkeys(readers[0].remarks.values())
+            read = [_times_of(one, recording, self.counters) for one in readers]
+            near = min((one for one in (limit, epochs.apart) if one is not None), default=None)
+            rows = approximate_sets([time[order] for _, time, order in read], near)
             ids += [recording] * len(rows)
             for n, (log_time, time, order) in enumerate(read):
                 place_of = order[rows[:, n]]
@@ -96,7 +104,8 @@ class Synced(Sequence[tuple["Message", ...]]):
                 first, behind = (np.searchsorted(log_time, log, side) for side in _SIDES)
                 is_whole = questions[n].is_unbounded and questions[n].predicate is None
                 is_alone = (behind - first == 1) & is_whole
-                found[n].append(np.stack([time[place_of], log, place_of - first, is_alone]))
+                own = time[place_of] - epochs.offsets(log)
+                found[n].append(np.stack([own, log, place_of - first, is_alone]))
             known += [[len(log) for log, _, _ in read], [len(order) for _, _, order in read]]
         self.recordings = tuple(ids)
         left_out = [
@@ -126,7 +135,7 @@ class Synced(Sequence[tuple["Message", ...]]):
 
     def remarks(self) -> list[str]:
         """Sentences about the sets: messages that are in none, and what the topics may lack."""
-        session, found = self._opened(), list(self._why_left_out)
+        session, found = self._opened(), [*self._why_left_out, *self._restarts]
         for question, _ in self._topics:
             found += completeness_of(session, question).sentences
         return [*dict.fromkeys(found)]
@@ -192,11 +201,9 @@ def _in_range(session: Session, question: Question) -> set[int]:
 
 
 def _times_of(
-    session: Session, question: Question, recording: str, clock: Clock, counters: Counters
+    reader: TopicReader, recording: str, counters: Counters
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Log times of a recording's messages, times on a clock, and the order by these."""
-    own = replace(question, recordings=(recording,), fields=())
-    reader = TopicReader(session, own, clock)
+    """Log times of a recording's messages, times on the clock, and the order by these."""
     read = [(np.empty(0, np.int64), np.empty(0, np.int64)), *reader.times(recording)]
     counters.add(reader.counters)
     log_time, time = (np.concatenate(parts) for parts in zip(*read, strict=True))

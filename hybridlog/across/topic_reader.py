@@ -20,6 +20,7 @@ from hybridlog.query.planner import Planner
 from hybridlog.query.question import Counters
 from hybridlog.schema.arrow_types import column_of, common_schema
 from hybridlog.schema.column import STAMP
+from hybridlog.tf.epochs import Epochs, epochs_of
 from hybridlog.tf.in_frame import stream
 from hybridlog.wording import listed
 from hybridlog_storage.errors import TimeError, UsageError
@@ -66,6 +67,7 @@ class TopicReader:
         self.prefix = prefix
         self.is_apart = is_apart
         self.counters = Counters()
+        self.remarks: dict[str, str] = {}
         self.is_by_log_time = clock == "log"
         self._session = session
         known = session.field_types(question.topics, question.recordings)
@@ -125,19 +127,43 @@ class TopicReader:
         with self._planned(question) as planner:
             for table in stream(planner):
                 if table.num_rows:
-                    yield _ns(table[self._time]), table
+                    yield self._times(table, recording), table
+
+    def epochs(self, recording: str) -> Epochs:
+        """The epochs of the times of the messages beside a recording."""
+        if self._time != STAMP:
+            return Epochs(np.empty(0, np.int64))
+        found = epochs_of(self._session, recording)
+        if len(found.begins):
+            snapshot = self._session.snapshot()
+            name = snapshot.summaries[snapshot.by_id[recording]].name
+            self.remarks[recording] = found.sentence(name)
+        return found
+
+    def _times(self, table: pa.Table, recording: str) -> NDArray[np.int64]:
+        """Times of messages on the clock, ns, those of other epochs far apart.
+
+        `UNKNOWN` where a stamp is missing or not set.
+        """
+        times = _ns(table[self._time])
+        if self._time != STAMP:
+            return times
+        own = times
+        if not self.is_apart:
+            own = times + self.epochs(recording).offsets(_ns(table[TIME]))
+        return np.where((times == 0) | (times == UNKNOWN), UNKNOWN, own)
 
     def by_clock(self, recording: str) -> Block:
         """The messages beside a recording that have a time, in memory, by their times."""
         none = self.empty()
-        found = [(_ns(none[self._time]), none), *self.tables(recording)]
+        found = [(self._times(none, recording), none), *self.tables(recording)]
         times = np.concatenate([part for part, _ in found])
         order = np.argsort(times, kind="stable")
         order = order[times[order] != UNKNOWN]
         return times[order], concatenated([part for _, part in found]).take(pa.array(order))
 
     def times(self, recording: str) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-        """Log times of the messages beside a recording, and their times, without their fields."""
+        """Log times of the messages beside a recording, and their times, as of `tables`."""
         if self._time == STAMP:
             yield from ((_ns(table[TIME]), times) for times, table in self.tables(recording))
             return

@@ -17,7 +17,7 @@ from hybridlog.cli.completion import (
     complete_recording,
     complete_topic,
 )
-from hybridlog.cli.options import Asking, in_frame, parse_fields, query_of
+from hybridlog.cli.options import Asking, InFrame, parse_fields, query_of
 from hybridlog.cli.output import remarks
 from hybridlog.query.choice import Choice
 from hybridlog_storage.errors import TopicError, UsageError
@@ -39,7 +39,7 @@ def _complete_of_topic(
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Given(Asking, Tabular):
+class _Given(Asking, InFrame, Tabular):
     needs_topic: ClassVar[bool] = True
     base: str | None = option(
         "The topic whose messages are the rows.",
@@ -84,7 +84,6 @@ class _Given(Asking, Tabular):
         "TOPIC: A,B.C",
         shell_complete=_complete_of_topic,
     )
-    frame: str | None = in_frame()
 
 
 @command(_Given)
@@ -132,7 +131,7 @@ def _aligned(store: Store, given: _Given) -> Aligned:
 
         placed = [has_places(Planner(q.session, q.question, q.counters)) for q in queries]
         queries = [
-            query.in_frame(given.frame) if is_placed or not any(placed) else query
+            given.placed(query) if is_placed or not any(placed) else query
             for query, is_placed in zip(queries, placed, strict=True)
         ]
     queries[0] = given.bounded(queries[0])

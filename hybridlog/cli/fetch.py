@@ -23,7 +23,7 @@ from hybridlog.cli.answers import (
 )
 from hybridlog.cli.binder import command, option
 from hybridlog.cli.completion import complete_path
-from hybridlog.cli.options import Asking, Slices, in_frame, parse_fields, query_of
+from hybridlog.cli.options import Asking, InFrame, Slices, parse_fields, query_of
 from hybridlog.formats import OUTPUTS, formats_of, is_directory
 from hybridlog_storage.errors import TopicError, UsageError
 from hybridlog_storage.stopping import at_safe_points
@@ -39,7 +39,7 @@ _FORMATS = formats_of()
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Choices(Asking, Tabular, Slices):
+class _Choices(Asking, InFrame, Tabular, Slices):
     needs_topic: ClassVar[bool] = True
     formats: ClassVar[Sequence[str]] = _FORMATS
 
@@ -66,7 +66,6 @@ class _Choices(Asking, Tabular, Slices):
     fields: str | None = option(
         "Only these fields, with commas between them.", "A,B.C", shell_complete=complete_path
     )
-    frame: str | None = in_frame()
     within: str | None = option(
         "Greatest distance in time of messages of other topics in --where "
         "'/odom: twist.twist.linear.x > 0.5'.",
@@ -230,8 +229,7 @@ def _query(store: Store, choices: _Choices) -> Query:
         query = query.where(predicate, near if is_across else None)
     if choices.fields is not None:
         query = query.fields(*parse_fields(choices.fields))
-    if choices.frame is not None:
-        query = query.in_frame(choices.frame)
+    query = choices.placed(query)
     if choices.tags is not None:
         query = query.tags(*parse_fields(choices.tags, "--tags"))
     if choices.every > 1:

@@ -369,14 +369,35 @@ def one_recording(
     return argument(what, metavar, shell_complete=complete_recording)
 
 
-def in_frame() -> Any:
-    """The option for points and poses in another frame."""
+def tf_topic(**rules: Any) -> Any:
+    """The option for the topics whose transforms count."""
     return option(
+        "Transforms of this topic; without, of tf and tf_static of the innermost namespace that "
+        "has them.",
+        "TOPIC",
+        name="--tf-topic",
+        shell_complete=complete_topic,
+        **rules,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class InFrame:
+    """Options for points and poses in another frame."""
+
+    frame: str | None = option(
         "Points and poses in this frame, such as map, at the times of their headers.",
         "FRAME",
         name="--in-frame",
         shell_complete=complete_frame,
     )
+    tf_topic: tuple[str, ...] = tf_topic(needs=("frame",))
+
+    def placed(self, query: Query) -> Query:
+        """The query in that frame, if one is given."""
+        if self.frame is None:
+            return query
+        return query.in_frame(self.frame, tf_topics=self.tf_topic)
 
 
 def cache_size() -> Any:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, ClassVar
 from hybridlog.cli.answers import SCREEN, Tabular
 from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.completion import complete_frame
-from hybridlog.cli.options import Strict, Topics, Verbose, topics
+from hybridlog.cli.options import Strict, Topics, Verbose, tf_topic, topics
 from hybridlog.cli.output import remarks, short_duration
 from hybridlog.cli.render import Column, numbers, print_table
 from hybridlog.wording import counted, listed
@@ -18,10 +18,15 @@ from hybridlog_storage.errors import IncompleteError, UsageError
 _MAX_TIMES = 10_000_000
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     import numpy as np
+    import pyarrow as pa
     from numpy.typing import NDArray
 
+    from hybridlog.query.query import Query
     from hybridlog.query.times import TimeLike
+    from hybridlog.tf.reader import Trees
     from hybridlog.tf.tree import FrameTree
 
 
@@ -45,6 +50,7 @@ class _Given(Strict, Verbose, Topics, Tabular):
     topic: tuple[str, ...] = topics(
         "At the header stamps of this topic, or the log times of one without."
     )
+    tf_topic: tuple[str, ...] = tf_topic()
     extrapolate: str | None = option(
         "So long before its first and after its last, a transform holds; without, it does not.",
         "DURATION",
@@ -55,44 +61,62 @@ class _Given(Strict, Verbose, Topics, Tabular):
 def tf_command(given: _Given) -> None:
     """Show coordinate frames, or transforms between them.
 
-    Without frames, the tree: how often each frame moves, and where its longest gap is. With
+    Without frames, the trees: how often each frame moves, and where its longest gap is. With
     two, where SOURCE is in TARGET: translation in m, rotation as quaternion and as roll,
     pitch and yaw in rad; by default at the latest time that has a transform. Rows of times
     without one are empty, and the reasons are printed.
     """
-    target, source, topic = given.target, given.source, given.topic
-    between = given.span if given.step or topic else given.between
-    if target is None and (topic or between):
+    if given.target is None and (given.topic or given.between):
         raise UsageError("Times are those of a transform: name its TARGET and SOURCE frames.")
-    from hybridlog.tf.reader import frames_and_stamps
+    from hybridlog.tf.reader import trees_in
 
     with given.opened(snapshot=True) as store:
-        chosen = given.recordings_in(store)
-        tree = store.tf(chosen.ids or None)
-        if given.strict and tree.remarks:
-            raise IncompleteError(" ".join(tree.remarks))
-        if target is None:
-            _show_tree(tree, given)
-            return
-        if not topic:
-            stamps = _times(tree, given, between)
+        chosen = given.recordings_in(store).check()
+        query = given.bounded(chosen.topic(*given.topic)) if given.topic else None
+        if query is not None and len(query.topics) > 1:
+            raise UsageError(f"Times are those of one topic, not of {listed(query.topics)}.")
+        only = chosen.topic(*given.tf_topic).topics if given.tf_topic else ()
+        trees = trees_in(store.session, chosen.summaries, only)
+        names = [topics[0] for topics in trees.topics.values()]
+        if given.target is not None or not names:
+            names = [] if query is None else [*query.topics]
+        shown = {name: trees.tree(name) for name in names} or {"": trees.tree()}
+        lacks = [*dict.fromkeys(text for tree in shown.values() for text in tree.remarks)]
+        if given.strict and lacks:
+            raise IncompleteError(" ".join(lacks))
+        if given.target is None:
+            _show_trees(shown, given)
         else:
-            query = given.bounded(chosen.topic(*topic))
-            if len(query.topics) > 1:
-                raise UsageError(f"Times are those of one topic, not of {listed(query.topics)}.")
-            frames, stamps = frames_and_stamps(query.session, query.question, query.counters)
-            if source is None and len(frames) == 1:
-                source = frames[0]
-        if source is None:
-            raise UsageError("A transform has two frames: name TARGET and SOURCE.")
-        found = tree.lookup(target, source, stamps, extrapolate=given.extrapolate)
-        if len(found) == 1 and found.missing:
-            tree.transform(target, source, int(stamps[0]), extrapolate=given.extrapolate)
-        given.answer([found.to_arrow()])
-        sys.stdout.flush()
-        times = ((counted(n, "time"), why) for why, n in found.missing.items())
-        missing = (f"{many} without a transform: {why}." for many, why in times)
-        remarks((*missing, *tree.remarks))
+            _show_transforms(given, given.target, trees, query)
+        remarks(lacks)
+
+
+def _show_transforms(given: _Given, target: str, trees: Trees, query: Query | None) -> None:
+    source, extrapolate = given.source, given.extrapolate
+    tree, log_time = trees.tree(None if query is None else query.topics[0]), None
+    if query is None:
+        stamps = _times(tree, given, given.span if given.step else given.between)
+    else:
+        from hybridlog.tf.reader import frames_and_stamps
+
+        asked = query.session, query.question, query.counters
+        frames, stamps, log_time = frames_and_stamps(*asked)
+        source = frames[0] if source is None and len(frames) == 1 else source
+    if source is None:
+        raise UsageError("A transform has two frames: name TARGET and SOURCE.")
+    if query is None or log_time is None:
+        found = tree.lookup(target, source, stamps, extrapolate=extrapolate)
+    else:
+        way = query.topics[0], target, source
+        found = trees.lookup(*way, stamps, log_time, extrapolate=extrapolate)
+    if len(found) == 1 and found.missing:
+        tree.transform(target, source, int(stamps[0]), extrapolate=extrapolate)
+    given.answer([found.to_arrow()])
+    sys.stdout.flush()
+    remarks(
+        f"{counted(number, 'time')} without a transform: {why}."
+        for why, number in found.missing.items()
+    )
 
 
 def _times(
@@ -118,20 +142,33 @@ def _times(
     return np.array([tree.latest(target, given.source or target)], np.int64)
 
 
-def _show_tree(tree: FrameTree, given: _Given) -> None:
+def _show_trees(trees: Mapping[str, FrameTree], given: _Given) -> None:
+    """Show the frames of trees, by a topic of each, which is a column if there are several."""
     if given.to_form != SCREEN:
-        given.answer([tree.to_arrow()])
+        given.answer([_with_name(name, tree, trees) for name, tree in trees.items()])
         return
     names = ("transforms", "Hz", "longest gap", "from")
     rows = []
-    for name, depth in tree.walk():
-        row: dict[str, object] = {**dict.fromkeys(names), "frame": "  " * depth + name}
-        if (frame := tree.frames.get(name)) is not None:
-            row["transforms"] = "static" if frame.is_static else len(frame.stamps)
-            row["Hz"] = None if frame.rate_hz is None else f"{frame.rate_hz:.2f}"
-            if (gap := frame.longest_gap()) is not None:
-                row["longest gap"] = short_duration(gap[1] - gap[0])
-                row["from"] = f"{(gap[0] - tree.span[0]) / 1e9:+.3f}s"
-        rows.append(row)
-    print_table([Column("frame", side="whole"), *numbers(*names)], rows)
-    remarks([*tree.problems(), *tree.remarks])
+    for topic, tree in trees.items():
+        for name, depth in tree.walk():
+            row: dict[str, object] = {**dict.fromkeys(names), "frame": "  " * depth + name}
+            row["tree"] = topic
+            if (frame := tree.frames.get(name)) is not None:
+                row["transforms"] = "static" if frame.is_static else len(frame.stamps)
+                row["Hz"] = None if frame.rate_hz is None else f"{frame.rate_hz:.2f}"
+                if (gap := frame.longest_gap()) is not None:
+                    row["longest gap"] = short_duration(gap[1] - gap[0])
+                    row["from"] = f"{(gap[0] - tree.span[0]) / 1e9:+.3f}s"
+            rows.append(row)
+    several = [Column("tree", side="whole")] if len(trees) > 1 else []
+    print_table([*several, Column("frame", side="whole"), *numbers(*names)], rows)
+    remarks(dict.fromkeys(text for tree in trees.values() for text in tree.problems()))
+
+
+def _with_name(topic: str, tree: FrameTree, trees: Mapping[str, FrameTree]) -> pa.Table:
+    import pyarrow as pa
+
+    table = tree.to_arrow()
+    if len(trees) == 1:
+        return table
+    return table.add_column(0, "tree", pa.array([topic] * len(table), pa.string()))

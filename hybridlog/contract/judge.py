@@ -121,10 +121,11 @@ class _Judge:
         limited = [name for name, limit in limits.items() if limit is not None]
         if not limited and not rules.stamps_in_order:
             return
-        least, greatest, backwards = None, None, 0
+        least, greatest, backwards, unset = None, None, 0, 0
         last: NDArray[np.int64] = np.empty(0, np.int64)
         for table in Query(self._session, self._question(topic)).fields("stamp").to_tables():
             rows = table.select(["log_time", "stamp"]).drop_null()
+            unset += table.num_rows - rows.num_rows
             if rows.num_rows:
                 stamp = rows["stamp"].cast("int64").to_numpy()
                 age = rows["log_time"].cast("int64").to_numpy() - stamp
@@ -133,17 +134,20 @@ class _Judge:
                 greatest = high if greatest is None else max(greatest, high)
                 backwards += int((np.diff(np.concatenate([last, stamp])) < 0).sum())
                 last = stamp[-1:]
+        without = f"; {unset} without a stamp that is set" if unset else ""
         for name in limited:
             limit, age_ns = limits[name], least if name == "least_age" else greatest
             assert limit is not None
             holds = age_ns is not None and (
                 age_ns >= limit if name == "least_age" else age_ns <= limit
             )
-            found = "no header stamps" if age_ns is None else format_duration(age_ns)
-            yield self._result(topic, name, format_duration(limit), found, holds=holds)
+            found = "no header stamps" if age_ns is None else format_duration(age_ns) + without
+            wanted = format_duration(limit)
+            yield self._result(topic, name, wanted, found, holds=holds and not unset)
         if rules.stamps_in_order:
-            found = "no header stamps" if least is None else f"{backwards} before the last one"
-            holds = least is not None and not backwards
+            found = f"{backwards} before the last one{without}"
+            found = "no header stamps" if least is None else found
+            holds = least is not None and not backwards and not unset
             yield self._result(topic, "stamps_in_order", "in order", found, holds=holds)
 
     def _of_others(self, rules: TopicRules, one: TopicCheck) -> Iterator[Result]:

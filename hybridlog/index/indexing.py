@@ -127,7 +127,7 @@ class _Results:
     Attributes:
         unreadable: bool[n], messages that cannot be read.
         surplus: bool[n], those with bytes left over.
-        stamped: bool[n], those with a header stamp.
+        stamped: bool[n], those with a header stamp, which may be zero: not set.
         stamps: int64[n], the stamps.
     """
 
@@ -150,8 +150,8 @@ class _Results:
                 unset=len(stamps) - len(skew),
                 skew_sum=float(skew.sum(dtype=np.float64)),  # integers could overflow
             )
-            if len(stamps):
-                found.first_stamp, found.last_stamp = int(stamps.min()), int(stamps.max())
             if len(skew):
+                known = stamps[stamps != 0]
+                found.first_stamp, found.last_stamp = int(known.min()), int(known.max())
                 found.skew_min, found.skew_max = int(skew.min()), int(skew.max())
             yield int(self._number[begin]), found

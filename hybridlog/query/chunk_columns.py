@@ -139,8 +139,6 @@ def log_bounds(bounds: tuple[int, int], stats: Collection[ChannelStats]) -> tupl
     """
     begin, end = bounds
     known = [one for one in stats if one.skew_min is not None]
-    if begin <= 0 < end and any(one.unset for one in stats):
-        return None
     if not all(map(_is_exact, known)):
         return None
     least = min((one.skew_min or 0 for one in known), default=0)

@@ -193,7 +193,8 @@ def _queries(parts: Sequence[Part], own: Filter) -> list[Query]:
         if part.clock != "log" and part.bounds is not None:
             begin, end = part.bounds
             name = STAMP if part.clock == "header" else "_meta.pub"
-            condition[name] = {"$gte": begin, "$lte" if end == END else "$lt": end}
+            unset = {"$ne": 0} if part.clock == "header" else {}
+            condition[name] = {"$gte": begin, "$lte" if end == END else "$lt": end, **unset}
         # Of an open recording, more may have come.
         span = (0, END) if part.recording.status == "open" else part.span or (0, 0)
         for low, high in np.clip(part.log_windows, *span).tolist():

@@ -253,7 +253,7 @@ class Query:
                 raise TopicError(_no_field(path, known, self.topics))
         return self._with(fields=tuple(paths))
 
-    def in_frame(self, frame: str) -> Query:
+    def in_frame(self, frame: str, *, tf_topics: Sequence[str] = ()) -> Query:
         """Points and poses in tables and arrays in another frame, at the times of their headers.
 
         By the rules of tf2. A message without a transform keeps its row, without a place;
@@ -261,8 +261,11 @@ class Query:
 
         Args:
             frame: Its name.
+            tf_topics: Topics with transforms; empty for `tf` and `tf_static` of the topic's
+                innermost namespace that has them, and for frames that these lack, of the root.
         """
-        return self._with(frame=frame)
+        topics = self.session.resolve_in(tf_topics, self.question.recordings)
+        return self._with(frame=frame, tf_topics=tuple(topics))
 
     def tags(self, *keys: str) -> Query:
         """Tags of the recordings as columns of tables, behind `topic` and `recording`.

@@ -46,6 +46,7 @@ class Question:
         names_recording: Tables have the column `recording` even if there is only one.
         during: Intervals of log time that messages must lie in; None for all times.
         frame: Frame of points and poses in the answer; None for that of each message.
+        tf_topics: Topics whose transforms lead to that frame; empty for those of each tree.
         namesakes: Further topics that end with a short name that chose one of `topics`.
     """
 
@@ -62,6 +63,7 @@ class Question:
     names_recording: bool = False
     during: Intervals | None = None
     frame: str | None = None
+    tf_topics: tuple[str, ...] = ()
     namesakes: tuple[str, ...] = field(default=(), compare=False)
 
     @property
@@ -247,6 +249,7 @@ class Counters:
             has answered; several.
         no_transform: The frame asked for with a reason why points or poses are not in it, and
             the number of messages; several.
+        of_frames: Sentences about the transforms that were used.
         elapsed_s: Wall time, seconds.
     """
 
@@ -265,6 +268,7 @@ class Counters:
     without_arrays: int = 0
     not_indexed: tuple[tuple[str, int], ...] = ()
     no_transform: tuple[tuple[str, int], ...] = ()
+    of_frames: tuple[str, ...] = ()
     elapsed_s: float = 0.0
 
     @property

@@ -182,7 +182,7 @@ def unreadable(bad: Mapping[str, list[int]]) -> list[Unreadable]:
 
 
 def stamps_of(codec: Codec, batch: Batch) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
-    """Rows of those messages of one channel that have a header stamp, and the stamps, ns."""
+    """Rows of those messages of one channel whose header stamp is set, and the stamps, ns."""
     decoded = codec.columns_of(batch, {STAMP})
     found = stamp_array(decoded.arrow())
     if found is None:
@@ -193,7 +193,10 @@ def stamps_of(codec: Codec, batch: Batch) -> tuple[NDArray[np.intp], NDArray[np.
 
 
 def stamp_array(records: pa.StructArray) -> pa.Array[Any] | None:
-    """The header stamps of decoded messages, timestamp[ns]; None when they have none."""
+    """The header stamps of decoded messages, timestamp[ns]; None when they have none.
+
+    A stamp of zero was not set, and is no time: it is null.
+    """
     import pyarrow as pa
     import pyarrow.compute as pc
 
@@ -201,4 +204,7 @@ def stamp_array(records: pa.StructArray) -> pa.Array[Any] | None:
         found: pa.Array[Any] = pc.struct_field(records, STAMP.split("."))
     except pa.ArrowException:
         return None
-    return found if pa.types.is_timestamp(found.type) else None
+    if not pa.types.is_timestamp(found.type):
+        return None
+    is_unset = pc.equal(found.view(pa.int64()), 0)
+    return pc.if_else(is_unset, None, found) if pc.any(is_unset).as_py() else found

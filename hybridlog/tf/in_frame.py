@@ -24,7 +24,7 @@ from hybridlog.message import messages_in
 from hybridlog.query.planner import Planner
 from hybridlog.query.times import decoded_time
 from hybridlog.schema.arrow_types import with_values
-from hybridlog.tf.reader import frame_tree
+from hybridlog.tf.reader import Trees
 from hybridlog.tf.transform import Transform, placed
 from hybridlog_storage.errors import DefinitionError, PayloadError, TopicError, UsageError
 
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from hybridlog.message import Message
     from hybridlog.query.question import Counters, Question
     from hybridlog.session import Session
-    from hybridlog.tf.tree import FrameTree
 
 _STAMPS: Final = ("header.stamp", "timestamp")
 _FRAMES: Final = ("header.frame_id", "frame_id", "parent_frame_id")
@@ -139,7 +138,8 @@ def points_of(session: Session, question: Question, counters: Counters) -> Itera
         times = np.array([one.stamp for one, _ in found], np.int64)
         frames = [str(_first_of(fields, _FRAMES) or "") for _, fields in found]
         recordings = [one.message.recording for one, _ in found]
-        poses = looked.transforms(recordings, frames, times)
+        log_time = np.array([one.message.log_time_ns for one, _ in found], np.int64)
+        poses = looked.transforms(recordings, frames, times, log_time)
         for row, (one, fields) in enumerate(found):
             pose = Transform(poses.translation[row], poses.rotation[row])
             own = fields.get("pose")  # of the points, in Foxglove's messages
@@ -155,18 +155,37 @@ class _Looked:
         self._session = session
         self._counters = counters
         self.target = str(question.frame)
-        self._trees: dict[str, FrameTree] = {}
+        self._question = question
+        self._topic = question.topics[0]
+        self._trees: dict[str, Trees | TopicError] = {}
 
-    def _tree(self, recording: str) -> FrameTree:
+    def _of(self, recording: str) -> Trees | TopicError:
+        """The trees of a recording, or why the frame asked for is not there."""
         if recording not in self._trees:
             snapshot = self._session.look([recording])
             summary = snapshot.summaries[snapshot.by_id[recording]]
-            topics = sorted(snapshot.topics_of(summary))
-            self._trees[recording] = frame_tree(self._session, summary, topics)
+            trees = Trees(self._session, summary, self._question.tf_topics)
+            try:
+                trees.check(self._topic, self.target)
+                self._trees[recording] = trees
+                self._counters.of_frames += tuple(trees.tree(self._topic).remarks)
+            except TopicError as error:
+                self._trees[recording] = error
         return self._trees[recording]
 
+    def _refuse(self, error: TopicError) -> None:
+        """Refuse a frame that no recording has."""
+        summaries = self._session.look(self._question.recordings).summaries
+        ids = [summaries[n].id for n in self._session.chosen(self._question).tolist()]
+        if all(isinstance(self._of(recording), TopicError) for recording in ids):
+            raise error
+
     def transforms(
-        self, recordings: Sequence[str], frames: Sequence[str], times: NDArray[np.int64]
+        self,
+        recordings: Sequence[str],
+        frames: Sequence[str],
+        times: NDArray[np.int64],
+        log_time: NDArray[np.int64],
     ) -> Transform:
         """The transforms from some frames at some times; NaN where there are none."""
         made = Transform(np.full((len(times), 3), np.nan), np.full((len(times), 4), np.nan))
@@ -174,13 +193,18 @@ class _Looked:
         pairs = [*zip(recordings, frames, strict=True)]
         for pair in dict.fromkeys(pairs):
             recording, frame = pair
-            tree = self._tree(recording)
-            tree.check(self.target)
+            trees = self._of(recording)
             rows = np.flatnonzero([one == pair for one in pairs])
-            if frame.removeprefix("/") not in tree.names:
+            if isinstance(trees, TopicError):
+                self._refuse(trees)
+                missing["no such frame in the recording"] += len(rows)
+                continue
+            own = times[rows], log_time[rows]
+            try:
+                found = trees.lookup(self._topic, self.target, frame, *own)
+            except TopicError:
                 missing[f"no frame {frame!r} among the transforms"] += len(rows)
                 continue
-            found = tree.lookup(self.target, frame, times[rows])
             made.translation[rows], made.rotation[rows] = found.translation, found.rotation
             missing.update(found.missing)
         self._counters.no_transform += tuple(
@@ -261,14 +285,21 @@ def _tables_of_poses(planner: Planner) -> Iterator[pa.Table]:
         recordings = [ids[name] for name in names]
         frames = [str(name or "") for name in table[frame].to_pylist()]
         times = table[stamp].cast(pa.int64()).fill_null(0).to_numpy()
+        log_time = table["log_time"].cast(pa.int64()).to_numpy()
         columns = {name: table[name].combine_chunks() for name in table.column_names}
         if found.poses:
-            moved = looked.transforms(recordings, frames, times)
+            moved = looked.transforms(recordings, frames, times, log_time)
             for pose in found.poses:
                 columns |= _pose_in_frame(columns, pose, moved)
         for name, inside in found.lists.items():
             columns[name] = _list_in_frame(
-                columns[name], inside, looked, recordings=recordings, frames=frames, times=times
+                columns[name],
+                inside,
+                looked,
+                recordings=recordings,
+                frames=frames,
+                times=times,
+                log_time=log_time,
             )
         columns[frame] = pa.array([question.frame] * table.num_rows, pa.string())
         yield pa.table({name: column for name, column in columns.items() if name not in hidden})
@@ -311,6 +342,7 @@ def _list_in_frame(
     recordings: Sequence[str],
     frames: Sequence[str],
     times: NDArray[np.int64],
+    log_time: NDArray[np.int64],
 ) -> Any:
     """A list of structures with poses, in frames of their own or that of their messages."""
     values, rows = column.flatten(), pc.list_parent_indices(column).to_pylist()
@@ -320,7 +352,8 @@ def _list_in_frame(
     pairs = [(row, one or frames[row]) for row, one in zip(rows, own, strict=True)]
     number = {pair: place for place, pair in enumerate(dict.fromkeys(pairs))}
     of = [row for row, _ in number]
-    found = looked.transforms([recordings[row] for row in of], [f for _, f in number], times[of])
+    asked = [recordings[row] for row in of], [f for _, f in number]
+    found = looked.transforms(*asked, times[of], log_time[of])
     places = [number[pair] for pair in pairs]
     moved = Transform(found.translation[places], found.rotation[places])
     for pose in poses:

@@ -5,77 +5,213 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import combinations
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from hybridlog.arrays.message_arrays import plain_type
 from hybridlog.frames.answer import stream, to_arrow
-from hybridlog.frames.columns import flat
 from hybridlog.query.answers.lost import completeness_of
 from hybridlog.query.planner import Planner, match_times
 from hybridlog.query.question import Counters, Question
 from hybridlog.tf import is_of_transforms
+from hybridlog.tf.epochs import epochs_of
+from hybridlog.tf.rows import transforms_of
 from hybridlog.tf.transform import Transform
-from hybridlog.tf.tree import Frame, FrameTree
-from hybridlog.wording import listed
+from hybridlog.tf.tree import Frame, FrameTree, Lookup
+from hybridlog.wording import counted, listed
 from hybridlog_storage.errors import TopicError
+from hybridlog_storage.times import BEGIN, END
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from hybridlog.query.times import DurationLike
     from hybridlog.session import Session
     from hybridlog_storage.summary import RecordingSummary
 
-_STATIC: Final = "tf_static"
+_NAMES: Final = {"tf", "tf_static"}
+_LATE_NS: Final = 100_000_000
 _MAX_NORM_ERROR: Final = 1e-2
 """Greatest distance of a quaternion's norm from 1; that of tf2."""
 
 
-def frame_tree(session: Session, recording: RecordingSummary, topics: Sequence[str]) -> FrameTree:
-    """The frames of one recording, by its topics, full names, that may have transforms.
+class Trees:
+    """The trees of frames of a recording, each read once it is asked for.
 
-    Those whose names end in `tf_static` hold at all times.
+    A tree is of the topics `tf` and `tf_static` of a namespace. What it lacks comes from the
+    root's, to which Foxglove's messages belong, whatever their topic.
+
+    Args:
+        only: Topics of one tree that takes the place of all others.
+
+    Attributes:
+        topics: Topics of each tree, by its namespace, the root's first; empty is the root's.
+        epochs: The epochs of the recording; each has transforms of its own.
     """
-    question = Question(tuple(topics), (recording.id,))
-    types = {
-        one.channel.topic: one.channel.schema.name
-        for one in Planner(session, question).channels()
-        if one.channel.schema
-    }
-    names = [topic for topic, name in types.items() if is_of_transforms(name)]
-    if not names:
-        raise TopicError(
-            "No topic has transforms: they are messages of tf2_msgs/TFMessage or "
-            "foxglove.FrameTransform."
-        )
-    found = [
-        _transforms_of(table, is_static=topic.endswith(_STATIC))
-        for topic in names
-        for table in stream(Planner(session, replace(question, topics=(topic,))))
-    ]
-    lacks = completeness_of(session, replace(question, topics=tuple(names))).sentences
-    invalid = Counter[str]()
-    frames = _frames(pa.concat_tables(found), invalid) if found else {}
-    return FrameTree(frames, recording.extent, dict(invalid), [*lacks])
+
+    def __init__(
+        self, session: Session, recording: RecordingSummary, only: Sequence[str] = ()
+    ) -> None:
+        self._session, self._recording = session, recording
+        self.epochs = epochs_of(session, recording.id)
+        names = only or sorted(session.look([recording.id]).topics_of(recording))
+        found: dict[str, list[str]] = {}
+        for topic, name in _types_of(session, recording, names).items():
+            above, _, last = topic.lstrip("/").rpartition("/")
+            if is_of_transforms(name) and (only or plain_type(name).startswith("foxglove.")):
+                found.setdefault("", []).append(topic)
+            elif is_of_transforms(name) and last in _NAMES:
+                found.setdefault(above, []).append(topic)
+        self.topics: Mapping[str, Sequence[str]] = dict(sorted(found.items()))
+        self._trees: dict[tuple[str, int], FrameTree] = {}
+
+    def tree(self, topic: str | None = None, epoch: int = -1) -> FrameTree:
+        """The tree of a topic: that of its innermost namespace with one, or the only one.
+
+        Without a topic, it is the root's, or the only one. Its transforms are of one epoch.
+
+        Raises:
+            TopicError: No topic has transforms, or only those of other namespaces.
+        """
+        above = (topic or "").lstrip("/")
+        while above and above not in self.topics:
+            above = above.rpartition("/")[0]
+        if above not in self.topics and len(self.topics) == 1:
+            (above,) = self.topics
+        if self.topics and above not in self.topics:
+            what = "No tree of frames is the root's" if topic is None else f"{topic} has no tree"
+            names = listed([topics[0] for topics in self.topics.values()])
+            raise TopicError(f"{what}; choose one of these by its topic (--tf-topic): {names}.")
+        number = range(len(self.epochs.begins) + 1)[epoch]
+        if (above, number) not in self._trees:
+            own = self._read(self.topics.get(above, ()), number)
+            if above and "" in self.topics:
+                root = self.tree(epoch=number)
+                frames, lacks = {**root.frames, **own.frames}, [*own.remarks, *root.remarks]
+                own = replace(own, frames=frames, remarks=[*dict.fromkeys(lacks)])
+            self._trees[above, number] = own
+        return self._trees[above, number]
+
+    def lookup(
+        self,
+        topic: str | None,
+        target: str,
+        source: str,
+        times: NDArray[np.int64],
+        log_time: NDArray[np.int64],
+        *,
+        extrapolate: DurationLike | None = None,
+    ) -> Lookup:
+        """Transforms between frames of a topic's tree, as of `FrameTree.lookup`.
+
+        They are those of the epochs of the log times.
+        """
+        number = self.epochs.number(log_time)
+        if not len(times) or (number == number[0]).all():
+            tree = self.tree(topic, number[0] if len(times) else -1)
+            return tree.lookup(target, source, times, extrapolate=extrapolate)
+        made = Transform(np.full((len(times), 3), np.nan), np.full((len(times), 4), np.nan))
+        missing = Counter[str]()
+        for epoch in np.unique(number).tolist():
+            own = np.flatnonzero(number == epoch)
+            tree = self.tree(topic, epoch)
+            try:
+                found = tree.lookup(target, source, times[own], extrapolate=extrapolate)
+            except TopicError:
+                missing["no such frame before or after the stamps start again"] += len(own)
+                continue
+            made.translation[own], made.rotation[own] = found.translation, found.rotation
+            missing.update(found.missing)
+        return Lookup(made.translation, made.rotation, times, dict(missing))
+
+    def check(self, topic: str | None, frame: str) -> None:
+        """Refuse a frame that a topic's tree has in no epoch."""
+        for epoch in reversed(range(len(self.epochs.begins) + 1)):
+            try:
+                self.tree(topic, epoch).check(frame)
+            except TopicError:
+                if not epoch:
+                    raise
+            else:
+                return
+
+    def _read(self, topics: Sequence[str], epoch: int) -> FrameTree:
+        if not topics:
+            raise TopicError(
+                "No topic has transforms: they are messages of tf2_msgs/TFMessage on topics "
+                "called tf or tf_static, or of foxglove.FrameTransform."
+            )
+        session, question = self._session, Question(tuple(topics), (self._recording.id,))
+        found = [
+            transforms_of(table, place, is_static=topic.endswith("tf_static"))
+            for place, topic in enumerate(topics)
+            for table in stream(Planner(session, replace(question, topics=(topic,))))
+        ]
+        lacks = [*completeness_of(session, question).sentences]
+        invalid = Counter[str]()
+        if not found:
+            return FrameTree({}, self._recording.extent, {}, lacks)
+        rows = pa.concat_tables(found)
+        if len(self.epochs.begins):
+            numbers = self.epochs.number(rows["log_time"].to_numpy())
+            is_static = rows["is_static"].to_numpy()
+            rows = rows.filter(pa.array((numbers == epoch) | (is_static & (numbers < epoch))))
+            lacks.append(self.epochs.sentence(self._recording.name))
+        frames = _frames(rows, topics, invalid)
+        lacks += [
+            f"{counted(one.late, 'transform')} of {name} came after one of a later time: sorted in."
+            for name, one in frames.items()
+            if one.late
+        ]
+        return FrameTree(frames, self._recording.extent, dict(invalid), lacks)
+
+
+def trees_in(
+    session: Session, summaries: Sequence[RecordingSummary], topics: Sequence[str] = ()
+) -> Trees:
+    """The trees of a single recording; of `topics` alone if some are given.
+
+    Raises:
+        TopicError: Several recordings.
+    """
+    if len(summaries) > 1:
+        names = listed([one.name for one in summaries])
+        raise TopicError(f"Frames belong to one recording: name one of {names}.")
+    return Trees(session, summaries[0], topics)
+
+
+def _types_of(
+    session: Session, recording: RecordingSummary, topics: Sequence[str]
+) -> dict[str, str]:
+    """Message types of topics with definitions, by topic."""
+    planner = Planner(session, Question(tuple(topics), (recording.id,)))
+    return {c.channel.topic: c.channel.schema.name for c in planner.channels() if c.channel.schema}
 
 
 def frames_and_stamps(
     session: Session, question: Question, counters: Counters
-) -> tuple[list[str], NDArray[np.int64]]:
-    """The frames that the headers of a topic name, and header stamps, or log times without, ns."""
+) -> tuple[list[str], NDArray[np.int64], NDArray[np.int64]]:
+    """The frames that the headers of a topic name, and header stamps and log times, ns.
+
+    The stamps of a topic without headers are its log times.
+    """
     known = session.field_types(question.topics, question.recordings) or {}
     wanted = [name for name in ("header.stamp", "header.frame_id") if name in known]
     if "header.stamp" not in wanted:  # no message has to be read
         times = match_times(session, question, counters)
-        return [], np.concatenate([np.empty(0, np.int64), *(one.log_time for one in times)])
+        log_time = np.concatenate([np.empty(0, np.int64), *(one.log_time for one in times)])
+        return [], log_time, log_time
     table = to_arrow(Planner(session, replace(question, fields=tuple(wanted)), counters))
     frames = table["header.frame_id"].unique().to_pylist() if len(wanted) == 2 else []
-    return frames, table["header.stamp"].cast(pa.int64()).to_numpy()
+    stamps, log_time = (table[n].cast(pa.int64()).to_numpy() for n in ("header.stamp", "log_time"))
+    return frames, stamps, log_time
 
 
-def _frames(rows: pa.Table, invalid: Counter[str]) -> dict[str, Frame]:
+def _frames(rows: pa.Table, topics: Sequence[str], invalid: Counter[str]) -> dict[str, Frame]:
     """The frames with a parent, by name; counts transforms that are left out, by reason."""
     rows = rows.take(pa.array(np.argsort(rows["log_time"].to_numpy(), kind="stable")))
     pose = Transform(
@@ -90,7 +226,9 @@ def _frames(rows: pa.Table, invalid: Counter[str]) -> dict[str, Frame]:
     good = _valid(
         np.asarray(known, object)[child], np.asarray(above, object)[parent], pose, invalid
     )
-    stamps, static = rows["stamp"].to_numpy(), rows["is_static"].to_numpy()
+    stamps, static, log_time = (
+        rows[name].to_numpy() for name in ("stamp", "is_static", "log_time")
+    )
     made: dict[str, Frame] = {}
     by_child = np.argsort(child, kind="stable")
     starts = np.searchsorted(child[by_child], np.arange(len(known) + 1))
@@ -99,15 +237,20 @@ def _frames(rows: pa.Table, invalid: Counter[str]) -> dict[str, Frame]:
         own = own[good[own]]
         if not len(own):
             continue
+        conflict = _conflict(name, topics, rows.take(pa.array(own)))
         # As in tf2, the first transform decides whether a frame is static.
-        is_static, repeated = bool(static[own[0]]), 0
+        is_static, repeated, late = bool(static[own[0]]), 0, 0
         if other := int((static[own] != is_static).sum()):
             here, there = ("static", "moving") if is_static else ("moving", "static")
             invalid[f"{there}, while {name} is {here}"] += other
             own = own[static[own] == is_static]
+        times = log_time if is_static else stamps
         if is_static:
-            own = own[-1:]
+            values = np.column_stack([pose.translation, pose.rotation, parent])[own]
+            own = own[np.concatenate(([True], (np.diff(values, axis=0) != 0).any(axis=1)))]
         else:
+            before = np.maximum.accumulate(stamps[own])
+            late = int((before - stamps[own] > _LATE_NS).sum())
             own = own[np.argsort(stamps[own], kind="stable")]
             is_first = np.concatenate(([True], np.diff(stamps[own]) != 0))
             repeated = int((~is_first).sum())
@@ -118,12 +261,33 @@ def _frames(rows: pa.Table, invalid: Counter[str]) -> dict[str, Frame]:
             name,
             tuple(above[code] for code in codes),
             is_static,
-            stamps[own],
+            times[own],
             np.array([place_of[code] for code in parent[own].tolist()], np.intp),
-            Transform(pose.translation[own], pose.rotation[own]),
+            Transform(pose.translation[own] + (np.nan if conflict else 0), pose.rotation[own]),
             repeated,
+            late,
+            conflict,
         )
     return made
+
+
+def _conflict(name: str, topics: Sequence[str], rows: pa.Table) -> str:
+    """The parents that two topics give a frame at overlapping times, as words; empty for none."""
+    seen: list[tuple[set[str], str, int, int]] = []
+    for place, topic in enumerate(topics):
+        own = rows.filter(pc.equal(rows["topic"], place))
+        if own.num_rows:
+            parents = set(pc.utf8_ltrim(own["parent"], "/").unique().to_pylist())
+            ends = pc.min_max(own["stamp"]).as_py()
+            span = (BEGIN, END) if own["is_static"][0].as_py() else (ends["min"], ends["max"])
+            seen.append((parents, topic, *span))
+    for (one, here, begin, end), (other, there, first, last) in combinations(seen, 2):
+        if one != other and begin <= last and first <= end:
+            return (
+                f"{name} is below {listed(sorted(one))} by {here}, and at the same time below "
+                f"{listed(sorted(other))} by {there}"
+            )
+    return ""
 
 
 def _valid(
@@ -146,46 +310,3 @@ def _valid(
             invalid[why] += number
         good &= ~bad
     return good
-
-
-def _transforms_of(table: pa.Table, *, is_static: bool) -> pa.Table:
-    """The transforms of messages as rows: times, frames, seven numbers, and `is_static`."""
-    times = table["log_time"].combine_chunks().cast(pa.int64())
-    columns = {name: table[name].combine_chunks() for name in table.column_names}
-    if "transforms" in columns:
-        times = times.take(pc.list_parent_indices(columns["transforms"]))
-        columns = flat(columns["transforms"].flatten())
-    is_foxglove = "parent_frame_id" in columns
-    stamp, parent, pose = (
-        ("timestamp", "parent_frame_id", "")
-        if is_foxglove
-        else ("header.stamp", "header.frame_id", "transform.")
-    )
-    names = {
-        "parent": parent,
-        "child": "child_frame_id",
-        **{f"t{axis}": f"{pose}translation.{axis}" for axis in "xyz"},
-        **{f"r{axis}": f"{pose}rotation.{axis}" for axis in "xyzw"},
-    }
-    if missing := [name for name in names.values() if name not in columns]:
-        raise TopicError(f"Messages of transforms lack {listed(missing)}.")
-    found = {"log_time": times, "stamp": _nanoseconds(columns, stamp)}
-    for own, name in names.items():
-        kind = pa.string() if own in {"parent", "child"} else pa.float64()
-        found[own] = columns[name].cast(kind)
-    found["is_static"] = pa.repeat(pa.scalar(is_static), len(times))
-    return pa.table(found).drop_null()
-
-
-def _nanoseconds(columns: Mapping[str, pa.Array], name: str) -> pa.Array:
-    """Times in ns, from Arrow's own or from seconds and nanoseconds."""
-    if name in columns:
-        return columns[name].cast(pa.timestamp("ns", "UTC")).cast(pa.int64())
-    parts = [
-        next((f"{name}.{one}" for one in names if f"{name}.{one}" in columns), None)
-        for names in (("sec", "seconds"), ("nsec", "nanos", "nanosec"))
-    ]
-    if None in parts:
-        raise TopicError(f"Messages of transforms lack {name}.")
-    seconds, rest = (columns[str(part)].cast(pa.int64()) for part in parts)
-    return pc.add(pc.multiply(seconds, 10**9), rest)

@@ -41,11 +41,15 @@ class Frame:
     Attributes:
         name: Its name, without a leading slash.
         parents: Its parents, the latest last; usually one.
-        is_static: True if its transform holds at all times.
-        stamps: int64[n], ascending without repetition, ns; of a static frame int64[1].
+        is_static: True if a transform holds until another one comes, the first at all times before.
+        stamps: int64[n], ascending, ns; of a static frame the log times of its transforms that
+            differ from the one before.
         parent: intp[n], the place in `parents` of each.
         poses: The n transforms from the frame to its parent.
         repeated: Transforms that were left out because of an equal stamp.
+        late: Transforms more than 100 ms older than one that came before them.
+        conflict: The parents that different topics give it at the same time, as words; it has no
+            transform then.
     """
 
     name: str
@@ -55,6 +59,8 @@ class Frame:
     parent: Places
     poses: Transform
     repeated: int = 0
+    late: int = 0
+    conflict: str = ""
 
     @property
     def rate_hz(self) -> float | None:
@@ -72,19 +78,16 @@ class Frame:
 
     def parent_at(self, times: Times) -> Places:
         """The place in `parents` at each time: that of the latest transform, or the first."""
-        if len(self.parents) == 1 or self.is_static:
+        if len(self.parents) == 1:
             return np.broadcast_to(self.parent[-1], times.shape)
         return self.parent[np.maximum(self.stamps.searchsorted(times, "right") - 1, 0)]
 
     def pose_at(self, times: Times, extrapolate_ns: int) -> Transform:
         """The transforms to the parent at some times; NaN where there are none."""
-        if self.is_static:
-            shape = len(times)
-            return Transform(
-                np.broadcast_to(self.poses.translation[-1], (shape, 3)),
-                np.broadcast_to(self.poses.rotation[-1], (shape, 4)),
-            )
         stamps = self.stamps
+        if self.is_static:
+            place = np.maximum(stamps.searchsorted(times, "right") - 1, 0)
+            return Transform(self.poses.translation[place], self.poses.rotation[place])
         last = len(stamps) - 1
         before = np.clip(stamps.searchsorted(times, "right") - 1, 0, last)
         after = np.minimum(before + 1, last)
@@ -112,7 +115,9 @@ class Frame:
 
     def why_not(self, times: Times, extrapolate_ns: int) -> Iterator[tuple[str, NDArray[np.bool_]]]:
         """Reasons why there is no transform, and at which of the times."""
-        if not self.is_static:
+        if self.conflict:
+            yield self.conflict, np.ones(len(times), np.bool_)
+        elif not self.is_static:
             early, late = self._outside(times, extrapolate_ns)
             begin, end = (format_time(int(stamp)) for stamp in self.stamps[[0, -1]])
             yield f"before the first transform of {self.name}, {begin}", early
@@ -198,6 +203,14 @@ class FrameTree:
             for why, number in self.invalid.items()
         ]
         for one in self.frames.values():
+            if one.conflict:
+                found.append(f"{one.conflict[0].upper()}{one.conflict[1:]}: it has no transform.")
+            if one.is_static and len(one.stamps) > 1:
+                found.append(
+                    f"{one.name} is static and changed {counted(len(one.stamps) - 1, 'time')}: "
+                    f"until {format_time(int(one.stamps[1]))} its first transform holds, then "
+                    "each from its log time on."
+                )
             if len(one.parents) > 1:
                 found.append(f"{one.name} has several parents: {listed(one.parents)}.")
             if one.repeated:

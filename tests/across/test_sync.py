@@ -231,8 +231,8 @@ def test_messages_without_a_stamp_are_in_no_set(tmp_path: Path) -> None:
                     payload = b"x" if (topic, n) == ("/a", 3) else stamp
                     recording.write(Channel(topic, "ros1", schema), payload, log_time=n)
         assert store.sync(["/a", "/b"]).remarks() == [
-            "1 of 5 messages of /a is in no set: 1 without a time on the clock.",
-            "1 of 5 messages of /b is in no set.",
+            "2 of 5 messages of /a are in no set: 2 without a time on the clock.",
+            "2 of 5 messages of /b are in no set: 1 without a time on the clock.",
         ]
         assert store.sync(["/a", "/b"], clock="log").left_out == (0, 0)
 

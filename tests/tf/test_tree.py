@@ -128,15 +128,6 @@ def test_there_is_no_transform_outside(log: Log) -> None:
     assert held.translation[1:3, 0].tolist() == [0, 2]
 
 
-def test_a_static_transform_holds_at_all_times(log: Log) -> None:
-    tree = log.tree(
-        said(1, "odom", "base"),
-        static=[said(50, "base", "laser", (1, 0, 0)), said(60, "base", "laser", (2, 0, 0))],
-    )
-    assert tree.transform("base", "laser", BEGIN - 99 * S).translation.tolist() == [2, 0, 0]
-    assert tree.latest("odom", "laser") == BEGIN + S
-
-
 def test_a_frame_that_changes_its_parent(log: Log) -> None:
     """Its latest transform names the parent; a new one begins anew."""
     tree = log.tree(

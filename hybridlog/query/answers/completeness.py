@@ -191,6 +191,7 @@ def left_out(question: Question, counters: Counters, expired: str) -> Iterator[s
         reasons[why] += number
     for why, number in reasons.items():
         yield f"{counted(number, 'message')} without a transform {why}."
+    yield from dict.fromkeys(counters.of_frames)
 
 
 def _unreadable(messages: int, question: Question) -> str:

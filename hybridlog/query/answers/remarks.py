@@ -61,7 +61,7 @@ def _about_stamps(session: Session, question: Question) -> Iterator[str]:
     for channel in (one for entry in entries for one in session.channels_of(entry, topics)):
         stats = channel.stats
         if channel.recording.is_decoded:
-            missing += stats.messages - stats.stamped
+            missing += stats.messages - stats.stamped + stats.unset
         first, last = stats.first_stamp, stats.last_stamp
         if is_noted or first is None or last is None or stats.first is None or stats.last is None:
             continue
@@ -74,7 +74,8 @@ def _about_stamps(session: Session, question: Question) -> Iterator[str]:
             )
     if missing:
         are, have = ("message is", "it has") if missing == 1 else ("messages are", "they have")
-        yield f"{missing} {are} at no time of the header clock: {have} no header stamp."
+        none = f"{have} no header stamp, or one of zero"
+        yield f"{missing} {are} at no time of the header clock: {none}."
 
 
 def _missing_fields(session: Session, question: Question, *, is_empty: bool) -> Iterator[str]:
