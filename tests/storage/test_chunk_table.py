@@ -15,7 +15,8 @@ from hybridlog_storage.segments.chunk_table import (
     TableBuilder,
     parts_of,
 )
-from hybridlog_storage.segments.segment_format import checked_frame, index_order
+from hybridlog_storage.segments.compression import checked_frame
+from hybridlog_storage.segments.segment_format import index_order
 
 
 def batch(channel: list[int], log_time: list[int]) -> Batch:
