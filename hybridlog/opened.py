@@ -222,6 +222,7 @@ class OpenStore(Shared):
 
     def close(self) -> None:
         """Close files and connections. May be called more than once."""
+        self.is_closed = True
         with self._opening:
             for reader in self._segments.values():
                 reader.close()

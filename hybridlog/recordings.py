@@ -92,9 +92,12 @@ class Recordings(Sequence["RecordingEntry"]):
             raise TopicError(self._problem or self._source.now().when_empty)
         return self
 
-    def topics(self) -> list[str]:
-        """Names of their topics, sorted; includes those whose messages are all lost."""
-        return self._source.now().topics_of(self.ids)
+    def topics(self, *types: str) -> list[str]:
+        """Names of their topics, sorted, also of some types alone; as of `Store.topics`."""
+        from hybridlog.query.choosing import topics_of_types
+
+        session = self._source.now()
+        return topics_of_types(session, types, self.ids) if types else session.topics_of(self.ids)
 
     def topic(self, *names: str) -> Query:
         """Make a query about topics of these recordings.

@@ -56,6 +56,7 @@ class Shared(ABC):
 
     def __init__(self, directory: StoreDirectory) -> None:
         self._process = os.getpid()
+        self.is_closed = False
         self.directory = directory
         self.repairs = RepairReport()
         self.cache = Cache()
@@ -75,7 +76,9 @@ class Shared(ABC):
         return os.getpid() != self._process
 
     def check_process(self) -> None:
-        """Refuse to go on in a child of the process that opened the store."""
+        """Refuse to go on after closing, or in a child of the process that opened the store."""
+        if self.is_closed:
+            raise UsageError(f"The store {self.directory.place} is closed: open it again.")
         if self.is_inherited:
             raise UsageError(
                 f"The store {self.directory.place} was opened before this process was forked: open "

@@ -369,7 +369,7 @@ class Store:
         self._close(mends=True)
 
     def _close(self, *, mends: bool) -> None:
-        if self.shared.is_inherited:  # its files and connections are the parent's
+        if self.shared.is_closed or self.shared.is_inherited:  # or another's to close
             return
         is_open = self._source is self.shared  # and no snapshot
         if mends and is_open:
@@ -454,9 +454,18 @@ class Store:
         """
         return self.session.select(names)
 
-    def topics(self) -> list[str]:
-        """Names of all topics, sorted; includes those whose messages are all lost."""
-        return self.session.topics()
+    def topics(self, *types: str) -> list[str]:
+        """Names of all topics, sorted; includes those whose messages are all lost.
+
+        Args:
+            types: Only topics of these types: `LaserScan`, full names, globs.
+
+        Raises:
+            TopicError: No topic is of these types.
+        """
+        from hybridlog.query.choosing import topics_of_types
+
+        return topics_of_types(self.session, types) if types else self.session.topics()
 
     def attachments(self, recording: str | RecordingEntry) -> list[StoredAttachment]:
         """The attachments of a recording's log, in their order.

@@ -125,8 +125,8 @@ def with_numbers(session: Session, question: Question, how: str) -> Question:
 
 def _no_number(field: str, topic: str) -> UsageError:
     return UsageError(
-        f"{field} of {topic} is no single number; ask for a summary, such as {field}.min, or for "
-        "its first or last value."
+        f"{field} of {topic} is no single number: ask for its first or last value, or for a "
+        "summary of an array, such as ranges.min."
     )
 
 

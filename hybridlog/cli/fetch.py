@@ -92,7 +92,7 @@ class _Choices(Asking, InFrame, Tabular, Slices):
 
     def check(self) -> None:
         """Refuse what makes no sense, or cannot be written."""
-        assert self.topics
+        assert self.topics or self.topic_type
         form = self.to_form
         as_it_came = form in OUTPUTS and OUTPUTS[form].content in {"log", "pictures", "video"}
         if self.frame is not None and (as_it_came or form == "raw"):
@@ -198,7 +198,7 @@ def _follow(query: Query, choices: _Choices) -> None:
     from hybridlog.query.query import Query
 
     started = time.monotonic()
-    following = query.follow(*choices.topics)
+    following = query.follow(*(choices.topics or query.topics))
     try:
         with at_safe_points():
             write_following(following, choices.to_form)
@@ -214,7 +214,7 @@ def _follow(query: Query, choices: _Choices) -> None:
 def _query(store: Store, choices: _Choices) -> Query:
     from hybridlog.query.predicate.parser import names_topics
 
-    query = choices.bounded(query_of(store, choices.topics, choices.choice))
+    query = choices.bounded(query_of(store, choices.topics, choices.choice, choices.topic_type))
     query = query.clock(choices.clock)
     near: str | tuple[str, str] | None = choices.within
     if (choices.before, choices.after) != (None, None):

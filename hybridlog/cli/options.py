@@ -233,18 +233,21 @@ class Topics(Ranged):
         "Topics, as for --topic.", "[TOPIC]...", shell_complete=complete_topic
     )
     topic: tuple[str, ...] = topics()
+    topic_type: tuple[str, ...] = option(
+        "Also all topics of this type, such as LaserScan; a glob, too.", "TYPE"
+    )
 
     @property
     def topics(self) -> tuple[str, ...]:
         """The topics as typed."""
         found = (*self.words, *self.topic)
-        if self.needs_topic and not found:
+        if self.needs_topic and not (found or self.topic_type):
             raise click.UsageError("Missing TOPIC; `hybridlog info` lists the topics.")
         return found
 
     def query(self, store: Store) -> Query:
         """The query about these topics, recordings, times and predicates."""
-        query = self.bounded(query_of(store, self.topics, self.choice))
+        query = self.bounded(query_of(store, self.topics, self.choice, self.topic_type))
         for predicate in self.where:
             query = query.where(predicate)
         if self.strict:
@@ -429,13 +432,17 @@ def recordings_of(store: Store, choice: Choice) -> Recordings:
     return chosen if choice.is_everything else chosen.check()
 
 
-def query_of(store: Store, topics: Sequence[str] | None, choice: Choice) -> Query:
+def query_of(
+    store: Store, topics: Sequence[str] | None, choice: Choice, types: Sequence[str] = ()
+) -> Query:
     """A query of some topics, as typed, of the chosen recordings; without any topic, of all.
 
     Short names and globs are resolved among the topics of these recordings alone.
     """
     chosen = None if choice.is_everything else recordings_of(store, choice)
     asked = store if chosen is None else chosen
+    if types:
+        topics = [*(topics or ()), *asked.topics(*types)]
     if not topics:
         return asked.all_topics()
     try:

@@ -77,6 +77,30 @@ def choose(session: Session, choice: Choice) -> Chosen:
     return Chosen(choosing.summaries, "")
 
 
+def topics_of_types(
+    session: Session, types: Sequence[str], recordings: Sequence[str] | None = None
+) -> list[str]:
+    """The topics of recordings, by id, with messages of some types, as `--type` names these.
+
+    Raises:
+        TopicError: There is none.
+    """
+    snapshot = session.look(recordings)
+    places = snapshot.having(session.topics_of(recordings), recordings)
+    found = {
+        channel.topic: channel.type
+        for summary in snapshot.differing(places)
+        for channel in session.entry_of(summary).channels
+    }
+    chosen = [topic for topic, name in found.items() if any(_is_type(name, one) for one in types)]
+    if not chosen:
+        known = sorted({*found.values()} - {""})
+        near = difflib.get_close_matches(types[0], [*known, *map(_last, known)], cutoff=0.6)
+        hint = f"did you mean {listed(near)}?" if near else f"there are {listed(known, 10)}"
+        raise TopicError(f"there is no topic of type {listed(types)}; {hint}")
+    return sorted(chosen)
+
+
 def placed(session: Session, names: Iterable[str]) -> dict[int, None]:
     """Positions of recordings by names and globs."""
     snapshot = session.snapshot()
@@ -229,9 +253,13 @@ def _is_side(moment: TimeLike | None) -> bool:
 
 def _is_type(name: str, pattern: str) -> bool:
     """True if a type is meant: `sensor_msgs/msg/Imu` by itself, `sensor_msgs/Imu` or `Imu`."""
-    spelled = {name, _short(name), name.replace(".", "/").rpartition("/")[2]}
+    spelled = {name, _short(name), _last(name)}
     wanted = {pattern, _short(pattern)}
     return any(fnmatchcase(one, want) or one == want for one in spelled for want in wanted)
+
+
+def _last(name: str) -> str:
+    return name.replace(".", "/").rpartition("/")[2]
 
 
 def _short(name: str) -> str:

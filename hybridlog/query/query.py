@@ -216,7 +216,7 @@ class Query:
         Raises:
             UsageError: a negative number.
         """
-        if not isinstance(count, int) or count < 0:
+        if type(count) is not int or count < 0:
             raise UsageError(f"A limit is a whole number and not negative; {count!r} is not.")
         return self._with(limit=count)
 
@@ -226,7 +226,7 @@ class Query:
         Raises:
             UsageError: less than one.
         """
-        if not isinstance(step, int) or step < 1:
+        if type(step) is not int or step < 1:
             raise UsageError(f"every(n) needs a number n of at least 1, not {step!r}.")
         return self._with(every=min(step, _MAX_STEP))
 
@@ -856,7 +856,7 @@ def _no_field(path: str, known: Mapping[str, str], topics: Sequence[str]) -> str
 
 def _stacked(arrays: list[NDArray[Any]]) -> NDArray[Any] | list[NDArray[Any]]:
     alike = {(a.shape, a.dtype) for a in arrays}
-    return np.stack(arrays) if len(alike) == 1 else arrays
+    return np.stack(arrays) if len(alike) == 1 else arrays or np.empty(0)
 
 
 def _message_at(query: Query, moment: TimeLike) -> Message:

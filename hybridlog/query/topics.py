@@ -223,7 +223,7 @@ def _unknown(pattern: str, known: list[str]) -> str:
     by_key: dict[str, list[str]] = {}
     for topic in known:
         whole = topic.casefold().strip("/")
-        for key in {whole, whole.rsplit("/", 1)[-1]}:
+        for key in {whole, *whole.split("/")}:
             by_key.setdefault(key, []).append(topic)
     for word in (wanted, last):
         for key in difflib.get_close_matches(word, by_key, n=_MAX_NAMES, cutoff=0.6):

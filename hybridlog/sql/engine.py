@@ -190,6 +190,8 @@ class SqlConnection:
         """
         if isinstance(params, str) or not isinstance(() if params is None else params, Iterable):
             raise UsageError("Parameters are a list, or a dictionary by name: sql(query, [0.5]).")
+        if not isinstance(timeout, int | float | None):
+            raise UsageError(f"A timeout is a number of seconds, not {timeout!r}.")
         with explained(self.memory):
             statements = list(self.cursor.extract_statements(text))
         if not statements:

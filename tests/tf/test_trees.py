@@ -7,10 +7,11 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import hybridlog as hl
-from hybridlog_storage.errors import TopicError
+from hybridlog_storage.errors import TopicError, UsageError
 from hybridlog_storage.messages import Channel
 from tests.cli.running import run
 from tests.odd_messages import ros_channel
@@ -180,3 +181,34 @@ def test_a_stamp_of_zero_is_no_time(store: hl.Store) -> None:
     assert store.topic("/a").limit(1).to_arrow()["header.stamp"].cast("int64").to_pylist() == [0]
     (message,) = store.topic("/a").limit(1)
     assert message.header_stamp_ns is None
+
+
+def test_topics_by_type(store: hl.Store, tmp_path: Path) -> None:
+    messages = [(topic, point("base", S), BEGIN) for topic in ("/a", "/b")]
+    recorded(store, "x", [*messages, ("/tf", tf("map", "base", S, 1), BEGIN)])
+    assert store.topics("PointStamped") == store.topics("geometry_msgs/*") == ["/a", "/b"]
+    assert store.recordings("x").topics(POINT, "TFMessage") == store.topics()
+    with pytest.raises(TopicError, match="did you mean PointStamped"):
+        store.topics("PointStampd")
+    path = tmp_path / "store"
+    assert run("fetch", "--topic-type", "Point*", "--count", store=path).out == "2\n"
+    assert run("fetch", "tf", "--topic-type", "Point*", "--count", store=path).out == "3\n"
+
+
+def test_odd_arguments_and_a_closed_store(store: hl.Store) -> None:
+    recorded(store, "x", [("/gps/battery/state", point("base", S), BEGIN)])
+    query = store.topic("state")
+    for refused in (lambda: query.limit(True), lambda: query.every(True)):
+        with pytest.raises(UsageError):
+            refused()
+    with pytest.raises(UsageError, match="number of seconds"):
+        store.sql("select 1", timeout="5s")  # type: ignore[arg-type]
+    with pytest.raises(TopicError, match="did you mean /gps/battery/state"):
+        store.topic("batery")
+    nothing = query.where("point.x > 5").to_numpy()
+    assert isinstance(nothing, np.ndarray)
+    assert len(nothing) == 0
+    store.close()
+    for asked in (query.count, query.to_arrow, store.topics):
+        with pytest.raises(UsageError, match="is closed: open it again"):
+            asked()

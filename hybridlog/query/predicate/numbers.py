@@ -5,6 +5,9 @@ from __future__ import annotations
 import math
 from typing import TypeGuard
 
+import numpy as np
+
+from hybridlog.query.predicate.tree import Value
 from hybridlog.schema.text import nearest
 
 LOW, HIGH = -(2**63), 2**63 - 1
@@ -19,6 +22,15 @@ def is_number(value: object) -> TypeGuard[float]:
 def is_nan(value: object) -> bool:
     """True if a value is NaN."""
     return isinstance(value, float) and math.isnan(value)
+
+
+def single(value: Value) -> Value:
+    """The float32 nearest to a decimal literal; integers, and what float32 cannot hold, stay."""
+    if not isinstance(value, float):
+        return value
+    with np.errstate(over="ignore"):
+        near = float(np.float32(value))
+    return near if math.isfinite(near) else value
 
 
 def for_doubles(order: str, value: float) -> tuple[str, float]:

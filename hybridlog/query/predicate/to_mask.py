@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -21,6 +22,7 @@ from hybridlog.query.predicate.numbers import (
     for_integers,
     is_nan,
     is_number,
+    single,
 )
 from hybridlog.query.predicate.tree import (
     And,
@@ -414,6 +416,8 @@ def _elements(leaves: _Leaves) -> Iterator[_Leaves]:
 
 def _tested(node: Compare | Member | Match, leaves: _Leaves, types: FieldTypes) -> Mask:
     """Mask of the values that satisfy a condition, without its negation: bool[values]."""
+    if types.are_singles(node.field.parts):
+        node = _of_singles(node)
     if leaves.is_summary:
         return _of_summaries(node, leaves, types)
     match node:
@@ -428,6 +432,16 @@ def _tested(node: Compare | Member | Match, leaves: _Leaves, types: FieldTypes) 
             if leaves.is_element and _kind_of(leaves.values) == "f":
                 found &= np.isfinite(_numpy(leaves.values).astype(np.float64))
             return found
+
+
+def _of_singles(node: Compare | Member | Match) -> Compare | Member | Match:
+    """The condition with its decimal literals as float32 holds them, like the values."""
+    match node:
+        case Compare(value=value):
+            return replace(node, value=single(value))
+        case Member(values=values):
+            return replace(node, values=tuple(map(single, values)))
+    return node
 
 
 def _equal_to(leaves: _Leaves, values: Sequence[Value]) -> Mask:

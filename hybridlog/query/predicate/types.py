@@ -118,6 +118,12 @@ class FieldTypes:
         """Kind of a field, or of the elements of an array."""
         return _KINDS.get(self.base(path), "other")
 
+    def are_singles(self, parts: Parts) -> bool:
+        """True if a field, the elements of an array, or its ends are of float32."""
+        is_end = self.statistic(parts) in {"min", "max"}
+        names = [part for part in (parts[:-1] if is_end else parts) if isinstance(part, str)]
+        return self.base(".".join(names)) == "float32"
+
     def are_floats(self, path: str) -> bool:
         """True if a field, or the elements of an array, are floating-point numbers."""
         return self.base(path) in FLOATS

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import operator
+import struct
 from fractions import Fraction
 
 import numpy as np
@@ -21,6 +22,14 @@ ORDERS = {
     ">": operator.gt,
     ">=": operator.ge,
 }
+
+
+def as_single(bound: float) -> float:
+    """A decimal literal as float32 holds it, if it is one and does."""
+    try:
+        return bound if isinstance(bound, int) else struct.unpack("<f", struct.pack("<f", bound))[0]  # type: ignore[no-any-return]
+    except OverflowError:
+        return bound
 
 
 @pytest.mark.parametrize(
@@ -47,7 +56,8 @@ def test_numbers_are_compared_by_value(name: str, order: str) -> None:
         records = pa.StructArray.from_arrays([pa.array(values)], ["x"])
         mask = to_mask(asked, {"x": name}, records)
         assert mask is not None
-        expected = [ORDERS[order](Fraction(v), Fraction(bound)) for v in values.tolist()]
+        given = Fraction(as_single(bound) if name == "float32" else bound)
+        expected = [ORDERS[order](Fraction(v), given) for v in values.tolist()]
         assert mask.tolist() == expected, bound
         objects = [{"x": value} for value in values.tolist()]
         assert mask_of_objects(asked, {"x": name}, objects).tolist() == expected
@@ -58,6 +68,34 @@ def mask_of(
 ) -> list[bool] | None:
     mask = to_mask(parse(text), types, records.to_struct_array())
     return None if mask is None else mask.tolist()
+
+
+def test_decimal_literals_are_those_of_float32() -> None:
+    """Beside fields, elements and ends of float32; not beside means, which are doubles."""
+    types = {"v": "float32", "list[]": "float32", "a": "float32[]", "d": "float64"}
+    values = np.array([15.8, 15.7, 0.1], np.float32)
+    rows: list[dict[str, object]] = [
+        {"v": v, "a": [v], "d": v, "list": [v]} for v in values.tolist()
+    ]
+    kind = pa.list_(pa.float32())
+    fields = [("v", pa.float32()), ("a", kind), ("d", pa.float64()), ("list", kind)]
+    records = pa.array(rows, pa.struct(fields))
+    for text, wanted in (
+        ("v <= 15.8", [True, True, True]),
+        ("v == 15.8 or v in [0.1]", [True, False, True]),
+        ("v > 15.8", [False] * 3),
+        ("a.max == 15.8", [True, False, False]),
+        ("a[0] >= 15.8", [True, False, False]),
+        ("list == 0.1", [False, False, True]),
+        ("a.mean == 15.8", [False] * 3),
+        ("d == 15.8", [False] * 3),
+        ("v < 1e300", [True] * 3),
+        ("v < 16777217", [True] * 3),
+    ):
+        mask = to_mask(parse(text), types, records)
+        assert mask is not None, text
+        assert mask.tolist() == wanted, text
+        assert mask_of_objects(parse(text), types, rows).tolist() == wanted, text
 
 
 def test_times_are_nanoseconds() -> None:
