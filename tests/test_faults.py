@@ -659,13 +659,13 @@ def test_opening_does_not_take_the_directory_of_a_recording_that_begins(
     path: Path, short: Path, calls: Calls
 ) -> None:
     """Another process opens the store after the directory is made, before it is locked."""
-    from hybridlog_storage.disk.directory import StoreDirectory
+    from hybridlog_storage.manifests import DiskManifests
 
     def made(found: None, *_: object) -> None:
         with hl.open(path, require_database=True) as other:
             assert other.recordings() == []
 
-    calls.change(StoreDirectory, "make_folder", made)
+    calls.change(DiskManifests, "_make_lock", made)
     with hl.open(path, require_database=True) as store:
         store.record(short)
         assert store.verify().findings == []

@@ -386,9 +386,13 @@ def _own_directory(given: Path) -> Path:
 
 
 def _make_folder(path: Path) -> None:
-    """Create a private folder unless it exists."""
-    with contextlib.suppress(FileExistsError):
+    """Create a private folder unless it exists; replace a plain file of its name."""
+    try:
         files.make_folder(path, 0o700)
+    except FileExistsError:
+        if stat.S_ISREG(files.status(path).st_mode):
+            files.unlink(path)
+            _make_folder(path)
 
 
 def _refuse_odd_files(directory: Path) -> None:
