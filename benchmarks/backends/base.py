@@ -6,7 +6,8 @@ To add one, write a class in a module of its own, and name it in `registry.py`.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -20,6 +21,15 @@ class BackendMissingError(Exception):
 
 class BackendFailedError(Exception):
     """A system has stopped working in the middle: a dead server, a full disk."""
+
+
+@contextmanager
+def failing(system: str, *errors: type[Exception]) -> Iterator[None]:
+    """What a driver raises in the block is a failure of the system."""
+    try:
+        yield
+    except errors as error:
+        raise BackendFailedError(f"{system}: {' '.join(str(error).split())}") from error
 
 
 class Backend(ABC):

@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from benchmarks.backends.base import Backend, BackendFailedError, BackendMissingError
+from benchmarks.backends.base import Backend, BackendFailedError, BackendMissingError, failing
 from benchmarks.usage import wait_for_mongods, working_below
 from hybridlog_storage.errors import HybridlogError, MissingDependencyError
 from hybridlog_storage.mongo.collection_names import collection_of
@@ -75,10 +75,8 @@ class Hybridlog(Backend):
         recording, self._recording = self._recording, None
         if recording is None:
             return
-        try:
+        with failing("hybridlog", HybridlogError, OSError):
             report = recording.close()
-        except (HybridlogError, OSError) as error:
-            raise BackendFailedError(f"hybridlog: {error}") from error
         if report.missed:
             raise BackendFailedError(
                 f"hybridlog: {report.missed} messages are stored, but not in the index: "
@@ -88,7 +86,7 @@ class Hybridlog(Backend):
     def counts(self) -> Mapping[str, int]:
         """Payloads that were read back, by topic."""
         found = dict.fromkeys((channel.topic for channel in self._channels), 0)
-        try:
+        with failing("hybridlog", HybridlogError, OSError):
             store = self.store
             store.refresh()
             database = store.shared.index.database_for("Counting")
@@ -101,8 +99,6 @@ class Hybridlog(Backend):
                         f"hybridlog: {topic} has {found[topic]} payloads and {indexed} index "
                         "documents"
                     )
-        except (HybridlogError, OSError) as error:
-            raise BackendFailedError(f"hybridlog: {error}") from error
         return found
 
     def close(self) -> None:

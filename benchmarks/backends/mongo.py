@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
-from benchmarks.backends.base import BackendFailedError, BackendMissingError
+from benchmarks.backends.base import BackendMissingError, failing
 from benchmarks.backends.conversion import INSERTED_AT
 from benchmarks.backends.database import DatabaseBackend
 from benchmarks.backends.server import Server
@@ -105,10 +105,8 @@ class Mongo(DatabaseBackend):
             connectTimeoutMS=_FIND_MS,
             socketTimeoutMS=_ANSWER_MS,
         )
-        try:
+        with failing("MongoDB", PyMongoError):
             self._make_collections()
-        except PyMongoError as error:
-            raise BackendFailedError(f"MongoDB: {error}") from error
         self._batches = [_Batch() for _ in channels]
 
     def _make_collections(self) -> None:
@@ -149,21 +147,17 @@ class Mongo(DatabaseBackend):
         journaled = self._client["harness"].get_collection(
             "finish", write_concern=WriteConcern(w=1, j=True)
         )
-        try:
+        with failing("MongoDB", PyMongoError):
             journaled.replace_one({"_id": 0}, {}, upsert=True)
-        except PyMongoError as error:
-            raise BackendFailedError(f"MongoDB: {error}") from error
 
     def counts(self) -> Mapping[str, int]:
         from pymongo.errors import PyMongoError
 
-        try:
+        with failing("MongoDB", PyMongoError):
             return {
                 topic: self.database[collection_of(topic)].count_documents({})
                 for topic in self._topics()
             }
-        except PyMongoError as error:
-            raise BackendFailedError(f"MongoDB: {error}") from error
 
     def close(self) -> None:
         client, self._client = self._client, None
@@ -181,10 +175,8 @@ class Mongo(DatabaseBackend):
 
         if not batch.documents:
             return
-        try:
+        with failing("MongoDB", PyMongoError):
             self._collections[channel].insert_many(batch.documents, ordered=False)
-        except PyMongoError as error:
-            raise BackendFailedError(f"MongoDB: {error}") from error
         batch.documents, batch.size = [], 0
 
 

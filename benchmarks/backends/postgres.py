@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from benchmarks.backends import postgres_server
-from benchmarks.backends.base import BackendFailedError
+from benchmarks.backends.base import BackendFailedError, failing
 from benchmarks.backends.conversion import T
 from benchmarks.backends.database import DatabaseBackend
 from benchmarks.backends.requirements import need
@@ -100,12 +100,10 @@ class Postgres(DatabaseBackend):
         """A new connection in autocommit mode; whoever asked for it closes it."""
         import psycopg
 
-        try:
+        with failing("PostgreSQL", psycopg.Error):
             return psycopg.connect(
                 postgres_server.connection_string(self._server.sockets), autocommit=True
             )
-        except psycopg.Error as error:
-            raise _failed(error) from error
 
     def open(self, channels: Sequence[Channel]) -> None:
         self.check()
@@ -130,12 +128,9 @@ class Postgres(DatabaseBackend):
     def _make_tables(self) -> None:
         import psycopg
 
-        with self.connect() as connection:
-            try:
-                for topic, groups in self._topics().items():
-                    self._make_table(connection, topic, groups)
-            except psycopg.Error as error:
-                raise _failed(error) from error
+        with failing("PostgreSQL", psycopg.Error), self.connect() as connection:
+            for topic, groups in self._topics().items():
+                self._make_table(connection, topic, groups)
         self._copies = [f"COPY {table_of(c.topic)} (data) FROM STDIN" for c in self._channels]
 
     def _make_table(
@@ -162,7 +157,7 @@ class Postgres(DatabaseBackend):
                 copy = batch.copy or self._begin(channel, batch)
                 copy.write_row((text,))
             except psycopg.Error as error:
-                raise _failed(error) from error
+                raise BackendFailedError(f"PostgreSQL: {error}") from error
             batch.size += len(text)
             if batch.size >= BATCH_BYTES or time.monotonic() - batch.since >= BATCH_S:
                 self._commit(batch)
@@ -176,15 +171,10 @@ class Postgres(DatabaseBackend):
         import psycopg
 
         found = {}
-        with self.connect() as connection:
-            try:
-                for topic in self._topics():
-                    row: Any = connection.execute(
-                        f"SELECT count(*) FROM {table_of(topic)}"
-                    ).fetchone()
-                    found[topic] = int(row[0])
-            except psycopg.Error as error:
-                raise _failed(error) from error
+        with failing("PostgreSQL", psycopg.Error), self.connect() as connection:
+            for topic in self._topics():
+                row: Any = connection.execute(f"SELECT count(*) FROM {table_of(topic)}").fetchone()
+                found[topic] = int(row[0])
         return found
 
     def close(self) -> None:
@@ -208,10 +198,8 @@ class Postgres(DatabaseBackend):
     def _commit(self, batch: _Batch) -> None:
         import psycopg
 
-        try:
+        with failing("PostgreSQL", psycopg.Error):
             batch.ending.close()
-        except psycopg.Error as error:
-            raise _failed(error) from error
         batch.copy, batch.size = None, 0
 
 
@@ -228,7 +216,3 @@ class PostgresIndexed(Postgres):
 
     _type = "jsonb"
     _is_indexed = True
-
-
-def _failed(error: Exception) -> BackendFailedError:
-    return BackendFailedError(f"PostgreSQL: {' '.join(str(error).split())}")

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from benchmarks.backends.base import BackendFailedError
+from benchmarks.backends.base import BackendFailedError, failing
 from benchmarks.backends.conversion import T
 from benchmarks.backends.database import DatabaseBackend
 from benchmarks.backends.requirements import need
@@ -74,15 +74,13 @@ class Sqlite(DatabaseBackend):
     def open(self, channels: Sequence[Channel]) -> None:
         self.check()
         self._take_channels(channels)
-        try:
+        with failing("SQLite", sqlite3.Error):
             self._opened = sqlite3.connect(
                 self.path, timeout=_BUSY_S, isolation_level=None, check_same_thread=False
             )
             self._opened.execute("PRAGMA journal_mode = WAL")
             self._opened.execute("PRAGMA synchronous = NORMAL")
             self._make_tables()
-        except sqlite3.Error as error:
-            raise _failed(error) from error
         self._inserts = [
             f"INSERT INTO {table_of(channel.topic)} (msg) VALUES (?)" for channel in channels
         ]
@@ -104,27 +102,21 @@ class Sqlite(DatabaseBackend):
             try:
                 self.connection.execute(self._inserts[channel], (text,))
             except sqlite3.Error as error:
-                raise _failed(error) from error
+                raise BackendFailedError(f"SQLite: {error}") from error
 
     def finish(self) -> None:
-        with self._lock:
-            try:
-                # With `synchronous` NORMAL this is when commits reach the disk for good.
-                self.connection.execute("PRAGMA wal_checkpoint(FULL)")
-            except sqlite3.Error as error:
-                raise _failed(error) from error
+        with self._lock, failing("SQLite", sqlite3.Error):
+            # With `synchronous` NORMAL this is when commits reach the disk for good.
+            self.connection.execute("PRAGMA wal_checkpoint(FULL)")
 
     def counts(self) -> Mapping[str, int]:
-        with self._lock:
-            try:
-                return {
-                    topic: self.connection.execute(
-                        f"SELECT count(*) FROM {table_of(topic)}"
-                    ).fetchone()[0]
-                    for topic in self._topics()
-                }
-            except sqlite3.Error as error:
-                raise _failed(error) from error
+        with self._lock, failing("SQLite", sqlite3.Error):
+            return {
+                topic: self.connection.execute(
+                    f"SELECT count(*) FROM {table_of(topic)}"
+                ).fetchone()[0]
+                for topic in self._topics()
+            }
 
     def close(self) -> None:
         with self._lock:
@@ -163,17 +155,10 @@ class SqliteIndexed(Sqlite):
                 if self._size >= BATCH_BYTES or time.monotonic() - self._since >= BATCH_S:
                     connection.execute("COMMIT")
             except sqlite3.Error as error:
-                raise _failed(error) from error
+                raise BackendFailedError(f"SQLite: {error}") from error
 
     def finish(self) -> None:
-        with self._lock:
-            try:
-                if self.connection.in_transaction:
-                    self.connection.execute("COMMIT")
-            except sqlite3.Error as error:
-                raise _failed(error) from error
+        with self._lock, failing("SQLite", sqlite3.Error):
+            if self.connection.in_transaction:
+                self.connection.execute("COMMIT")
         super().finish()
-
-
-def _failed(error: sqlite3.Error) -> BackendFailedError:
-    return BackendFailedError(f"SQLite: {error}")

@@ -37,7 +37,7 @@ _END_S = 5.0
 
 
 class StoppedError(Exception):
-    """Whoever started this process wants its end, or has gone."""
+    """Whoever started this process wants its end."""
 
 
 def log(*, load: str, backend: str, directory: str, publishing: Publishing) -> Values:
@@ -52,7 +52,6 @@ def log(*, load: str, backend: str, directory: str, publishing: Publishing) -> V
     Returns:
         `status`, `reason`, and what was measured.
     """
-    parent = os.getppid()
     opened = Load.open(Path(load))
     values: Values = {"status": "ok", "reason": ""}
     with ended_by_signals():
@@ -60,7 +59,7 @@ def log(*, load: str, backend: str, directory: str, publishing: Publishing) -> V
         try:
             system.check()
             system.open(opened.channels)
-            _run(system, opened, publishing, values, parent)
+            _run(system, opened, publishing, values)
         except BackendMissingError as error:
             values |= {"status": "missing", "reason": str(error)}
         except (BackendFailedError, StoppedError) as error:
@@ -98,7 +97,7 @@ def _close(system: Backend, values: Values) -> None:
             values |= {"status": "failed", "reason": str(error)}
 
 
-def _run(system: Backend, load: Load, publishing: Publishing, values: Values, parent: int) -> None:
+def _run(system: Backend, load: Load, publishing: Publishing, values: Values) -> None:
     """Everything between opening and closing; `values` is filled as things become known."""
     counters = Counters(Path(publishing["counters"]), len(load.channels))
     subscribers = Subscribers(load, system, counters)
@@ -131,7 +130,7 @@ def _run(system: Backend, load: Load, publishing: Publishing, values: Values, pa
         meter = _Meter(system)
         publisher.stdin.write("go\n")
         publisher.stdin.flush()
-        _watch(publisher, subscribers, parent)
+        _watch(publisher, subscribers)
         failure = subscribers.failure
         if not subscribers.failed.is_set():
             try:
@@ -152,20 +151,14 @@ def _run(system: Backend, load: Load, publishing: Publishing, values: Values, pa
         raise BackendFailedError(failure)
 
 
-def _watch(publisher: subprocess.Popen[str], subscribers: Subscribers, parent: int) -> None:
+def _watch(publisher: subprocess.Popen[str], subscribers: Subscribers) -> None:
     """Wait until all that is published has been taken, or the backend has failed."""
     while not subscribers.join(_LOOK_S):
-        _see(parent)
         if subscribers.failed.is_set():
             _end(publisher)
             # Those that hang in the backend end with the process.
             subscribers.join(_END_S)
             return
-
-
-def _see(parent: int) -> None:
-    if os.getppid() != parent:
-        raise StoppedError("the process that started this run has gone")
 
 
 def _end(publisher: subprocess.Popen[str]) -> None:

@@ -34,12 +34,6 @@ _BLOCK = 4096
 """Rows made Python numbers at once: a tenth of a millisecond, also in a log of millions."""
 _BATCH = 512
 """Messages after which the clock is looked at again by a publisher that is late."""
-_NAP_NS = 250_000_000
-"""Longest sleep; after each the publisher sees whether its logger is still there."""
-
-
-class _OrphanedError(Exception):
-    """The logger has gone."""
 
 
 def publish_to_queues(
@@ -73,7 +67,7 @@ def publish_to_queues(
 
 def _batches(load: Load, start: int, speed: float) -> Iterator[tuple[int, list[int]]]:
     """Sleep until messages are due; give the first row and the channels."""
-    clock, parent = time.monotonic_ns, os.getppid()
+    clock = time.monotonic_ns
     for block in range(0, len(load), _BLOCK):
         rows = slice(block, block + _BLOCK)
         due = (start + np.rint(load.due[rows] / speed).astype(np.int64)).tolist()
@@ -82,9 +76,7 @@ def _batches(load: Load, start: int, speed: float) -> Iterator[tuple[int, list[i
         while at < len(due):
             now = clock()
             if due[at] > now:
-                time.sleep(min(due[at] - now, _NAP_NS) / 1e9)
-                if os.getppid() != parent:
-                    raise _OrphanedError
+                time.sleep((due[at] - now) / 1e9)
                 continue
             stop = bisect_right(due, now, at, min(at + _BATCH, len(due)))
             yield block + at, channels[at:stop]
@@ -119,5 +111,5 @@ def main(*, load: str, counters: str, pipes: list[int], limit: int, speed: float
 if __name__ == "__main__":
     try:
         print(json.dumps(main(**json.loads(sys.argv[1]))))
-    except (_OrphanedError, BrokenPipeError, KeyboardInterrupt):
+    except (BrokenPipeError, KeyboardInterrupt):
         sys.exit(1)

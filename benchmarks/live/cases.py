@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from benchmarks.live.recorders import Kept, Recorder, speech
 from benchmarks.live.talker import Data, Load
+from benchmarks.numbers import percent, size
 from benchmarks.samples import Sample, Status
 from benchmarks.side import SideError
 from benchmarks.usage import cpu_s, rss, stolen_s, wait_for_mongods, with_children, working_below
@@ -73,7 +74,7 @@ def _plain(name: str, load: Load) -> Case:
         yield _row(name, "hybridlog", _Recorded(said, did, kept, stolen[0]))
 
     about = (
-        f"{load.topics} topic{'s'[: load.topics > 1]} of {_size(load.size)} at {load.hz:g} Hz, "
+        f"{load.topics} topic{'s'[: load.topics > 1]} of {size(load.size)} at {load.hz:g} Hz, "
         f"{load.megabytes_per_s:,.0f} MB/s"
     )
     return Case(about, run)
@@ -108,7 +109,7 @@ def _row(name: str, recorder: str, recorded: _Recorded) -> Row:
     told = ", ".join(f"{cause} {count:,}" for cause, count in kept.causes.items())
     whole = kept.stored - kept.reduced
     text = (
-        f"{whole:,} of {did['sent']:,.0f} stored whole ({_share(whole, did['sent'])}), "
+        f"{whole:,} of {did['sent']:,.0f} stored whole ({percent(100 * whole / did['sent'])} %), "
         f"{told or 'nothing'} in the ledger, {missing:,.0f} missing without a word"
     )
     return Row(name, recorder, values, text, missing == 0 and not_indexed == 0)
@@ -269,14 +270,6 @@ def _steal() -> Iterator[list[float]]:
     found = [0.0]
     yield found
     found[0] = stolen_s() - before
-
-
-def _size(size: int) -> str:
-    return f"{size // 1000} kB" if size >= 1000 else f"{size} B"
-
-
-def _share(part: float, whole: float) -> str:
-    return "100 %" if part == whole else f"{100 * part / whole:.2f} %"
 
 
 CASES: dict[str, Case] = {

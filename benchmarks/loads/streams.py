@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from hashlib import md5
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,9 +21,6 @@ TYPE = "hybridlog_benchmarks/Frame"
 _FIELDS = "Header header\nfloat32[] ranges\nuint8[] data\n"
 _HEADER = "uint32 seq\ntime stamp\nstring frame_id\n"
 _DEFINITION = f"{_FIELDS}\n{'=' * 80}\nMSG: std_msgs/Header\n{_HEADER}"
-_HEADER_SUM = "2176decaecbce78abc3b96ef049fabed"
-"""ROS 1 checksum of std_msgs/Header, which stands for its name in those that use it."""
-_SUM = md5(_FIELDS.replace("Header ", f"{_HEADER_SUM} ").strip().encode()).hexdigest()
 
 _POOL_BYTES = 64 << 20
 _POOL_MESSAGES = 100
@@ -96,7 +92,7 @@ def _channel(number: int, topics: int) -> Channel:
         topic=f"/frames/{number:0{digits}}",
         message_encoding="ros1",
         schema=Schema(TYPE, "ros1msg", _DEFINITION.encode()),
-        metadata={"callerid": "/hybridlog_benchmarks", "md5sum": _SUM},
+        metadata={"callerid": "/hybridlog_benchmarks"},
         has_publish_time=False,
     )
 

@@ -13,11 +13,9 @@ from benchmarks.simulator.write import DEFAULT_DURATION_S, DEFAULT_SEED, write_b
 def main() -> None:
     """Run the command."""
     parser = argparse.ArgumentParser("python -m benchmarks.simulator", description=__doc__)
-    parser.add_argument("path", type=Path, help="bag to write (a directory with --ros 2)")
+    parser.add_argument("path", type=Path, help="bag to write")
     parser.add_argument("--duration", type=float, default=DEFAULT_DURATION_S, metavar="SECONDS")
     parser.add_argument("--seed", type=int, default=DEFAULT_SEED)
-    parser.add_argument("--ros", type=int, choices=(1, 2), default=1)
-    parser.add_argument("--storage", choices=("mcap", "sqlite3"), default="mcap")
     parser.add_argument(
         "--demo",
         action="store_true",

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -62,8 +60,7 @@ class Context:
             settings: All that it depends on, values that JSON can hold.
             make: Makes it in an empty directory.
         """
-        text = json.dumps([name, settings], sort_keys=True)
-        place = self.work / "loads" / f"{name}-{sha256(text.encode()).hexdigest()[:16]}"
+        place = self.work / "loads" / "-".join(map(str, [name, *settings.values()]))
         if not place.exists():
             place.mkdir(parents=True)
             make(place)

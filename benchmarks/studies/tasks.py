@@ -123,7 +123,7 @@ def run(context: Context, group: str) -> None:
 
 def robot_store(context: Context, settings: Settings) -> Path:
     """The store with the robot's log, recorded once; the log lies beside it."""
-    place = context.work / "loads" / f"robot-{settings.seconds}-{context.seed}"
+    place = context.work / "loads" / f"store-{settings.seconds}-{context.seed}"
     if not place.exists():
         place.mkdir(parents=True)
         robot.write_log(place / "robot.mcap", seconds=settings.seconds, seed=context.seed)
