@@ -69,11 +69,8 @@ def mongods(store: Path) -> list[str]:
     return found
 
 
-def without(store: Path, *arguments: object) -> bytes:
-    """What a command says that can import no driver and start no server."""
-    log = store / "mongod" / "mongod.log"
-    before = log.stat().st_mtime_ns if log.exists() else time.time_ns()
-    ended = subprocess.run(
+def blocked(store: Path, *arguments: object) -> subprocess.CompletedProcess[bytes]:
+    return subprocess.run(
         [sys.executable, "-c", BLOCKED, *map(str, arguments)],
         stdin=subprocess.DEVNULL,
         capture_output=True,
@@ -81,6 +78,13 @@ def without(store: Path, *arguments: object) -> bytes:
         timeout=120,
         check=False,
     )
+
+
+def without(store: Path, *arguments: object) -> bytes:
+    """What a command says that can import no driver and start no server."""
+    log = store / "mongod" / "mongod.log"
+    before = log.stat().st_mtime_ns if log.exists() else time.time_ns()
+    ended = blocked(store, *arguments)
     assert b"imported" not in ended.stderr, ended.stderr[-2000:]
     assert ended.returncode == 0, ended.stderr[-2000:]
     assert not log.exists() or log.stat().st_mtime_ns == before
@@ -94,20 +98,7 @@ def test_topics_and_times_are_answered_without_a_server(store: Path, name: str) 
 
 def test_the_blocker_blocks(store: Path) -> None:
     """The tests above can fail: making the index again does need the server."""
-    ended = subprocess.run(
-        [
-            sys.executable,
-            "-c",
-            BLOCKED,
-            "index",
-            "rebuild",
-        ],
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        env=environment(HYBRIDLOG_STORE=str(store)),
-        timeout=120,
-        check=False,
-    )
+    ended = blocked(store, "index", "rebuild")
     assert ended.returncode != 0
     assert b"imported" in ended.stderr
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -14,19 +13,6 @@ NASTY = st.text(alphabet="/_a~.$ \0A0é", max_size=12)
 ROS = st.lists(st.from_regex(r"[a-z0-9]{1,3}(_[a-z0-9]{1,2})?", fullmatch=True), min_size=1).map(
     lambda parts: "/" + "/".join(parts)
 )
-
-
-@pytest.mark.parametrize(
-    ("topic", "name"),
-    [
-        ("/scan", "scan"),
-        ("/r_gripper_controller/command", "r_gripper_controller__command"),
-        ("/a/b", "a__b"),
-        ("/camera/front/image_raw", "camera__front__image_raw"),
-    ],
-)
-def test_canonical_names_stay_readable(topic: str, name: str) -> None:
-    assert collection_of(topic) == name
 
 
 @given(NASTY | ROS | st.text(max_size=300))

@@ -17,7 +17,7 @@ import pytest
 
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import LOCK, Holder, StoreDirectory
-from hybridlog_storage.errors import HeldError, StoreError, TopicError
+from hybridlog_storage.errors import HeldError, TopicError
 from tests.waiting import at_once
 
 
@@ -36,17 +36,6 @@ def test_a_new_store(tmp_path: Path) -> None:
     assert again.settings == made.settings == StoreDirectory(made.path).settings
     other = StoreDirectory.create(tmp_path / "other")
     assert other.settings.store_id != made.settings.store_id
-
-
-def test_what_is_no_place_for_a_store(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("x")
-    (tmp_path / "full").mkdir()
-    (tmp_path / "full/precious.txt").write_text("x")
-    with pytest.raises(StoreError, match="is a file"):
-        StoreDirectory.create(tmp_path / "file")
-    with pytest.raises(StoreError, match="holds files"):
-        StoreDirectory.create(tmp_path / "full")
-    assert sorted(p.name for p in tmp_path.rglob("*")) == ["file", "full", "precious.txt"]
 
 
 def made(store: StoreDirectory, name: str = "r") -> Path:

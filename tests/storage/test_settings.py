@@ -91,16 +91,6 @@ def test_what_is_unknown_is_ignored(tmp_path: Path) -> None:
     assert read_settings(tmp_path) == StoreSettings("x")
 
 
-def test_no_store(tmp_path: Path) -> None:
-    with pytest.raises(StoreError, match="no such directory"):
-        read_settings(tmp_path / "none")
-    with pytest.raises(StoreError, match=r"no hybridlog\.toml"):
-        read_settings(tmp_path)
-    (tmp_path / "file").touch()
-    with pytest.raises(StoreError, match="is a file"):
-        read_settings(tmp_path / "file")
-
-
 def test_the_way_to_the_store_may_be_a_symlink(tmp_path: Path) -> None:
     (tmp_path / "store").mkdir()
     (tmp_path / "link").symlink_to("store")
