@@ -20,7 +20,7 @@ from benchmarks.live.talker import Data, Load
 from benchmarks.numbers import percent, size
 from benchmarks.samples import Sample, Status
 from benchmarks.side import SideError
-from benchmarks.usage import cpu_s, rss, stolen_s, wait_for_mongods, with_children, working_below
+from benchmarks.usage import cpu_s, rss, wait_for_mongods, with_children, working_below
 from tests.live.sources.ros1_peers import FakeMaster
 
 if TYPE_CHECKING:
@@ -37,14 +37,12 @@ class Row(NamedTuple):
     Attributes:
         case: Which case.
         recorder: Whose.
-        values: Figures by name; units stand in the names.
-        text: The figures in words.
+        text: What came of it.
         holds: Nothing is missing without a word, and what was damaged came back.
     """
 
     case: str
     recorder: str
-    values: dict[str, float]
     text: str
     holds: bool
 
@@ -66,12 +64,11 @@ def _plain(name: str, load: Load) -> Case:
 
     def run(work: Path, quick: bool) -> Iterator[Row]:  # noqa: FBT001 - one shape for all cases
         said = load._replace(seconds=2.0) if quick else load
-        with _recording(work, "--reserve", "0") as (running, master), _steal() as stolen:
+        with _recording(work, "--reserve", "0") as (running, master):
             with speech(said, master) as talker:
-                did = talker.ended()
+                sent = talker.ended()
             time.sleep(1)
-            kept = running.stop()
-        yield _row(name, "hybridlog", _Recorded(said, did, kept, stolen[0]))
+            yield _row(name, "hybridlog", sent, running.stop())
 
     about = (
         f"{load.topics} topic{'s'[: load.topics > 1]} of {size(load.size)} at {load.hz:g} Hz, "
@@ -80,39 +77,16 @@ def _plain(name: str, load: Load) -> Case:
     return Case(about, run)
 
 
-class _Recorded(NamedTuple):
-    """A load that has been said, and what a recorder has of it."""
-
-    load: Load
-    did: dict[str, float]
-    kept: Kept
-    stolen_s: float
-
-
-def _row(name: str, recorder: str, recorded: _Recorded) -> Row:
-    load, did, kept, stolen_s = recorded
-    missing = did["sent"] - kept.stored - kept.told
+def _row(name: str, recorder: str, sent: int, kept: Kept) -> Row:
+    missing = sent - kept.stored - kept.told
     not_indexed = 0 if kept.indexed is None else kept.stored - kept.indexed
-    values = {
-        "offered_mb_per_s": round(load.megabytes_per_s, 1),
-        "sent": did["sent"],
-        "dropped_by_talker": did["dropped"],
-        "talker_late_ms": did["late_ms"],
-        "stored": kept.stored,
-        "reduced": kept.reduced,
-        "told": kept.told,
-        "missing": missing,
-        "whole_share": round((kept.stored - kept.reduced) / did["sent"], 5),
-        "cpu_s": round(kept.cpu_s, 1),
-        "stolen_s": round(stolen_s, 1),
-    }
     told = ", ".join(f"{cause} {count:,}" for cause, count in kept.causes.items())
     whole = kept.stored - kept.reduced
     text = (
-        f"{whole:,} of {did['sent']:,.0f} stored whole ({percent(100 * whole / did['sent'])} %), "
-        f"{told or 'nothing'} in the ledger, {missing:,.0f} missing without a word"
+        f"{whole:,} of {sent:,} stored whole ({percent(100 * whole / sent)} %), "
+        f"{told or 'nothing'} in the ledger, {missing:,} missing without a word"
     )
-    return Row(name, recorder, values, text, missing == 0 and not_indexed == 0)
+    return Row(name, recorder, text, missing == 0 and not_indexed == 0)
 
 
 def _stopped_database(work: Path, quick: bool) -> Iterator[Row]:  # noqa: FBT001
@@ -120,14 +94,13 @@ def _stopped_database(work: Path, quick: bool) -> Iterator[Row]:  # noqa: FBT001
     pause = 3.0 if quick else 10.0
     load = Load(20, 40_000, 50, 2 * pause + 4)
     for how in ("halted", "killed"):
-        with _recording(work, "--reserve", "0") as (running, master), _steal() as stolen:
+        case = f"mongod {how} for {pause:g} s" if how == "halted" else "mongod killed"
+        with _recording(work, "--reserve", "0") as (running, master):
             with speech(load, master) as talker:
                 time.sleep(2)
                 _disturb(work / "store", how, pause)
-                did = talker.ended()
-            kept = running.stop()
-        case = f"mongod {how} for {pause:g} s" if how == "halted" else "mongod killed"
-        yield _row(case, "hybridlog", _Recorded(load, did, kept, stolen[0]))
+                sent = talker.ended()
+            yield _row(case, "hybridlog", sent, running.stop())
 
 
 def _disturb(store: Path, how: str, pause: float) -> None:
@@ -159,18 +132,12 @@ def _kills(work: Path, quick: bool) -> Iterator[Row]:  # noqa: FBT001
             stored += messages
             wrong += faults
     worst = max(lost_s, default=0.0)
-    values = {
-        "kills": count,
-        "stored": stored,
-        "wrong": wrong,
-        "lost_s_median": round(statistics.median(lost_s), 3) if lost_s else 0.0,
-        "lost_s_worst": round(worst, 3),
-    }
+    usual = statistics.median(lost_s) if lost_s else 0.0
     text = (
         f"{count} kills: {stored:,} messages came back, {wrong} of them wrong or out of order; "
-        f"the last one was {values['lost_s_median']:.2f} s old at the kill, {worst:.2f} s at most"
+        f"the last one was {usual:.2f} s old at the kill, {worst:.2f} s at most"
     )
-    yield Row("kill -9", "hybridlog", values, text, wrong == 0 and worst < 2 * _FLUSH_S)
+    yield Row("kill -9", "hybridlog", text, wrong == 0 and worst < 2 * _FLUSH_S)
 
 
 def _recovered(store: Path, load: Load, killed_ns: int) -> tuple[float, int, int]:
@@ -200,50 +167,36 @@ def _robot(work: Path, quick: bool) -> Iterator[Row]:  # noqa: FBT001
     """
     load = Load(20, 50_000, 50, 10.0 if quick else 60.0)
     for mongo, recorder in (("none", "hybridlog --mongo none"), ("embedded", "hybridlog")):
-        row = _watched("robot", recorder, load, work, "--mongo", mongo, "--budget", "128MiB")
-        per_gb = row.values["cpu_s"] / (load.megabytes_per_s * load.seconds / 1000)
-        values = {**row.values, "cpu_s_per_gb": round(per_gb, 2)}
-        yield row._replace(
-            values=values, text=f"{per_gb:.1f} s of processor time a gigabyte; {row.text}"
-        )
+        yield _watched(recorder, load, work, "--mongo", mongo, "--budget", "128MiB")
 
 
-def _watched(case: str, name: str, load: Load, work: Path, *options: str) -> Row:
+def _watched(name: str, load: Load, work: Path, *options: str) -> Row:
     """A load to ours alone, and its memory meanwhile."""
     seconds = load.seconds
     recorder: list[int] = []
-    database: list[int] = []
     servers: set[int] = set()
-    with _recording(work, *options) as (running, master), _steal() as stolen:
+    with _recording(work, *options) as (running, master):
         with speech(load, master) as talker:
             begin = time.monotonic()
             while time.monotonic() - begin < seconds - 1:
                 time.sleep(1)
                 recorder.append(rss(with_children([running.process.pid])))
                 servers = with_children(working_below(work / "store", "mongod"))
-                database.append(rss(servers))
-            did = talker.ended()
+            sent = talker.ended()
         database_s = cpu_s(servers)
         kept = running.stop()
-    row = _row(case, name, _Recorded(load, did, kept, stolen[0]))
+    row = _row("robot", name, sent, kept)
     fifth = max(len(recorder) // 5, 1)
     early, late = (
         statistics.median(part) / 1e6 for part in (recorder[fifth : 2 * fifth], recorder[-fifth:])
     )
-    values = {
-        **row.values,
-        "cpu_s": round(kept.cpu_s + database_s, 1),
-        "seconds": seconds,
-        "rss_mb_early": round(early),
-        "rss_mb_late": round(late),
-        "rss_mb_peak": round(max(recorder) / 1e6),
-        "mongod_mb_peak": round(max(database) / 1e6),
-    }
+    per_gb = (kept.cpu_s + database_s) / (load.megabytes_per_s * seconds / 1000)
     text = (
+        f"{per_gb:.1f} s of processor time a gigabyte; "
         f"{load.megabytes_per_s:.0f} MB/s for {seconds:.0f} s: {early:.0f} MB in the second "
-        f"fifth, {late:.0f} MB in the last, {values['rss_mb_peak']} MB at most; {row.text}"
+        f"fifth, {late:.0f} MB in the last, {max(recorder) / 1e6:.0f} MB at most; {row.text}"
     )
-    return Row(case, name, values, text, row.holds and late < 1.1 * early + 20)
+    return row._replace(text=text, holds=row.holds and late < 1.1 * early + 20)
 
 
 @contextmanager
@@ -261,15 +214,6 @@ def _recording(work: Path, *options: str) -> Iterator[tuple[Recorder, FakeMaster
         with suppress(TimeoutError):
             wait_for_mongods(work)
         shutil.rmtree(work, ignore_errors=True)
-
-
-@contextmanager
-def _steal() -> Iterator[list[float]]:
-    """Processor seconds that the host took from the machine while the block ran."""
-    before = stolen_s()
-    found = [0.0]
-    yield found
-    found[0] = stolen_s() - before
 
 
 CASES: dict[str, Case] = {

@@ -13,7 +13,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from benchmarks.live.talker import TYPE, Load
 from benchmarks.side import SideError
@@ -125,29 +124,29 @@ class Speech:
         self._process = subprocess.Popen(
             [sys.executable, "-m", "benchmarks.live.talker", json.dumps(load)],
             stdout=subprocess.PIPE,
+            text=True,
             cwd=_ROOT,
         )
         self._master = master
         self._topics = [f"/t{number}" for number in range(load.topics)]
-        uri = self.line()["uri"]
+        uri = self.line()
         for topic in self._topics:
             master.add(topic, TYPE, "/talker", uri)
 
-    def line(self) -> dict[str, Any]:
-        """What it says next: that it speaks, later what it did."""
+    def line(self) -> str:
+        """What it says next: where it is, that it speaks, how many messages it has sent."""
         assert self._process.stdout is not None
         line = self._process.stdout.readline()
         if not line:
             raise SideError("the talker has ended: nobody listened")
-        found: dict[str, Any] = json.loads(line)
-        return found
+        return line.strip()
 
-    def ended(self) -> dict[str, Any]:
-        """Waits until a talker that speaks has said everything, and tells what it did."""
-        found = self.line()
+    def ended(self) -> int:
+        """Waits until a talker that speaks has said everything: so many messages."""
+        sent = int(self.line())
         for topic in self._topics:
             self._master.remove(topic, "/talker")
-        return found
+        return sent
 
     def kill(self) -> None:
         """Ends it at once."""
