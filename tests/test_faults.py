@@ -7,8 +7,6 @@ import random
 import resource
 import signal
 import struct
-import subprocess
-import sys
 import threading
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
@@ -35,12 +33,11 @@ from hybridlog_storage.segments.segment_reader import SegmentReader
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import independent, places
 from tests.calls import Calls
-from tests.cli import running
+from tests.cli.running import run, started
 from tests.waiting import wait_for
 
 pytestmark = pytest.mark.mongo("embedded")
 
-COMMAND = [sys.executable, "-m", "hybridlog"]
 LIMIT_S = 120
 Message = independent.Seen
 
@@ -106,30 +103,6 @@ def content(messages: list[hl.Message]) -> Counter[Message]:
     return Counter(Message(m.topic, m.log_time_ns, m.raw) for m in messages)
 
 
-def run(
-    *arguments: object, store: Path, code: int, before: Callable[[], None] | None = None
-) -> subprocess.CompletedProcess[str]:
-    """A command in a process of its own, which must end with this exit code."""
-    words = [str(argument) for argument in arguments]
-    if before is None:
-        told = running.run(*words, store=store, code=code)
-        return subprocess.CompletedProcess(words, told.code, told.out, told.err)
-    # Where files may not grow, Python would cut short what it compiles.
-    variables = {"HYBRIDLOG_STORE": str(store), "PYTHONDONTWRITEBYTECODE": "1"}
-    done = subprocess.run(
-        [*COMMAND, *words],
-        env={**os.environ, **variables},
-        capture_output=True,
-        text=True,
-        timeout=LIMIT_S,
-        preexec_fn=before,
-        check=False,
-    )
-    assert "Traceback" not in done.stderr, done.stderr
-    assert done.returncode == code, (done.returncode, done.stdout, done.stderr)
-    return done
-
-
 # A recorder that is killed.
 
 
@@ -142,18 +115,9 @@ def bytes_of(store: Path, recording: str) -> int:
 
 def kill_recorder(store: Path, log: Path, name: str, after_bytes: int) -> None:
     """Start to record, and kill -9 when so much lies on the disk."""
-    process = subprocess.Popen(
-        [*COMMAND, "record", str(log), "--again", "--quiet", "--name", name],
-        env={**os.environ, "HYBRIDLOG_STORE": str(store)},
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    try:
+    words = ("record", log, "--store", store, "--again", "--quiet", "--name", name)
+    with started(*words, output=Path(os.devnull)) as process:
         wait_for(lambda: bytes_of(store, name) >= after_bytes or process.poll() is not None)
-    finally:
-        process.kill()
-        process.wait()
 
 
 def test_a_killed_recorder_loses_nothing_that_was_written(
@@ -199,8 +163,8 @@ def test_what_was_cut_short_can_be_recorded_again(path: Path, robot: Path) -> No
         store.remove("whole")
     kill_recorder(path, robot, "robot", whole // 2)
     refused = run("record", robot, "--quiet", store=path, code=8)
-    assert "cut short" in refused.stderr
-    assert "--again" in refused.stderr
+    assert "cut short" in refused.err
+    assert "--again" in refused.err
     run("record", robot, "--quiet", "--again", store=path, code=0)
     with hl.open(path, require_database=True) as store:
         part, again = sorted(store.recordings(), key=lambda r: r.created)
@@ -306,8 +270,10 @@ def at_most(limit: int) -> Callable[[], None]:
 
 
 def test_a_disk_that_fills_up(path: Path, robot: Path) -> None:
-    done = run("record", robot, "--quiet", store=path, code=7, before=at_most(5_000_000))
-    assert "No space left" in done.stderr
+    # Where files may not grow, Python would cut short what it compiles.
+    limited: Any = {"before": at_most(5_000_000), "PYTHONDONTWRITEBYTECODE": "1"}
+    done = run("record", robot, "--quiet", store=path, code=7, **limited)
+    assert "No space left" in done.err
     with hl.open(path, require_database=True) as store:
         assert store.recordings() == []
         assert places.folders(path) == []
@@ -410,7 +376,7 @@ def test_a_flipped_bit(store: hl.Store, said: Counter[Message]) -> None:
             fetched(opened, "short")
         check_the_rest(opened, said, {(place.segment, place.number)})
     done = run("verify", store=store.directory.path, code=1)
-    assert place.path.name in done.stdout
+    assert place.path.name in done.out
 
 
 def damage_summary(path: Path) -> None:

@@ -21,6 +21,7 @@ from pymongo import MongoClient
 
 import hybridlog as hl
 from benchmarks.simulator.write import write_bag
+from benchmarks.usage import working_below
 from hybridlog.index import access
 from hybridlog.query.index_reader import IndexReader
 from hybridlog.query.planner import Planner
@@ -69,18 +70,8 @@ def store(template: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(template, tmp_path / "store"))
 
 
-def pids(store: Path) -> list[int]:
-    """Processes with the store's mongod directory in their command line."""
-    found = []
-    for process in psutil.process_iter():
-        with contextlib.suppress(psutil.Error):
-            if any(str(store / "mongod") in part for part in process.cmdline()):
-                found.append(process.pid)
-    return found
-
-
 def ended(store: Path) -> None:
-    wait_for(lambda: not pids(store))
+    wait_for(lambda: not working_below(store / "mongod", ""))
 
 
 def kill_mongod(store: Path) -> None:

@@ -52,6 +52,7 @@ FOLDERS = {
     "tables": "tables",
     "unfinished tables": "tables.part",
 }
+TABLES = ("tables/*", "tables/*/*", "tables.part/new")
 MONGOD_FILES = (
     "users.lock",
     "keeper.lock",
@@ -204,6 +205,8 @@ def use(path: Path, mongo: str | None, bag: Path) -> list[HybridlogError]:
 
 def name_of(store: Path, kind: str) -> str:
     """The path of a kind of file in a store."""
+    if kind in TABLES:
+        return str(next(iter(store.glob(kind)), store / kind).relative_to(store))
     found = {
         "root": places.root(store),
         "small": places.folder(store, "small"),
@@ -226,11 +229,11 @@ def planted(template: Path, tmp_path: Path, name: str, target: Path) -> Path:
     return store
 
 
-LEADS = pytest.mark.parametrize("leads", ["out", "to nothing"])
+KINDS = [*FILES, *FOLDERS, *TABLES]
 
 
-@LEADS
-@pytest.mark.parametrize("kind", [*FILES, *FOLDERS])
+@pytest.mark.parametrize("leads", ["out", "to nothing"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_place_that_leads_elsewhere(
     template: Path, tmp_path: Path, server: str, bag: Path, kind: str, leads: str
 ) -> None:
@@ -239,7 +242,7 @@ def test_a_place_that_leads_elsewhere(
     original = template / name
     if leads == "to nothing":
         target = victims.place / "new"
-    elif kind in FILES:
+    elif kind in FILES or original.is_file():
         target = victims.file(original.read_bytes() if original.is_file() else b"precious")
     else:
         target = victims.folder(
@@ -247,25 +250,7 @@ def test_a_place_that_leads_elsewhere(
         )
     store = planted(template, tmp_path, name, target)
     victims.watch()
-    use(store, database(server, f"{[*FILES, *FOLDERS].index(kind)}{leads[0]}"), bag)
-    victims.check()
-
-
-@LEADS
-@pytest.mark.parametrize("kind", ["tables/*", "tables/*/*", "tables.part/new"])
-def test_tables_that_lead_out(
-    template: Path, tmp_path: Path, server: str, bag: Path, kind: str, leads: str
-) -> None:
-    victims = Victims(tmp_path / "victims")
-    place = next(iter(template.glob(kind)), template / kind)
-    name = str(place.relative_to(template))
-    if leads == "to nothing":
-        target = victims.place / "new"
-    else:
-        target = victims.file(place.read_bytes()) if place.is_file() else victims.folder(place)
-    store = planted(template, tmp_path, name, target)
-    victims.watch()
-    use(store, database(server, f"tables{len(kind)}{leads[0]}"), bag)
+    use(store, database(server, f"{KINDS.index(kind)}{leads[0]}"), bag)
     victims.check()
 
 
@@ -287,27 +272,18 @@ def refuse(directory: Path) -> str:
     return str(caught.value)
 
 
-@pytest.mark.parametrize("name", MONGOD_FILES)
+@pytest.mark.parametrize("name", [*MONGOD_FILES, *MONGOD_FOLDERS])
 @pytest.mark.parametrize("exists", [True, False])
-def test_a_file_of_mongods(tmp_path: Path, name: str, exists: bool) -> None:
+def test_a_place_of_mongods(tmp_path: Path, name: str, exists: bool) -> None:
     victims = Victims(tmp_path / "victims")
-    target = victims.file(b"{}") if exists else victims.place / "new"
+    target = victims.place / "new"
+    if exists:
+        target = victims.file(b"{}") if name in MONGOD_FILES else victims.folder(None)
     directory = hostile_mongod(tmp_path, name, target)
     victims.watch()
     assert Path(name).name in refuse(directory)
     victims.check()
     assert (directory / name).is_symlink()
-
-
-@pytest.mark.parametrize("name", MONGOD_FOLDERS)
-@pytest.mark.parametrize("exists", [True, False])
-def test_a_folder_of_mongods(tmp_path: Path, name: str, exists: bool) -> None:
-    victims = Victims(tmp_path / "victims")
-    target = victims.folder(None) if exists else victims.place / "new"
-    directory = hostile_mongod(tmp_path, name, target)
-    victims.watch()
-    refuse(directory)
-    victims.check()
 
 
 @pytest.mark.parametrize("name", ["mongod.log", "data/x", "users.lock"])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -26,22 +26,31 @@ def environment(**extra: str) -> dict[str, str]:
     return {**kept, "LC_ALL": "C.UTF-8", **extra}
 
 
-def run(*arguments: object, store: Path | None = None, code: int | None = 0, **env: str) -> Answer:
+def run(
+    *arguments: object,
+    store: Path | None = None,
+    code: int | None = 0,
+    before: Callable[[], None] | None = None,
+    **env: str,
+) -> Answer:
     """Run a command to its end.
 
     Args:
         arguments: Of the command.
         store: What HYBRIDLOG_STORE says.
         code: The exit code that is expected; None for any.
+        before: Called in its process, which is then a fresh one.
         env: Variables.
     """
     if store is not None:
         env["HYBRIDLOG_STORE"] = str(store)
     words = [os.fsdecode(a) if isinstance(a, bytes) else str(a) for a in arguments]
     variables = environment(**env)
-    ended = fork_server().run(words, variables, _LIMIT_S) or subprocess.run(
+    forked = None if before else fork_server().run(words, variables, _LIMIT_S)
+    ended = forked or subprocess.run(
         [*COMMAND, *words],
         stdin=subprocess.DEVNULL,
+        preexec_fn=before,
         capture_output=True,
         env=variables,
         timeout=_LIMIT_S,

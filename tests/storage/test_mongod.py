@@ -18,6 +18,7 @@ import psutil
 import pytest
 from pymongo import MongoClient
 
+from benchmarks.usage import working_below
 from hybridlog_storage.errors import (
     DatabaseError,
     DiskFullError,
@@ -67,17 +68,6 @@ def gone(*numbers: int) -> None:
     wait_for(lambda: not any(map(is_running, numbers)))
 
 
-def processes_on(directory: Path) -> list[int]:
-    """Every mongod and keeper with this directory on its command line."""
-    found = []
-    for process in psutil.process_iter():
-        with contextlib.suppress(psutil.Error):
-            line = process.cmdline()
-            if process.pid != os.getpid() and any(str(directory) in part for part in line):
-                found.append(process.pid)
-    return found
-
-
 def ping(uri: str) -> bool:
     with MongoClient(uri, serverSelectionTimeoutMS=3000) as client:
         return client.admin.command("ping")["ok"] == 1.0
@@ -98,9 +88,9 @@ def directory(tmp_path: Path) -> Iterator[Path]:
     result = tmp_path / "mongod"
     yield result
     deadline = time.monotonic() + 5
-    while processes_on(tmp_path) and time.monotonic() < deadline:
+    while working_below(tmp_path, "") and time.monotonic() < deadline:
         time.sleep(0.02)
-    left = processes_on(tmp_path)
+    left = working_below(tmp_path, "")
     for pid in left:
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
@@ -229,7 +219,9 @@ def test_users_that_come_all_at_once_start_one(directory: Path) -> None:
         uris = set(pool.map(EmbeddedMongod.start, users * 2))  # each from two threads
     assert len(uris) == 1
     mongods = [
-        pid for pid in processes_on(directory) if "--dbpath" in psutil.Process(pid).cmdline()[1]
+        pid
+        for pid in working_below(directory, "")
+        if "--dbpath" in psutil.Process(pid).cmdline()[1]
     ]
     assert mongods == [pids(directory)[0]]
     for user in users:
@@ -382,7 +374,7 @@ def test_a_mongod_that_never_answers(
     limit(mongod_start_s=1.0)
     with pytest.raises(DatabaseError, match="did not answer within 1 s"):
         EmbeddedMongod(directory, linger_s=LINGER_S).start()
-    wait_for(lambda: not processes_on(directory))
+    wait_for(lambda: not working_below(directory, ""))
 
 
 def marked(directory: Path) -> Path:
