@@ -92,16 +92,6 @@ def test_a_segment_that_cannot_be_read_any_more_is_told(
             assert not store.topic("said").completeness().has_losses
 
 
-def test_entries_belong_to_their_moment(tmp_path: Path) -> None:
-    with hl.open(tmp_path / "store", create=True) as store:
-        record(store, "one", START)
-        then = store.snapshot()
-        before = then.entry("one")
-        store.refresh()
-        assert then.entry("one") is before
-        assert store.entry("one") is not before
-
-
 def test_a_gap_at_the_end_is_longer_than_what_may_not_be_flushed(tmp_path: Path) -> None:
     second = 10**9
     often, once = Channel("/often", "json", None), Channel("/once", "json", None)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from tests import places
 from tests.cli.within import answer
 from tests.drawing.test_mp4 import read as read_mp4
 from tests.drawing.test_video import JSON, encoded, payload
+from tests.independent import read_mcap
 from tests.odd_messages import ros_channel
 from tests.ros_values import ROS2
 from tests.waiting import wait_for
@@ -179,10 +181,7 @@ def content(path: Path) -> Any:
         name, times, pictures = read_mp4(path)
         return name, times, [one.tobytes() for one in pictures]
     if path.suffix == ".mcap":
-        from mcap.reader import make_reader
-
-        with path.open("rb") as file:
-            return [(c.topic, m.log_time, m.data) for _, c, m in make_reader(file).iter_messages()]
+        return read_mcap(path)
     return path.read_bytes()
 
 
@@ -204,96 +203,51 @@ def jobs(tmp_path_factory: pytest.TempPathFactory) -> Jobs:
     return Jobs(tmp_path_factory.mktemp("jobs"))
 
 
-@contextmanager
-def ended(jobs: Jobs, path: Path, _: pytest.MonkeyPatch) -> Iterator[None]:
-    shutil.copytree(jobs.path, path)
-    yield
-
-
-@contextmanager
-def running(jobs: Jobs, path: Path, _: pytest.MonkeyPatch) -> Iterator[None]:
-    import fcntl
-
-    shutil.copytree(jobs.copy, path)
-    with (places.folder(path, "run") / "writer.lock").open("r+b") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        yield
-
-
-@contextmanager
-def unfinished(jobs: Jobs, path: Path, patch: pytest.MonkeyPatch) -> Iterator[None]:
-    """The recorder has died, and nothing can be written."""
-    shutil.copytree(jobs.copy, path)
-    patch.setattr(StoreDirectory, "is_writable", False)
-    yield
-
-
-@contextmanager
-def recovered(jobs: Jobs, path: Path, _: pytest.MonkeyPatch) -> Iterator[None]:
-    shutil.copytree(jobs.copy, path)
-    yield
-
-
-@contextmanager
-def read_only(jobs: Jobs, path: Path, patch: pytest.MonkeyPatch) -> Iterator[None]:
-    shutil.copytree(jobs.path, path)
-    patch.setattr(StoreDirectory, "is_writable", False)
-    yield
-
-
-@contextmanager
-def damaged(jobs: Jobs, path: Path, _: pytest.MonkeyPatch) -> Iterator[None]:
-    """Chunks of a topic that no job asks for are damaged, and the index of none."""
-    shutil.copytree(jobs.path, path)
-    segments = places.folder(path, "run").glob("*.mcap")
+def damage(recording: Path) -> None:
+    """Damage chunks of a topic that no job asks for, and the index of none."""
+    segments = recording.glob("*.mcap")
     (segment, data), *_ = ((one, found) for one in segments if NOISE in (found := one.read_bytes()))
     for _ in range(3):
         data = data.replace(NOISE, b"DAMAGE" * (len(NOISE) // 6) + b"D" * (len(NOISE) % 6), 1)
     segment.write_bytes(data)
-    yield
+
+
+GOES_ON = ("running", "unfinished", "recovered")
+STATES = ("ended", *GOES_ON, "read-only", "damaged", "with arrays", "with MongoDB")
 
 
 @contextmanager
-def with_arrays(jobs: Jobs, path: Path, _: pytest.MonkeyPatch) -> Iterator[None]:
-    shutil.copytree(jobs.path, path)
-    with hl.open(path, mongo="none") as store:
-        (found,) = store.index.arrays("/scan")
-        assert found.recordings
+def in_state(jobs: Jobs, path: Path, state: str, patch: pytest.MonkeyPatch) -> Iterator[None]:
+    shutil.copytree(jobs.copy if state in GOES_ON else jobs.path, path)
+    if state in {"unfinished", "read-only"}:
+        patch.setattr(StoreDirectory, "is_writable", False)
+    elif state == "damaged":
+        damage(places.folder(path, "run"))
+    elif state == "with arrays":
+        with hl.open(path, mongo="none") as store:
+            (found,) = store.index.arrays("/scan")
+            assert found.recordings
+    elif state == "with MongoDB":
+        patch.setenv("HYBRIDLOG_MONGO_URI", "embedded")
+        answer("index", "rebuild", store=path)
+    elif state == "running":
+        with (places.folder(path, "run") / "writer.lock").open("r+b") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            yield
+        return
     yield
 
 
-@contextmanager
-def with_mongodb(jobs: Jobs, path: Path, patch: pytest.MonkeyPatch) -> Iterator[None]:
-    shutil.copytree(jobs.path, path)
-    patch.setenv("HYBRIDLOG_MONGO_URI", "embedded")
-    answer("index", "rebuild", store=path)
-    yield
-
-
-STATES = (
-    ended,
-    running,
-    unfinished,
-    recovered,
-    read_only,
-    damaged,
-    with_arrays,
-    with_mongodb,
-)
-
-
-@pytest.mark.parametrize("state", STATES, ids=lambda one: one.__name__)
-def test_jobs(
-    jobs: Jobs, state: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with state(jobs, tmp_path / "store", monkeypatch):
+@pytest.mark.parametrize("state", STATES)
+def test_jobs(jobs: Jobs, state: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with in_state(jobs, tmp_path / "store", state, monkeypatch):
         found = jobs.answers(tmp_path / "store", tmp_path / "found")
     for asked, (code, said, files) in jobs.wanted.items():
         own_code, own, own_files = found[asked]
-        if state is damaged and asked[0] == "diff":
+        if state == "damaged" and asked[0] == "diff":
             assert own_code == 5  # it reads all topics
             continue
-        if state is running and asked[0] in {"check", "diff"}:
+        if state == "running" and asked[0] in {"check", "diff"}:
             said, own = (but_for_flushing(rows) for rows in (said, own))
         assert own_code == code, (asked, own)
         assert own == said, asked

@@ -24,7 +24,6 @@ from tests.cli.running import complete
 from tests.cli.within import answer
 from tests.imports import ROOT
 from tests.indexed import documents_of
-from tests.limits import Limit
 from tests.running.methods import LABEL, METHODS, rows, same, sent
 from tests.running.running import NO_MONGODB, Running, begun
 from tests.running.sequence import SAID, START, Known, messages
@@ -51,27 +50,6 @@ def check(store: hl.Store, known: Known) -> None:
         if name not in ABOUT_LOSSES:
             found, wanted = rule.ask(store), rule.right(known)
             assert same(found, wanted), (name, found, wanted)
-
-
-def test_a_copy_that_cannot_be_written(running: Running, tmp_path: Path, limit: Limit) -> None:
-    known = running.flushed()
-    copied = copy_of(running, tmp_path / "copy")
-    limit(directory_is_writable=False)
-    with hl.open(copied, mongo=NO_MONGODB) as store:
-        assert store.entry(LABEL).status == "unfinished"
-        check(store, known)
-        found = store.topic("arm").completeness()
-        assert (found.has_losses, found.is_exact) == (True, False)
-        assert list(places.folder(copied, "live").glob("*.open"))
-
-
-def test_a_copy_is_recovered(running: Running, tmp_path: Path) -> None:
-    known = running.flushed()
-    copied = copy_of(running, tmp_path / "copy")
-    with hl.open(copied, mongo=NO_MONGODB) as store:
-        assert store.entry(LABEL).status == "recovered"
-        check(store, known)
-    assert running.before.entry(LABEL).status == "open"
 
 
 NEED_PAYLOADS = {
@@ -167,6 +145,9 @@ def test_a_killed_recorder(kind: str, tmp_path: Path, monkeypatch: pytest.Monkey
                     counts = dict(entry.messages_by_topic())
                     assert all(counts[topic] >= count for topic, count in least.items())
                     check(store, Known(everything, counts))
+                    found = store.topic("arm").completeness()
+                    assert (found.has_losses, found.is_exact) == (True, False)
+                    assert list(places.folder(path, LABEL).glob("*.open"))
             with hl.open(path, mongo=NO_MONGODB) as store:
                 entry = store.entry(LABEL)
                 assert entry.status == "recovered"
