@@ -59,11 +59,15 @@ def read_sqlite(path: Path) -> list[Seen]:
 
 
 def write_mcap(
-    path: Path, said: Iterable[tuple[Any, ...]], silent: Iterable[Channel] = (), **options: Any
+    path: Path,
+    said: Iterable[tuple[Any, ...]],
+    silent: Iterable[Channel] = (),
+    attachments: Iterable[tuple[int, int, str, str, bytes]] = (),
+    **options: Any,
 ) -> Path:
     """An MCAP file of messages: channel, log time and payload of each, and its publish time.
 
-    Channels that may be silent come first.
+    Channels that may be silent come first, attachments last.
     """
     from mcap.writer import Writer
 
@@ -86,5 +90,7 @@ def write_mcap(
             id_of(channel)
         for channel, time, payload, *publish in said:
             writer.add_message(id_of(channel), time, payload, *(publish or [time]))
+        for attachment in attachments:
+            writer.add_attachment(*attachment)
         writer.finish()
     return path

@@ -21,6 +21,7 @@ from hybridlog.attachments import Extras, StoredAttachment, extras_of, file_name
 from hybridlog.cli.answers import write_answer
 from hybridlog_storage.catalog import CATALOG
 from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segments.recovery import recover_segment
 from hybridlog_storage.segments.segment_check import damage_of
 from hybridlog_storage.segments.segment_reader import SegmentReader
@@ -28,6 +29,7 @@ from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
 from tests.cli.running import run
 from tests.copies import bring
+from tests.independent import write_mcap
 
 pytestmark = pytest.mark.mongo
 
@@ -283,14 +285,9 @@ def test_bags_keep_connections_and_say_what_they_cannot_hold(tmp_path: Path) -> 
     with BagReader(tmp_path / "b.bag") as reader:
         assert sorted(reader.topics) == ["/a", "/silent"]
         assert reader.message_count == 1
-    with (tmp_path / "c.mcap").open("wb") as file:
-        writer = Writer(file)
-        writer.start(profile="ros1")
-        schema = writer.register_schema("std_msgs/String", "ros1msg", b"string data\n")
-        channel = writer.register_channel("/c", "ros1", schema)
-        writer.add_message(channel, TIMES[0], b"\x01\0\0\0x", 0)
-        writer.add_attachment(0, 0, "a", "", b"a")
-        writer.finish()
+    channel = Channel("/c", "ros1", Schema("std_msgs/String", "ros1msg", b"string data\n"))
+    rows = [(channel, TIMES[0], b"\x01\0\0\0x", 0)]
+    write_mcap(tmp_path / "c.mcap", rows, attachments=[(0, 0, "a", "", b"a")])
     run("record", tmp_path / "c.mcap", store=store)
     done = run("export", tmp_path / "c.bag", "-r", "c", store=store)
     assert "A bag has no attachments and metadata records of the log" in done.err
@@ -314,13 +311,9 @@ def test_names_become_file_names_in_one_folder() -> None:
 def test_large_attachments_are_never_in_memory(tmp_path: Path) -> None:
     size = 96 << 20
     block = bytes(range(256)) * 4096
-    with (tmp_path / "a.mcap").open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        channel = writer.register_channel("/n", "json", 0)
-        writer.add_message(channel, 1, b"{}", 1)
-        writer.add_attachment(0, 0, "large", "", block * (size // len(block)))
-        writer.finish()
+    attached = (0, 0, "large", "", block * (size // len(block)))
+    rows = [(Channel("/n", "json", None), 1, b"{}")]
+    write_mcap(tmp_path / "a.mcap", rows, attachments=[attached])
     want = hashlib.sha256(block * (size // len(block))).hexdigest()
     with hl.open(tmp_path / "s", create=True) as store:
         tracemalloc.start()

@@ -36,6 +36,7 @@ from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.types import check
 from hybridlog_storage import errors
 from hybridlog_storage.errors import HybridlogError, ManifestError
+from hybridlog_storage.messages import Channel, Schema
 from tests import places
 from tests.cli.fork_server import ForkServer
 from tests.format_reader import (
@@ -48,6 +49,7 @@ from tests.format_reader import (
     collection_name,
     index_key,
 )
+from tests.independent import write_mcap
 
 if TYPE_CHECKING:
     from hybridlog_storage.catalog import RecordingEntry
@@ -761,24 +763,18 @@ def test_the_patterns_find_what_is_said() -> None:
 
 def json_log(path: Path) -> None:
     """An MCAP with publish times, odd topics, and more than one channel on one of them."""
-    from mcap.writer import Writer
-
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        schema = writer.register_schema("Weather", "jsonschema", b"{}")
-        names = ["/weather", "/weather_", "weather", "/Wetter in Köln", "/weather"]
-        channels = [
-            writer.register_channel(name, "json", schema if n < 4 else 0, {"n": str(n)})
-            for n, name in enumerate(names)
-        ]
-        for number in range(500):
-            now = START_NS + (number * 7919 % 500) * 10**8
-            value = {"t": number, "list": list(range(number % 40)), "_id": None}
-            payload = json.dumps(value).encode()
-            channel = channels[number % 5]
-            writer.add_message(channel, now, payload, now - number, sequence=number)
-        writer.finish()  # type: ignore[no-untyped-call]
+    schema = Schema("Weather", "jsonschema", b"{}")
+    names = ["/weather", "/weather_", "weather", "/Wetter in Köln", "/weather"]
+    channels = [
+        Channel(name, "json", schema if n < 4 else None, {"n": str(n)})
+        for n, name in enumerate(names)
+    ]
+    rows = []
+    for number in range(500):
+        now = START_NS + (number * 7919 % 500) * 10**8
+        value = {"t": number, "list": list(range(number % 40)), "_id": None}
+        rows.append((channels[number % 5], now, json.dumps(value).encode(), now - number, number))
+    write_mcap(path, rows)
 
 
 @pytest.fixture(scope="module")

@@ -34,7 +34,7 @@ from hypothesis.stateful import (
     rule,
     run_state_machine_as_test,
 )
-from mcap.writer import CompressionType, Writer
+from mcap.writer import CompressionType
 from rosbags.interfaces import ConnectionExtRosbag1
 from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -48,10 +48,12 @@ from hybridlog_storage.errors import TimeError, TopicError
 from hybridlog_storage.manifest import Manifest
 from hybridlog_storage.manifest import replace as changed
 from hybridlog_storage.manifests import MANIFEST_OLD
+from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.mongo.mongod import EmbeddedMongod
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
+from tests.independent import write_mcap
 
 pytestmark = pytest.mark.mongo("embedded")
 
@@ -242,35 +244,27 @@ def _indexed(data: list[float]) -> object:
     return {"n": len(data), "min": min(data), "max": max(data), "mean": sum(data) / len(data)}
 
 
-def write_mcap(path: Path, chosen: Sequence[Draft]) -> list[Said]:
+def write_log(path: Path, chosen: Sequence[Draft]) -> list[Said]:
     """An MCAP file, by the official writer; its chunks are small."""
-    out: list[Said] = []
-    with path.open("wb") as file:
-        writer = Writer(file, chunk_size=2000, compression=CompressionType.ZSTD)
-        writer.start(profile="ros2")
-        schemas = {}
-        for encoding, kind in (("cdr", "ros2msg"), ("ros1", "ros1msg")):
-            for name in ("Stamped", "Plain"):
-                definition, _ = STORES[encoding].generate_msgdef(
-                    f"x/msg/{name}", **({"ros_version": 2} if encoding == "cdr" else {})
-                )
-                full = f"x/msg/{name}" if encoding == "cdr" else f"x/{name}"
-                schemas[encoding, name] = writer.register_schema(full, kind, definition.encode())
-        ids = []
-        for spec in MCAP_CHANNELS:
-            schema = schemas.get((spec.encoding, "Stamped" if spec.stamped else "Plain"), 0)
-            ids.append(
-                writer.register_channel(spec.topic, spec.encoding, schema, {"who": spec.who})
+    schemas = {}
+    for encoding, kind in (("cdr", "ros2msg"), ("ros1", "ros1msg")):
+        for name in ("Stamped", "Plain"):
+            definition, _ = STORES[encoding].generate_msgdef(
+                f"x/msg/{name}", **({"ros_version": 2} if encoding == "cdr" else {})
             )
-        for number, draft in enumerate(chosen):
-            channel = draft.channel % len(MCAP_CHANNELS)
-            message = said(MCAP_CHANNELS[channel], draft, bag=False)
-            assert message.published is not None
-            writer.add_message(
-                ids[channel], message.log_time, message.payload, message.published, number
-            )
-            out.append(message)
-        writer.finish()  # type: ignore[no-untyped-call]
+            full = f"x/msg/{name}" if encoding == "cdr" else f"x/{name}"
+            schemas[encoding, name] = Schema(full, kind, definition.encode())
+    channels = []
+    for spec in MCAP_CHANNELS:
+        schema = schemas.get((spec.encoding, "Stamped" if spec.stamped else "Plain"))
+        channels.append(Channel(spec.topic, spec.encoding, schema, {"who": spec.who}))
+    out, rows = [], []
+    for number, draft in enumerate(chosen):
+        channel = draft.channel % len(channels)
+        one = said(MCAP_CHANNELS[channel], draft, bag=False)
+        rows.append((channels[channel], one.log_time, one.payload, one.published, number))
+        out.append(one)
+    write_mcap(path, rows, channels, chunk_size=2000, compression=CompressionType.ZSTD)
     return out
 
 
@@ -436,7 +430,7 @@ class Machine(RuleBasedStateMachine):
     ) -> None:
         self.written += 1
         path = self.logs / f"log{self.written}{'.bag' if is_bag else '.mcap'}"
-        everything = (write_bag if is_bag else write_mcap)(path, chosen)
+        everything = (write_bag if is_bag else write_log)(path, chosen)
         kept = [
             m
             for m in everything

@@ -7,17 +7,19 @@ import random
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from mcap.writer import Writer
 
 import hybridlog as hl
 from hybridlog.across import topic_reader
+from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.calls import Calls
+from tests.independent import write_mcap
 from tests.limits import Limit
 
 MS = 10**6
@@ -105,22 +107,16 @@ def _write(path: Path, seed: int) -> list[Said]:
             stamp = time - rng.randrange(30) * MS
             said.append(Said(topic, time, stamp, len(said) + 1))
     said.sort(key=lambda one: one.time)
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start("ros1")
-        schema = writer.register_schema("demo/Pose", "ros1msg", POSE.encode())
-        any_json = writer.register_schema("Any", "jsonschema", b"{}")
-        channels = {
-            topic: writer.register_channel(topic, "ros1", schema)
-            for topic in dict.fromkeys(one.topic for one in said)
-        }
-        weather = writer.register_channel("/weather", "json", any_json)
-        for one in said:
-            writer.add_message(channels[one.topic], one.time, _pose(one), one.stamp)
-            if one.topic == "/right/pose":
-                report = json.dumps({"n": one.number, "v": one.number / 2 if seed == 2 else "hot"})
-                writer.add_message(weather, one.time, report.encode(), one.time)
-        writer.finish()
+    schema = Schema("demo/Pose", "ros1msg", POSE.encode())
+    weather = Channel("/weather", "json", Schema("Any", "jsonschema", b"{}"))
+    channel = cache(lambda topic: Channel(topic, "ros1", schema))
+    rows: list[tuple[Channel, int, bytes, int]] = []
+    for one in said:
+        rows.append((channel(one.topic), one.time, _pose(one), one.stamp))
+        if one.topic == "/right/pose":
+            report = json.dumps({"n": one.number, "v": one.number / 2 if seed == 2 else "hot"})
+            rows.append((weather, one.time, report.encode(), one.time))
+    write_mcap(path, rows, [weather])
     return said
 
 

@@ -9,8 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.writer import Writer
 
+from hybridlog_storage.messages import Channel, Schema
+from tests.independent import write_mcap
 from tests.some import in_turn
 
 from .running import run
@@ -22,25 +23,17 @@ PROGRAM = "from hybridlog.cli.main import main; import sys; sys.exit(main())"
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("long")
-    with (place / "long.mcap").open("wb") as file:
-        writer = Writer(file)
-        writer.start("ros2")
-        random = np.random.default_rng(0)
-        for name, definition, width in (
-            ("bytes", b"uint8[] a\n", 1),
-            ("doubles", b"float64[] a\n", 8),
-        ):
-            schema = writer.register_schema(f"my/msg/{name.title()}", "ros2msg", definition)
-            for size in (16, SIZE):
-                where = "long" if size == SIZE else "short"
-                channel = writer.register_channel(f"/{name}/{where}", "cdr", schema)
-                count = size // width
-                values = (
-                    random.random(count) if width == 8 else random.integers(0, 256, count, "u1")
-                )
-                head = b"\0\1\0\0" + struct.pack("<I", count) + bytes(4 if width == 8 else 0)
-                writer.add_message(channel, 10**18, head + values.tobytes(), 0)
-        writer.finish()  # type: ignore[no-untyped-call]
+    random, rows = np.random.default_rng(0), []
+    for name, definition, width in (("bytes", b"uint8[] a\n", 1), ("doubles", b"float64[] a\n", 8)):
+        schema = Schema(f"my/msg/{name.title()}", "ros2msg", definition)
+        for size in (16, SIZE):
+            where = "long" if size == SIZE else "short"
+            count = size // width
+            values = random.random(count) if width == 8 else random.integers(0, 256, count, "u1")
+            head = b"\0\1\0\0" + struct.pack("<I", count) + bytes(4 if width == 8 else 0)
+            channel = Channel(f"/{name}/{where}", "cdr", schema)
+            rows.append((channel, 10**18, head + values.tobytes(), 0))
+    write_mcap(place / "long.mcap", rows)
     run("record", place / "long.mcap", "-q", store=place / "store")
     return place / "store"
 

@@ -17,7 +17,6 @@ from typing import Any
 import foxglove.messages
 import numpy as np
 import pytest
-from mcap.writer import Writer
 from numpy.typing import NDArray
 
 import hybridlog as hl
@@ -25,7 +24,9 @@ from hybridlog.arrays.bitstream import FrameOrder, frame_of, is_key_frame
 from hybridlog.arrays.video import VideoDecoder
 from hybridlog.view.playback.played import PlayedLog
 from hybridlog_storage.errors import MissingDependencyError, PayloadError, TopicError
+from hybridlog_storage.messages import Channel, Schema
 from tests.cli.within import answer
+from tests.independent import write_mcap
 
 av = pytest.importorskip("av")
 
@@ -62,6 +63,13 @@ ROS2 = (
     + b"\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
 )
 JSON = b'{"type":"object","properties":{"data":{"type":"string","contentEncoding":"base64"}}}'
+MADE = foxglove.messages.CompressedVideo.get_schema()
+SCHEMAS = {
+    "ros1": Schema("foxglove_msgs/CompressedVideo", "ros1msg", ROS % b"time"),
+    "cdr": Schema("foxglove_msgs/msg/CompressedVideo", "ros2msg", ROS2),
+    "json": Schema("foxglove.CompressedVideo", "jsonschema", JSON),
+    "protobuf": Schema(MADE.name, MADE.encoding, MADE.data),
+}
 
 
 @cache
@@ -126,19 +134,6 @@ def payload(encoding: str, form: str, data: bytes) -> bytes:
     return head + body + struct.pack("<I", len(name) + 1) + name + b"\0"
 
 
-def register(writer: Writer, topic: str, encoding: str) -> int:
-    if encoding == "protobuf":
-        made = foxglove.messages.CompressedVideo.get_schema()
-        schema = writer.register_schema(made.name, made.encoding, made.data)
-    elif encoding == "json":
-        schema = writer.register_schema("foxglove.CompressedVideo", "jsonschema", JSON)
-    elif encoding == "ros1":
-        schema = writer.register_schema("foxglove_msgs/CompressedVideo", "ros1msg", ROS % b"time")
-    else:
-        schema = writer.register_schema("foxglove_msgs/msg/CompressedVideo", "ros2msg", ROS2)
-    return writer.register_channel(topic, encoding, schema)
-
-
 def write(
     path: Path,
     topics: dict[str, tuple[str, list[bytes | None]]],
@@ -146,16 +141,13 @@ def write(
     order: Callable[[list[tuple[int, bytes | None]]], Iterable[tuple[int, bytes | None]]] = iter,
 ) -> None:
     """A log with a chunk a message; frames that are None are left out."""
-    with path.open("wb") as file:
-        writer = Writer(file, chunk_size=1)
-        writer.start()
-        for topic, (encoding, frames) in topics.items():
-            channel = register(writer, topic, encoding)
-            for n, data in order([*enumerate(frames)]):
-                if data is not None:
-                    time = BASE + n * STEP
-                    writer.add_message(channel, time, payload(encoding, form, data), time)
-        writer.finish()
+    rows = []
+    for topic, (encoding, frames) in topics.items():
+        channel = Channel(topic, encoding, SCHEMAS[encoding])
+        for n, data in order([*enumerate(frames)]):
+            if data is not None:
+                rows.append((channel, BASE + n * STEP, payload(encoding, form, data)))
+    write_mcap(path, rows, chunk_size=1)
 
 
 @pytest.fixture(scope="module")

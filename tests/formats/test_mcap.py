@@ -22,13 +22,17 @@ from mcap.writer import CompressionType, Writer
 import hybridlog as hl
 from hybridlog.formats.mcap.reader import McapSource
 from hybridlog.formats.reading import BATCH_BYTES, BATCH_MESSAGES, Damage
+from hybridlog_storage import messages as log
 from hybridlog_storage.mcap.mcap_content import MAGIC
 from hybridlog_storage.segments.segment_format import METADATA_CHECK
 from tests import places
+from tests.independent import write_mcap
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
+
+ANY_JSON = log.Channel("/a", "json", None)
 
 
 class Seen(NamedTuple):
@@ -111,16 +115,10 @@ def official(path: Path) -> list[Seen]:
 
 def test_a_count_that_no_file_can_hold_is_not_kept(tmp_path: Path) -> None:
     """The loss ledger goes into a database whose integers have 64 bits."""
-    out = io.BytesIO()
-    writer = Writer(out, enable_crcs=False)
-    writer.start()
-    channel = writer.register_channel("/a", "json", 0)
-    writer.add_message(channel, 1, b"{}", 1)
-    writer.finish()
+    path = write_mcap(tmp_path / "a.mcap", [(ANY_JSON, 1, b"{}")], enable_crcs=False)
     count = struct.pack("<BQQ", Opcode.STATISTICS, 56, 1)
-    assert out.getvalue().count(count) == 1
-    path = tmp_path / "a.mcap"
-    path.write_bytes(out.getvalue().replace(count, count[:9] + b"\xff" * 8))
+    assert path.read_bytes().count(count) == 1
+    path.write_bytes(path.read_bytes().replace(count, count[:9] + b"\xff" * 8))
     found = read(path)
     assert len(found.messages) == 1
     assert found.lost == [None]
@@ -253,18 +251,15 @@ def test_missing_bytes_cost_no_intact_chunk(
 
 
 def test_a_chunk_in_a_payload_of_a_damaged_chunk_is_none_of_the_file(
-    put: Callable[[bytes], Path],
+    tmp_path: Path,
 ) -> None:
-    out = io.BytesIO()
-    writer = Writer(out, chunk_size=1, compression=CompressionType.NONE)
-    writer.start()
-    channel = writer.register_channel("/a", "log", 0)
-    for i in range(3):
-        writer.add_message(channel, 100 + i, VARIANTS["NONE"], 100 + i)
-    writer.finish()
-    bad = bytearray(out.getvalue())
+    rows = [(ANY_JSON, 100 + i, VARIANTS["NONE"]) for i in range(3)]
+    none = CompressionType.NONE
+    path = write_mcap(tmp_path / "a.mcap", rows, chunk_size=1, compression=none)
+    bad = bytearray(path.read_bytes())
     del bad[120:140]
-    found = read(put(bytes(bad)))
+    path.write_bytes(bad)
+    found = read(path)
     assert [message.log_time for message in found.messages] == [101, 102]
 
 
@@ -394,17 +389,10 @@ def test_a_summary_that_counts_more_than_there_is_raises_suspicion(
     assert found.lost == [3]
 
 
-def test_large_chunks_become_batches_of_bounded_size(put: Callable[[bytes], Path]) -> None:
-    out = io.BytesIO()
-    writer = Writer(out, chunk_size=1 << 30, compression=CompressionType.ZSTD)
-    writer.start()
-    channel = writer.register_channel("/a", "x", 0)
-    for i in range(40_000):
-        writer.add_message(channel, i, b"", i)
-    for i in range(20):
-        writer.add_message(channel, i, bytes(300_000), i)
-    writer.finish()
-    with McapSource(put(out.getvalue())) as source:
+def test_large_chunks_become_batches_of_bounded_size(tmp_path: Path) -> None:
+    rows = [(ANY_JSON, i, b"") for i in range(40_000)]
+    rows += [(ANY_JSON, i, bytes(300_000)) for i in range(20)]
+    with McapSource(write_mcap(tmp_path / "a.mcap", rows, chunk_size=1 << 30)) as source:
         batches = list(source.batches())
     assert sum(map(len, batches)) == 40_020
     assert max(map(len, batches)) <= BATCH_MESSAGES

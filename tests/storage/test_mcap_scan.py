@@ -20,6 +20,7 @@ from mcap.records import Channel, DataEnd, Footer, Header, Message, MessageIndex
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
+from hybridlog_storage import messages
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.mcap.mcap_content import (
     MAGIC,
@@ -31,6 +32,7 @@ from hybridlog_storage.mcap.mcap_content import (
 from hybridlog_storage.mcap.mcap_scan import Scan
 from hybridlog_storage.segments.attachments import Attachment
 from tests.data import DATA, needs_data
+from tests.independent import write_mcap
 from tests.work import calls_in
 
 if TYPE_CHECKING:
@@ -307,17 +309,13 @@ def test_a_log_behind_the_end_of_another_one_is_told() -> None:
     assert damages(items)[0].reason == "bytes follow the end of the log"
 
 
-def test_a_torn_chunk_gives_its_beginning() -> None:
+def test_a_torn_chunk_gives_its_beginning(tmp_path: Path) -> None:
+    channel = messages.Channel("/a", "x", None)
+    wanted = [np.random.default_rng(i).bytes(1000) for i in range(1000)]
     for compression in CompressionType:
-        out = io.BytesIO()
-        writer = Writer(out, compression=compression)
-        writer.start()
-        channel = writer.register_channel("/a", "x", 0)
-        wanted = [np.random.default_rng(i).bytes(1000) for i in range(1000)]
-        for i, payload in enumerate(wanted):
-            writer.add_message(channel, i, payload, i, i)
-        writer.finish()
-        items = items_of(out.getvalue()[:400_000])
+        rows = ((channel, i, payload) for i, payload in enumerate(wanted))
+        path = write_mcap(tmp_path / "a.mcap", rows, compression=compression)
+        items = items_of(path.read_bytes()[:400_000])
         found = payloads(items)
         assert found == wanted[: len(found)]
         assert len(found) > 100
@@ -369,13 +367,8 @@ def test_memory_stays_bounded_over_a_long_file(tmp_path: Path) -> None:
     import tracemalloc
 
     path = tmp_path / "long.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file, use_chunking=False)
-        writer.start()
-        channel = writer.register_channel("/a", "x", 0)
-        for i in range(30_000):
-            writer.add_message(channel, i, bytes(1000), i, i)
-        writer.finish()
+    channel = messages.Channel("/a", "x", None)
+    write_mcap(path, ((channel, i, bytes(1000)) for i in range(30_000)), use_chunking=False)
     size = path.stat().st_size
     with path.open("rb") as file:
         tracemalloc.start()

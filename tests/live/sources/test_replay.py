@@ -7,17 +7,17 @@ import threading
 import time
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Sequence
+from functools import cache
 from pathlib import Path
 
 import pytest
-from mcap.writer import Writer
 
 from hybridlog.formats.log_set import open_source
 from hybridlog.live.sources import replay
 from hybridlog.live.sources.base import Cause
 from hybridlog.live.sources.replay import ReplaySource
 from hybridlog_storage.errors import UsageError
-from hybridlog_storage.messages import Batch
+from hybridlog_storage.messages import Batch, Channel, Schema
 from tests import independent
 from tests.calls import Calls
 from tests.data import DATA, needs_data
@@ -36,19 +36,14 @@ def _nothing_is_left() -> Iterator[None]:
 
 
 def write(path: Path, messages: Iterable[tuple[str, int, bytes]], sequence: int = 0) -> Path:
-    with path.open("wb") as file:
-        writer = Writer(file, chunk_size=1000)
-        writer.start()
-        schema = writer.register_schema("T", "jsonschema", b"{}")
-        channels: dict[str, int] = {}
-        for at, (topic, log_time, payload) in enumerate(messages):
-            if topic not in channels:
-                channels[topic] = writer.register_channel(topic, "json", schema)
-            number = channels[topic]
-            writer.add_message(number, log_time, payload, log_time - 5, sequence and sequence + at)
-        writer.add_attachment(0, 0, "notes.txt", "text/plain", b"hello")
-        writer.finish()
-    return path
+    schema = Schema("T", "jsonschema", b"{}")
+    channel = cache(lambda topic: Channel(topic, "json", schema))
+    rows = [
+        (channel(topic), time, payload, time - 5, sequence and sequence + at)
+        for at, (topic, time, payload) in enumerate(messages)
+    ]
+    notes = (0, 0, "notes.txt", "text/plain", b"hello")
+    return independent.write_mcap(path, rows, attachments=[notes], chunk_size=1000)
 
 
 def play(path: Path, heard: Heard, *, speed: float = FAST) -> None:

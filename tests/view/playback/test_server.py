@@ -17,15 +17,14 @@ from tests import places
 
 pytest.importorskip("websockets", reason="websockets is not installed: no playback is tested")
 
-from mcap.writer import Writer
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 import hybridlog as hl
 from hybridlog.view.playback.played import PlayedLog
 from hybridlog_storage.errors import TimeError
-from hybridlog_storage.messages import Channel
-from tests.independent import Seen, read_mcap
+from hybridlog_storage.messages import Channel, Schema
+from tests.independent import Seen, read_mcap, write_mcap
 from tests.limits import Limit
 from tests.view.playback.viewer import SDK, WEBSOCKET, Data, State, Time, Viewer, served
 
@@ -37,40 +36,25 @@ TEXT = b"string data\n"
 
 def write_log(path: Path, begin: int, seconds: int = 3) -> Path:
     """A log with latched and many-published topics, several encodings, and equal times."""
-    with path.open("wb") as file:
-        writer = Writer(file, chunk_size=2000)
-        writer.start()
-        text = writer.register_schema("std_msgs/String", "ros1msg", TEXT)
-        proto = writer.register_schema("a.B", "protobuf", b"\n\x00\xff\xfe")
-        odd = writer.register_schema("pkg/Odd", "ros1msg", b"string data # \xff\n")
-        channels = {
-            "/map": writer.register_channel(
-                "/map", "ros1", text, {"callerid": "/server", "latching": "1"}
-            ),
-            "/tf a": writer.register_channel("/tf", "ros1", text, {"callerid": "/a"}),
-            "/tf b": writer.register_channel("/tf", "ros1", text, {"callerid": "/b"}),
-            "/n": writer.register_channel("/n", "json", 0),
-            "/proto": writer.register_channel("/proto", "protobuf", proto),
-            "/odd": writer.register_channel("/odd", "ros1", odd),
-            "/bare": writer.register_channel("/bare", "cdr", 0),
-            "/silent": writer.register_channel("/silent", "json", 0),
-        }
-
-        def add(name: str, time: int, payload: bytes) -> None:
-            writer.add_message(channels[name], time, payload, time)
-
-        add("/map", begin, b"\x03\x00\x00\x00map")
-        for n in range(seconds * 100):
-            time = begin + n * S // 100
-            add("/n", time, b'{"n": %d}' % n)
-            add("/tf a", time, b"\x01\x00\x00\x00a")
-            add("/tf b", time, b"\x01\x00\x00\x00b")
-            if n % 100 == 50:
-                add("/proto", time, b"\x08" + bytes([n % 128]))
-                add("/bare", time, b"\x00\x01\x00\x00" + bytes([n % 128]))
-                add("/odd", time, b"\x01\x00\x00\x00o")
-        writer.finish()
-    return path
+    text = Schema("std_msgs/String", "ros1msg", TEXT)
+    proto = Channel("/proto", "protobuf", Schema("a.B", "protobuf", b"\n\x00\xff\xfe"))
+    odd = Channel("/odd", "ros1", Schema("pkg/Odd", "ros1msg", b"string data # \xff\n"))
+    latched = Channel("/map", "ros1", text, {"callerid": "/server", "latching": "1"})
+    tf_a, tf_b = (Channel("/tf", "ros1", text, {"callerid": f"/{n}"}) for n in "ab")
+    counted, bare = Channel("/n", "json", None), Channel("/bare", "cdr", None)
+    silent = Channel("/silent", "json", None)
+    said = [(latched, begin, b"\x03\x00\x00\x00map")]
+    for n in range(seconds * 100):
+        time = begin + n * S // 100
+        said.append((counted, time, b'{"n": %d}' % n))
+        said.append((tf_a, time, b"\x01\x00\x00\x00a"))
+        said.append((tf_b, time, b"\x01\x00\x00\x00b"))
+        if n % 100 == 50:
+            said.append((proto, time, b"\x08" + bytes([n % 128])))
+            said.append((bare, time, b"\x00\x01\x00\x00" + bytes([n % 128])))
+            said.append((odd, time, b"\x01\x00\x00\x00o"))
+    every = (latched, tf_a, tf_b, counted, proto, odd, bare, silent)
+    return write_mcap(path, said, every, chunk_size=2000)
 
 
 @pytest.fixture(scope="module")
