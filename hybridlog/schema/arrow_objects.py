@@ -15,6 +15,7 @@ import numpy as np
 import pyarrow as pa
 
 from hybridlog.schema.arrow_columns import DURATION, TIME, lists, structs
+from hybridlog.schema.column import offsets
 from hybridlog.schema.text import MAX_DEPTH, json_text, repaired_text
 
 if TYPE_CHECKING:
@@ -84,9 +85,7 @@ def missing_rows(values: Sequence[object]) -> NDArray[np.bool_] | None:
 
 def offsets_of(rows: Sequence[Sequence[object] | None]) -> NDArray[np.int64]:
     """Offsets of the elements of each row, int64[n + 1]."""
-    offset = np.zeros(len(rows) + 1, np.int64)
-    np.cumsum([0 if row is None else len(row) for row in rows], out=offset[1:])
-    return offset
+    return offsets(np.array([0 if row is None else len(row) for row in rows], np.int64))
 
 
 def _kind(kind: type) -> type:

@@ -126,7 +126,7 @@ class FieldPath:
 
 _NOT_PORTABLE = frozenset({"wstring", "wchar", "float128"})
 _DUMMY = "structure_needs_at_least_one_member"
-_TIME_FIELDS = (("sec", "int32"), ("nanosec", "uint32"))
+_TIME_FIELDS = [RawField("sec", "int32"), RawField("nanosec", "uint32")]
 _TIME_TYPES: dict[str, Literal["time", "duration"]] = {
     "builtin_interfaces/Time": "time",
     "builtin_interfaces/Duration": "duration",
@@ -364,14 +364,8 @@ class _Resolver:
                 return _ROS1_TIMES[_TIME_TYPES[name]]
             return _ROS1_TIMES.get(name)
         kind = _TIME_TYPES.get(name)
-        if kind is None:
-            return None
-        given = self._types.get(name)
-        if given is not None and [(raw.name, raw.type) for raw in given] != list(_TIME_FIELDS):
-            return None
-        if given is not None and any(raw.array for raw in given):
-            return None
-        return Instant(kind, True, False)
+        is_usual = self._types.get(name, _TIME_FIELDS) == _TIME_FIELDS
+        return Instant(kind, True, False) if kind is not None and is_usual else None
 
 
 def type_text(field_type: FieldType) -> str:
