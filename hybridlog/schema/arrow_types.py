@@ -250,12 +250,9 @@ def _exact_integer(kinds: Kinds, arrays: Arrays) -> pa.DataType:
 
 def _range(arrays: Any) -> tuple[int, int]:
     """Least and greatest integer of some arrays, including zero."""
-    low = high = 0
-    for array in arrays:
-        found = pc.min_max(array)
-        if found["min"].is_valid:
-            low, high = min(low, found["min"].as_py()), max(high, found["max"].as_py())
-    return low, high
+    ends = [end.as_py() for array in arrays for end in pc.min_max(array).values()]
+    known = [0, *(end for end in ends if end is not None)]
+    return min(known), max(known)
 
 
 def common_schema(tables: Iterable[pa.Table]) -> pa.Schema:
