@@ -56,7 +56,7 @@ def values_array(
         elif kind is list:
             array = _lists(values, wanted, depth + 1)
         elif kind is str:
-            array = _strings(values)
+            array = pa.array([v and repaired_text(v) for v in values], pa.string())
         elif kind is bool or kind is bytes:
             array = pa.array(values, pa.bool_() if kind is bool else pa.binary())
     return json_array(values) if array is None else array
@@ -105,13 +105,6 @@ def _numbers(values: Sequence[Any], kinds: set[type]) -> pa.Array[Any] | None:
         with suppress(OverflowError, pa.ArrowInvalid):
             return pa.array(values, kind)
     return None
-
-
-def _strings(values: Sequence[str | None]) -> pa.Array[Any]:
-    try:
-        return pa.array(values, pa.string())
-    except UnicodeEncodeError:
-        return pa.array([None if v is None else repaired_text(v) for v in values], pa.string())
 
 
 def _lists(

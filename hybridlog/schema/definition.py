@@ -17,7 +17,6 @@ from hybridlog.schema.definition_text import (
     MAX_NAME,
     NAME,
     RawField,
-    Section,
     canonical,
     derived_from,
     has_parts,
@@ -201,7 +200,10 @@ def _parse_sections(schema: Schema, ros: int) -> tuple[dict[str, list[RawField]]
         if kind == "IDL" and ros == 2:
             parse_idl(name, section.text, idl)
             continue
-        parsed = _parse_text(name, section, ros)
+        if ros == 2 and has_parts(section.text):
+            parsed = parse_parts(name, section.text)
+        else:
+            parsed = {name: parse_msg(name, section.text, defaults=ros == 2)}
         if not section.kind and not any(parsed.values()):
             blank = parsed  # what stands before the header line of the definition
             continue
@@ -212,12 +214,6 @@ def _parse_sections(schema: Schema, ros: int) -> tuple[dict[str, list[RawField]]
         types.setdefault(key, fields)
     derived = derived_from(interface_of(canonical(schema.name)), types) if ros == 2 else {}
     return blank | derived | types, first
-
-
-def _parse_text(name: str, section: Section, ros: int) -> dict[str, list[RawField]]:
-    if ros == 2 and has_parts(section.text):
-        return parse_parts(name, section.text)
-    return {name: parse_msg(name, section.text, defaults=ros == 2)}
 
 
 def standard_text(name: str, ros: int) -> str | None:
