@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import chain, repeat
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -42,10 +43,8 @@ def _multi_echo_scan(message: Any) -> NDArray[Any]:
     counts = [len(beam) for beam in ranges]
     angles = _angles(len(ranges), message.angle_min, message.angle_increment).repeat(counts)
     echoes = np.arange(len(angles)) - (np.cumsum(counts, dtype=np.intp) - counts).repeat(counts)
-    intensities = []
-    for number, count in enumerate(counts):
-        given = message.intensities[number].echoes if number < len(message.intensities) else ()
-        intensities.append(_fill(given, count))
+    given = chain((beam.echoes for beam in message.intensities), repeat(()))
+    intensities = [_fill(some, count) for some, count in zip(given, counts, strict=False)]
     none = np.empty(0, np.float32)
     measured = np.concatenate([none, *intensities])
     return _scan(

@@ -78,7 +78,8 @@ class FieldShape:
         for number, field in enumerate(kind):
             name, values = field.name, array.field(number)
             about = {EMPTY: ""} if _is_empty(field.type) else {}
-            if _has_summary(field.type):
+            width = field.type.list_size if pa.types.is_fixed_size_list(field.type) else LIMIT + 1
+            if is_array(field.type) and width > LIMIT:
                 values, summaries = self._split(values)
                 columns.append((name, values, about))
                 columns.append((f"{name}_summary", summaries, {SUMMARY: name}))
@@ -107,12 +108,6 @@ class FieldShape:
         short = array.take(pa.array(np.arange(len(array)), mask=is_long))
         long = array if len(rows) == len(array) else array.take(pa.array(rows))
         return self._column(short), without(summary(long), rows, len(array))
-
-
-def _has_summary(kind: Any) -> bool:
-    if not is_array(kind):
-        return False
-    return not pa.types.is_fixed_size_list(kind) or kind.list_size > LIMIT
 
 
 def is_of_bytes(kind: Any) -> bool:

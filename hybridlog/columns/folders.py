@@ -18,6 +18,7 @@ from bisect import bisect_right
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import chain, count
 from pathlib import Path
 from stat import S_ISDIR
 from typing import Any, Final
@@ -118,7 +119,7 @@ class TableFolders:
                     break
         if waiting.pieces:
             self._merge(place, shared, waiting)
-        self._publish(place, addition.files, [name for name in names if name not in old], old)
+        self._publish(place, addition.files, names, old)
         with suppress(OSError), files.folder(place.parent) as fd:
             files.system.rmdir(folder, folder=fd)
 
@@ -210,17 +211,12 @@ class TableFolders:
     def _publish(
         self, place: Path, parts: Sequence[Path], names: Collection[str], old: Sequence[str]
     ) -> None:
-        """Give finished files their names: first those of the files that they replace."""
-        taken, number, free = set(names), 0, list(old)
-        for part in parts:
-            if free:
-                name = free.pop(0)
-            else:
-                while (name := f"{self._recording}-{number}{SUFFIX}") in taken:
-                    number += 1
-            taken.add(name)
+        """Give finished files free names: first those of the old files, which they replace."""
+        numbered = (f"{self._recording}-{number}{SUFFIX}" for number in count())
+        free = (name for name in numbered if name not in names)
+        for part, name in zip(parts, chain(old, free), strict=False):
             files.rename(part, place / name)
-        for name in free:
+        for name in old[len(parts) :]:
             files.remove_tree(place / name)
 
 

@@ -18,6 +18,7 @@ import hashlib
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -110,15 +111,12 @@ def column_names(
     message.
     """
     names = list(names)
-    taken = {name.casefold() for name in reserved}
-    lower = [name.casefold() for name in names]
-    for place, name in enumerate(names):
-        column, number = name, 2
-        if name.casefold() in taken:
-            is_ours = name.casefold() in reserved
-            column = f"{name}_" if is_ours else f"{name}_{number}"
-            while column.casefold() in taken or column.casefold() in lower[place + 1 :]:
-                column, number = f"{name}_{number}", number + 1
+    ours, lower = {one.casefold() for one in reserved}, {one.casefold() for one in names}
+    taken = {*ours}
+    for name in names:
+        others = chain([f"{name}_"] * (name.casefold() in ours), (f"{name}_{n}" for n in count(2)))
+        fresh = (one for one in others if one.casefold() not in lower)
+        column = next(one for one in chain([name], fresh) if one.casefold() not in taken)
         taken.add(column.casefold())
         yield name, column
 

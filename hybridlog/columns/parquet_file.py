@@ -42,7 +42,13 @@ class ParquetFileWriter:
         self.path = path
         self._sink = _Sink(path)
         kinds = {leaf.path: leaf.kind for leaf in leaves(schema)}
-        running = [path for path, kind in kinds.items() if _runs(path, kind)]
+        running = [  # adjacent values differ by little
+            path
+            for path, kind in kinds.items()
+            if path in _RUNNING
+            or pa.types.is_timestamp(kind)
+            or (path.endswith(".seq") and pa.types.is_integer(kind))
+        ]
         # DuckDB answers wrongly from statistics of floats with NaN among them.
         ordered = [
             path
@@ -155,10 +161,3 @@ class _Sink:
 
     def close(self) -> None:
         """Do nothing: the footer follows."""
-
-
-def _runs(path: str, kind: pa.DataType) -> bool:
-    """True if adjacent values differ by little: times and counters."""
-    if path in _RUNNING or pa.types.is_timestamp(kind):
-        return True
-    return path.endswith(".seq") and bool(pa.types.is_integer(kind))

@@ -112,6 +112,7 @@ def piece_of(
                 errors[row] = bad.reason
         if len(decoded.rows):
             found = without(columns(decoded), decoded.rows, count)
+    stamps = None if found is None else stamp_array(found)
     error = pa.array(errors, pa.string())
     states = pa.repeat(pa.scalar(str(state)), count)
     if error.null_count < count:
@@ -128,7 +129,7 @@ def piece_of(
         "t": pa.array(batch.log_time),
         "seq": pa.array(places.seq),
         "pub": pa.array(batch.publish_time, mask=np.isin(batch.channel, silent)),
-        "stamp": _stamps(found, count),
+        "stamp": pa.nulls(count, pa.int64()) if stamps is None else stamps.view(pa.int64()),
         "channel": pa.array(batch.channel % EXPIRED_IDS),
         "state": states,
         "error": error,
@@ -154,11 +155,3 @@ def as_table(own: Mapping[str, Any], fields: Any) -> Any:
         schema += list(fields.type)
         arrays += fields.flatten()
     return pa.Table.from_arrays(arrays, schema=pa.schema(schema))
-
-
-def _stamps(fields: Any, rows: int) -> Any:
-    """Header stamps, ns."""
-    import pyarrow as pa
-
-    found = None if fields is None else stamp_array(fields)
-    return pa.nulls(rows, pa.int64()) if found is None else found.view(pa.int64())

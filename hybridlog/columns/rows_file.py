@@ -80,13 +80,12 @@ class RowsFile(ColumnFile):
             "column",
             self.number,
             group,
-            make=lambda: self._struct(group),
+            make=lambda: (
+                self.read(group, range(len(self.leaves))).to_struct_array().combine_chunks()
+            ),
             size_of=lambda one: int(one.nbytes),
         )
         return found.slice(begin, rows)
-
-    def _struct(self, group: int) -> pa.StructArray:
-        return self.read(group, range(len(self.leaves))).to_struct_array().combine_chunks()
 
 
 def lines_of(folder: Path, log: File, names: Iterable[str]) -> list[File]:

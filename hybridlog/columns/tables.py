@@ -284,11 +284,8 @@ class Tables:
         """The table of a topic from some files; None without rows of it, or with stale ones."""
         if not found or not all(rows.is_of(recording) for rows in found):
             return None
-        counts = TopicCounts(0)
-        parts: list[TablePart] = []
-        for rows in found:
-            counts = counts.plus(rows.section.counts)
-            parts += rows.file.parts(rows.begin, rows.section.rows)
+        counts = TopicCounts(*map(sum, zip(*(one.section.counts for one in found), strict=True)))
+        parts = [part for one in found for part in one.file.parts(one.begin, one.section.rows)]
         if any(one.id >= EXPIRED_IDS for one in self._channels_of(recording, topic)):
             counts = counts._replace(arrays=0)  # what has expired is in no answer
         table = TopicTable(topic, parts, counts, self.opened)

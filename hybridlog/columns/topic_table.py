@@ -16,7 +16,7 @@ from hybridlog.columns.column_file import FIRST
 from hybridlog.columns.fields import joined, names_of, records_of, type_of_all
 from hybridlog.columns.layout import POINTS
 from hybridlog.schema.arrow_columns import structs
-from hybridlog.schema.arrow_types import converted, is_list
+from hybridlog.schema.arrow_types import converted
 from hybridlog.schema.column import ranges
 from hybridlog.schema.states import State
 from hybridlog_storage.ordering import order_of
@@ -259,11 +259,10 @@ class TopicTable:
 
 
 def _has_values(column: Any) -> bool:
-    """True if a value inside a column is not null."""
-    if pa.types.is_struct(column.type):
-        return any(map(_has_values, column.flatten()))
-    if is_list(column.type):
-        return _has_values(column.flatten())
+    """True if a value inside a column of one leaf is not null."""
+    while column.type.num_fields:
+        inner = column.flatten()
+        column = inner[0] if isinstance(inner, list) else inner
     return bool(column.null_count < len(column))
 
 

@@ -136,9 +136,7 @@ def diff(
     found += rest
     if contract is not None:
         broke = [_broken(session, contract, side) for side in sides]
-        rules = sorted({*broke[0], *broke[1]})
-        changed = [rule for rule in rules if (rule in broke[0]) != (rule in broke[1])]
-        for topic, rule, limit in changed:
+        for topic, rule, limit in sorted(broke[0].keys() ^ broke[1].keys()):
             words = [one.get((topic, rule, limit), "holds") for one in broke]
             found.append(Difference(topic, f"{rule} {limit}", words[0], words[1]))
     return found

@@ -15,6 +15,7 @@ import numpy as np
 import pyarrow as pa
 
 from hybridlog.schema.arrow_columns import DURATION, TIME, lists, structs
+from hybridlog.schema.column import offsets
 from hybridlog.schema.text import MAX_DEPTH, json_text, repaired_text
 
 if TYPE_CHECKING:
@@ -55,7 +56,7 @@ def values_array(
         elif kind is list:
             array = _lists(values, wanted, depth + 1)
         elif kind is str:
-            array = _strings(values)
+            array = pa.array([v and repaired_text(v) for v in values], pa.string())
         elif kind is bool or kind is bytes:
             array = pa.array(values, pa.bool_() if kind is bool else pa.binary())
     return json_array(values) if array is None else array
@@ -84,9 +85,7 @@ def missing_rows(values: Sequence[object]) -> NDArray[np.bool_] | None:
 
 def offsets_of(rows: Sequence[Sequence[object] | None]) -> NDArray[np.int64]:
     """Offsets of the elements of each row, int64[n + 1]."""
-    offset = np.zeros(len(rows) + 1, np.int64)
-    np.cumsum([0 if row is None else len(row) for row in rows], out=offset[1:])
-    return offset
+    return offsets(np.array([0 if row is None else len(row) for row in rows], np.int64))
 
 
 def _kind(kind: type) -> type:
@@ -106,13 +105,6 @@ def _numbers(values: Sequence[Any], kinds: set[type]) -> pa.Array[Any] | None:
         with suppress(OverflowError, pa.ArrowInvalid):
             return pa.array(values, kind)
     return None
-
-
-def _strings(values: Sequence[str | None]) -> pa.Array[Any]:
-    try:
-        return pa.array(values, pa.string())
-    except UnicodeEncodeError:
-        return pa.array([None if v is None else repaired_text(v) for v in values], pa.string())
 
 
 def _lists(

@@ -66,10 +66,9 @@ def is_map(field: FieldDescriptor) -> bool:
     return field.type == _MESSAGE and bool(field.message_type.GetOptions().map_entry)
 
 
-def nanoseconds_of(message: Message) -> int:
+def nanoseconds_of(message: Any) -> int:
     """A `Timestamp` or `Duration` in nanoseconds."""
-    seconds, nanos = (getattr(message, name) for name in ("seconds", "nanos"))
-    return int(seconds * 10**9 + nanos)
+    return int(message.seconds * 10**9 + message.nanos)
 
 
 def map_key(key: object) -> str:

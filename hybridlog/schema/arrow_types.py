@@ -19,7 +19,7 @@ import pyarrow.compute as pc
 
 from hybridlog.schema.arrow_columns import lists, structs
 from hybridlog.schema.arrow_objects import EXACT, json_array
-from hybridlog.schema.column import Scalars
+from hybridlog.schema.column import Scalars, offsets
 from hybridlog.schema.summary import summarise
 
 if TYPE_CHECKING:
@@ -128,9 +128,7 @@ def lengths_of(array: Array) -> NDArray[np.int64]:
 
 def bounds_of(array: Array) -> NDArray[np.int64]:
     """int64[n + 1], where the elements of each row begin among those of `flatten()`."""
-    bounds = np.zeros(len(array) + 1, np.int64)
-    np.cumsum(lengths_of(array), out=bounds[1:])
-    return bounds
+    return offsets(lengths_of(array))
 
 
 def with_values(array: Array, values: Array) -> Array:
@@ -252,12 +250,9 @@ def _exact_integer(kinds: Kinds, arrays: Arrays) -> pa.DataType:
 
 def _range(arrays: Any) -> tuple[int, int]:
     """Least and greatest integer of some arrays, including zero."""
-    low = high = 0
-    for array in arrays:
-        found = pc.min_max(array)
-        if found["min"].is_valid:
-            low, high = min(low, found["min"].as_py()), max(high, found["max"].as_py())
-    return low, high
+    ends = [end.as_py() for array in arrays for end in pc.min_max(array).values()]
+    known = [0, *(end for end in ends if end is not None)]
+    return min(known), max(known)
 
 
 def common_schema(tables: Iterable[pa.Table]) -> pa.Schema:

@@ -15,6 +15,8 @@ from __future__ import annotations
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
+from itertools import accumulate
+from operator import itemgetter
 from typing import TYPE_CHECKING
 
 from hybridlog.schema.definition import (
@@ -156,15 +158,9 @@ def _standard(name: str, wire: Wire) -> list[_Candidate]:
 
 def _some(payloads: Sequence[Buffer]) -> list[Buffer]:
     """A few of many messages, and of few bytes."""
-    step = -(-len(payloads) // TRIED_MESSAGES) or 1
-    found: list[Buffer] = []
-    size = 0
-    for payload in payloads[::step]:
-        size += memoryview(payload).nbytes
-        if found and size > _TRIED_BYTES:
-            break
-        found.append(payload)
-    return found
+    found = list(payloads[:: -(-len(payloads) // TRIED_MESSAGES) or 1])
+    sizes = accumulate(memoryview(payload).nbytes for payload in found)
+    return found[: max(sum(size <= _TRIED_BYTES for size in sizes), 1)]
 
 
 def _fit(message_type: MessageType, wire: Wire, payloads: Sequence[Buffer]) -> tuple[int, int]:
@@ -192,9 +188,6 @@ def _fitting(
     better_than: tuple[int, int],
 ) -> _Candidate | None:
     """The candidate that fits most messages exactly, then most at all; None if none is better."""
-    best, most = None, better_than
-    for candidate in candidates:
-        found = _fit(candidate.type, wire, payloads)
-        if found > most:
-            best, most = candidate, found
-    return best
+    scored = [(_fit(one.type, wire, payloads), one) for one in candidates]
+    most, best = max(scored, key=itemgetter(0), default=(better_than, None))
+    return best if most > better_than else None

@@ -17,7 +17,6 @@ from hybridlog.schema.definition_text import (
     MAX_NAME,
     NAME,
     RawField,
-    Section,
     canonical,
     derived_from,
     has_parts,
@@ -126,7 +125,7 @@ class FieldPath:
 
 _NOT_PORTABLE = frozenset({"wstring", "wchar", "float128"})
 _DUMMY = "structure_needs_at_least_one_member"
-_TIME_FIELDS = (("sec", "int32"), ("nanosec", "uint32"))
+_TIME_FIELDS = [RawField("sec", "int32"), RawField("nanosec", "uint32")]
 _TIME_TYPES: dict[str, Literal["time", "duration"]] = {
     "builtin_interfaces/Time": "time",
     "builtin_interfaces/Duration": "duration",
@@ -201,7 +200,10 @@ def _parse_sections(schema: Schema, ros: int) -> tuple[dict[str, list[RawField]]
         if kind == "IDL" and ros == 2:
             parse_idl(name, section.text, idl)
             continue
-        parsed = _parse_text(name, section, ros)
+        if ros == 2 and has_parts(section.text):
+            parsed = parse_parts(name, section.text)
+        else:
+            parsed = {name: parse_msg(name, section.text, defaults=ros == 2)}
         if not section.kind and not any(parsed.values()):
             blank = parsed  # what stands before the header line of the definition
             continue
@@ -212,12 +214,6 @@ def _parse_sections(schema: Schema, ros: int) -> tuple[dict[str, list[RawField]]
         types.setdefault(key, fields)
     derived = derived_from(interface_of(canonical(schema.name)), types) if ros == 2 else {}
     return blank | derived | types, first
-
-
-def _parse_text(name: str, section: Section, ros: int) -> dict[str, list[RawField]]:
-    if ros == 2 and has_parts(section.text):
-        return parse_parts(name, section.text)
-    return {name: parse_msg(name, section.text, defaults=ros == 2)}
 
 
 def standard_text(name: str, ros: int) -> str | None:
@@ -364,14 +360,8 @@ class _Resolver:
                 return _ROS1_TIMES[_TIME_TYPES[name]]
             return _ROS1_TIMES.get(name)
         kind = _TIME_TYPES.get(name)
-        if kind is None:
-            return None
-        given = self._types.get(name)
-        if given is not None and [(raw.name, raw.type) for raw in given] != list(_TIME_FIELDS):
-            return None
-        if given is not None and any(raw.array for raw in given):
-            return None
-        return Instant(kind, True, False)
+        is_usual = self._types.get(name, _TIME_FIELDS) == _TIME_FIELDS
+        return Instant(kind, True, False) if kind is not None and is_usual else None
 
 
 def type_text(field_type: FieldType) -> str:

@@ -57,7 +57,6 @@ class IdlTypes:
     structs: dict[str, list[RawField]] = field(default_factory=dict)
     typedefs: dict[str, RawField] = field(default_factory=dict)
     constants: dict[str, int] = field(default_factory=dict)
-    enums: set[str] = field(default_factory=set)
 
     def resolved(self) -> dict[str, list[RawField]]:
         """Structs by canonical name, with typedefs resolved."""
@@ -70,12 +69,8 @@ class IdlTypes:
         for _ in range(_MAX_DEPTH):
             if raw.type in _PRIMITIVES:
                 return raw
-            target = self._lookup(scope, raw.type)
-            if target is None:
-                return replace(raw, type=canonical(raw.type))
-            if target in self.enums:
-                return replace(raw, type=_ENUM)
-            if target in self.structs:
+            target = next(filter(self._is_known, _candidates(scope, raw.type)), raw.type)
+            if target not in self.typedefs:
                 return replace(raw, type=canonical(target))
             alias = self.typedefs[target]
             if raw.array and alias.array:
@@ -87,12 +82,8 @@ class IdlTypes:
             scope = target
         raise DefinitionError(f"{canonical(scope)}: typedefs refer to each other in a circle")
 
-    def _lookup(self, scope: str, name: str) -> str | None:
-        known = (self.typedefs, self.structs, self.enums)
-        for candidate in _candidates(scope, name):
-            if any(candidate in table for table in known):
-                return candidate
-        return None
+    def _is_known(self, name: str) -> bool:
+        return name in self.typedefs or name in self.structs
 
 
 def _candidates(scope: str, name: str) -> list[str]:
@@ -272,7 +263,7 @@ class _Parser:
             self._types.constants[scope + name] = number
 
     def _enum(self, scope: str) -> None:
-        self._types.enums.add(scope + self._name())
+        self._types.typedefs[scope + self._name()] = RawField("", _ENUM)
         self._expect("{")
         while not self._take("}"):
             self._next()

@@ -26,7 +26,7 @@ _HEADER = r"\s*(MSG|IDL|SRV|ACTION):[^\S\n]*(\S+)[^\S\n]*(?:\n|\Z)"
 _FIRST_LINE = re.compile(_HEADER)
 # A line of `=`, or a rule in front of a header where the newlines around it are missing.
 _RULE = re.compile(rf"^={{20,}}[^\S\n]*(?:\n|\Z)|(?<!=)={{80,}}(?={_HEADER})", re.MULTILINE)
-_PART_RULE = "---"
+_PARTS = re.compile(r"^[^\S\n]*---[^\S\n]*$", re.MULTILINE)
 _FIELD = re.compile(
     r"(?P<type>[A-Za-z][A-Za-z0-9_/]*)"
     r"(?:<=(?P<text_bound>[0-9]{1,10}))?"
@@ -156,19 +156,14 @@ def parse_parts(name: str, text: str) -> dict[str, list[RawField]]:
     and stores the text of the service or action with them. `name` is the canonical name of any of
     these, or of the interface itself.
     """
-    parts: list[list[str]] = [[]]
-    for line in text.split("\n"):
-        if line.strip() == _PART_RULE:
-            parts.append([])
-        else:
-            parts[-1].append(line)
+    parts = _PARTS.split(text)
     if len(parts) not in {2, 3}:
         raise DefinitionError(f"{name}: {len(parts)} parts; a service has 2 and an action 3")
     stem = interface_of(name)
     names = _SERVICE if len(parts) == 2 else _ACTION
     found = {
-        f"{stem}{part}": parse_msg(name, "\n".join(lines), defaults=True)
-        for part, lines in zip(names, parts, strict=True)
+        f"{stem}{part}": parse_msg(name, inner, defaults=True)
+        for part, inner in zip(names, parts, strict=True)
     }
     return found | derived_from(stem, found)
 
@@ -203,4 +198,4 @@ def derived_from(stem: str, known: Collection[str]) -> dict[str, list[RawField]]
 
 def has_parts(text: str) -> bool:
     """True if a text is that of a service or an action."""
-    return any(line.strip() == _PART_RULE for line in text.split("\n"))
+    return bool(_PARTS.search(text))

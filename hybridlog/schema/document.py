@@ -232,13 +232,9 @@ def _same(numbers: NDArray[np.int64]) -> int | None:
 
 def _digits(index: NDArray[np.int64]) -> NDArray[np.int64]:
     """Decimal digits of each array key."""
-    digits = np.ones(len(index), np.int64)
-    top = int(index.max(initial=0))
-    power = 10
-    while power <= top:
-        digits += index >= power
-        power *= 10
-    return digits
+    longest = len(str(int(index.max(initial=0))))
+    longer = (index >= 10**power for power in range(1, longest))
+    return sum(longer, np.ones(len(index), np.int64))
 
 
 def _node(column: Column, limit: int) -> _Node:

@@ -23,7 +23,6 @@ from hybridlog_storage.errors import DefinitionError, PayloadError
 
 if TYPE_CHECKING:
     from collections.abc import Collection
-    from collections.abc import Set as AbstractSet
 
     import pyarrow as pa
     from google.protobuf.descriptor import Descriptor
@@ -148,17 +147,17 @@ def _message_class(schema: Schema) -> type[Message]:
 def _fill(pool: DescriptorPool, data: bytes) -> Exception | None:
     """Adds all files of a set to a pool, each after its imports; returns the error of one.
 
-    Imports that the set lacks are dropped: they matter only if a type of theirs is used. Files that
+    Imports that the set lacks are empty: they matter only if a type of theirs is used. Files that
     import each other in a circle raise ValueError.
     """
-    from google.protobuf.descriptor_pb2 import FileDescriptorSet
+    from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
 
     files = {file.name: file for file in FileDescriptorSet.FromString(data).file}
     if b"google.protobuf." in data:
         for name in sorted(_STANDARD - files.keys()):
             files[name] = _standard_file(name)
-    for file in files.values():
-        _drop_imports(file, files.keys())
+    for name in {name for file in files.values() for name in file.dependency} - files.keys():
+        files[name] = FileDescriptorProto(name=name)
     graph = {name: set(file.dependency) for name, file in files.items()}
     try:
         waiting = list(TopologicalSorter(graph).static_order())
@@ -176,21 +175,6 @@ def _fill(pool: DescriptorPool, data: bytes) -> Exception | None:
                 failed.append(name)
         waiting = failed
     return problem
-
-
-def _drop_imports(file: FileDescriptorProto, known: AbstractSet[str]) -> None:
-    """Removes the imports of a file that are not known."""
-    names = list(file.dependency)
-    there = [n for n, name in enumerate(names) if name in known]
-    if len(there) == len(names):
-        return
-    moved = {old: new for new, old in enumerate(there)}
-    for field in (file.public_dependency, file.weak_dependency):
-        left = [moved[n] for n in field if n in moved]
-        del field[:]
-        field.extend(left)
-    del file.dependency[:]
-    file.dependency.extend(names[n] for n in there)
 
 
 def _standard_file(name: str) -> FileDescriptorProto:

@@ -155,10 +155,9 @@ class _Typesdict:
     def _free(self, name: str) -> str:
         if not _TYPE_NAME.match(name):
             raise DefinitionError(f"{self._owner}: {name[:80]!r} is not a valid type name")
-        free, number = name, 2
-        while free in self.types:
-            free, number = f"{name}_{number}", number + 1
-        return free
+        while name in self.types:
+            name += "_"
+        return name
 
     def _describe(self, field: FieldType) -> FieldDesc:
         from rosbags.interfaces import Nodetype

@@ -73,14 +73,12 @@ class WireReader:
         offset = np.asarray(offset, np.int64)
         end = offset + np.asarray(length, np.int64)
         odd = _Odd()
-        rows: NDArray[np.intp] | None = None
         outside = (offset < 0) | (end < offset) | (end > memoryview(buffer).nbytes)
-        if bool(outside.any()):
-            rows = np.flatnonzero(~outside)
+        rows = np.flatnonzero(~outside)
+        if len(rows) < len(offset):
             odd.bad["lies outside of the chunk"] = [np.flatnonzero(outside)]
         if self._wire == "ros1":
-            everything = np.arange(len(offset)) if rows is None else rows
-            good, records = self._read(Source(buffer, "<"), everything, offset, end, odd)
+            good, records = self._read(Source(buffer, "<"), rows, offset, end, odd)
         else:
             good, records = self._read_cdr(buffer, rows, offset, end, odd)
         unreadable = [Unreadable(np.sort(np.concatenate(r)), why) for why, r in odd.bad.items()]
@@ -98,14 +96,12 @@ class WireReader:
     def _read_cdr(
         self,
         buffer: Buffer,
-        rows: NDArray[np.intp] | None,
+        rows: NDArray[np.intp],
         offset: NDArray[np.int64],
         end: NDArray[np.int64],
         odd: _Odd,
     ) -> tuple[NDArray[np.intp], Records]:
         """Split the rows by byte order, read both, and merge them."""
-        if rows is None:
-            rows = np.arange(len(offset))
         short = end[rows] - offset[rows] < _HEADER
         if bool(short.any()):
             odd.bad["is shorter than a CDR header"] = [rows[short]]
@@ -128,10 +124,6 @@ class WireReader:
             self._read(Source(buffer, order), rows[kind == code], start, end, odd)
             for order, code in orders
         )
-        if len(second_rows) == 0:
-            return first_rows, first
-        if len(first_rows) == 0:
-            return second_rows, second
         both = np.concatenate([first_rows, second_rows])
         order = np.argsort(both)
         return both[order], take(concatenate([first, second]), order)

@@ -14,7 +14,7 @@ from hybridlog.columns.tables import Tables
 from hybridlog_storage.messages import Schema
 from tests.limits import Limit
 from tests.tables.conftest import SMALL_CHUNKS
-from tests.tables.logs import BASE, table_of, write_log
+from tests.tables.logs import BASE, write_log
 
 
 def record(store: hl.Store, path: Path, values: Sequence[Any], topic: str = "/a") -> None:
@@ -58,17 +58,6 @@ def test_json_whose_types_change_has_files_and_no_answer(
     assert sum(pq.read_metadata(path).num_rows for path in files) == 2000
     assert rows(store) is None
     assert store.topic("/a").count() == 2000
-
-
-def test_json_that_is_none(store: hl.Store, tmp_path: Path) -> None:
-    said = [(BASE, "/a", b"{"), (BASE + 1, "/a", b'{"n": 1}')]
-    write_log(tmp_path / "log.mcap", said, {"/a": ("json", Schema("x", "jsonschema", b"{}"))})
-    store.record(tmp_path / "log.mcap", name="log")
-    assert rows(store) == [{"n": None}, {"n": 1}]
-    assert table_of(store).unreadable == 1
-    query = store.topic("/a")
-    assert [json.loads(line)["n"] for some in query.to_json_lines() for line in some] == [1]
-    assert query.counters.unreadable == 1
 
 
 def test_a_field_that_breaks_parquet_costs_only_its_topic(store: hl.Store, tmp_path: Path) -> None:

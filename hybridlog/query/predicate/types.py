@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Literal
+from typing import Any, Literal
 
 from hybridlog.query.predicate.tokens import error_at, is_filter
 from hybridlog.query.predicate.tree import (
@@ -44,6 +44,7 @@ _KINDS: dict[str, Kind] = {
     **dict.fromkeys(TIMES, "time"),
     **dict.fromkeys({*NUMBERS, "number", "integer"}, "number"),
 }
+_VALUES: dict[str, Any] = {"bool": bool, "string": str, "number": int | float}
 _COLUMNS = {
     "log_time": "_meta.t",
     "t": "_meta.t",
@@ -219,14 +220,8 @@ class _Checker:
     def _check_value(self, kind: Kind, path: str, value: Value, position: int) -> None:
         if kind == "other" or value is None:
             return
-        if isinstance(value, bool):
-            given = "bool"
-        elif isinstance(value, str):
-            given = "string"
-        elif isinstance(value, int | float):
-            given = "number"
-        else:  # in a filter alone
-            given = type(value).__name__
+        words = (name for name, known in _VALUES.items() if isinstance(value, known))
+        given = next(words, type(value).__name__)  # other types are in filters alone
         if given == "number" and kind == "time":
             self._check_time(value, self._types.base(path), position)
             return
