@@ -106,7 +106,5 @@ WAYS: dict[str, Way] = {
     "a folder for the turtle": lambda data: _replace(data / "WiredTiger.turtle", None),
     "no data": shutil.rmtree,
     "empty data": lambda data: (shutil.rmtree(data), data.mkdir()),
-    "a file for the data": lambda data: _replace(data, "x"),
     "no directory": lambda data: shutil.rmtree(data.parent),
-    "a file for the directory": lambda data: _replace(data.parent, "x"),
 }

@@ -97,7 +97,6 @@ def documents(store: hl.Store) -> list[int]:
 SOME = [
     "WiredTiger.turtle garbled",  # mongod does not start
     "a collection removed",  # mongod ends when a question needs it
-    "a file for the directory",
 ]
 
 
@@ -116,11 +115,8 @@ def heal(store: Path, way: str) -> str:
 @pytest.mark.parametrize("way", SOME)
 def test_a_damaged_index_is_made_again(store: Path, way: str) -> None:
     said = heal(store, way)
-    if way == "a file for the directory":
-        assert said.count("added to the index") == 1
-    else:
-        assert said.startswith(REPLACED)
-        assert len(said.splitlines()) == 2
+    assert said.startswith(REPLACED)
+    assert len(said.splitlines()) == 2
 
 
 @pytest.mark.exhaustive
@@ -363,7 +359,7 @@ def test_too_few_handles_are_told_as_that(store: Path) -> None:
     command = [sys.executable, "-m", "hybridlog", "verify", "--store", str(store)]
     done = subprocess.run([*LIMITED, *command], capture_output=True, text=True, check=False)
     assert done.returncode == 6, done.stderr
-    assert "ran out of memory or of file handles" in done.stderr
+    assert "Too many open files" in done.stderr
     assert "damaged" not in done.stderr
     assert "all is well in the files" in done.stdout
     ended(store)

@@ -136,7 +136,7 @@ def test_integers_are_exact_and_types_stay(tmp_path: Path) -> None:
 
 def test_what_is_refused(logs: Logs) -> None:
     query = logs.store.topic("left/pose")
-    with pytest.raises(UsageError, match=r"list of /left/pose is no single number.*list\.min"):
+    with pytest.raises(UsageError, match=r"list of /left/pose is no single number"):
         query.fields("x", "list").resample("1s", how="mean").to_arrow()
     with pytest.raises(UsageError, match="leave out tolerance"):
         query.resample("1s", how="mean", tolerance="1s")

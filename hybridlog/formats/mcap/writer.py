@@ -10,13 +10,12 @@ from mcap.writer import CompressionType, Writer
 from hybridlog.formats.answer import Answer, LogWriter
 from hybridlog.formats.writing import Sink, Target
 from hybridlog.schema.completion import with_nested
-from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_format import OUR_NAMES
 
 if TYPE_CHECKING:
     from mcap.records import AttachmentIndex, Statistics
 
-    from hybridlog_storage.messages import Batch, Schema
+    from hybridlog_storage.messages import Batch, Channel, Schema
     from hybridlog_storage.segments.attachments import Attachment
 
 
@@ -53,6 +52,7 @@ class McapWriter(LogWriter):
         self._sink = Sink(target)
         self._schemas: dict[Schema, int] = {}
         self._known: dict[Channel, int] = {}
+        self._ids: dict[tuple[object, ...], int] = {}  # by what is written of a channel
         try:
             self._writer = _Writer(
                 cast("IO[Any]", self._sink),
@@ -101,12 +101,13 @@ class McapWriter(LogWriter):
     def _channel(self, channel: Channel) -> int:
         if channel not in self._known:
             metadata = source_metadata(channel)
-            plain = Channel(channel.topic, channel.message_encoding, channel.schema, metadata)
-            if plain not in self._known:
-                self._known[plain] = self._writer.register_channel(
-                    plain.topic, plain.message_encoding, self._schema(plain.schema), metadata
+            schema = self._schema(channel.schema)
+            said = channel.topic, channel.message_encoding, schema, tuple(sorted(metadata.items()))
+            if said not in self._ids:
+                self._ids[said] = self._writer.register_channel(
+                    channel.topic, channel.message_encoding, schema, metadata
                 )
-            self._known[channel] = self._known[plain]
+            self._known[channel] = self._ids[said]
         return self._known[channel]
 
     def _schema(self, schema: Schema | None) -> int:

@@ -386,13 +386,9 @@ def _own_directory(given: Path) -> Path:
 
 
 def _make_folder(path: Path) -> None:
-    """Create a private folder unless it exists; replace a plain file of its name."""
-    try:
+    """Create a private folder unless it exists."""
+    with contextlib.suppress(FileExistsError):
         files.make_folder(path, 0o700)
-    except FileExistsError:
-        if stat.S_ISREG(files.status(path).st_mode):
-            files.unlink(path)
-            _make_folder(path)
 
 
 def _refuse_odd_files(directory: Path) -> None:
@@ -425,10 +421,11 @@ def _answers(path: str) -> bool:
 
 
 def _telling_lines(log: str) -> list[str]:
-    """Log lines that explain why mongod ended: its errors, or else the last lines; at most four."""
+    """Log lines that explain why mongod ended: a cause, its errors, or the last; at most four."""
     lines = [line for line in map(str.strip, log.splitlines()) if line]
+    causes = [line for line in lines if any(sign in line for sign in _OTHER_CAUSES)]
     errors = [line for line in lines if not re.search(r'"s":"[DIW]', line)]  # or not mongod's
     return [
         re.sub(r'^{.*?"msg":"(.*?)",?(.*)}$', r"\1 \2", line)[:300].strip()
-        for line in (errors or lines)[-4:]
+        for line in (causes or errors or lines)[-4:]
     ]
