@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     from hybridlog.query.answers.follow import Following
     from hybridlog.query.query import Query
     from hybridlog.query.question import Counters
-    from hybridlog.store import Store
     from hybridlog_storage.messages import Buffer
 
 
@@ -190,24 +189,18 @@ def _tables_of(rows: Iterable[Mapping[str, Any]]) -> Iterator[pa.Table]:
         yield pa.Table.from_pylist(block)
 
 
-@dataclass
-class Answering:
-    """A question; `is_empty` is None where the counters of the query tell it."""
-
-    store: Store
-    query: Query
-    is_empty: bool | None = None
-
-
 @contextmanager
-def answering(given: Topics) -> Iterator[Answering]:
-    """The open store and the query; its cost and remarks are printed at the end."""
+def answering(given: Topics) -> Iterator[Query]:
+    """The query of an open store; its cost and remarks are printed at the end.
+
+    Its counters say by then how many messages or rows the answer has.
+    """
     started = time.monotonic()
     with given.opened(snapshot=True) as store:
-        asked = Answering(store, given.query(store))
-        yield asked
-        print_end(asked.query.counters, started, verbose=given.verbose, count=True)
-        output.remarks(asked.query.remarks(is_empty=asked.is_empty))
+        query = given.query(store)
+        yield query
+        print_end(query.counters, started, verbose=given.verbose, count=True)
+        output.remarks(query.remarks())
 
 
 def write_answer(
