@@ -107,11 +107,6 @@ class Tabular(Forced, AsJson):
         """The path or stream that a writer takes."""
         return self.output or sys.stdout.buffer
 
-    @property
-    def most(self) -> int | None:
-        """Greatest number of rows that are printed or written; None for all."""
-        return SCREEN_ROWS if self.limit is None and self.to_form == SCREEN else self.limit
-
     def check(self) -> None:
         """Refuse what cannot be written."""
         form = self.to_form
