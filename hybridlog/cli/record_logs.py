@@ -178,17 +178,6 @@ def _between(source: Source, log: LogSet, choices: RecordChoices) -> tuple[int, 
     return parse_range(*choices.between, start=start, end=end)
 
 
-def _outside(source: Source, between: tuple[int, int]) -> TimeError:
-    from hybridlog.query.times import format_time
-
-    low, high = map(format_time, between)
-    spans = ""
-    if source.time_range is not None:
-        start, end = source.time_range
-        spans = f"; it spans {format_time(start)} to {format_time(end - 1)}"
-    return TimeError(f"{source.path} has no message from {low} up to {high}{spans}.")
-
-
 class LogRecorder:
     """Records logs with the options of the command; what came of them is told at the end."""
 
@@ -258,6 +247,7 @@ class LogRecorder:
     def _record_one(
         self, store: Store, log: LogSet, progress: Callable[[int, int], None]
     ) -> RecordReport:
+        from hybridlog.query.times import format_time
         from hybridlog.record.recorder import RecordOptions
 
         choices = self._choices
@@ -281,7 +271,12 @@ class LogRecorder:
             if options.between is not None and is_empty and report.skipped + report.latched:
                 store.refresh()
                 store.remove(report.entry.id)
-                raise _outside(source, options.between)
+                low, high = map(format_time, options.between)
+                spans = ""
+                if source.time_range is not None:
+                    start, end = source.time_range
+                    spans = f"; it spans {format_time(start)} to {format_time(end - 1)}"
+                raise TimeError(f"{source.path} has no message from {low} up to {high}{spans}.")
         for pattern in (p for one in (matcher, no_index) if one is not None for p in one.unused()):
             output.note(f"{log.path}: no topic fits {output.quoted(pattern)}.")
         return report
