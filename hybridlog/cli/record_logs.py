@@ -218,8 +218,8 @@ class LogRecorder:
                 self.fail(piece.path, error)
             else:
                 report.entry = entry = with_misfits(store, report.entry)
-                for problem in _problems(piece.path, report):
-                    self.exit_code = self.exit_code or problem.exit_code
+                code = _told(piece.path, report)
+                self.exit_code = self.exit_code or code
                 many, size = (
                     output.counted(entry.messages, "message"),
                     output.size(entry.stored_bytes),
@@ -326,21 +326,22 @@ class LogRecorder:
             output.remarks([f"{many} recorded, {left}."])
 
 
-def _problems(path: Path, report: RecordReport) -> Iterator[HybridlogError]:
-    """Print problems; gives an error for each that sets the exit code."""
+def _told(path: Path, report: RecordReport) -> int:
+    """Print what is odd about a recording; returns the exit code."""
     if report.latched_left_out:
         output.note(
             f"{path}: {output.counted(report.latched_left_out, 'latched message')} from before "
             "the time range did not fit in memory."
         )
     output.remarks((*remarks_on(report.entry), *report.remarks))
-    if report.failure is not None:
-        output.note(f"hybridlog: {output.not_indexed(report)}")
-        yield DatabaseError(str(report.failure))
+    code = 0
     if report.damage:
-        entry = report.entry
+        entry, code = report.entry, SourceDamagedError.exit_code
         output.note(
             f"{path} is damaged: {output.stored(entry.messages)}; "
             f"{coverage(entry, losses_of(entry))}; `hybridlog info --losses` says where."
         )
-        yield SourceDamagedError(str(path))
+    if report.failure is not None:
+        code = DatabaseError.exit_code
+        output.note(f"hybridlog: {output.not_indexed(report)}")
+    return code
