@@ -220,12 +220,9 @@ class LogRecorder:
                 report.entry = entry = with_misfits(store, report.entry)
                 code = _told(piece.path, report)
                 self.exit_code = self.exit_code or code
-                many, size = (
-                    output.counted(entry.messages, "message"),
-                    output.size(entry.stored_bytes),
-                )
-                line = f"{entry.name}: {many}, {size}, from {piece.path}"
-                self._tell(row_of(report, piece.path), "recorded", [line])
+                many = output.counted(entry.messages, "message")
+                about = f"{many}, {output.size(entry.stored_bytes)}, from {piece.path}"
+                self._tell(row_of(report, piece.path), "recorded", [f"{entry.name}: {about}"])
         self._left.remove(log.path)
 
     def _pieces(self, store: Store, log: LogSet) -> Iterator[LogSet]:
