@@ -1142,7 +1142,7 @@ def test_the_specification_names_what_there_is() -> None:
 
 
 def test_the_unit_for_systemd_starts_a_recorder() -> None:
-    from hybridlog.cli.record import record_command
+    from hybridlog.cli.commands.record import record_command
     from hybridlog.cli.record_choices import RecordChoices, check_choices
     from hybridlog.cli.record_live import recorder_options
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.cli import output
-from hybridlog.cli.ls import with_misfits
+from hybridlog.cli.commands.ls import with_misfits
 from hybridlog.cli.options import parse_tags
 from hybridlog.cli.progress import Bar
 from hybridlog.cli.record_choices import RecordChoices
