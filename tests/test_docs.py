@@ -519,7 +519,10 @@ def params_of(command: click.Command) -> list[click.Parameter]:
     return [param for each in command.commands.values() for param in each.params]
 
 
-ASKING = {"-t", "--between", "--where", "--strict", "-n", "-F", "-o", "-f", "--json", "-q", "-v"}
+ASKING = {
+    *("-t", "--topic-type", "--between", "--where", "--strict", "-n", "-F", "-o", "-f"),
+    *("--json", "-q", "-v"),
+}
 """Options that all commands have which ask about topics."""
 CHOICE = (
     "| `-r`, `--tag`, `--has`, `--type`, `--during`, `--last`, `--older-than`, `--with` "
