@@ -519,7 +519,10 @@ def params_of(command: click.Command) -> list[click.Parameter]:
     return [param for each in command.commands.values() for param in each.params]
 
 
-ASKING = {"-t", "--between", "--where", "--strict", "-n", "-F", "-o", "-f", "--json", "-q", "-v"}
+ASKING = {
+    *("-t", "--topic-type", "--between", "--where", "--strict", "-n", "-F", "-o", "-f"),
+    *("--json", "-q", "-v"),
+}
 """Options that all commands have which ask about topics."""
 CHOICE = (
     "| `-r`, `--tag`, `--has`, `--type`, `--during`, `--last`, `--older-than`, `--with` "
@@ -1142,7 +1145,7 @@ def test_the_specification_names_what_there_is() -> None:
 
 
 def test_the_unit_for_systemd_starts_a_recorder() -> None:
-    from hybridlog.cli.record import record_command
+    from hybridlog.cli.commands.record import record_command
     from hybridlog.cli.record_choices import RecordChoices, check_choices
     from hybridlog.cli.record_live import recorder_options
 

@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     from hybridlog.query.answers.follow import Following
     from hybridlog.query.query import Query
     from hybridlog.query.question import Counters
-    from hybridlog.store import Store
     from hybridlog_storage.messages import Buffer
 
 
@@ -107,11 +106,6 @@ class Tabular(Forced, AsJson):
     def place(self) -> Target:
         """The path or stream that a writer takes."""
         return self.output or sys.stdout.buffer
-
-    @property
-    def most(self) -> int | None:
-        """Greatest number of rows that are printed or written; None for all."""
-        return SCREEN_ROWS if self.limit is None and self.to_form == SCREEN else self.limit
 
     def check(self) -> None:
         """Refuse what cannot be written."""
@@ -190,24 +184,18 @@ def _tables_of(rows: Iterable[Mapping[str, Any]]) -> Iterator[pa.Table]:
         yield pa.Table.from_pylist(block)
 
 
-@dataclass
-class Answering:
-    """A question; `is_empty` is None where the counters of the query tell it."""
-
-    store: Store
-    query: Query
-    is_empty: bool | None = None
-
-
 @contextmanager
-def answering(given: Topics) -> Iterator[Answering]:
-    """The open store and the query; its cost and remarks are printed at the end."""
+def answering(given: Topics) -> Iterator[Query]:
+    """The query of an open store; its cost and remarks are printed at the end.
+
+    Its counters say by then how many messages or rows the answer has.
+    """
     started = time.monotonic()
     with given.opened(snapshot=True) as store:
-        asked = Answering(store, given.query(store))
-        yield asked
-        print_end(asked.query.counters, started, verbose=given.verbose, count=True)
-        output.remarks(asked.query.remarks(is_empty=asked.is_empty))
+        query = given.query(store)
+        yield query
+        print_end(query.counters, started, verbose=given.verbose, count=True)
+        output.remarks(query.remarks())
 
 
 def write_answer(

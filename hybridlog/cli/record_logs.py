@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.cli import output
-from hybridlog.cli.ls import with_misfits
+from hybridlog.cli.commands.ls import with_misfits
 from hybridlog.cli.options import parse_tags
 from hybridlog.cli.progress import Bar
 from hybridlog.cli.record_choices import RecordChoices
@@ -178,17 +178,6 @@ def _between(source: Source, log: LogSet, choices: RecordChoices) -> tuple[int, 
     return parse_range(*choices.between, start=start, end=end)
 
 
-def _outside(source: Source, between: tuple[int, int]) -> TimeError:
-    from hybridlog.query.times import format_time
-
-    low, high = map(format_time, between)
-    spans = ""
-    if source.time_range is not None:
-        start, end = source.time_range
-        spans = f"; it spans {format_time(start)} to {format_time(end - 1)}"
-    return TimeError(f"{source.path} has no message from {low} up to {high}{spans}.")
-
-
 class LogRecorder:
     """Records logs with the options of the command; what came of them is told at the end."""
 
@@ -229,14 +218,11 @@ class LogRecorder:
                 self.fail(piece.path, error)
             else:
                 report.entry = entry = with_misfits(store, report.entry)
-                for problem in _problems(piece.path, report):
-                    self.exit_code = self.exit_code or problem.exit_code
-                many, size = (
-                    output.counted(entry.messages, "message"),
-                    output.size(entry.stored_bytes),
-                )
-                line = f"{entry.name}: {many}, {size}, from {piece.path}"
-                self._tell(row_of(report, piece.path), "recorded", [line])
+                code = _told(piece.path, report)
+                self.exit_code = self.exit_code or code
+                many = output.counted(entry.messages, "message")
+                about = f"{many}, {output.size(entry.stored_bytes)}, from {piece.path}"
+                self._tell(row_of(report, piece.path), "recorded", [f"{entry.name}: {about}"])
         self._left.remove(log.path)
 
     def _pieces(self, store: Store, log: LogSet) -> Iterator[LogSet]:
@@ -258,6 +244,7 @@ class LogRecorder:
     def _record_one(
         self, store: Store, log: LogSet, progress: Callable[[int, int], None]
     ) -> RecordReport:
+        from hybridlog.query.times import format_time
         from hybridlog.record.recorder import RecordOptions
 
         choices = self._choices
@@ -281,7 +268,12 @@ class LogRecorder:
             if options.between is not None and is_empty and report.skipped + report.latched:
                 store.refresh()
                 store.remove(report.entry.id)
-                raise _outside(source, options.between)
+                low, high = map(format_time, options.between)
+                spans = ""
+                if source.time_range is not None:
+                    start, end = source.time_range
+                    spans = f"; it spans {format_time(start)} to {format_time(end - 1)}"
+                raise TimeError(f"{source.path} has no message from {low} up to {high}{spans}.")
         for pattern in (p for one in (matcher, no_index) if one is not None for p in one.unused()):
             output.note(f"{log.path}: no topic fits {output.quoted(pattern)}.")
         return report
@@ -331,21 +323,22 @@ class LogRecorder:
             output.remarks([f"{many} recorded, {left}."])
 
 
-def _problems(path: Path, report: RecordReport) -> Iterator[HybridlogError]:
-    """Print problems; gives an error for each that sets the exit code."""
+def _told(path: Path, report: RecordReport) -> int:
+    """Print what is odd about a recording; returns the exit code."""
     if report.latched_left_out:
         output.note(
             f"{path}: {output.counted(report.latched_left_out, 'latched message')} from before "
             "the time range did not fit in memory."
         )
     output.remarks((*remarks_on(report.entry), *report.remarks))
-    if report.failure is not None:
-        output.note(f"hybridlog: {output.not_indexed(report)}")
-        yield DatabaseError(str(report.failure))
+    code = 0
     if report.damage:
-        entry = report.entry
+        entry, code = report.entry, SourceDamagedError.exit_code
         output.note(
             f"{path} is damaged: {output.stored(entry.messages)}; "
             f"{coverage(entry, losses_of(entry))}; `hybridlog info --losses` says where."
         )
-        yield SourceDamagedError(str(path))
+    if report.failure is not None:
+        code = DatabaseError.exit_code
+        output.note(f"hybridlog: {output.not_indexed(report)}")
+    return code

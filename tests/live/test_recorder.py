@@ -17,7 +17,7 @@ import pytest
 from mcap.reader import make_reader
 
 import hybridlog as hl
-from hybridlog.cli.record import record_command
+from hybridlog.cli.commands.record import record_command
 from hybridlog.cli.record_choices import RecordChoices
 from hybridlog.cli.record_live import recorder_options
 from hybridlog.live import recorder as recorder_module

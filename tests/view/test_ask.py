@@ -15,7 +15,7 @@ import pytest
 from click.testing import CliRunner
 
 import hybridlog as hl
-from hybridlog.cli import fetch
+from hybridlog.cli.commands import fetch
 from hybridlog.drawing.tree import MAX_SHOWN
 from hybridlog.view.loopback import Admission
 from hybridlog.view.routes import ask, export

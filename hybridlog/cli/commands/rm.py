@@ -11,7 +11,7 @@ import click
 
 from hybridlog.cli import output
 from hybridlog.cli.binder import command, option
-from hybridlog.cli.ls import RECORDINGS
+from hybridlog.cli.commands.ls import RECORDINGS
 from hybridlog.cli.options import InStore, Named, Quiet, names_argument, recordings_of
 from hybridlog.cli.render import print_table
 from hybridlog.cli.signals import if_stopped

@@ -58,9 +58,9 @@ def check_command(given: _Given) -> int:
             chosen = given.recordings_in(store)
             results = [one for name in chosen.ids for one in store.judge(rules, name)]
         return _show_verdict(results, len(chosen), given)
-    with answering(given) as asked:
-        asked.is_empty = False
-        found = asked.query.check()
+    with answering(given) as query:
+        found = query.check()
+        query.counters.messages = len(found)
         if make is not None:
             if len({one.recording for one in found}) != 1:
                 raise UsageError("A contract is made from one good recording: name it with -r.")

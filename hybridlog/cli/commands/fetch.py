@@ -182,7 +182,7 @@ def _with_times(marks: pa.Table) -> pa.Table:
 
 def _write_pieces(query: Query, choices: _Choices, front: Front) -> None:
     """Write a file for each part of the answer, and a line about each."""
-    from hybridlog.cli.export import pieces, print_written
+    from hybridlog.cli.commands.export import pieces, print_written
 
     assert choices.output is not None
     folder, how = is_directory(choices.to_form, choices.output), choices.split or ""
@@ -194,7 +194,7 @@ def _write_pieces(query: Query, choices: _Choices, front: Front) -> None:
 
 def _follow(query: Query, choices: _Choices) -> None:
     """Print messages as they come, then what they may lack."""
-    from hybridlog.cli.ls import status_text
+    from hybridlog.cli.commands.ls import status_text
     from hybridlog.query.query import Query
 
     started = time.monotonic()

@@ -69,15 +69,15 @@ def intervals_command(given: _Given) -> None:
     within --pause are one change.
     """
     noun = "change" if given.changes else "gap" if given.gaps else "interval"
-    with answering(given) as asked:
-        found = _intervals(given, asked.query)
+    with answering(given) as query:
+        found = _intervals(given, query)
         if given.strict:
-            asked.query.completeness().check()
-        asked.is_empty = not len(found)
+            query.completeness().check()
+        query.counters.messages = len(found)
         if given.count:
             output.say(str(len(found)))
         else:
-            names = {recording.id: recording.name for recording in asked.store.summaries()}
+            names = {recording.id: recording.name for recording in query.summaries()}
             rows = (
                 {
                     "recording": names[row.recording],

@@ -11,7 +11,7 @@ from hybridlog.cli import output
 from hybridlog.cli.answers import Listing
 from hybridlog.cli.app import DIFFERENT
 from hybridlog.cli.binder import argument, command, option
-from hybridlog.cli.check import verdict
+from hybridlog.cli.commands.check import verdict
 from hybridlog.cli.completion import complete_topic
 from hybridlog.cli.options import Between, InStore, Quiet, one_recording, topics
 from hybridlog.cli.render import Column

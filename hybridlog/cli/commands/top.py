@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -13,7 +13,7 @@ from hybridlog.cli import output
 from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.completion import complete_field, complete_running
 from hybridlog.cli.options import AsJson, InStore
-from hybridlog.cli.render import Column
+from hybridlog.cli.render import Column, numbers, table_lines
 from hybridlog.cli.signals import Stopped
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.stopping import at_safe_points
@@ -69,15 +69,16 @@ def top_command(given: _Given) -> None:
         table = held.enter_context(LiveTable(error=False)) if on_screen else None
         for state in states(directory, recorder, _EVERY_S):
             name = state.name
-            values = []
+            values, width = [], output.screen_width()
             if opened is not None:
                 values = _values(opened, recorder, state, fields, span)
+            below = table_lines(_FIELDS, values, width) if values else []
             if given.as_json:
                 output.print_json({**summary_of(state), "fields": values}, at_once=True)
             elif table is not None:
-                table.show(state, _lines(values))
+                table.show(state, below)
             else:
-                for line in drawn(state, width=output.screen_width(), below=_lines(values)):
+                for line in drawn(state, width=width, below=below):
                     output.say(line)
             if given.once or not (given.as_json or on_screen):
                 return
@@ -109,7 +110,14 @@ def _values(
         (topic, *others) = resolve([name], topics)
         if others:
             raise UsageError(f"{name!r} fits several topics: name one.")
-        row: dict[str, Any] = {"topic": topic, "field": field, "n": 0}
+        row = {
+            "topic": topic,
+            "field": field,
+            "n": 0,
+            "least": None,
+            "mean": None,
+            "greatest": None,
+        }
         with suppress(UsageError):  # nothing has come yet
             (one, *_) = store.query([topic], [recording]).between(since).stats(field)
             row |= {"n": one.count, "least": one.min, "mean": one.mean, "greatest": one.max}
@@ -117,13 +125,4 @@ def _values(
     return found
 
 
-def _lines(values: Sequence[Mapping[str, Any]]) -> list[str]:
-    lines = []
-    for row in values:
-        said = "nothing yet"
-        if row["n"]:
-            names = ("least", "mean", "greatest")  # of texts there is no mean
-            parts = [f"{name} {Column(name).cell(row) or '-'}" for name in names]
-            said = f"{', '.join(parts)} ({output.counted(row['n'], 'message')})"
-        lines.append(f"{row['topic']} {row['field']}: {said}")
-    return lines
+_FIELDS = [Column("topic"), Column("field"), *numbers("n", "least", "mean", "greatest")]

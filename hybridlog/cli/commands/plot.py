@@ -65,12 +65,12 @@ def plot_command(given: _Given) -> None:
     path = None if given.output is None or str(given.output) == "-" else given.output
     if path is not None:
         check_room(path, force=given.force)
-    with answering(given) as asked:
+    with answering(given) as query:
         from hybridlog.drawing.figure import figure, lines
 
         names = [] if given.fields is None else parse_fields(given.fields)
         width = _WIDTH if shape is None else shape[0]
-        found = lines(asked.query, names, pixels=width if form else _MAX_LETTERS)
+        found = lines(query, names, pixels=width if form else _MAX_LETTERS)
         if form:
             height = _HEIGHT * max(1, len({line.topic for line in found}))
             size = shape or (width, height)
@@ -79,7 +79,8 @@ def plot_command(given: _Given) -> None:
             _COLUMNS, found if any(len(one.series.times) for one in found) else ()
         ):
             output.note("No message.")
-        asked.is_empty = not found or not asked.query.counters.messages
+        if not found:
+            query.counters.messages = 0
 
 
 def _form(path: Path | None, form: str | None) -> str:

@@ -134,8 +134,7 @@ def _write_tables(query: Query, form: str, directory: Path, given: _Given) -> No
             try:
                 write_answer(one, form, path, front=given.front)
             except (DefinitionError, PayloadError, TimeError, UsageError) as error:
-                is_named = isinstance(error, DefinitionError) or topic in str(error)
-                output.note(f"{'' if is_named else f'{topic}: '}{error}")
+                output.note(f"{topic}: {error}")
                 left_out.append(error)
                 continue
             print_written(path, one)

@@ -30,11 +30,11 @@ def stats_command(given: _Given) -> None:
 
     Also their standard deviation, and how many values are NaN.
     """
-    with answering(given) as asked:
-        stats = asked.query.stats(*([] if given.fields is None else parse_fields(given.fields)))
+    with answering(given) as query:
+        stats = query.stats(*([] if given.fields is None else parse_fields(given.fields)))
         found = [asdict(row) for row in stats]
         if given.strict:
-            asked.query.completeness().check()
+            query.completeness().check()
         # How many are no numbers is left out only where there are none.
         order = {name: 1 for name in ("nan", "infinite") if not any(row[name] for row in found)}
         order["std"] = 2

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from hybridlog.cli import output
 from hybridlog.cli.binder import command, option
-from hybridlog.cli.open import foxglove
+from hybridlog.cli.commands.open import foxglove
 from hybridlog.cli.options import AsJson, InStore, Served, one_recording
 from hybridlog.cli.signals import ended_by_signal
 from hybridlog_storage.errors import MissingDependencyError

@@ -14,6 +14,8 @@ import click
 
 from hybridlog.cli import options, output
 from hybridlog.cli.binder import command, option
+from hybridlog.cli.commands.keep import pin_cells
+from hybridlog.cli.commands.ls import recording_dict, status_text, with_misfits
 from hybridlog.cli.info_parts import (
     attachment_as_dict,
     show_attachments,
@@ -22,8 +24,6 @@ from hybridlog.cli.info_parts import (
     show_tables,
     show_topics,
 )
-from hybridlog.cli.keep import pin_cells
-from hybridlog.cli.ls import recording_dict, status_text, with_misfits
 from hybridlog.cli.options import (
     AsJson,
     Choosing,

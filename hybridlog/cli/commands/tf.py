@@ -11,7 +11,7 @@ from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.completion import complete_frame
 from hybridlog.cli.options import Strict, Topics, Verbose, tf_topic, topics
 from hybridlog.cli.output import remarks, short_duration
-from hybridlog.cli.render import Column, numbers, print_table
+from hybridlog.cli.render import Column, print_table
 from hybridlog.wording import counted, listed
 from hybridlog_storage.errors import IncompleteError, UsageError
 
@@ -147,21 +147,13 @@ def _show_trees(trees: Mapping[str, FrameTree], given: _Given) -> None:
     if given.to_form != SCREEN:
         given.answer([_with_name(name, tree, trees) for name, tree in trees.items()])
         return
-    names = ("transforms", "Hz", "longest gap", "from")
-    rows = []
-    for topic, tree in trees.items():
-        for name, depth in tree.walk():
-            row: dict[str, object] = {**dict.fromkeys(names), "frame": "  " * depth + name}
-            row["tree"] = topic
-            if (frame := tree.frames.get(name)) is not None:
-                row["transforms"] = "static" if frame.is_static else len(frame.stamps)
-                row["Hz"] = None if frame.rate_hz is None else f"{frame.rate_hz:.2f}"
-                if (gap := frame.longest_gap()) is not None:
-                    row["longest gap"] = short_duration(gap[1] - gap[0])
-                    row["from"] = f"{(gap[0] - tree.span[0]) / 1e9:+.3f}s"
-            rows.append(row)
-    several = [Column("tree", side="whole")] if len(trees) > 1 else []
-    print_table([*several, Column("frame", side="whole"), *numbers(*names)], rows)
+    frames = (
+        (topic, "  " * depth + name, tree.frames.get(name), tree.span[0])
+        for topic, tree in trees.items()
+        for name, depth in tree.walk()
+    )
+    rows = [(*row, row[2] and row[2].longest_gap()) for row in frames]
+    print_table(_FRAMES[len(trees) == 1 :], rows)
     remarks(dict.fromkeys(text for tree in trees.values() for text in tree.problems()))
 
 
@@ -172,3 +164,17 @@ def _with_name(topic: str, tree: FrameTree, trees: Mapping[str, FrameTree]) -> p
     if len(trees) == 1:
         return table
     return table.add_column(0, "tree", pa.array([topic] * len(table), pa.string()))
+
+
+_FRAMES = [
+    Column("tree", 0, "whole"),
+    Column("frame", 1, "whole"),
+    Column(
+        "transforms",
+        lambda row: row[2] and ("static" if row[2].is_static else len(row[2].stamps)),
+        "right",
+    ),
+    Column("Hz", lambda row: row[2] and row[2].rate_hz and f"{row[2].rate_hz:.2f}", "right"),
+    Column("longest gap", lambda row: row[4] and short_duration(row[4][1] - row[4][0]), "right"),
+    Column("from", lambda row: row[4] and f"{(row[4][0] - row[3]) / 1e9:+.3f}s", "right"),
+]
