@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING, overload
 
 from hybridlog.query.query import Query
 from hybridlog.query.question import Question
-from hybridlog.query.topics import namesakes
 from hybridlog.wording import listed
 from hybridlog_storage.errors import TopicError
 
 if TYPE_CHECKING:
-    from hybridlog.session import Asked, Session
+    from hybridlog.session import Asked
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.summary import RecordingSummary
 
@@ -109,12 +108,7 @@ class Recordings(Sequence["RecordingEntry"]):
         Raises:
             TopicError: There is no recording; or a name matches no topic, or several.
         """
-        self.check()
-        if not names:
-            raise TopicError(f"Name a topic. There are: {listed(self.topics())}.")
-        session = self._source.now()
-        found = session.resolve_in(names, self.ids)
-        return self._query(session, found, namesakes(names, session.topics_of(self.ids)))
+        return Query(self._source, self._source.now().question(names, self.check().ids))
 
     def all_topics(self) -> Query:
         """Make a query about all topics of these recordings.
@@ -123,10 +117,5 @@ class Recordings(Sequence["RecordingEntry"]):
             TopicError: There is no recording.
         """
         session = self._source.now()
-        return self._query(session, session.topics_of(self.check().ids))
-
-    def _query(
-        self, session: Session, topics: Sequence[str], others: tuple[str, ...] = ()
-    ) -> Query:
-        found = session.having(topics, self.ids)
-        return Query(self._source, Question(*found, namesakes=others))
+        ids = self.check().ids
+        return Query(self._source, Question(*session.having(session.topics_of(ids), ids)))

@@ -19,8 +19,8 @@ import numpy as np
 
 from hybridlog.entries import channels_of, read_again, summary_of, take_inventory
 from hybridlog.query.chunk_columns import PARTS, ChunkColumns, log_bounds
-from hybridlog.query.question import RecordedChannel, field_types
-from hybridlog.query.topics import resolve
+from hybridlog.query.question import Question, RecordedChannel, field_types
+from hybridlog.query.topics import namesakes, resolve
 from hybridlog.record.marks import MARKS
 from hybridlog.snapshot import UNFINISHED
 from hybridlog.wording import counted, listed
@@ -44,7 +44,6 @@ if TYPE_CHECKING:
     from hybridlog.columns.topic_table import TopicTable
     from hybridlog.query.chunk_columns import Chunk
     from hybridlog.query.predicate.tree import Predicate
-    from hybridlog.query.question import Question
     from hybridlog.shared import Shared
     from hybridlog.snapshot import Snapshot
     from hybridlog_storage.catalog import RecordingEntry
@@ -249,10 +248,6 @@ class Session:
         problem = "is ambiguous" if found else "is not in the store"
         return TopicError(f"Recording {name!r} {problem}. There are: {listed(names)}.")
 
-    def topics(self) -> list[str]:
-        """Names of all topics, sorted; includes those whose messages are all lost."""
-        return self.look().topics
-
     def channels_of(
         self, recording: RecordingEntry, topics: Collection[str]
     ) -> list[RecordedChannel]:
@@ -324,16 +319,20 @@ class Session:
             self.definitions(self.entry_of(summary))
         return {digest: schema.name for digest, schema in self.shared.schemas.items()}
 
-    def resolve(self, names: tuple[str, ...]) -> _Topics:
-        """The topics that patterns match, and the recordings that have them."""
-        known = self.topics()
+    def question(self, names: Sequence[str], recordings: Sequence[str] | None = None) -> Question:
+        """The question about the topics that patterns match, in recordings by their ids, or all."""
+        known = self.topics_of(recordings)
         if not names:
             there = f"There are: {listed(known)}." if known else self.when_empty
             raise TopicError(f"Name a topic. {there}")
-        return self.having(resolve(names, known))
+        found = self.having(self.resolve_in(names, recordings), recordings)
+        return Question(*found, namesakes=namesakes(names, known))
 
-    def topics_of(self, recordings: Sequence[str] | None) -> list[str]:
-        """Names of all topics of the recordings with some ids, or of all, sorted."""
+    def topics_of(self, recordings: Sequence[str] | None = None) -> list[str]:
+        """Names of all topics of the recordings with some ids, or of all, sorted.
+
+        They include those whose messages are all lost.
+        """
         snapshot = self.look(recordings)
         if recordings is None:
             return snapshot.topics

@@ -31,7 +31,6 @@ from hybridlog.query.choice import Choice
 from hybridlog.query.query import Query, narrowed, of_now
 from hybridlog.query.question import Question
 from hybridlog.query.times import parse_range, parse_time
-from hybridlog.query.topics import namesakes
 from hybridlog.record.losses import extent_of
 from hybridlog.session import Asked, Session
 from hybridlog_storage.catalog import Catalog, RecordingEntry
@@ -465,7 +464,7 @@ class Store:
         """
         from hybridlog.query.choosing import topics_of_types
 
-        return topics_of_types(self.session, types) if types else self.session.topics()
+        return topics_of_types(self.session, types) if types else self.session.topics_of()
 
     def attachments(self, recording: str | RecordingEntry) -> list[StoredAttachment]:
         """The attachments of a recording's log, in their order.
@@ -511,15 +510,12 @@ class Store:
         """
         if not all(isinstance(name, str) for name in names):
             raise UsageError("Topics are names: topic('scan', 'odom').")
-        session = self.session
-        found = session.resolve(names)
-        others = namesakes(names, session.topics())
-        return Query(self._source, Question(*found, namesakes=others))
+        return Query(self._source, self.session.question(names))
 
     def all_topics(self) -> Query:
         """Make a query about all topics."""
         session = self.session
-        return Query(self._source, Question(*session.having(session.topics())))
+        return Query(self._source, Question(*session.having(session.topics_of())))
 
     def query(self, topics: Sequence[str], recordings: Names | None = None) -> Query:
         """A question about topics by their full names, in some recordings or all.

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 from hybridlog.index.access import IndexAddress, again_if_lost
 from hybridlog.query.query import Query
-from hybridlog.query.question import Question
 from hybridlog_storage.errors import TopicError, UsageError
 from hybridlog_storage.mongo.collection_names import collection_of
 
@@ -128,7 +127,7 @@ class Index:
     def list(self, *topics: str) -> _FieldIndexes:
         """The indexes on fields, of these topics or of all."""
         database = self._shared.index.database_for("Indexes")
-        names = self._about(*topics).topics if topics else self._shared.now().topics()
+        names = self._about(*topics).topics if topics else self._shared.now().topics_of()
         return _indexes(database, names)
 
     def arrays(self, *topics: str, off: bool = False, progress: Progress | None = None) -> _Arrays:
@@ -195,7 +194,7 @@ class Index:
         return self._shared.index.address(_CLIENTS_WAIT_S)
 
     def _about(self, *topics: str) -> Query:
-        return Query(self._shared, Question(*self._shared.now().resolve(topics)))
+        return Query(self._shared, self._shared.now().question(topics))
 
 
 def _indexes(database: Database, topics: Iterable[str]) -> list[FieldIndex]:
@@ -221,5 +220,5 @@ def contents(shared: OpenStore) -> list[tuple[str, str, int]]:
     """Each topic with the MongoDB collection of its documents, and their number there."""
     database = shared.index.database_for("The contents of the index")
     there = {*database.list_collections()}
-    topics = ((topic, collection_of(topic)) for topic in shared.now().topics())
+    topics = ((topic, collection_of(topic)) for topic in shared.now().topics_of())
     return [(topic, name, database.count(name)) for topic, name in topics if name in there]

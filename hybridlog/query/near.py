@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import reduce
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -14,7 +15,6 @@ from hybridlog.query.predicate.tree import And, Condition, Near, Node, Not, Or, 
 from hybridlog.query.question import Question
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import TIME_LIMIT
-from hybridlog.query.topics import namesakes
 from hybridlog_storage.errors import WhereError
 
 if TYPE_CHECKING:
@@ -38,10 +38,7 @@ def question_about(
 
     Wanted messages are at most `before` in front of one of the other topic, and `after` behind it.
     """
-    recordings = question.recordings
-    topics = session.resolve_in([topic], recordings)
-    others = namesakes([topic], session.topics_of(recordings))
-    found = Question(*session.having(topics, recordings), namesakes=others)
+    found = session.question([topic], question.recordings)
     if question.is_unbounded or not question.is_by_log_time:
         return found
     if {*found.topics} <= {*mark_topics(session)}:
@@ -49,7 +46,7 @@ def question_about(
     spans = RangeResolver(session, question).spans()
     rows = ((one.id, np.array([[begin, end, 0]], np.int64)) for one, (begin, end) in spans)
     near = Intervals.of(rows).widened(after, before).merged()
-    return Question(found.topics, found.recordings, during=near)
+    return replace(found, during=near)
 
 
 def split_own(node: Node) -> tuple[list[Node], list[Node]]:

@@ -36,16 +36,14 @@ def pieces(query: Query, how: str) -> Iterator[Piece]:
     if how == "mark":
         yield from _of_intervals(query, _marks(query))
         return
-    events = query
     if ": " in how and not is_filter(how):
         topic, how = split_topic(how)
-        topics = query.session.resolve_in([topic], query.recordings)
-        events = type(query)(query.session, Question(tuple(topics), query.recordings))
+        question = query.session.question([topic], query.recordings)
     elif len(query.topics) != 1:
         raise UsageError("Name the topic of the predicate: 'TOPIC: PREDICATE'.")
     else:
-        events = type(query)(query.session, Question(query.topics, query.recordings))
-    held = events.where(how).intervals()
+        question = Question(query.topics, query.recordings)
+    held = type(query)(query.session, question).where(how).intervals()
     yield from _of_intervals(query, ((one.recording, one.begin_ns, one.end_ns, "") for one in held))
 
 

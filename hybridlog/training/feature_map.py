@@ -76,7 +76,7 @@ class FeatureMap:
 
     def resolved(self, session: Session) -> FeatureMap:
         """The map with full names of topics."""
-        full = {name: session.resolve((name,))[0] for name in self.topics}
+        full = {name: session.resolve_in([name], None) for name in self.topics}
         if several := [name for name, found in full.items() if len(found) > 1]:
             raise TopicError(f"{several[0]} means several topics: {listed(full[several[0]])}.")
         return FeatureMap(

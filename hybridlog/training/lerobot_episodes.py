@@ -155,8 +155,7 @@ def write_episode(
 def _task(session: Session, episode: Episode, options: LerobotOptions) -> str:
     if options.task_topic is None:
         return options.task
-    topics, _ = session.resolve((options.task_topic,))
-    topic = Query(session, Question(topics, (episode.recording,)))
+    topic = Query(session, session.question([options.task_topic], [episode.recording]))
     text = getattr(topic.at(int(episode.times[0])).decode(), "data", None)
     if not isinstance(text, str) or not text.strip():
         raise UsageError(f"{options.task_topic} has no text in `data`: name another topic.")
