@@ -11,7 +11,6 @@ from collections.abc import (
     Mapping,
     Sequence,
 )
-from contextlib import suppress
 from itertools import accumulate
 from typing import TYPE_CHECKING, Protocol, TypeVar
 
@@ -341,22 +340,7 @@ class Session:
 
     def resolve_in(self, names: Sequence[str], recordings: Sequence[str] | None) -> list[str]:
         """The topics of some recordings that patterns match."""
-        known = self.topics_of(recordings)
-        snapshot = self.look(recordings)
-        try:
-            return resolve(names, known)
-        except TopicError as error:
-            found: list[str] = []
-            for name in names:
-                with suppress(TopicError):
-                    found += resolve([name], snapshot.topics)
-            others = snapshot.having({*found}.difference(known)).tolist()
-            if not others:
-                raise
-            known_by = listed((snapshot.summaries[place].name for place in others), _MAX_NAMES)
-            have = "has" if len(others) == 1 else "have"
-            join = " In" if str(error).endswith("?") else "; in"
-            raise TopicError(f"{error}{join} the store, {known_by} {have} such a topic") from error
+        return resolve(names, self.topics_of(recordings))
 
     def predicate(
         self,

@@ -70,10 +70,9 @@ class ChunkColumns:
         self.last = np.maximum.reduceat(self.parts["last"], self._starts)
         self._messages = np.add.reduceat(self.parts["messages"], self._starts)
 
-    def chunks(self, rows: NDArray[np.bool_] | None = None) -> list[Chunk]:
-        """Some of the chunks, or all."""
-        chosen = range(len(self.number)) if rows is None else np.flatnonzero(rows).tolist()
-        return [self._chunk(row) for row in chosen]
+    def chunks(self, rows: NDArray[np.bool_]) -> list[Chunk]:
+        """Some of the chunks."""
+        return [self._chunk(row) for row in np.flatnonzero(rows).tolist()]
 
     def _chunk(self, row: int) -> Chunk:
         place = place_of(self._table, int(self.number[row]), self._bounds)

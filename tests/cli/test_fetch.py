@@ -173,4 +173,3 @@ def test_remarks_follow_the_closing_line(store: Path) -> None:
     assert "Nothing matched the condition that gives the times" in done.err
     done = run("fetch", "-t", "odom", "-r", "odd", "--count", store=store, code=2)
     assert "there is no topic 'odom'" in done.err
-    assert "in the store, robot has such a topic" in done.err

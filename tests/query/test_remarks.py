@@ -11,7 +11,7 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.query.topics import namesakes
-from hybridlog_storage.errors import TimeError, TopicError, UsageError
+from hybridlog_storage.errors import TimeError, UsageError
 from hybridlog_storage.messages import Channel, Schema
 
 SECOND = 10**9
@@ -159,16 +159,6 @@ def test_why_an_answer_is_empty(store: hl.Store) -> None:
         store.topic("/n").between(day + SECOND, day + 2 * SECOND).count()
 
 
-def test_a_topic_of_another_recording_is_named_as_one(store: hl.Store) -> None:
-    elsewhere = r"there is no topic '/?j'; there is /n; in the store, monday has such a topic$"
-    with pytest.raises(TopicError, match=elsewhere):
-        store.recordings("tuesday").topic("j")
-    with pytest.raises(TopicError, match=elsewhere):
-        store.topic("/n").in_recording("tuesday").where("/j: n > 1", within="1s")
-    with pytest.raises(TopicError, match=r"there is no topic '/k'; there is /n$"):
-        store.recordings("tuesday").topic("/k")
-
-
 def test_a_short_name_that_several_topics_end_with(store: hl.Store) -> None:
     query = store.topic("scan")
     assert query.topics == ("/scan",)
@@ -198,8 +188,6 @@ def test_a_short_name_that_topics_of_other_recordings_end_with(tmp_path: Path) -
             store.recordings(["o*", "t*"]).topic("scan").remarks(is_empty=False) == query.remarks()
         )
         assert query.in_recording("one").remarks(is_empty=False) == []
-        with pytest.raises(TopicError, match=r"\? In the store, two has such a topic$"):
-            store.recordings("one").topic("base/scan")
         answer = store.sql("select count(*) from scan")
         assert answer.to_arrow().to_pylist() == [{"count_star()": 1}]
         assert answer.sentences() == ["/scan was asked, not the view base__scan."]

@@ -199,20 +199,18 @@ def _unwritten(session: Session, questions: Sequence[Question]) -> tuple[int | N
     Returns:
         Their number, None if a recorder does not answer; and a sentence for each recording.
     """
-    snapshot = session.snapshot()
-    topics: dict[int, set[str]] = defaultdict(set)
+    running: dict[str, RecordingSummary] = {}
+    topics: dict[str, set[str]] = defaultdict(set)
     for question in questions:
-        places = session.chosen(question)
-        for place in places[snapshot.is_open[places]].tolist():
-            one = snapshot.summaries[place]
+        for one in session.summaries_of(question):
             if one.status == "open" and _reaches_past(session, question, one):
-                topics[place].update(question.topics)
+                running[one.id] = one
+                topics[one.id].update(question.topics)
     missing: int | None = 0
     sentences: list[str] = []
-    for place, names in topics.items():
-        one = snapshot.summaries[place]
+    for one in running.values():
         late = _taken(session, one)
-        number = None if late is None else sum(late.get(topic, 0) for topic in names)
+        number = None if late is None else sum(late.get(topic, 0) for topic in topics[one.id])
         missing = None if number is None or missing is None else missing + number
         if number != 0:
             sentences.append(not_written(one.name, number, flush_interval_ns(one)))
