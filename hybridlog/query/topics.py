@@ -215,19 +215,17 @@ def _glob_class(pattern: str, at: int) -> tuple[str, int]:
 def _unknown(pattern: str, known: list[str]) -> str:
     import difflib
 
-    # Compared by last part and in lower case, too: `/scna` is near `/base/scan`.
-    nearest: dict[str, None] = {}
+    # Compared by parts and in lower case, too: `/scna` is near `/base/scan`.
     wanted = pattern.casefold().strip("/")
     last = wanted.rsplit("/", 1)[-1]
-    nearest.update(dict.fromkeys(topic for topic in known if last and last in topic.casefold()))
-    by_key: dict[str, list[str]] = {}
-    for topic in known:
+
+    def is_near(topic: str) -> bool:
         whole = topic.casefold().strip("/")
-        for key in {whole, *whole.split("/")}:
-            by_key.setdefault(key, []).append(topic)
-    for word in (wanted, last):
-        for key in difflib.get_close_matches(word, by_key, n=_MAX_NAMES, cutoff=0.6):
-            nearest.update(dict.fromkeys(by_key[key]))
+        names = {whole, *whole.split("/")}
+        close = (difflib.get_close_matches(word, names) for word in (wanted, last))
+        return bool(last and last in whole) or any(close)
+
+    nearest = [topic for topic in known if is_near(topic)]
     if nearest:
         return f"there is no topic {_shown(pattern)}; did you mean {_listed(nearest)}?"
     return f"there is no topic {_shown(pattern)}; {_there_are(known)}"
