@@ -46,6 +46,7 @@ PLACES = {
     "ros2_hand_over_s": "hybridlog.live.sources.ros2.source._HAND_OVER_S",
     "ros2_pause_s": "hybridlog.live.sources.ros2.source._PAUSE_S",
     "shown_bytes": "hybridlog.message._MAX_SHOWN",
+    "merged_bytes": "hybridlog.query.chunk_scan._MERGED_BYTES",
     "min_threaded_bytes": "hybridlog.query.chunk_scan._MIN_THREADED_BYTES",
     "latched_held": "hybridlog.query.latching.MAX_HELD",
     "sampled_periods": "hybridlog.query.periods._SAMPLED",

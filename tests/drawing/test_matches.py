@@ -40,8 +40,9 @@ def test_ticks_count_each_match_once(drive: Drive) -> None:
     assert len(times) > 500
 
 
-def test_ticks_of_many_blocks(drive: Drive) -> None:
+def test_ticks_of_many_blocks(drive: Drive, limit: Limit) -> None:
     """Elements of long arrays are asked of the messages, a chunk at a time."""
+    limit(merged_bytes=1)
     query = drive.store.topic("drive").where("wide[3] > 0")
     wanted = drive.times[drive.wide[:, 3] > 0].tolist()
     assert len([*match_times(query.session, query.question, query.counters)]) > 3
