@@ -147,6 +147,8 @@ class OpenStore(Shared):
             self.entries = {}
         self.channels.clear()
         self._drop_files()
+        self.cache.drop("column")
+        vars(self).pop("tables", None)
 
     # Repairs.
 
@@ -229,6 +231,7 @@ class OpenStore(Shared):
         self._drop_files()
         self.index.disconnect()
         is_missing = "tables" in vars(self) and not self.catalog.recordings_file.exists()
+        vars(self).pop("tables", None)
         is_written = self.directory.is_writable and not self.catalog.is_in_memory
         if is_written and (self.catalog.has_changed or is_missing):
             with suppress(OSError, HybridlogError):

@@ -125,11 +125,7 @@ class Shared(ABC):
         for recording in recordings:
             self.channels.pop(recording, None)
             self.entries.pop(recording, None)
-        with self._opening:
-            self._rows.clear()
-            for key in [key for key in self._segments if key[0] in recordings]:
-                del self._segments[key]
-        self.cache.drop("chunk")
+        self._drop_files()
         if "tables" in vars(self):
             self.tables.look_again()
 
@@ -138,8 +134,6 @@ class Shared(ABC):
             self._rows.clear()
             self._segments.clear()  # each is closed by the last thread that reads from it
         self.cache.drop("chunk")
-        self.cache.drop("column")
-        vars(self).pop("tables", None)
 
     # Recordings.
 
