@@ -223,23 +223,16 @@ def format_duration(ns: int) -> str:
     ns = int(ns)
     if ns < 0:
         return "-" + format_duration(-ns)
-    if ns == 0:
-        return "0s"
-    if ns < _SECOND:
-        for unit, size, digits in (("ms", 10**6, 6), ("us", 10**3, 3)):
-            if ns >= size:
-                whole, rest = divmod(ns, size)
-                return f"{whole}{_fraction(rest, digits)}{unit}"
-        return f"{ns}ns"
+    for unit, size, digits in (("ns", 1, 0), ("us", 10**3, 3), ("ms", 10**6, 6)):
+        if 0 < ns < 1000 * size:
+            whole, rest = divmod(ns, size)
+            return f"{whole}{_fraction(rest, digits)}{unit}"
     seconds, rest = divmod(ns, _SECOND)
     text = ""
     for unit, size in (("d", 86_400), ("h", 3_600), ("m", 60)):
         count, seconds = divmod(seconds, size)
-        if count:
-            text += f"{count}{unit}"
-    if seconds or rest:
-        text += f"{seconds}{_fraction(rest, 9)}s"
-    return text
+        text += f"{count}{unit}" if count else ""
+    return text if text and not (seconds or rest) else f"{text}{seconds}{_fraction(rest, 9)}s"
 
 
 def _parse_text(text: str, start: int | None, end: int | None) -> int:

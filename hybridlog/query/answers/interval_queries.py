@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
     from hybridlog.query.question import Counters, Part, Question, Span
     from hybridlog.session import Session
-    from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.summary import RecordingSummary
 
 _Rows = TypeVar("_Rows", bound="tuple[Any, ...]")
@@ -113,13 +112,11 @@ class IntervalQueries:
             raise UsageError("A window needs a length: give before, after or both.")
         found = [*(self._lasting() if are_marks else self._moments())]
         snapshot = self._session.snapshot()
-        keys = {name: snapshot.summaries[snapshot.by_id[name]].key for name, _ in found}
+        known = {name: snapshot.summaries[snapshot.by_id[name]] for name, _ in found}
         # Windows that begin together are in the order of the recordings' keys.
-        ordered = sorted(found, key=lambda item: keys[item[0]])
-        wide = Intervals.of(ordered).widened(before, after)
-        return wide.within(
-            {name: _extent(snapshot.summaries[snapshot.by_id[name]]) for name in wide.recordings}
-        )
+        ordered = sorted(found, key=lambda item: known[item[0]].key)
+        whole = {name: (0, END) if one.span is None else one.extent for name, one in known.items()}
+        return Intervals.of(ordered).widened(before, after).within(whole)
 
     def _lasting(self) -> Iterator[tuple[str, NDArray[np.int64]]]:
         """Begin and end of marks, by recording."""
@@ -129,20 +126,14 @@ class IntervalQueries:
 
     def _moments(self) -> Iterator[tuple[str, NDArray[np.int64]]]:
         """The time of each message as an interval without length, by recording."""
-        for entry, times in self._times():
-            at = placed(times)
-            yield entry.id, np.stack([at, at, np.ones_like(at)], axis=1)
-
-    def _times(self) -> Iterator[tuple[RecordingEntry, NDArray[np.int64]]]:
-        """Log times of the messages of the answer, by recording."""
-        if not self._question.returns_all:
-            for run in self._planner.runs():
-                entry_of = [channel.recording for channel in run.channels]
-                for index in np.unique(run.batch.channel).tolist():
-                    yield entry_of[index], run.batch.log_time[run.batch.channel == index]
+        if self._question.returns_all:
+            for part in self._planner.parts():
+                yield part.recording.id, _at(self._planner.times(part))
             return
-        for part in self._planner.parts():
-            yield part.recording, self._planner.times(part)
+        for run in self._planner.runs():
+            for index in np.unique(run.batch.channel).tolist():
+                times = run.batch.log_time[run.batch.channel == index]
+                yield run.channels[index].recording.id, _at(times)
 
     def _spans(self) -> Iterator[tuple[Part, Span]]:
         """The one part of each recording, without a time range, with each span of the question."""
@@ -211,6 +202,12 @@ class IntervalQueries:
             )
 
 
+def _at(times: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Intervals without length, of a message each."""
+    begin = placed(times)
+    return np.stack([begin, begin, np.ones_like(begin)], axis=1)
+
+
 def _bounded(part: Part, span: Span) -> Part:
     return replace(part, bounds=span, clock="log", windows=None)
 
@@ -226,11 +223,3 @@ def _steps(
     numbers = np.arange(len(whole))
     differs = rows_differ(whole, numbers, np.maximum(numbers - 1, 0), tolerance)
     return differs[len(whole) - len(rows) :], whole[-1:]
-
-
-def _extent(recording: RecordingSummary) -> Span:
-    """Span of log time in which a recording has messages."""
-    if recording.span is None:
-        return 0, END
-    begin, end = recording.extent
-    return begin, end
