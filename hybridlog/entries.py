@@ -278,16 +278,23 @@ def describe(catalog: Catalog, inventory: Inventory, *, is_open: bool = False) -
     if manifest is None:
         raise ManifestError(NO_MANIFEST.format(inventory.id))
     entry = _base(inventory, manifest)
-    channels: dict[int, Channel] = {}
+    channels = channels_of(inventory.summaries.values())
     lost: list[dict[str, Any]] = []
-    for summary in inventory.summaries.values():
-        channels.update(summary.channels)
+    entry.stored_bytes = sum(size for _, _, size in entry.rows)
+    for number, summary in inventory.summaries.items():
         lost += summary.losses
+        entry.held[str(number)] = np.unique(summary.table.parts["channel"]).tolist()
+        entry.digests[str(number)] = inventory.digest(number)
+        entry.spans += spans_of(number, summary.table)
+        name = inventory.listing.sealed[number]
+        if name == sealed_name(number):
+            entry.stored_bytes += summary.size
+        else:
+            entry.files[str(number)] = name
         entry.chunks += len(summary.table.chunks)
         entry.attachments += len(summary.attachments)
         entry.metadata_records += len(summary.metadata)
     entry.segments = len(inventory.summaries)
-    entry.stored_bytes = sum(size for _, _, size in entry.rows)
     entry.end = end_values(manifest) if manifest.is_ended else {}
     ours = [row for sealed in inventory.lost for row in _losses_of_segment(inventory, sealed)]
     ours += _losses_of_chunks(inventory, catalog.damage(inventory.id))
@@ -297,19 +304,6 @@ def describe(catalog: Catalog, inventory: Inventory, *, is_open: bool = False) -
     entry.status = _status(inventory, manifest, is_open=is_open, has_losses=has_losses)
     if lost or ours:
         entry.end["losses"] = joined([*entry.end.get("losses", ()), *lost]) + ours
-    for number, summary in inventory.summaries.items():
-        entry.held[str(number)] = np.unique(summary.table.parts["channel"]).tolist()
-        entry.digests[str(number)] = inventory.digest(number)
-        name = inventory.listing.sealed[number]
-        if name == sealed_name(number):
-            entry.stored_bytes += summary.size
-        else:
-            entry.files[str(number)] = name
-    entry.spans = [
-        span
-        for number, summary in inventory.summaries.items()
-        for span in spans_of(number, summary.table)
-    ]
     entry.channels = [
         channel_entry(channel_id, channel, codec_for(channel).reason)
         for channel_id, channel in sorted(channels.items())

@@ -88,7 +88,7 @@ def test_numbers_that_nobody_knows() -> None:
     assert Completeness(4, is_exact=True).limits(297) == (297, 301)
     assert not Completeness(0, is_exact=True, reduced=9).has_losses
     assert str(Completeness(1, is_exact=True)) == "1 message is lost"
-    assert str(Completeness(1, is_exact=False)) == "at least 1 messages are lost"
+    assert str(Completeness(1, is_exact=False)) == "at least 1 message is lost"
     assert str(unknown) == "an unknown number of messages are lost"
     assert str(Completeness(4, is_exact=True, reduced=6, expired=1)) == (
         "4 messages are lost; 5 messages have no payload, which was dropped under pressure; "

@@ -78,11 +78,8 @@ class Completeness:
     def _losses(self) -> str:
         if not self.has_losses:
             return "no message is lost"
-        if not self.messages:
-            return "an unknown number of messages are lost"
-        is_one = self.messages == 1 and self.is_exact
-        number = f"{'' if self.is_exact else 'at least '}{self.messages}"
-        return f"{number} message is lost" if is_one else f"{number} messages are lost"
+        are = "is" if self.messages == 1 else "are"
+        return f"{_number(self.messages, is_exact=self.is_exact)} {are} lost"
 
     def limits(self, count: int, limit: int | None = None) -> tuple[int, int | None]:
         """Least and greatest number of messages if none had been lost; None for any number.
@@ -229,11 +226,15 @@ def about_losses(name: str, rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
 
 def in_words(losses: Collection[Mapping[str, Any]]) -> str:
     """The number of lost messages: `at least 4 messages lost in 2 places`."""
-    lost = sum(loss["count"] or 0 for loss in losses)
-    known = counted(lost, "message")
-    if any(loss["count"] is None for loss in losses):
-        known = f"at least {known}" if lost else "an unknown number of messages"
+    is_exact = all(loss["count"] is not None for loss in losses)
+    known = _number(sum(loss["count"] or 0 for loss in losses), is_exact=is_exact)
     return f"{known} lost in {counted(len(losses), 'place')}"
+
+
+def _number(lost: int, *, is_exact: bool) -> str:
+    """A number of lost messages, which is the least one if it is not exact."""
+    known = counted(lost, "message")
+    return known if is_exact else f"at least {known}" if lost else "an unknown number of messages"
 
 
 def line_of(loss: Mapping[str, Any]) -> str:
