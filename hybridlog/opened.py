@@ -110,23 +110,18 @@ class OpenStore(Shared):
                 return
             self.catalog.has_changed |= bool(recordings)
             before = self._latest.snapshot()
-            ids = {one for one in recordings if one in before.by_id}
-            changed, names = self.directory.changed(), self._names
-            has_changed = changed != self._changed
-            if has_changed:
-                names = self.directory.ids()
-                come = [one for one in names if one not in before.by_id]
-                if len(before) + len(come) > len(names):
-                    ids |= before.by_id.keys() - {*names}
-                ids.update(come)
+            changed, names = self.directory.changed(), self.directory.ids()
+            known = before.by_id.keys()
+            moved = known ^ {*names}  # they came or went
+            ids = moved | ({*recordings} & known)
             now = replace(self._files, mends=mends).catch_up(before, ids)
-            if now is None or (has_changed and self.directory.changed()[0] != changed[0]):
+            if now is None or (moved and self.directory.changed()[0] != changed[0]):
                 self.invalidate()
                 return
             self._changed, self._names = changed, names
             self._latest = Session(self, now)
             self.index.note_changes()
-            self._invalidate_recordings(ids & before.by_id.keys())
+            self._invalidate_recordings(ids & known)
 
     def newest(self) -> Snapshot:
         """All recordings; those that look different by now are read again."""
@@ -135,7 +130,6 @@ class OpenStore(Shared):
             looks = self.directory.looks(list(known))
             changed = [one for one, look in known.items() if looks.get(one) != look]
             if changed or self.directory.ids() != self._names:
-                self._changed = 0, False  # another one may have come at the same time
                 self.catch_up(*changed)
             return self.now().snapshot()
 
