@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -23,7 +23,6 @@ from hybridlog_storage.times import BEGIN, END, span_of
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.query.intervals import Intervals
     from hybridlog.query.question import Question, RecordedChannel, Span
     from hybridlog.session import Session
     from hybridlog_storage.catalog import ChannelStats
@@ -55,50 +54,32 @@ class RangeResolver:
 
     def resolve(self) -> list[Resolved]:
         """The recordings to ask, oldest first; without reading their entries."""
-        question = self._question
-        places = self._session.chosen(question)
-        snapshot = self._session.snapshot()
-        if question.during is not None:
-            places = self._in_intervals(places, question.during)
-        bounds: list[Span | None] = [None] * len(places)
+        question, during = self._question, self._question.during
+        chosen = self._session.summaries_of(question)
+        if during is not None:
+            named = {*during.recordings}
+            chosen = [one for one in chosen if one.id in named]
+        found: list[tuple[RecordingSummary, Span | None]] = [(one, None) for one in chosen]
         if question.bounds is not None:
             shared = self._shared_bounds()
-            if shared is not None:
-                inside = snapshot.between(places, *shared)
-                bounds = [shared] * len(inside)
-            else:
-                bounds, inside = self._bounds_of(places)
-            if len(places) and not len(inside) and question.during is None:
-                self._refuse(places)
-            self._check_begin(snapshot.begin[inside])
-            places = inside
-        during = question.during
+            spans = [(one, shared or self.bounds_in(one)) for one in chosen]
+            found = [(one, span) for one, span in spans if not self._is_outside(span, one)]
+            if chosen and not found and during is None:
+                self._refuse(chosen)
+            self._check_begin([one.extent[0] for one, _ in found])
         return [
             Resolved(one, span, None if during is None else during.of_recording(one.id))
-            for one, span in zip(map(snapshot.summaries.__getitem__, places), bounds, strict=True)
+            for one, span in found
         ]
 
-    def _check_begin(self, first: NDArray[np.int64]) -> None:
+    def _check_begin(self, first: Sequence[int]) -> None:
         """Refuse a range that begins far before any first message of the recordings, ns."""
         assert self._question.bounds is not None
         begin, _ = self._question.bounds
-        if self._question.clock == "log" and is_early(begin) and len(first):
-            low = parse_time(begin, start=None, end=None)
-            if int(first.min()) - low > _FAR_NS:
-                raise TimeError(f"The range begins long before any message.{units_of(begin)}")
-
-    def _in_intervals(self, places: NDArray[np.intp], during: Intervals) -> NDArray[np.intp]:
-        """The recordings that have any of some intervals."""
-        by_id = self._session.snapshot().by_id
-        own = [by_id.get(name, -1) for name in during.recordings]
-        return np.intersect1d(places, np.array(own, np.intp))
-
-    def _bounds_of(self, places: NDArray[np.intp]) -> tuple[list[Span | None], NDArray[np.intp]]:
-        """A range that is relative to each recording, and the recordings that it overlaps."""
-        summaries = self._session.snapshot().summaries
-        found = [(place, self.bounds_in(summaries[place])) for place in places.tolist()]
-        inside = [(p, span) for p, span in found if not self._is_outside(span, summaries[p])]
-        return [span for _, span in inside], np.array([p for p, _ in inside], np.intp)
+        if self._question.clock != "log" or not is_early(begin) or not first:
+            return
+        if min(first) - parse_time(begin, start=None, end=None) > _FAR_NS:
+            raise TimeError(f"The range begins long before any message.{units_of(begin)}")
 
     def _shared_bounds(self) -> Span | None:
         """The range by the log clock if it is the same in each recording, ns."""
@@ -179,23 +160,21 @@ class RangeResolver:
         beside = self._question.clock == "log" and (bounds[0] >= end or bounds[1] <= start)
         return beside or bounds[0] >= bounds[1]
 
-    def _refuse(self, places: NDArray[np.intp]) -> None:
+    def _refuse(self, chosen: Sequence[RecordingSummary]) -> None:
         """Refuse a range that overlaps no recording."""
         assert self._question.bounds is not None
         begin, stop = self._question.bounds
-        summaries = self._session.snapshot().summaries
         spans: list[str] = []
-        for place in places.tolist():
-            start, end = self._clock_span(summaries[place])
-            low, high = self.bounds_in(summaries[place])
+        for one in chosen:
+            start, end = self._clock_span(one)
+            low, high = self.bounds_in(one)
             # `2025-01-01` to `end` is no mistake: the recording simply ends before.
             if low < high or low == start or high == end:
-                name = summaries[place].name
-                spans.append(f"{name} spans {format_time(start)} to {format_time(end)}")
+                spans.append(f"{one.name} spans {format_time(start)} to {format_time(end)}")
             if len(spans) == _MAX_NAMES:
                 break
         if not spans:
-            start, end = self._clock_span(summaries[places[0]])
+            start, end = self._clock_span(chosen[0])
             parse_range(begin, stop, start=start, end=end)
         raise TimeError(
             f"Nothing was recorded between {begin} and {stop}: {'; '.join(spans)}.{self.others()}"
