@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 UNFINISHED = frozenset({"open", "unfinished"})
 """Statuses of recordings that may have ended, or grown, since the snapshot."""
 _LEAST = 4  # characters of an id that stand for it
-_LATEST = (1 << 63) - 1
 
 
 def _order(one: RecordingSummary) -> tuple[bool, tuple[int, int], str, str]:
@@ -58,11 +57,6 @@ class Snapshot:
     def end(self) -> NDArray[np.int64]:
         """int64[n], one past the last log time of each, ns; both count lost messages."""
         return np.array([one.extent[1] for one in self.summaries], np.int64)
-
-    @lazy
-    def is_open(self) -> NDArray[np.bool_]:
-        """bool[n], whether each may have later messages by now."""
-        return np.array([one.status in UNFINISHED for one in self.summaries], np.bool_)
 
     @lazy
     def _set(self) -> NDArray[np.intp]:
@@ -171,13 +165,6 @@ class Snapshot:
             return found
         own = [self.by_id[one] for one in ids if one in self.by_id]
         return np.intersect1d(found, np.array(own, np.intp))
-
-    def between(self, places: NDArray[np.intp], begin: int, end: int) -> NDArray[np.intp]:
-        """Those of some recordings that overlap the log time `[begin, end)`, ns."""
-        if begin >= end:
-            return places[:0]
-        low, high = (max(min(bound, _LATEST), -_LATEST) for bound in (begin, end))
-        return places[(self.begin[places] < high) & (self.end[places] > low)]
 
     def during(self, places: NDArray[np.intp], begin: int, end: int, now: int) -> NDArray[np.intp]:
         """Those of some recordings that overlap the log time `[begin, end)`, ns.

@@ -187,9 +187,10 @@ class RangeResolver:
         if self._question.recordings is None or shared is None:
             return ""
         snapshot = self._session.snapshot()
-        places = snapshot.between(snapshot.having(self._question.topics), *shared).tolist()
-        known = [snapshot.summaries[place] for place in places]
-        names = [one.name for one in known if one.id not in self._question.recordings]
+        places = snapshot.having(self._question.topics).tolist()
+        known = (snapshot.summaries[place] for place in places)
+        inside = (one for one in known if not self._is_outside(shared, one))
+        names = [one.name for one in inside if one.id not in self._question.recordings]
         return f" Other recordings span that time: {listed(names, _MAX_NAMES)}." if names else ""
 
 

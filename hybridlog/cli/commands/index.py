@@ -202,7 +202,7 @@ def watch_command(given: _Watch) -> None:
 
 def _look(store: Store) -> Iterator[StoreError]:
     """Index what has come since the last look, and print it; yields what cannot be read."""
-    if store.session.snapshot().is_open.any() or store.shared.has_changed():
+    if store.session.snapshot().unfinished or store.shared.has_changed():
         store.refresh()
     repairs = store.repairs
     try:
