@@ -420,8 +420,7 @@ class Query:
         question = just_before(self.question, found.recording, time, time)
         # What is lost between the message and the moment may have been the current one.
         snapshot = now.session.snapshot()
-        place = snapshot.by_id[found.recording]
-        start, end = int(snapshot.begin[place]), int(snapshot.end[place])
+        start, end = snapshot.summaries[snapshot.by_id[found.recording]].extent
         latest = max(parse_time(moment, start=start, end=end), time)
         since = Query(self.source, replace(question, bounds=(time, latest + 1)))
         return Query(self.source, question, (*self.conditions, since))

@@ -11,6 +11,7 @@ from collections.abc import Hashable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
+from operator import itemgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,13 +23,11 @@ from hybridlog.query.latching import depth_of, is_key_frame, is_video, publisher
 from hybridlog.query.planner import Planner
 from hybridlog.query.question import Counters, Question
 from hybridlog.query.ranges import RangeResolver
-from hybridlog.query.times import TimeLike, is_relative, parse_time
+from hybridlog.query.times import TimeLike, parse_time
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.times import END, earlier, span_of
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from hybridlog.message import Message
     from hybridlog.query.chunk_columns import Chunk
     from hybridlog.query.question import RecordedChannel, Span
@@ -42,36 +41,24 @@ def message_at(
     session: Session, question: Question, counters: Counters, moment: TimeLike
 ) -> Message | None:
     """The last message not after a time, in any recording; None if none exists."""
-    snapshot = session.look(question.recordings)
-    places = session.chosen(question)
-    start, end = snapshot.begin[places], snapshot.end[places]
-    latest = np.minimum(_moments(moment, start, end), np.where(end == END, END, end - 1))
-    latest[(start >= end) | (start > latest)] = -1
+    candidates = []
+    for one in session.summaries_of(question):
+        start, end = one.extent
+        latest = min(parse_time(moment, start=start, end=end), end if end == END else end - 1)
+        if start < end and start <= latest:
+            candidates.append((latest, start, one))
     best: tuple[tuple[int, str, int], Message] | None = None
     # Ask the recording that could hold the latest message first: it usually does.
-    while len(latest):
-        row = int(latest.argmax())
-        now = int(latest[row])
-        if now < 0 or (best is not None and now < best[0][0]):
+    for latest, start, one in sorted(candidates, key=itemgetter(0), reverse=True):
+        if best is not None and latest < best[0][0]:
             break
-        latest[row] = -1
-        recording = session.entry_of(snapshot.summaries[places[row]])
-        found = _last_of(session, question, counters, recording, (int(start[row]), now))
+        recording = session.entry_of(one)
+        found = _last_of(session, question, counters, recording, (start, latest))
         if found is not None:
             place = found.log_time_ns, recording.key, found.seq
             if best is None or place > best[0]:
                 best = place, found
     return best[1] if best is not None else None
-
-
-def _moments(
-    moment: TimeLike, start: NDArray[np.int64], end: NDArray[np.int64]
-) -> NDArray[np.int64]:
-    """A time in each of some recordings, ns."""
-    if not is_relative(moment):
-        return np.full(len(start), parse_time(moment, start=None, end=None), np.int64)
-    spans = zip(start.tolist(), end.tolist(), strict=True)
-    return np.array([parse_time(moment, start=a, end=b) for a, b in spans], np.int64)
 
 
 def just_before(question: Question, recording: str, begin: int, latest: int) -> Question:
