@@ -218,7 +218,6 @@ class OpenStore(Shared):
 
     def close(self) -> None:
         """Close files and connections. May be called more than once."""
-        self.is_closed = True
         with self._opening:
             for reader in self._segments.values():
                 reader.close()
@@ -230,4 +229,5 @@ class OpenStore(Shared):
         if is_written and (self.catalog.has_changed or is_missing):
             with suppress(OSError, HybridlogError):
                 self._write_recordings_file()
+        self.is_closed = True
         self.catalog.close()
