@@ -290,9 +290,8 @@ class IndexAccess:
 
     def _another_again(self) -> Database:
         """An additional connection to the index, after one has failed."""
-        if not self.id:
-            with self._connecting:
-                self._open()
+        with self._connecting:
+            self._open()
         return self.another()
 
     def _reached(self, *, brings: bool) -> Database | None:

@@ -377,7 +377,7 @@ def test_a_segment_cut_in_its_summary_is_what_it_was(tmp_path: Path, missing: in
 
 @pytest.mark.parametrize("span", [0, -1, 1 << 62])
 def test_a_chunk_lasts_longer_than_no_time(span: int) -> None:
-    with pytest.raises(UsageError, match="a chunk must last"):
+    with pytest.raises(UsageError, match="a chunk lasts longer than no time"):
         SegmentSettings(chunk_span_ns=span)
 
 

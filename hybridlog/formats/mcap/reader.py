@@ -25,11 +25,11 @@ from hybridlog_storage.mcap.mcap_content import MAGIC, ChunkContent
 from hybridlog_storage.mcap.mcap_scan import Item, Scan
 from hybridlog_storage.messages import MAX_CHANNELS, Channel, Schema
 from hybridlog_storage.ordering import distinct
-from hybridlog_storage.segments.attachments import Attachment, FileHandle
+from hybridlog_storage.segments.attachments import Attachment, reader_of
 from hybridlog_storage.times import END, span_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
     from pathlib import Path
     from typing import BinaryIO
 
@@ -66,7 +66,8 @@ class McapSource(Source):
         except BaseException:
             self._file.close()
             raise
-        self._handle: FileHandle | None = None  # for attachments, which outlive this reader
+        # For attachments, which outlive this reader.
+        self._read: Callable[[int, int], bytes] | None = None
         self._given = 0
         self._lost = 0
         self._uncounted: list[Damage] = []  # what the totals at the end may count
@@ -97,7 +98,7 @@ class McapSource(Source):
     def close(self) -> None:
         """Close the file."""
         self._file.close()
-        self._handle = None
+        self._read = None
 
     def batches(self) -> Iterator[Batch]:
         """Yield all readable messages once, in file order."""
@@ -123,8 +124,8 @@ class McapSource(Source):
         elif isinstance(item, records.Metadata):
             self.extras.append(item)
         elif isinstance(item, Attachment):
-            self._handle = self._handle or FileHandle(self._file.fileno())
-            self.extras.append(replace(item, data=item.data.through(self._handle.read)))
+            self._read = self._read or reader_of(self._file.fileno())
+            self.extras.append(replace(item, data=item.data.through(self._read)))
 
     def _content(self, content: ChunkContent, offset: int) -> Iterator[Batch]:
         """Yield the messages of one chunk or run, split where a definition changes."""

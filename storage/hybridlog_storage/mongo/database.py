@@ -428,7 +428,6 @@ def _mapped(address: str, *, question: bool = False) -> Iterator[None]:
     from pymongo.errors import (
         ConnectionFailure,
         DocumentTooLarge,
-        ExecutionTimeout,
         InvalidOperation,
         OperationFailure,
         PyMongoError,
@@ -437,11 +436,6 @@ def _mapped(address: str, *, question: bool = False) -> Iterator[None]:
 
     try:
         yield
-    except ExecutionTimeout as error:
-        raise DatabaseError(
-            f"MongoDB at {address} exceeded the time allowed for the question; allow more time, "
-            f"or ask for less."
-        ) from error
     except OperationFailure as error:
         code, said = error.code or 0, error.details or {}
         text = str(said.get("errmsg", "")) or str(error)  # pymongo's own adds the whole reply

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Iterator
+import weakref
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -58,10 +59,10 @@ class Attachment:
             left -= len(piece)
             yield piece
 
-    def fields(self) -> bytes:
-        """The fields of its record before the content."""
+    def record(self) -> Iterator[bytes]:
+        """Its MCAP record, in pieces."""
         name, media_type = self.name.encode(), self.media_type.encode()
-        return b"".join(
+        fields = b"".join(
             (
                 _TIMES.pack(self.log_time, self.create_time),
                 _TEXT.pack(len(name)),
@@ -71,10 +72,6 @@ class Attachment:
                 _SIZE.pack(len(self.data)),
             )
         )
-
-    def record(self) -> Iterator[bytes]:
-        """Its MCAP record, in pieces."""
-        fields = self.fields()
         crc = crc32(fields)
         size = len(fields) + len(self.data) + _CRC.size
         yield RECORD_HEAD.pack(Opcode.ATTACHMENT, size) + fields
@@ -134,19 +131,15 @@ def _text(head: Buffer, at: int) -> tuple[str, int]:
     return str(memoryview(head)[at : at + size], "utf-8"), at + size
 
 
-class FileHandle:
+def reader_of(fd: int) -> Callable[[int, int], bytes]:
     """Reads a file by position, beside its other users and after they have closed it.
 
-    It closes when nothing refers to it any more.
+    It is closed when nothing refers to the function any more, which takes an offset and a length.
     """
+    own = files.duplicate(fd)
 
-    def __init__(self, fd: int) -> None:
-        self._fd = files.duplicate(fd)
+    def read(offset: int, size: int) -> bytes:
+        return files.pread(own, size, offset)
 
-    def __del__(self) -> None:
-        if hasattr(self, "_fd"):
-            os.close(self._fd)
-
-    def read(self, offset: int, size: int) -> bytes:
-        """Bytes of the file; fewer at its end."""
-        return files.pread(self._fd, size, offset)
+    weakref.finalize(read, os.close, own).atexit = False
+    return read

@@ -39,8 +39,8 @@ from hybridlog_storage.ordering import distinct
 from hybridlog_storage.segments.attachments import (
     MAX_HEAD,
     Attachment,
-    FileHandle,
     parse_attachment,
+    reader_of,
 )
 from hybridlog_storage.segments.chunk import StoredChunk
 from hybridlog_storage.segments.chunk_table import ChunkTable
@@ -284,7 +284,7 @@ class SegmentReader:
         start, size = offset + RECORD_HEAD.size, length - RECORD_HEAD.size
         head = self.read(start, max(min(size, MAX_HEAD), 0))
         found, used = parse_attachment(
-            head, FilePart(FileHandle(self._fd).read, start, size), needs_crc=True
+            head, FilePart(reader_of(self._fd), start, size), needs_crc=True
         )
         if used != size:
             raise SegmentError("an attachment record is longer than its fields")

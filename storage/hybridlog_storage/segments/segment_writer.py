@@ -82,14 +82,18 @@ class SegmentSettings:
     sync: Literal["chunk", "seal", "never"] = "seal"
 
     def __post_init__(self) -> None:
-        if not 1 << 10 <= self.chunk_size <= 1 << 28:
-            raise UsageError("the chunk size must lie between 1 KiB and 256 MiB")
-        if not 0 < self.chunk_span_ns <= _MAX_SPAN:
-            raise UsageError("a chunk must last longer than no time, and an hour at most")
-        if not 1 <= self.level <= 19:
-            raise UsageError("the zstd level must lie between 1 and 19")
-        if self.segment_span_s is not None and not self.segment_span_s > 0:
-            raise UsageError("a segment must last longer than no time")
+        span_s = self.segment_span_s
+        for is_right, words in (
+            (
+                1 << 10 <= self.chunk_size <= 1 << 28,
+                "a chunk has between 1 KiB and 256 MiB",
+            ),
+            (0 < self.chunk_span_ns <= _MAX_SPAN, "a chunk lasts longer than no time, to an hour"),
+            (1 <= self.level <= 19, "the zstd level lies between 1 and 19"),
+            (span_s is None or span_s > 0, "a segment lasts longer than no time"),
+        ):
+            if not is_right:
+                raise UsageError(f"{words}; give another value.")
 
 
 @dataclass(slots=True)
