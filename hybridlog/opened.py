@@ -190,7 +190,6 @@ class OpenStore(Shared):
         """See a recording that has ended; if MongoDB is available again, index the rest."""
         self.catch_up(report.entry.id)
         if report.failure is None:
-            self.note_indexed(report.entry.id)
             return
         self.index.disconnect()
         try:

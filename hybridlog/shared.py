@@ -90,11 +90,6 @@ class Shared(ABC):
         """Recordings, channels, chunks and schemas."""
         return open_catalog(self.directory)
 
-    def note_indexed(self, recording: str) -> None:
-        """Note that the index has all of a recording: the next connection need not look at it."""
-        if self.index.connected is not None:
-            self.catalog.put_indexed([recording], self.index.id)
-
     @lazy
     def tables(self) -> Tables:
         """Parquet tables of topics; pyarrow is loaded for them."""

@@ -223,8 +223,6 @@ class _Beside:
                 follower.follow()
         follower.is_stopped = False
         follower.finish(put_entry(directory, catalog, task.recording))
-        if follower.failure is None:
-            store.shared.note_indexed(task.recording)
 
     def _recover(self) -> None:
         """Make documents that the index lacks of earlier recordings."""

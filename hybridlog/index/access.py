@@ -15,10 +15,7 @@ from hybridlog_storage.errors import (
     ConnectionBrokenError,
     ConnectionLostError,
     DatabaseError,
-    DiskFullError,
     HybridlogError,
-    MissingDependencyError,
-    ResourceError,
     StoreError,
     WithoutMongoError,
 )
@@ -90,7 +87,6 @@ class IndexAccess:
         wanted: The URI that was asked for; None for the one in the store's settings.
         cache_mb: As above.
         may_write: False if the user of MongoDB may only read.
-        has_none: True if the store does without MongoDB: none is wanted, or ours does not start.
         id: Id of the index; an index that replaces it has another one. Empty without a
             connection, and for an index without an id that this user may only read.
         unavailable: The reason why MongoDB is unavailable; None while that is unknown.
@@ -107,7 +103,6 @@ class IndexAccess:
     ) -> None:
         self.wanted = mongo
         self.may_write = True
-        self.has_none = False
         self.id = ""
         self.unavailable: HybridlogError | None = None
         self._shared = shared
@@ -167,7 +162,9 @@ class IndexAccess:
             database = self.database_for(purpose, writes=True, brings=self._recovers)
         except DatabaseError as error:
             why = self.unavailable if isinstance(self.unavailable, DatabaseError) else error
-            return IndexTarget(failure=None if self.has_none else why, renew=self._another_again)
+            # It does without MongoDB if none is wanted, or ours does not start.
+            has_none = self._named in {EMBEDDED, NONE} and not isinstance(why, ConnectionLostError)
+            return IndexTarget(failure=None if has_none else why, renew=self._another_again)
         return IndexTarget(database, renew=self._another_again)
 
     def connect(self, *, brings: bool = True) -> Database:
@@ -255,7 +252,6 @@ class IndexAccess:
                 self._directory.settings, self._directory.path, self.wanted
             )
         if self._uri == NONE:
-            self.has_none = True
             setting = "--mongo none" if self.wanted else f'mongo = "none" in {NAME}'
             raise WithoutMongoError(
                 f"The store is used without MongoDB ({setting}). With --mongo embedded, or --mongo "
@@ -278,12 +274,7 @@ class IndexAccess:
             uri = self._mongod.start()
         except StoreError as error:
             # A read-only store has no embedded MongoDB, but its segments can be read.
-            self.has_none = True
             raise DatabaseError(str(error)) from error
-        except (DatabaseError, MissingDependencyError, ResourceError) as error:
-            self.has_none = not isinstance(error, DiskFullError)
-            raise
-        self.has_none = False
         if self._mongod.damage is not None:
             self._shared.repairs.damage.append(self._mongod.damage)
         return uri
