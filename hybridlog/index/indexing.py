@@ -48,7 +48,6 @@ class ChunkIndexer:
     """
 
     def __init__(self, recording: str, *, has_documents: bool = True) -> None:
-        self.recording = recording
         self._key = recording[-16:]
         self._has_documents = has_documents
         self._parts: dict[int, tuple[Codec, DocumentAssembler, bool]] = {}
@@ -90,10 +89,6 @@ class ChunkIndexer:
             if tables:
                 documents.append(Documents(channel.topic, tables))
         return documents, decoded
-
-    def reason(self, channel_id: int, channel: Channel) -> str | None:
-        """Reason why a channel's fields are not indexed, None if they are."""
-        return self._part(channel_id, channel)[0].reason
 
     def _part(self, channel_id: int, channel: Channel) -> tuple[Codec, DocumentAssembler, bool]:
         part = self._parts.get(channel_id)

@@ -12,8 +12,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.entries import topic_types
-from hybridlog.index.indexing import ChunkIndexer
 from hybridlog.record.losses import Cause, joined
+from hybridlog.schema.codecs import codec_for
 from hybridlog.snapshot import UNFINISHED
 from hybridlog_storage.catalog import ChannelEntry, ChannelStats, channel_entry, channel_totals
 from hybridlog_storage.disk.directory import is_stable
@@ -55,7 +55,6 @@ class RunningRecording:
         self._state = "", False  # the look of its directory, and whether it is being written
         self._segments: dict[int, OpenSegment] = {}
         self._unreadable: dict[int, str] = {}  # why, by number of the segment
-        self._indexer: ChunkIndexer | None = None
         self.entry: RecordingEntry | None = None
         self.topics: set[TopicType] = set()
         self.schemas: dict[str, Schema] = {}
@@ -111,8 +110,6 @@ class RunningRecording:
                 continue
             with self._noting(number):
                 self._segments[number] = before.get(number) or OpenSegment(path, number)
-        if self._indexer is None:
-            self._indexer = ChunkIndexer(self._sealed.id)
 
     def _with_flushed(self, sealed: RecordingEntry) -> RecordingEntry:
         """The entry with what is flushed besides."""
@@ -142,10 +139,9 @@ class RunningRecording:
         return found
 
     def _add_channels(self, channels: dict[int, ChannelEntry], segment: OpenSegment) -> None:
-        assert self._indexer is not None
         for number, channel in segment.channels.items():
             if number not in channels:
-                reason = self._indexer.reason(number, channel)
+                reason = codec_for(channel).reason
                 channels[number] = found = channel_entry(number, channel, reason)
                 if channel.schema is not None and found.schema is not None:
                     self.schemas[found.schema] = channel.schema
