@@ -93,7 +93,8 @@ class Scan:
         self._last = self._at  # start of the last record
         self._has_ended = False  # the data, and the summary follows
         self._needs_crc = False  # messages have no checksum of their own
-        self._is_damaged = self._is_torn = False  # torn: the file ends in damage
+        self._is_damaged = self._is_closed = False
+        self._is_torn = False  # the file ends in damage
 
     def _read(self, offset: int, length: int) -> memoryview:
         self._file.seek(offset)
@@ -132,18 +133,13 @@ class Scan:
 
         Items are messages with the definitions between them, other records, and damage.
         """
-        is_closed = False
         while self._at < self._bytes.size:
             for at, item in self._step():
                 self._is_damaged |= isinstance(item, Damage)
                 yield at, item
             if self._has_ended:
-                is_closed = self._pass_summary()
-                if self._at < self._bytes.size:
-                    why = "bytes follow the end of the log"
-                    yield self._behind_end(why if is_closed else "the summary is damaged")
-                    is_closed = True  # the damage tells it
-        if not (is_closed or self._is_torn):
+                yield from self._end()
+        if not (self._is_closed or self._is_torn):
             why = "the file was not closed: its end is missing; all before it was read"
             yield _damage(self._bytes.size, 0, why, 0)
 
@@ -379,28 +375,21 @@ class Scan:
         is_known = opcode == Opcode.FOOTER or is_in_summary(opcode)
         return is_known and length <= self._bytes.size - end - HEAD
 
-    def _pass_summary(self) -> bool:
-        """Go behind the footer; False if the summary is damaged, or the end is missing."""
-        while True:
-            head = self._bytes.at(self._at, HEAD, move=True)
-            if len(head) < HEAD:
-                return False
-            opcode, length = RECORD_HEAD.unpack(head)
-            end = self._at + HEAD + length
-            if opcode == Opcode.FOOTER and self._bytes.at(end, len(MAGIC)) == MAGIC:
-                self._at = end + len(MAGIC)
-                return True
-            if not is_in_summary(opcode) or end > self._bytes.size:
-                return False
-            self._at = end
-
-    def _behind_end(self, why: str) -> tuple[int, Item]:
-        """Go on with the next chunk behind the end of a log, if there is one."""
+    def _end(self) -> Iterator[tuple[int, Item]]:
+        """Go behind the end of a log, and on with the next chunk if there is one."""
         at, size = self._at, self._bytes.size
-        found = self._bytes.search(at, size, {Opcode.CHUNK}, self._is_start)
-        self._at = self._behind = size if found is None else found
+        rest = self._bytes.at(at, TAIL + 1)
+        is_footer = len(rest) == TAIL and footer_of(rest) is not None
+        self._is_closed = self.summary is not None or is_footer
+        found: int | None = None
+        if not self._is_closed and at < size:
+            found = self._bytes.search(at, size, {Opcode.CHUNK}, self._is_start)
+            why = "the summary is damaged, or bytes follow it"
+            why = why if found is None else "bytes follow the end of the log"
+            yield _damage(at, (found or size) - at, why, 0)
+            self._is_closed = True  # the damage tells it
+        self._at = self._behind = found or size
         self._has_ended, self._stop = found is None, None
-        return _damage(at, self._at - at, why, 0)
 
     # Behind damage
 
