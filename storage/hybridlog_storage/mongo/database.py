@@ -80,14 +80,15 @@ class Database:
 
     Every method raises `DatabaseError` if the server does not answer or refuses. Methods with a
     `filter` or a pipeline raise `WhereError` if that is invalid. `is_lost` is True after a method
-    found no connection; make a new `Database` then.
+    found no connection; make a new `Database` then. `address` is the URI without user, password
+    and options, for messages.
     """
 
     def __init__(self, client: MongoClient[Document], name: str, address: str) -> None:
         self.is_lost = False
         self._client = client
         self._database: PymongoDatabase[Document] = client[name]
-        self._address = address
+        self.name, self.address = name, address
 
     @classmethod
     def connect(cls, uri: str, name: str = "hybridlog", *, timeout_s: float = 5.0) -> Self:
@@ -143,16 +144,6 @@ class Database:
             raise
         return self
 
-    @property
-    def name(self) -> str:
-        """Name of the database."""
-        return self._database.name
-
-    @property
-    def address(self) -> str:
-        """The URI without user, password and options, for messages."""
-        return self._address
-
     def __enter__(self) -> Self:
         return self
 
@@ -173,7 +164,7 @@ class Database:
 
         left = _TRIES
         try:
-            with _mapped(self._address, question=question):
+            with _mapped(self.address, question=question):
                 while True:
                     try:
                         return command()
@@ -249,7 +240,7 @@ class Database:
             for one in failed:
                 if one.get("code") != _DUPLICATE_KEY:
                     words = str(one.get("errmsg", ""))
-                    raise _refused(self._address, one.get("code", 0), words) from None
+                    raise _refused(self.address, one.get("code", 0), words) from None
             return int(found["nInserted"])
         return len(documents)
 
@@ -269,7 +260,7 @@ class Database:
         """
         from bson import encode
 
-        with _mapped(self._address, question=True):
+        with _mapped(self.address, question=True):
             size = max((len(encode(query)) for _, query in questions), default=1)
         step = max(1, min(_MAX_QUESTIONS_PER_COMMAND, _MAX_COMMAND_BYTES // size))
         for first in range(0, len(questions), step):
@@ -357,7 +348,7 @@ class Database:
 
     def drop_all(self) -> None:
         """Remove the whole database."""
-        self._again(lambda: self._client.drop_database(self._database.name))
+        self._again(lambda: self._client.drop_database(self.name))
 
     def list_collections(self) -> list[str]:
         """Names of all collections, sorted, without MongoDB's own."""

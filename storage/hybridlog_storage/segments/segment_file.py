@@ -197,11 +197,6 @@ class SegmentFile:
         return segment
 
     @property
-    def chunks(self) -> int:
-        """Number of chunks in the file, which is the number of the next one."""
-        return self.table.chunks
-
-    @property
     def is_complete(self) -> bool:
         """True if the summary is written, so nothing can be added."""
         return self._sealed is not None
@@ -429,7 +424,7 @@ class SegmentFile:
             attachment_count=len(self._attachment_indexes),
             channel_count=len(self.channels),
             channel_message_counts=counts,
-            chunk_count=self.chunks,
+            chunk_count=self.table.chunks,
             message_count=sum(counts.values()),
             message_end_time=int(times["last"].max(initial=0)),
             message_start_time=int(times["first"].min()) if len(times) else 0,

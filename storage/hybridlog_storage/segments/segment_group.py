@@ -123,7 +123,7 @@ class SegmentGroup:
         if span_s is not None and time.monotonic() - self._opened >= span_s:
             return True
         return self.position >= size or any(
-            one.chunks >= _MAX_CHUNKS or one.table.parts >= _MAX_PARTS
+            one.table.chunks >= _MAX_CHUNKS or one.table.parts >= _MAX_PARTS
             for one in self.segments.values()
         )
 

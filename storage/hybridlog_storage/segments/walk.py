@@ -130,13 +130,9 @@ class Walk:
                 self._damaged.append(Damage(at, behind - at, str(error)))
                 self.end = behind
 
-    def _peek(self, at: int, size: int) -> memoryview:
-        """Bytes of the file, fewer at its end."""
-        return self._bytes.at(at, size, move=True)
-
     def _head(self, at: int) -> tuple[int, int]:
         """Opcode of a record, and where it ends."""
-        head = self._peek(at, HEAD)
+        head = self._bytes.at(at, HEAD, move=True)
         if len(head) < HEAD:
             raise _TornError("the file ends in the middle of a record")
         opcode, length = RECORD_HEAD.unpack(head)
@@ -185,7 +181,7 @@ class Walk:
     def _take_chunk(self, at: int, end: int) -> int:
         head = self._chunk_head(at, end)
         trailer = self._trailer(at, end, head.size)
-        if crc32(self._peek(at, head.start)) != trailer.head_crc:
+        if crc32(self._bytes.at(at, head.start, move=True)) != trailer.head_crc:
             raise SegmentError("the head of a chunk changed: its checksum differs")
         behind = end + trailer.length
         if trailer.indexes == []:
@@ -209,7 +205,7 @@ class Walk:
 
     def _chunk_head(self, at: int, end: int) -> ChunkHead:
         """A chunk record before its content; `SegmentError` if the file ends in the chunk."""
-        head = chunk_head_of(self._peek(at, MAX_CHUNK_HEAD))
+        head = chunk_head_of(self._bytes.at(at, MAX_CHUNK_HEAD, move=True))
         if head is not None and at + head.end == end <= self._reader.size:
             return head
         if end > self._reader.size and (head is None or at + head.end == end):
@@ -266,7 +262,7 @@ class Walk:
 
     def _is_room(self, at: int) -> bool:
         """True if zeros follow, as a writer leaves behind its last block."""
-        if any(self._peek(at, HEAD)):
+        if any(self._bytes.at(at, HEAD, move=True)):
             return False
         rest = self._reader.read(at, min(self._reader.size - at, _SEARCHED))
         return not np.frombuffer(rest, np.uint8).any()
@@ -281,7 +277,7 @@ class Walk:
                 return True
             head = self._chunk_head(at, end)
             trailer = self._trailer(at, end, head.size)
-            return crc32(self._peek(at, head.start)) == trailer.head_crc
+            return crc32(self._bytes.at(at, head.start, move=True)) == trailer.head_crc
         except SegmentError:
             return False
 
