@@ -501,7 +501,7 @@ def test_a_runtime_directory_that_is_no_use(
     directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("HYBRIDLOG_RUNTIME_DIR", str(tmp_path / ("x" * 100)))
-    with pytest.raises(DatabaseError, match="HYBRIDLOG_RUNTIME_DIR to a short one"):
+    with pytest.raises(DatabaseError, match="HYBRIDLOG_RUNTIME_DIR to a short path"):
         EmbeddedMongod(directory).start()
     monkeypatch.setenv("HYBRIDLOG_RUNTIME_DIR", "/proc/nowhere")
     with pytest.raises(DatabaseError, match="cannot be made"):

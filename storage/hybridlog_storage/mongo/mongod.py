@@ -10,14 +10,9 @@ state, and the kernel releases the locks of killed processes:
 * `keeper.lock`: held by the process that starts a keeper, and inherited by the keeper and by
   mongod, so it is free only when both have ended.
 
-A process locks `users.lock` before it looks for a mongod, so the mongod that it finds
-cannot be ended under it.
-
-The data files are derived from the segments. If they are damaged, the last words in mongod's
-log are of its storage; the next start then removes them, and the index is built again.
-
-The directory belongs to one user of the system. If it belongs to another user, a directory
-beside it with the uid in its name is used. mongod would follow symlinks, so it is not started
+A process locks `users.lock` before it looks for a mongod, so none is ended under it. If the
+data files are damaged, the last words in mongod's log are of its storage; the next start then
+removes them, and the index is built again. mongod would follow symlinks, so it is not started
 on a directory with any.
 """
 
@@ -53,9 +48,6 @@ from hybridlog_storage.settings import MIN_CACHE_MB
 
 START_LIMIT_S = 60.0
 """Seconds for a start; one that takes longer goes on, and the next command finds it."""
-_LISTENS_S = 1.0
-_SLOW_OPERATION_MS = 5000
-_JOURNAL_MS = 500  # longest time between two checks
 _LOG_TAIL = 256 << 10
 _MAX_SOCKET = 100  # bytes of its path; Linux allows 107, other systems 103
 
@@ -133,10 +125,9 @@ class EmbeddedMongod:
         return self._directory / "data"
 
     def start(self) -> str:
-        """Return the URI of a running mongod; start one if necessary.
+        """Return the URI of a running mongod; start one if none runs, or it has ended.
 
-        May be called again at any time, for example after a `DatabaseError`: it checks again, and
-        restarts a mongod that has ended. Damaged data files are replaced by empty ones.
+        Damaged data files are replaced by empty ones.
         """
         with self._mutex:
             entered = self._users is None
@@ -273,14 +264,14 @@ class EmbeddedMongod:
             *("--filePermissions", "0700"),
             "--noscripting",
             "--quiet",
-            *("--slowms", str(_SLOW_OPERATION_MS)),
+            *("--slowms", "5000"),
             *("--wiredTigerCacheSizeGB", f"{self._cache_mb / 1024:g}"),
             # An empty database then takes 11 MB instead of 300 MB.
             *("--wiredTigerEngineConfigString", "log=(prealloc=false,file_max=10MB)"),
             *("--setParameter", "diagnosticDataCollectionEnabled=false"),
             # Checking the journal ten times a second takes half of an idle server's processor
             # time. Documents lost by checking less often are rebuilt from the segments.
-            *("--journalCommitInterval", str(_JOURNAL_MS)),
+            *("--journalCommitInterval", "500"),
         ]
 
     def _last_run(self) -> str:
@@ -327,17 +318,15 @@ def _is_damage(log: str) -> bool:
 def _socket_of(users: int) -> Path:
     """Path of the socket that goes with an open file, the same in every process.
 
-    Its directory, which only this user can open, is made in `/tmp`, or in HYBRIDLOG_RUNTIME_DIR:
-    the path of the store may be too long for a socket, and XDG_RUNTIME_DIR is removed at logout,
-    while a recording may go on.
+    Its directory, which only this user can open, is made in `/tmp`, or in HYBRIDLOG_RUNTIME_DIR;
+    XDG_RUNTIME_DIR is removed at logout, while a recording may go on.
     """
     base = Path(os.environ.get("HYBRIDLOG_RUNTIME_DIR") or "/tmp").absolute()  # noqa: S108
     base, about = base / f"hybridlog-{os.geteuid()}", os.fstat(users)
     path = base / f"{about.st_dev:x}-{about.st_ino:x}.sock"
     if len(os.fsencode(path)) > _MAX_SOCKET:
         raise DatabaseError(
-            f"{base.parent} is too long a path for a socket: set HYBRIDLOG_RUNTIME_DIR to a short "
-            "one."
+            f"{base.parent} is too long for a socket: set HYBRIDLOG_RUNTIME_DIR to a short path."
         )
     try:
         with contextlib.suppress(FileExistsError):
@@ -416,7 +405,7 @@ def _directory_error(directory: Path, error: OSError) -> HybridlogError:
 def _answers(path: str) -> bool:
     """True if a mongod listens at this socket, which it does once it is ready."""
     with socket.socket(socket.AF_UNIX) as connection:
-        connection.settimeout(_LISTENS_S)
+        connection.settimeout(1.0)
         return connection.connect_ex(path) == 0
 
 

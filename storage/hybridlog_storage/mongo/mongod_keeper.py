@@ -1,8 +1,7 @@
 """The process that starts one embedded mongod, waits, and ends it.
 
-`hybridlog_storage.mongo.mongod` runs it as a script and never imports it. It uses only the
-standard library, so it starts fast and stays small. It outlives the process that started
-it: mongod belongs to all processes on a store, not to the first one.
+`hybridlog_storage.mongo.mongod` runs it as a script. It uses only the standard library, so it
+starts fast and stays small. It outlives its starter: mongod belongs to all processes on a store.
 
     python -I -S mongod_keeper.py LOCK_FD LINGER_S SOCKET MONGOD ARGUMENT...
 
@@ -33,8 +32,6 @@ POLL_AT_START_S = 0.05
 YOUNG_S = 3.0
 PUBLISHED_S = 86_400.0
 """Most seconds for which mongod waits for clients."""
-CONNECTED = b"03"
-"""State of a connection in /proc/net/unix."""
 _PR_SET_PDEATHSIG = 1
 
 
@@ -147,9 +144,9 @@ def _has_clients(socket: str) -> bool:
     """True if any program is connected to a socket; other systems than Linux do not tell."""
     with contextlib.suppress(OSError):
         lines = Path("/proc/net/unix").read_bytes().splitlines()
-        # Num, RefCount, Protocol, Flags, Type, St, Inode, Path
+        # Num, RefCount, Protocol, Flags, Type, St (3: connected), Inode, Path
         connected = [line.split(None, 5)[5].split(None, 2) for line in lines[1:]]
-        return any(one[0] == CONNECTED and one[2:] == [os.fsencode(socket)] for one in connected)
+        return any(one[0] == b"03" and one[2:] == [os.fsencode(socket)] for one in connected)
     return False
 
 
