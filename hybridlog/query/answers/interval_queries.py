@@ -138,11 +138,17 @@ class IntervalQueries:
     def _spans(self) -> Iterator[tuple[Part, Span]]:
         """The one part of each recording, without a time range, with each span of the question."""
         ranges = RangeResolver(self._session, self._question).spans()
-        for summary, spans in groupby(ranges, key=itemgetter(0)):
-            # All stored messages of the topic may be lost: then nothing is known of its state.
-            for part in self._planner.parts_in(summary, None, None):
-                for _, span in spans:
-                    yield part, span
+        # All stored messages of the topic may be lost: then nothing is known of its state.
+        found = [
+            (part, [span for _, span in spans])
+            for summary, spans in groupby(ranges, key=itemgetter(0))
+            for part in self._planner.parts_in(summary, None, None)
+        ]
+        # MongoDB is asked once for all.
+        parts = self._planner.decided([part for part, _ in found])
+        for part, (_, spans) in zip(parts, found, strict=True):
+            for span in spans:
+                yield part, span
 
     def _states_in(self, part: Part, span: Span, gap: int | None) -> NDArray[np.int64]:
         # The last message before the range determines the state at its beginning.

@@ -31,6 +31,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Self
 from urllib.parse import quote
@@ -202,7 +203,8 @@ class EmbeddedMongod:
             keeper = self._open("keeper.lock")
             try:
                 if not _try_lock(keeper, fcntl.LOCK_EX):
-                    if _answers(path):
+                    # The second lock is the keeper's own: without it, mongod is dying.
+                    if not _try_lock(keeper, fcntl.LOCK_EX, fcntl.lockf) and _answers(path):
                         return f"mongodb://{quote(path, safe='')}/?directConnection=true"
                 else:
                     self._launch(path, keeper, has_started=has_started)
@@ -344,9 +346,9 @@ def _socket_of(users: int) -> Path:
     return path
 
 
-def _try_lock(descriptor: int, kind: int) -> bool:
+def _try_lock(descriptor: int, kind: int, lock: Callable[[int, int], None] = fcntl.flock) -> bool:
     try:
-        fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
+        lock(descriptor, kind | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
     except OSError as error:

@@ -27,9 +27,6 @@ LOG_LIMIT = 10 << 20
 """Bytes of log after which it is emptied."""
 END_LIMIT_S = 30.0
 """Seconds for an orderly end of mongod."""
-POLL_S = 0.25
-POLL_AT_START_S = 0.05
-YOUNG_S = 3.0
 PUBLISHED_S = 86_400.0
 """Most seconds for which mongod waits for clients."""
 _PR_SET_PDEATHSIG = 1
@@ -41,6 +38,7 @@ def main(lock: int, linger_s: float, socket: str, command: list[str]) -> int:
     mongod shares the lock of the descriptor `lock`.
     """
     os.umask(0o077)
+    fcntl.lockf(lock, fcntl.LOCK_EX)  # which mongod does not share
     end_signals: list[int] = []
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         signal.signal(number, lambda got, _frame: end_signals.append(got))
@@ -136,7 +134,7 @@ def _wait(
                 return False
             fcntl.flock(users, fcntl.LOCK_UN)
         _empty_long_log()
-        time.sleep(POLL_AT_START_S if now - born < YOUNG_S else POLL_S)
+        time.sleep(0.05 if now - born < 3 else 0.25)
     return False
 
 
