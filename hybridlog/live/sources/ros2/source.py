@@ -18,7 +18,7 @@ from contextlib import suppress
 from json import dumps
 from pathlib import Path
 from threading import Event, Lock, Thread
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from hybridlog.formats.yaml_values import YamlError, parse_yaml, read_yaml
 from hybridlog.live.sources.base import ThreadedSource, one_line
@@ -386,12 +386,19 @@ def environment_for(python: str, domain_id: int | None) -> dict[str, str]:
 
 MAX_DEPTH = 1_000_000
 
-_POLICIES = {
+_POLICIES: Final[dict[object, dict[str, int]]] = {
     "history": {"system_default": 0, "keep_last": 1, "keep_all": 2},
     "reliability": {"system_default": 0, "reliable": 1, "best_effort": 2},
     "durability": {"system_default": 0, "transient_local": 1, "volatile": 2},
     "liveliness": {"system_default": 0, "automatic": 1, "manual_by_topic": 3},
 }
+_VALUES: Final[dict[object, str]] = {
+    **{name: f"one of {', '.join(words)}" for name, words in _POLICIES.items()},
+    **dict.fromkeys(DURATIONS, "a duration, {sec: 1, nsec: 0}"),
+    "depth": f"a number from 1 to {MAX_DEPTH}",
+    "avoid_ros_namespace_conventions": "true or false",
+}
+"""What each policy may be, in words."""
 
 
 def read_overrides(path: Path) -> dict[str, dict[str, Any]]:
@@ -419,33 +426,20 @@ def read_overrides(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def _policy(name: object, value: object, where: str) -> int:
-    """The number of a policy."""
-    if name in DURATIONS:
-        return _duration(value, f"{where}: {name}")
-    if name == "depth":
-        if isinstance(value, bool) or not isinstance(value, int) or not 0 < value <= MAX_DEPTH:
-            raise UsageError(
-                f"{where}: depth is a number from 1 to {MAX_DEPTH}, not {reprlib.repr(value)}"
-            )
-        return value
-    if name == "avoid_ros_namespace_conventions":
-        if not isinstance(value, bool):
-            raise UsageError(f"{where}: {name} is true or false, not {reprlib.repr(value)}")
-        return value
-    words = _POLICIES.get(name) if isinstance(name, str) else None
-    if words is None:
+    """The number of a policy; of a duration, ns."""
+    match value:
+        case bool() if name == "avoid_ros_namespace_conventions":
+            return value
+        case bool():
+            pass
+        case int() if name == "depth" and 0 < value <= MAX_DEPTH:
+            return value
+        case str() if value.lower() in _POLICIES.get(name, ()):
+            return _POLICIES[name][value.lower()]
+        case {"sec": int(sec), "nsec": int(nsec), **more} if name in DURATIONS and not more:
+            if min(sec, nsec) >= 0:
+                return min(sec * 1_000_000_000 + nsec, FOREVER)
+    if name not in _VALUES:
         known = ", ".join(Profile._fields)
         raise UsageError(f"{where}: unknown policy {name!r}; choose one of {known}")
-    number = words.get(value.lower()) if isinstance(value, str) else None
-    if number is None:
-        raise UsageError(f"{where}: {name} is one of {', '.join(words)}, not {reprlib.repr(value)}")
-    return number
-
-
-def _duration(value: object, where: str) -> int:
-    """A duration in ns."""
-    if isinstance(value, dict) and set(value) == {"sec", "nsec"}:
-        sec, nsec = value["sec"], value["nsec"]
-        if all(isinstance(part, int) and part >= 0 for part in (sec, nsec)):
-            return int(min(sec * 1_000_000_000 + nsec, FOREVER))
-    raise UsageError(f"{where} is a duration, {{sec: 1, nsec: 0}}, not {reprlib.repr(value)}")
+    raise UsageError(f"{where}: {name} is {_VALUES[name]}, not {reprlib.repr(value)}")
