@@ -12,9 +12,7 @@ import asyncio
 import contextlib
 import socket
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Final, Literal
-
-import msgspec
+from typing import TYPE_CHECKING, Final
 
 from hybridlog.live.sources.base import PeerError, one_line
 from hybridlog.live.sources.network import PATIENCE_S, Endpoint, Network, UnreachedError, reason_of
@@ -253,11 +251,6 @@ ANY: Final = "*"
 """Wildcard of subscribers, and of relays that do not know their type yet."""
 
 _MAX_FIELDS = 1000
-_Protocol = tuple[
-    Literal["TCPROS"],
-    Annotated[str, msgspec.Meta(min_length=1)],
-    Annotated[int, msgspec.Meta(ge=1, lt=65536)],
-]
 
 
 def encode_header(fields: Mapping[str, str]) -> bytes:
@@ -335,11 +328,10 @@ async def subscribe(
 
 def _place_of(protocol: object) -> Endpoint:
     """The endpoint in a publisher's answer to `requestTopic`."""
-    try:
-        _, host, port = msgspec.convert(protocol, _Protocol)
-    except msgspec.ValidationError as error:
-        raise PeerError("it does not offer the topic over TCPROS") from error
-    return Endpoint(host, port)
+    match protocol:
+        case ["TCPROS", str(host), int(port)] if host and 0 < port < 65536:
+            return Endpoint(host, port)
+    raise PeerError("it does not offer the topic over TCPROS")
 
 
 async def _exchange_headers(connected: socket.socket, caller: str, topic: str) -> dict[str, str]:
