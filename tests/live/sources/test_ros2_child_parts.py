@@ -15,7 +15,8 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from hybridlog.live.sources.ros2.child import qos, topics
+from hybridlog.live.sources.ros2.child import middleware as qos
+from hybridlog.live.sources.ros2.child import topics
 from hybridlog.live.sources.ros2.child.child import Child
 from hybridlog.live.sources.ros2.child.definitions import (
     Definition,
@@ -25,14 +26,13 @@ from hybridlog.live.sources.ros2.child.definitions import (
 from hybridlog.live.sources.ros2.child.middleware import (
     VARIABLES,
     Offer,
+    Profile,
     default_profile,
     is_set_up,
     profile,
 )
-from hybridlog.live.sources.ros2.child.outbox import Outbox
-from hybridlog.live.sources.ros2.child.qos import Profile
+from hybridlog.live.sources.ros2.child.outbox import MAX_PAYLOAD, Outbox
 from hybridlog.live.sources.ros2.child.topics import Topics
-from hybridlog.live.sources.ros2.child.wire import MAX_PAYLOAD
 from hybridlog.live.sources.ros2.receiver import Receiver
 from tests.imports import ROOT, imports_of
 from tests.limits import Limit
@@ -95,12 +95,22 @@ def test_without_a_folder_for_the_profile_ros_comes_up_all_the_same(
 def test_what_is_asked_for_fits_all_publishers() -> None:
     best = Profile(reliability=qos.RELIABLE, durability=qos.TRANSIENT_LOCAL)
     poor = Profile(reliability=qos.BEST_EFFORT, durability=qos.VOLATILE)
-    assert qos.request([best, best], 7, {})[:4] == (1, 7, qos.RELIABLE, qos.TRANSIENT_LOCAL)
+    assert qos.request([best, best], 7, {})[:4] == (
+        1,
+        7,
+        qos.RELIABLE,
+        qos.TRANSIENT_LOCAL,
+    )
     mixed = qos.request([best, poor], 7, {})
     assert mixed[:4] == (1, 7, qos.BEST_EFFORT, qos.VOLATILE)
     assert not qos.conflicts(best, mixed)
     assert not qos.conflicts(poor, mixed)
-    assert qos.request([best], 7, {"depth": 3, "durability": qos.VOLATILE})[:4] == (1, 3, 1, 2)
+    assert qos.request([best], 7, {"depth": 3, "durability": qos.VOLATILE})[:4] == (
+        1,
+        3,
+        1,
+        2,
+    )
 
 
 @pytest.mark.parametrize(
@@ -122,7 +132,10 @@ def test_conflicts(offer: dict[str, int], wanted: dict[str, int], names: list[st
 
 def test_offers_are_written_as_bags_have_them() -> None:
     text = qos.offered_text(
-        [Profile(3, 0, 1, 1, qos.FOREVER, 10_000_000_000, 1, qos.FOREVER), Profile(depth=5)]
+        [
+            Profile(3, 0, 1, 1, qos.FOREVER, 10_000_000_000, 1, qos.FOREVER),
+            Profile(depth=5),
+        ]
     )
     assert text.startswith(
         "- history: 3\n  depth: 0\n  reliability: 1\n  durability: 1\n"
@@ -315,7 +328,11 @@ def live_topic(
 
 @pytest.mark.parametrize(
     ("kind", "depth"),
-    [("T", qos.DEPTH), ("Arrays", qos.DEPTH_OF_ARRAYS), ("Bytes", qos.DEPTH_OF_BYTES)],
+    [
+        ("T", qos.DEPTH),
+        ("Arrays", qos.DEPTH_OF_ARRAYS),
+        ("Bytes", qos.DEPTH_OF_BYTES),
+    ],
 )
 def test_types_that_may_be_large_have_shorter_queues(tmp_path: Path, kind: str, depth: int) -> None:
     rig = live_topic(tmp_path, offer(), kind=f"a/msg/{kind}")

@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 from hybridlog.formats.yaml_values import YamlError, parse_yaml, read_yaml
 from hybridlog.live.sources.base import ThreadedSource, one_line
-from hybridlog.live.sources.ros2.child.qos import DURATIONS, FOREVER, Profile
-from hybridlog.live.sources.ros2.child.wire import (
+from hybridlog.live.sources.ros2.child.middleware import DURATIONS, FOREVER, Profile
+from hybridlog.live.sources.ros2.child.outbox import (
     EVENT,
     HEADER,
     WireError,
