@@ -55,23 +55,15 @@ class Ros2Source(ThreadedSource):
             `HYBRIDLOG_ROS2_PYTHON`; else `python3` if a ROS environment is sourced; else
             the current one.
         qos_overrides: YAML file with QoS profiles by topic, in the format of rosbag2.
-        domain_id: ROS domain, None for that of the environment.
     """
 
     kind = "ROS 2"
 
-    def __init__(
-        self,
-        python: str | None = None,
-        qos_overrides: Path | None = None,
-        domain_id: int | None = None,
-    ) -> None:
+    def __init__(self, python: str | None = None, qos_overrides: Path | None = None) -> None:
         super().__init__()
-        domain = os.environ.get("ROS_DOMAIN_ID") or "0"
-        self.address = f"domain {domain if domain_id is None else domain_id}"
+        self.address = f"domain {os.environ.get('ROS_DOMAIN_ID') or '0'}"
         self._python = python
         self._overrides = qos_overrides
-        self._domain_id = domain_id
         self._lock = Lock()
         self._child: Process | None = None
         self._settings: dict[str, object] = {}
@@ -96,7 +88,7 @@ class Ros2Source(ThreadedSource):
         overrides = {} if self._overrides is None else read_overrides(self._overrides)
         settings = self._settings = {"overrides": overrides}
         try:
-            child, self._python = launch(self._python, settings, self._domain_id, self._stopping)
+            child, self._python = launch(self._python, settings, self._stopping)
         except ChildError as error:
             raise SourceError(
                 f"ROS 2 does not start: {one_line(str(error))}; does `ros2 topic list` work?"
@@ -168,7 +160,7 @@ class Ros2Source(ThreadedSource):
         while not self._stopping.wait(pause):
             pause = min(2 * pause, _MAX_PAUSE_S)
             try:
-                child, _ = launch(self._python, self._settings, self._domain_id, self._stopping)
+                child, _ = launch(self._python, self._settings, self._stopping)
             except (ChildError, MissingDependencyError) as error:
                 if self._stopping.is_set():
                     break
@@ -341,17 +333,16 @@ class Process:
 
 
 def launch(
-    python: str | None, settings: Mapping[str, Any], domain_id: int | None, cancelled: Event
+    python: str | None, settings: Mapping[str, Any], cancelled: Event
 ) -> tuple[Process, str]:
     """Starts a child under the first Python that has rclpy; returns also its interpreter.
 
-    Of `candidates`, or `python` alone if it is given; `cancelled` is set to give up. Without
-    `domain_id` it is that of the environment.
+    Of `candidates`, or `python` alone if it is given; `cancelled` is set to give up.
     """
     tried = []
     for name in [python] if python else candidates(os.environ):
         try:
-            environment = environment_for(name, domain_id)
+            environment = environment_for(name)
             return Process(name, settings, environment, cancelled), name
         except ChildMissingError as error:
             tried.append(str(error))
@@ -373,14 +364,12 @@ def candidates(environment: Mapping[str, str]) -> Sequence[str]:
     return list(dict.fromkeys([*found, sys.executable]))
 
 
-def environment_for(python: str, domain_id: int | None) -> dict[str, str]:
+def environment_for(python: str) -> dict[str, str]:
     """The environment of a child."""
     found = dict(os.environ)
     if python != sys.executable:
         # The wheels set this once they have found their libraries, and the child has others.
         found.pop("_ROS_WHEELS_BOOTSTRAP_COMPLETE", None)
-    if domain_id is not None:
-        found["ROS_DOMAIN_ID"] = str(domain_id)
     return found
 
 
