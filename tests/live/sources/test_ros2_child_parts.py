@@ -18,19 +18,8 @@ import pytest
 from hybridlog.live.sources.ros2.child import middleware as qos
 from hybridlog.live.sources.ros2.child import topics
 from hybridlog.live.sources.ros2.child.child import Child
-from hybridlog.live.sources.ros2.child.definitions import (
-    Definition,
-    Definitions,
-    UnknownTypeError,
-)
-from hybridlog.live.sources.ros2.child.middleware import (
-    VARIABLES,
-    Offer,
-    Profile,
-    default_profile,
-    is_set_up,
-    profile,
-)
+from hybridlog.live.sources.ros2.child.definitions import Definition, Definitions, UnknownTypeError
+from hybridlog.live.sources.ros2.child.middleware import VARIABLES, Offer, Profile
 from hybridlog.live.sources.ros2.child.outbox import MAX_PAYLOAD, Outbox
 from hybridlog.live.sources.ros2.child.topics import Topics
 from hybridlog.live.sources.ros2.receiver import Receiver
@@ -50,7 +39,7 @@ def test_the_profile_is_there_while_ros_comes_up_and_no_longer(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     environment: dict[str, str] = {"PATH": "x"}
-    with default_profile(environment) as is_used:
+    with qos.default_profile(environment) as is_used:
         assert is_used
         [name] = {environment[variable] for variable in VARIABLES}
         tree = ET.parse(name)
@@ -65,20 +54,20 @@ def test_the_profile_is_there_while_ros_comes_up_and_no_longer(
     [("212992\n", 212992), ("1000", 1 << 17), ("", 1 << 17), ("-5", 1 << 17), ("9" * 30, 32 << 20)],
 )
 def test_sockets_are_asked_for_what_the_kernel_allows(allowed: str, size: int) -> None:
-    assert f"<receiveBufferSize>{size}<" in profile(allowed)
+    assert f"<receiveBufferSize>{size}<" in qos.profile(allowed)
 
 
 @pytest.mark.parametrize("name", [*VARIABLES, "FASTDDS_BUILTIN_TRANSPORTS", "ROS2_EASY_MODE"])
 def test_what_the_user_has_set_up_is_left_alone(tmp_path: Path, name: str) -> None:
     environment = {name: "theirs"}
-    assert is_set_up(environment, tmp_path)
-    with default_profile(environment) as is_used:
+    assert qos.is_set_up(environment, tmp_path)
+    with qos.default_profile(environment) as is_used:
         assert not is_used
         assert environment == {name: "theirs"}
     assert environment == {name: "theirs"}
-    assert not is_set_up({name: ""}, tmp_path)
+    assert not qos.is_set_up({name: ""}, tmp_path)
     (tmp_path / "DEFAULT_FASTDDS_PROFILES.xml").touch()
-    assert is_set_up({}, tmp_path)
+    assert qos.is_set_up({}, tmp_path)
 
 
 def test_without_a_folder_for_the_profile_ros_comes_up_all_the_same(
@@ -87,7 +76,7 @@ def test_without_a_folder_for_the_profile_ros_comes_up_all_the_same(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "missing"))
     environment: dict[str, str] = {}
-    with default_profile(environment) as is_used:
+    with qos.default_profile(environment) as is_used:
         assert not is_used
         assert not environment
 
@@ -95,22 +84,12 @@ def test_without_a_folder_for_the_profile_ros_comes_up_all_the_same(
 def test_what_is_asked_for_fits_all_publishers() -> None:
     best = Profile(reliability=qos.RELIABLE, durability=qos.TRANSIENT_LOCAL)
     poor = Profile(reliability=qos.BEST_EFFORT, durability=qos.VOLATILE)
-    assert qos.request([best, best], 7, {})[:4] == (
-        1,
-        7,
-        qos.RELIABLE,
-        qos.TRANSIENT_LOCAL,
-    )
+    assert qos.request([best, best], 7, {})[:4] == (1, 7, qos.RELIABLE, qos.TRANSIENT_LOCAL)
     mixed = qos.request([best, poor], 7, {})
     assert mixed[:4] == (1, 7, qos.BEST_EFFORT, qos.VOLATILE)
     assert not qos.conflicts(best, mixed)
     assert not qos.conflicts(poor, mixed)
-    assert qos.request([best], 7, {"depth": 3, "durability": qos.VOLATILE})[:4] == (
-        1,
-        3,
-        1,
-        2,
-    )
+    assert qos.request([best], 7, {"depth": 3, "durability": qos.VOLATILE})[:4] == (1, 3, 1, 2)
 
 
 @pytest.mark.parametrize(
@@ -132,10 +111,7 @@ def test_conflicts(offer: dict[str, int], wanted: dict[str, int], names: list[st
 
 def test_offers_are_written_as_bags_have_them() -> None:
     text = qos.offered_text(
-        [
-            Profile(3, 0, 1, 1, qos.FOREVER, 10_000_000_000, 1, qos.FOREVER),
-            Profile(depth=5),
-        ]
+        [Profile(3, 0, 1, 1, qos.FOREVER, 10_000_000_000, 1, qos.FOREVER), Profile(depth=5)]
     )
     assert text.startswith(
         "- history: 3\n  depth: 0\n  reliability: 1\n  durability: 1\n"
@@ -328,11 +304,7 @@ def live_topic(
 
 @pytest.mark.parametrize(
     ("kind", "depth"),
-    [
-        ("T", qos.DEPTH),
-        ("Arrays", qos.DEPTH_OF_ARRAYS),
-        ("Bytes", qos.DEPTH_OF_BYTES),
-    ],
+    [("T", qos.DEPTH), ("Arrays", qos.DEPTH_OF_ARRAYS), ("Bytes", qos.DEPTH_OF_BYTES)],
 )
 def test_types_that_may_be_large_have_shorter_queues(tmp_path: Path, kind: str, depth: int) -> None:
     rig = live_topic(tmp_path, offer(), kind=f"a/msg/{kind}")
