@@ -27,7 +27,6 @@ from hybridlog.live.memory import resident_bytes
 from hybridlog.live.policy import (
     SMALL_BYTES,
     WHOLE_BELOW,
-    Priority,
     Rule,
     Throttle,
     first_fit,
@@ -115,7 +114,7 @@ class _RecordedChannel:
     channel: Channel
     tally: Tally
     throttle: Throttle | None
-    priority: Priority
+    whole_below: float
     reduced: Channel | None = None
     is_complete: bool = False
 
@@ -521,7 +520,7 @@ class Recorder:
         if self._refused is not None:
             self._lose(recorded, *self._refused, received)
             return
-        whole = size <= SMALL_BYTES or self._target.filled < WHOLE_BELOW[recorded.priority]
+        whole = size <= SMALL_BYTES or self._target.filled < recorded.whole_below
         number = 0 if sequence is None else sequence % _SEQUENCES
         try:
             if whole and self._target.write(
@@ -613,7 +612,7 @@ class Recorder:
                     channel,
                     Tally(),
                     None if hz is None else Throttle(hz),
-                    Priority.NORMAL if priority is None else Priority(int(priority)),
+                    WHOLE_BELOW["normal"] if priority is None else priority,
                 )
                 self._topic(topic, type_name).tallies.append(recorded.tally)
                 self._recorded_by_content[content] = recorded
