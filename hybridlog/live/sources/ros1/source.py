@@ -231,7 +231,6 @@ class Graph:
         self._reached = reached
         self._subscriptions: dict[str, Subscription] = {}
         self._types: dict[str, str] = {}
-        self._listed: dict[str, frozenset[str]] = {}
         self._wanted: dict[str, tuple[str, bool]] = {}
         self._hint = asyncio.Event()
         self._hinted: set[str] = set()
@@ -285,7 +284,7 @@ class Graph:
         try:
             state = await self._master.state()
             self._reached()
-            await self._learn_types(state)
+            self._types = await self._master.types()
             self._choose(context, state)
             stale = [
                 subscription
@@ -298,18 +297,6 @@ class Graph:
         except PeerError:
             self._hinted |= hinted
             raise
-
-    async def _learn_types(self, state: State) -> None:
-        """Asks for types if a topic is new or its type was unknown."""
-        before, self._listed = self._listed, state.publishers
-        if any(
-            topic not in before or self._types.get(topic, ANY) == ANY for topic in state.publishers
-        ):
-            try:
-                self._types = await self._master.types()
-            except PeerError:
-                self._listed = before
-                raise
 
     def _choose(self, context: Context, state: State) -> None:
         """Adds a subscription for each wanted topic without one."""
