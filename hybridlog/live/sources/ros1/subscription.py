@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 _FIRST_PAUSE_S: Final = 0.25
 _MAX_PAUSE_S: Final = 10.0
 _STABLE_S: Final = 10.0
-_MAX_CHANNELS: Final = 64
+_MAX_TYPES: Final = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,6 @@ class Subscription:
         self._links: dict[str, _Link] = {}
         self._type = ""
         self._types: dict[str, bool] = {}
-        self._channels: dict[tuple[tuple[str, str], ...], Channel] = {}
         self._reported = (False, "")
 
     def update(self, type_name: str, uris: Iterable[str], *, is_wanted: bool) -> None:
@@ -93,18 +92,12 @@ class Subscription:
             self._context.sink.topic_gone(self.topic)
 
     def channel(self, fields: Mapping[str, str]) -> Channel | None:
-        """The channel of a connection, the same for the same header; None if it is unwanted."""
+        """The channel of a connection; None if it is unwanted."""
         type_name = fields.get("type", "")
         if type_name and type_name != ANY and not self._takes(type_name, fields):
             return None
-        key = tuple(sorted(fields.items()))
-        channel = self._channels.pop(key, None)
-        if channel is None:
-            channel = channel_of(self.topic, fields)
-            self._context.sink.expect(channel)
-        self._channels[key] = channel
-        if len(self._channels) > _MAX_CHANNELS:
-            del self._channels[next(iter(self._channels))]
+        channel = channel_of(self.topic, fields)
+        self._context.sink.expect(channel)
         return channel
 
     def _takes(self, type_name: str, fields: Mapping[str, str]) -> bool:
@@ -121,7 +114,7 @@ class Subscription:
         wanted = self._types.get(type_name)
         if wanted is None:
             wanted = self._context.sink.wants(self.topic, type_name)
-            if len(self._types) < _MAX_CHANNELS:
+            if len(self._types) < _MAX_TYPES:
                 self._types[type_name] = wanted
         return wanted
 
