@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 _FIRST_PAUSE_S: Final = 0.25
 _MAX_PAUSE_S: Final = 10.0
 _STABLE_S: Final = 10.0
-_MAX_TYPES: Final = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,10 +57,9 @@ class Subscription:
         self._context = context
         self._links: dict[str, _Link] = {}
         self._type = ""
-        self._types: dict[str, bool] = {}
         self._reported = (False, "")
 
-    def update(self, type_name: str, uris: Iterable[str], *, is_wanted: bool) -> None:
+    def update(self, type_name: str, uris: Iterable[str]) -> None:
         """Updates the publishers, by their addresses.
 
         A connection to a publisher that is no longer listed goes on until it ends: a restarted
@@ -69,7 +67,6 @@ class Subscription:
         """
         if type_name:
             self._type = type_name
-            self._types[type_name] = is_wanted
         listed = set(uris)
         for uri, link in tuple(self._links.items()):
             link.list(is_listed=uri in listed)
@@ -111,12 +108,7 @@ class Subscription:
                 f"{one_line(self._type)} or {one_line(type_name)} (from {publisher}); "
                 "both are recorded"
             )
-        wanted = self._types.get(type_name)
-        if wanted is None:
-            wanted = self._context.sink.wants(self.topic, type_name)
-            if len(self._types) < _MAX_TYPES:
-                self._types[type_name] = wanted
-        return wanted
+        return self._context.sink.wants(self.topic, type_name)
 
     async def _reconnect(self, uri: str, link: _Link) -> None:
         await link.run(self._context)
