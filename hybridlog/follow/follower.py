@@ -16,7 +16,7 @@ from collections.abc import Set as AbstractSet
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from queue import Empty, SimpleQueue
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -586,18 +586,6 @@ def in_thread(
     return lambda entry: FollowerThread(Follower(directory, catalog, entry, target), interval_s)
 
 
-class Brought(NamedTuple):
-    """What a follower has made of an ended recording.
-
-    Attributes:
-        chunks: Number of chunks whose documents were made; None if nothing was missing.
-        problem: Why no tables were made; empty if they were.
-    """
-
-    chunks: int | None
-    problem: str = ""
-
-
 def bring(
     directory: StoreDirectory,
     catalog: Catalog,
@@ -609,8 +597,8 @@ def bring(
     until: float = math.inf,
     wait_s: float = 0.0,
     progress: Progress | None = None,
-) -> Brought:
-    """Bring what is derived of an ended recording up to date.
+) -> Follower | None:
+    """Bring what is derived of an ended recording up to date; None if nothing was missing.
 
     Args:
         directory: The store.
@@ -634,12 +622,11 @@ def bring(
         # Read now that it is locked: another process may have changed it meanwhile.
         entry = put_entry(directory, catalog, known.id)
         wanted = missing(directory, entry).union(topics)
-        done: dict[str, str] = {}
-        is_whole = True
+        done, is_whole = dict[str, str](), True
         if database is not None:
             done, is_whole = begin_again(database, entry, anew=anew)
         if is_whole and entry.is_decoded and not wanted:
-            return Brought(None)
+            return None
         follower = Follower(
             directory,
             catalog,
@@ -653,7 +640,7 @@ def bring(
         follower.finish(entry)
     if follower.failure is not None:
         raise follower.failure
-    return Brought(follower.made, follower.problem)
+    return follower
 
 
 def begin_again(
@@ -686,6 +673,7 @@ def make_tables(
     if not directory.is_writable:
         return "the store is read-only"
     try:
-        return bring(directory, catalog, entry, **options).problem
+        follower = bring(directory, catalog, entry, **options)
+        return "" if follower is None else follower.problem
     except (StoreError, TopicError) as error:
         return str(error)
