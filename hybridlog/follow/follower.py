@@ -12,7 +12,6 @@ import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from collections.abc import Set as AbstractSet
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from queue import Empty, SimpleQueue
@@ -28,7 +27,7 @@ from hybridlog.index.indexing import ChunkIndexer
 from hybridlog.maintenance.expiry import make_rows
 from hybridlog.maintenance.report import reporter
 from hybridlog.maintenance.retention import Rules
-from hybridlog.maintenance.tables import channels_of, missing
+from hybridlog.maintenance.tables import missing
 from hybridlog_storage.catalog import decoded_in, file_of
 from hybridlog_storage.errors import (
     DatabaseError,
@@ -350,14 +349,13 @@ class Follower:
         self._segments.clear()
 
     def _read_sealed(self, entry: RecordingEntry) -> None:
-        in_tables = None if self._topics is None else channels_of(entry, self._topics)
         rows, done = RecordingRows(self._path), 0
         for number in [n for n, _, _ in entry.spans if str(n) in entry.digests]:
             with open_log(self._path / file_of(entry, number), number, rows) as reader:
                 report = reporter(self._progress, entry.name, entry.stored_bytes, done)
                 if number not in self._ended:
                     digest = entry.digests[str(number)]
-                    self._read_segment(entry, reader, digest, in_tables, report)
+                    self._read_segment(entry, reader, digest, report)
                 done += reader.size
                 report(reader.size)
 
@@ -366,7 +364,6 @@ class Follower:
         entry: RecordingEntry,
         reader: SegmentReader,
         digest: str,
-        in_tables: AbstractSet[int] | None = None,
         report: Callable[[int], None] = lambda _: None,
     ) -> None:
         """Read what is left of a sealed segment."""
@@ -376,8 +373,9 @@ class Follower:
         places = summary.chunks
         if not segment.is_wanted and self._catalog.decoded(entry, number) is not None:
             segment.is_decoded = True
-            if in_tables is not None:
-                places = [one for one in places if not in_tables.isdisjoint(one.channels)]
+            if self._topics is not None:
+                wanted = {one.id for one in entry.channels if one.topic in self._topics}
+                places = [one for one in places if not wanted.isdisjoint(one.channels)]
         for group in self._groups(number, reader, places):
             if time.monotonic() > self._until:
                 raise TimeoutError
