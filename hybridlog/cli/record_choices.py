@@ -162,7 +162,10 @@ class RecordChoices(Between, Latched, InStore, AsJson, Quiet):
         default="1s",
     )
     ring: float | None = _live(
-        "Keep only the last TIME, and what is pinned.", "TIME", type=SOME_SECONDS
+        "Keep only the last TIME, and what is pinned.",
+        "TIME",
+        type=Amount(parse_seconds, "1ns", "24h"),
+        excludes=("use_sim_time", "contract"),
     )
     trigger: tuple[str, ...] = _live(
         "Mark and pin what is around such a message: '/diagnostics: status[*].level >= 2'.",
@@ -171,9 +174,11 @@ class RecordChoices(Between, Latched, InStore, AsJson, Quiet):
     before: float | None = _live(
         "Pin so much before a trigger or SIGUSR1; without, all that the ring has.",
         "TIME",
-        type=SECONDS,
+        type=Amount(parse_seconds, most="24h"),
     )
-    after: float | None = _live("Pin so much after it.", "TIME", type=SECONDS)
+    after: float | None = _live(
+        "Pin so much after it.", "TIME", type=Amount(parse_seconds, most="24h")
+    )
     contract: Path | None = _live(
         "Tell and mark topics that are silent for longer than the rules in this file allow, "
         "and judge the recording at its end.",

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
     from hybridlog.schema.codec import Codec
     from hybridlog_storage.manifest import File
     from hybridlog_storage.messages import Channel
@@ -38,6 +36,7 @@ _GROUP_BYTES: Final = 4 << 20  # of a row group in memory
 _LEVEL: Final = 3  # of zstd: 9 takes 1 to 5 % less, for much more time
 _MAX_OPEN = 8  # files of different columns: each row group of them waits in memory
 _Kind = tuple[str, str, bool]  # topic, hash of its definition, whether messages are reduced
+_Part = tuple[int, int, int, int]  # messages, bytes, first and last time
 
 
 @dataclass(slots=True)
@@ -59,7 +58,7 @@ class _OpenFile:
     waiting: int = 0
     pending: list[tuple[int, int]] = field(default_factory=list)
     chunks: list[list[tuple[int, int]]] = field(default_factory=list)
-    parts: defaultdict[int, list[Part]] = field(default_factory=lambda: defaultdict(list))
+    parts: defaultdict[int, list[_Part]] = field(default_factory=lambda: defaultdict(list))
 
 
 class RowsWriter:
@@ -106,7 +105,9 @@ class RowsWriter:
             file.pending.append((chunk.number, table.num_rows))
             for number in numbers:
                 own = chunk.batch.channel == number
-                file.parts[number].append(_part(chunk, own))
+                times, size = chunk.batch.log_time[own], int(chunk.batch.places[1][own].sum())
+                part = len(times), size, int(times.min()), int(times.max())
+                file.parts[number].append(part)
             if file.waiting >= _GROUP_BYTES:
                 self._flush(file)
 
@@ -141,7 +142,11 @@ class RowsWriter:
     def _finish(self, file: _OpenFile) -> None:
         if file.tables:
             self._flush(file)
-        parts = {number: _joined(own) for number, own in sorted(file.parts.items())}
+        parts = {
+            number: Part(sum(messages), sum(sizes), min(first), max(last))
+            for number, own in sorted(file.parts.items())
+            for messages, sizes, first, last in [zip(*own, strict=True)]
+        }
         rows = sum(part.messages for part in parts.values())
         digests = {str(self._log.number): self._log.digest}
         section = Section(self._folder.name, file.topic, 0, digests, TopicCounts(rows))
@@ -185,18 +190,3 @@ def _table(
         "surplus": pa.array(surplus),
     }
     return as_table({**piece.own, "ref": structs(more, len(rows))}, piece.fields)
-
-
-def _part(chunk: StoredChunk, own: NDArray[np.bool_]) -> Part:
-    times = chunk.batch.log_time[own]
-    size = int(chunk.batch.places[1][own].sum())
-    return Part(len(times), size, int(times.min()), int(times.max()))
-
-
-def _joined(parts: list[Part]) -> Part:
-    return Part(
-        sum(part.messages for part in parts),
-        sum(part.bytes for part in parts),
-        min(part.first for part in parts if part.first is not None),
-        max(part.last for part in parts if part.last is not None),
-    )

@@ -12,11 +12,10 @@ import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from collections.abc import Set as AbstractSet
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from queue import Empty, SimpleQueue
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -28,7 +27,7 @@ from hybridlog.index.indexing import ChunkIndexer
 from hybridlog.maintenance.expiry import make_rows
 from hybridlog.maintenance.report import reporter
 from hybridlog.maintenance.retention import Rules
-from hybridlog.maintenance.tables import channels_of, missing
+from hybridlog.maintenance.tables import missing
 from hybridlog_storage.catalog import decoded_in, file_of
 from hybridlog_storage.errors import (
     DatabaseError,
@@ -350,14 +349,13 @@ class Follower:
         self._segments.clear()
 
     def _read_sealed(self, entry: RecordingEntry) -> None:
-        in_tables = None if self._topics is None else channels_of(entry, self._topics)
         rows, done = RecordingRows(self._path), 0
         for number in [n for n, _, _ in entry.spans if str(n) in entry.digests]:
             with open_log(self._path / file_of(entry, number), number, rows) as reader:
                 report = reporter(self._progress, entry.name, entry.stored_bytes, done)
                 if number not in self._ended:
                     digest = entry.digests[str(number)]
-                    self._read_segment(entry, reader, digest, in_tables, report)
+                    self._read_segment(entry, reader, digest, report)
                 done += reader.size
                 report(reader.size)
 
@@ -366,7 +364,6 @@ class Follower:
         entry: RecordingEntry,
         reader: SegmentReader,
         digest: str,
-        in_tables: AbstractSet[int] | None = None,
         report: Callable[[int], None] = lambda _: None,
     ) -> None:
         """Read what is left of a sealed segment."""
@@ -376,8 +373,9 @@ class Follower:
         places = summary.chunks
         if not segment.is_wanted and self._catalog.decoded(entry, number) is not None:
             segment.is_decoded = True
-            if in_tables is not None:
-                places = [one for one in places if not in_tables.isdisjoint(one.channels)]
+            if self._topics is not None:
+                wanted = {one.id for one in entry.channels if one.topic in self._topics}
+                places = [one for one in places if not wanted.isdisjoint(one.channels)]
         for group in self._groups(number, reader, places):
             if time.monotonic() > self._until:
                 raise TimeoutError
@@ -586,18 +584,6 @@ def in_thread(
     return lambda entry: FollowerThread(Follower(directory, catalog, entry, target), interval_s)
 
 
-class Brought(NamedTuple):
-    """What a follower has made of an ended recording.
-
-    Attributes:
-        chunks: Number of chunks whose documents were made; None if nothing was missing.
-        problem: Why no tables were made; empty if they were.
-    """
-
-    chunks: int | None
-    problem: str = ""
-
-
 def bring(
     directory: StoreDirectory,
     catalog: Catalog,
@@ -609,8 +595,8 @@ def bring(
     until: float = math.inf,
     wait_s: float = 0.0,
     progress: Progress | None = None,
-) -> Brought:
-    """Bring what is derived of an ended recording up to date.
+) -> Follower | None:
+    """Bring what is derived of an ended recording up to date; None if nothing was missing.
 
     Args:
         directory: The store.
@@ -634,12 +620,11 @@ def bring(
         # Read now that it is locked: another process may have changed it meanwhile.
         entry = put_entry(directory, catalog, known.id)
         wanted = missing(directory, entry).union(topics)
-        done: dict[str, str] = {}
-        is_whole = True
+        done, is_whole = dict[str, str](), True
         if database is not None:
             done, is_whole = begin_again(database, entry, anew=anew)
         if is_whole and entry.is_decoded and not wanted:
-            return Brought(None)
+            return None
         follower = Follower(
             directory,
             catalog,
@@ -653,7 +638,7 @@ def bring(
         follower.finish(entry)
     if follower.failure is not None:
         raise follower.failure
-    return Brought(follower.made, follower.problem)
+    return follower
 
 
 def begin_again(
@@ -686,6 +671,7 @@ def make_tables(
     if not directory.is_writable:
         return "the store is read-only"
     try:
-        return bring(directory, catalog, entry, **options).problem
+        follower = bring(directory, catalog, entry, **options)
+        return "" if follower is None else follower.problem
     except (StoreError, TopicError) as error:
         return str(error)

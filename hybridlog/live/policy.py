@@ -10,7 +10,6 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import IntEnum
 from typing import Final
 
 from hybridlog.query.topics import TopicMatcher, matcher
@@ -23,21 +22,13 @@ _RATE = re.compile(r"(\d+(?:\.\d+)?)\s*(?:hz)?", re.IGNORECASE)
 _HIGHEST_HZ = 1e6
 
 
-class Priority(IntEnum):
-    """Priority of a topic's payloads while the memory budget fills."""
-
-    LOW = 0
-    NORMAL = 1
-    HIGH = 2
-
-
-WHOLE_BELOW: Final = {Priority.LOW: 0.5, Priority.NORMAL: 0.7, Priority.HIGH: 0.9}
+WHOLE_BELOW: Final = {"low": 0.5, "normal": 0.7, "high": 0.9}
 """Shares of the budget above which large messages of a priority keep their fields only."""
 
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """A setting for the topics that match a pattern: a rate in Hz, or a `Priority`."""
+    """A setting for the topics that match a pattern: a rate in Hz, or a share of the budget."""
 
     pattern: str
     fits: TopicMatcher
@@ -66,7 +57,7 @@ def priority_rule(pattern: str, word: str) -> Rule:
         TopicError: The pattern is malformed.
     """
     try:
-        return Rule(pattern, matcher([pattern]), Priority[word.strip().upper()])
+        return Rule(pattern, matcher([pattern]), WHOLE_BELOW[word.strip().lower()])
     except KeyError:
         raise UsageError(f"Unknown priority {word!r}; choose low, normal or high.") from None
 

@@ -27,7 +27,6 @@ from hybridlog.live.memory import resident_bytes
 from hybridlog.live.policy import (
     SMALL_BYTES,
     WHOLE_BELOW,
-    Priority,
     Rule,
     Throttle,
     first_fit,
@@ -71,7 +70,6 @@ _MAX_EXPECTED = 1000  # channels whose definitions are parsed before their first
 _SEQUENCES = 1 << 32
 _HELD_SHARE = 8  # of the memory budget, for messages that come before `/clock`
 _CLOCK_WAIT_S = 5.0
-_MAX_S = 86_400.0  # of a ring, and of what is pinned
 _SETTLED_S = 3.0  # after the first topic, when others may have come
 _SLOW_WRITE_S = 2.0  # to pack and write a chunk, on a disk that is busy
 
@@ -103,23 +101,10 @@ class RecorderOptions(LiveOptions):
     derives: bool = True
 
     def __post_init__(self) -> None:
-        """Refuse limits that would stop the recorder at once, and a ring that holds too little."""
+        """Refuse a ring that holds too little."""
         LiveOptions.__post_init__(self)
-        ring_s = self.ring_s
-        if self.use_sim_time and ring_s is not None:
-            raise UsageError("--ring goes by the time of this machine: leave out --use-sim-time.")
-        if self.contract is not None and ring_s is not None:
-            raise UsageError("--contract is for a recording that stores everything: leave --ring.")
-        if ring_s is not None and not 0 < ring_s <= _MAX_S:
-            raise UsageError("--ring must be between 0 and a day")
-        if not (0 <= (self.before_s or 0) <= _MAX_S and 0 <= self.after_s <= _MAX_S):
-            raise UsageError("--before and --after must be between 0 and a day")
-        if ring_s is not None and (self.before_s or 0) > ring_s:
+        if self.ring_s is not None and (self.before_s or 0) > self.ring_s:
             raise UsageError("--before cannot be longer than --ring")
-        for name in ("duration_s", "max_messages", "max_bytes"):
-            bound = getattr(self, name)
-            if bound is not None and not bound > 0:
-                raise UsageError(f"{name.removesuffix('_s').replace('_', ' ')} must be above 0")
 
 
 @dataclass(slots=True)
@@ -129,7 +114,7 @@ class _RecordedChannel:
     channel: Channel
     tally: Tally
     throttle: Throttle | None
-    priority: Priority
+    whole_below: float
     reduced: Channel | None = None
     is_complete: bool = False
 
@@ -535,7 +520,7 @@ class Recorder:
         if self._refused is not None:
             self._lose(recorded, *self._refused, received)
             return
-        whole = size <= SMALL_BYTES or self._target.filled < WHOLE_BELOW[recorded.priority]
+        whole = size <= SMALL_BYTES or self._target.filled < recorded.whole_below
         number = 0 if sequence is None else sequence % _SEQUENCES
         try:
             if whole and self._target.write(
@@ -627,7 +612,7 @@ class Recorder:
                     channel,
                     Tally(),
                     None if hz is None else Throttle(hz),
-                    Priority.NORMAL if priority is None else Priority(int(priority)),
+                    WHOLE_BELOW["normal"] if priority is None else priority,
                 )
                 self._topic(topic, type_name).tallies.append(recorded.tally)
                 self._recorded_by_content[content] = recorded

@@ -24,6 +24,7 @@ from hybridlog.live.policy import SMALL_BYTES
 from hybridlog.record.capture import Capture
 from hybridlog.record.losses import Cause, Ledger, Loss
 from hybridlog.record.recorder import RecordReport
+from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.errors import DatabaseError, DiskFullError, UsageError
 from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD
 from hybridlog_storage.messages import Channel, LooseBatch, Schema
@@ -202,7 +203,7 @@ class LiveRecording:
         self._check()
         for channel in channels:
             _check_channel(channel)
-            self.capture.expect(channel)
+            codec_for(channel).paths()
 
     def write(
         self,

@@ -105,7 +105,8 @@ class StoreIndex:
 
     def _bring(self, entry: RecordingEntry, **options: Any) -> int | None:
         directory, catalog, database = self.directory, self.catalog, self.database
-        return bring(directory, catalog, entry, database, progress=self.progress, **options).chunks
+        made = bring(directory, catalog, entry, database, progress=self.progress, **options)
+        return None if made is None else made.made
 
     def _remove_orphans(self, known: Iterable[str], report: RepairReport) -> None:
         """Remove recordings without a directory from the index.

@@ -13,7 +13,6 @@ import os
 import secrets
 import time
 from contextlib import suppress
-from dataclasses import dataclass, field
 from functools import partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
@@ -53,19 +52,6 @@ _POLL_S: Final = 0.1
 _PIECE: Final = 1 << 20
 
 
-@dataclass(slots=True)
-class Expired:
-    """The result of an expiry.
-
-    Attributes:
-        freed: Bytes of the disk that became free, what was written subtracted.
-        damaged: Why logs could not go, by number.
-    """
-
-    freed: int = 0
-    damaged: dict[int, str] = field(default_factory=dict)
-
-
 def expire(
     directory: StoreDirectory,
     recording: str,
@@ -78,8 +64,11 @@ def expire(
     progress: Progress | None = None,
     make_room: Callable[[], bool] = lambda: False,
     is_followed: bool = False,
-) -> Expired:
+) -> tuple[int, dict[int, str]]:
     """Delete sealed logs of a recording that this process has locked; it may record it, too.
+
+    Returns the bytes of the disk that became free, what was written subtracted, and why logs could
+    not go, by number.
 
     Logs that are gone already are left out, and those without messages. Those that have their rows
     go first. Where there is no room for rows, a log goes without, and is lost. Damaged ones without
@@ -91,7 +80,7 @@ def expire(
     """
     if is_followed:
         _have_rows(directory, recording, segments, check, make_room)
-    manifest, done = directory.manifests.read(recording), Expired()
+    manifest, freed, damaged = directory.manifests.read(recording), 0, dict[int, str]()
     logs = [manifest.logs.get(number) for number in sorted(segments)]
     if any(log and digests.get(log.number, log.digest) != log.digest for log in logs):
         raise ChangedError(f"{manifest.name}: a segment was replaced meanwhile.")
@@ -108,18 +97,17 @@ def expire(
             try:
                 made = _rows_of(directory, recording, log, version)
                 _go(directory, recording, {log.number: made}, check, copy)
-                done.freed -= sum(one.bytes for one in made)
+                freed -= sum(one.bytes for one in made)
             except DiskFullError:
                 if make_room():
                     continue
                 let_go(directory, recording, partial(_lines_of, log.number), check, NO_ROOM)
             except SegmentError as error:
-                done.damaged[log.number] = str(error)
+                damaged[log.number] = str(error)
             break
         before += log.bytes
         report(before)
-    done.freed += sum(log.bytes for log in going if log.number not in done.damaged)
-    return done
+    return freed + sum(log.bytes for log in going if log.number not in damaged), damaged
 
 
 def _have_rows(

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
-from hybridlog.maintenance.expiry import Expired, expire, let_go
+from hybridlog.maintenance.expiry import expire, let_go
 from hybridlog.maintenance.retention import (
     Held,
     Plan,
@@ -208,7 +208,7 @@ class Keeper:
         check = partial(_check, step, rules)
         while True:
             try:
-                done = self._done(step, check, how)
+                freed, damaged = self._done(step, check, how)
                 break
             except DiskFullError:
                 if not use_spare(self._directory):
@@ -218,18 +218,18 @@ class Keeper:
                 if not isinstance(error, ChangedError):  # else the next plan judges again
                     self._failed[step.id].add(_WHOLE)
                 return
-        found.freed_bytes += done.freed
-        for number, reason in done.damaged.items():
+        found.freed_bytes += freed
+        for number, reason in damaged.items():
             cure = "Its payloads stay until the file is restored from a copy"
             found.problems.append(f"{reason}. {cure}")
             self._failed[step.id].add(number)
 
     def _done(
         self, step: Step, check: Callable[[Manifest], None], how: Mapping[str, Any]
-    ) -> Expired:
+    ) -> tuple[int, dict[int, str]]:
         if not step.segments and not step.groups:
             self._remove(step.id, check)
-            return Expired(freed=step.bytes)
+            return step.bytes, {}
         is_own = step.id == self._own
         with ExitStack() as held:
             if not is_own:
@@ -242,7 +242,7 @@ class Keeper:
                     lambda now: [file for file in now.files if file.group in step.groups],
                     check,
                 )
-                done = Expired(freed=step.bytes)
+                done = step.bytes, dict[int, str]()
             else:
                 at_hand = self._directory.at_hand(step.id, step.segments, check)
                 with at_hand as (here, version):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Collection
 from contextlib import suppress
 from typing import TYPE_CHECKING
@@ -34,11 +33,6 @@ def missing(
         for topic in topics - lacking
         if tables.can_have(entry, topic) and tables.of(entry, topic) is None
     }
-
-
-def channels_of(entry: RecordingEntry, topics: Collection[str]) -> set[int]:
-    """Ids of the channels of some topics."""
-    return {channel.id for channel in entry.channels if channel.topic in topics}
 
 
 class TableChecker:
@@ -93,19 +87,13 @@ def clear(directory: StoreDirectory, gone: Collection[str], known: Collection[st
 
     `known` are the recordings that there are. What is impossible now is done the next time.
     """
-    unfinished = {name.removeprefix("r") for name in _names(directory, PARTS)}
-    for recording in sorted(unfinished.union(gone)):
+    unfinished = set(gone)
+    with suppress(OSError):
+        unfinished.update(name.removeprefix("r") for name in files.names(directory.path / PARTS))
+    for recording in sorted(unfinished):
         with suppress(OSError, StoreError, TopicError):
             if recording not in known:
                 remove(directory, recording)
                 continue
             with directory.writing(recording):
                 files.remove_tree(parts_folder(directory.path, recording))
-
-
-def _names(directory: StoreDirectory, top: str) -> list[str]:
-    try:
-        with files.folder(directory.path / top) as fd:
-            return os.listdir(fd)  # noqa: PTH208 - of a handle
-    except OSError:
-        return []

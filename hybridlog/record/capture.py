@@ -25,7 +25,6 @@ from hybridlog.entries import (
 )
 from hybridlog.maintenance.retention import Rules
 from hybridlog.query.latching import depth_of
-from hybridlog.schema.codecs import codec_for
 from hybridlog.wording import parse_size
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.disk.directory import LOCK_WAIT_S
@@ -46,7 +45,6 @@ if TYPE_CHECKING:
     from hybridlog.snapshot import Snapshot
     from hybridlog_storage.catalog import Catalog
     from hybridlog_storage.disk.directory import StoreDirectory
-    from hybridlog_storage.messages import Channel
     from hybridlog_storage.segments.segment_file import Sealed
 
 _REMOTE_SEGMENT: Final = "128MiB"
@@ -158,10 +156,6 @@ class Capture:
         """Messages that are to be in the index, and are not yet."""
         state = self.follower.state
         return max(self.writer.totals.messages - state.indexed, 0) if state.is_wanted else 0
-
-    def expect(self, channel: Channel) -> None:
-        """Prepare a channel before its first message."""
-        codec_for(channel).paths()
 
     def close(self, end: Mapping[str, Any]) -> DatabaseError | None:
         """Complete the recording; `entry` is then complete, too.

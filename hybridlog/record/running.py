@@ -15,7 +15,7 @@ from hybridlog.entries import topic_types
 from hybridlog.record.losses import Cause, joined
 from hybridlog.schema.codecs import codec_for
 from hybridlog.snapshot import UNFINISHED
-from hybridlog_storage.catalog import ChannelEntry, ChannelStats, channel_entry, channel_totals
+from hybridlog_storage.catalog import ChannelEntry, channel_entry, channel_totals
 from hybridlog_storage.disk.directory import is_stable
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.segments.open_segment import OpenSegment
@@ -122,7 +122,8 @@ class RunningRecording:
             self._add_channels(channels, segment)
             silent = {channel.id for channel in channels.values() if not channel.has_publish_time}
             for channel_id, stats in channel_totals(table, None, silent).items():
-                channels[channel_id].stats = _sum(channels[channel_id].stats, stats)
+                total = channels[channel_id].stats = replace(channels[channel_id].stats)
+                total.add(stats)
             if len(table.parts):
                 span = int(table.parts["first"].min()), int(table.parts["last"].max())
                 found.spans.append((number, *span))
@@ -145,12 +146,6 @@ class RunningRecording:
                 channels[number] = found = channel_entry(number, channel, reason)
                 if channel.schema is not None and found.schema is not None:
                     self.schemas[found.schema] = channel.schema
-
-
-def _sum(one: ChannelStats, other: ChannelStats) -> ChannelStats:
-    total = replace(one)
-    total.add(other)
-    return total
 
 
 def _losses(

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.compute as pc
 
 from hybridlog.schema.column import Scalars
 from hybridlog.schema.text import nearest
@@ -99,6 +97,9 @@ def _exact_sums(
     """Exact sums of segments of integers of at most 32 bits."""
     if elements.dtype.itemsize == 4 or int(counts.mean()) < _LONG:
         return np.add.reduceat(elements, begin, dtype=np.int64)
+    import pyarrow as pa  # a recorder does not load it
+    import pyarrow.compute as pc
+
     rows = zip(begin.tolist(), (begin + counts).tolist(), strict=True)
     return np.array([pc.sum(pa.array(elements[first:end])).as_py() for first, end in rows])
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hybridlog.live.policy import (
-    Priority,
+    WHOLE_BELOW,
     Throttle,
     first_fit,
     priority_rule,
@@ -69,7 +69,7 @@ def test_rules() -> None:
     assert first_fit(rules, "/camera/image_raw") == 5
     assert first_fit(rules, "/front/image_raw") == 0.5
     assert first_fit(rules, "/scan") is None
-    assert first_fit([priority_rule("scan", "HIGH")], "/base/scan") == Priority.HIGH
+    assert first_fit([priority_rule("scan", "HIGH")], "/base/scan") == WHOLE_BELOW["high"]
 
 
 @pytest.mark.parametrize("rate", ["", "fast", "-1", "0", "0Hz", "1e400", "nan", "5 kHz"])

@@ -190,7 +190,7 @@ def domain() -> dict[str, str]:
 FAKE = """\
 #!{python}
 import json, os, signal, socket, sys, time
-from hybridlog.live.sources.ros2.child.wire import *
+from hybridlog.live.sources.ros2.child.outbox import *
 
 peer = socket.socket(fileno=int(sys.argv[-1]))
 file = peer.makefile("rb")

@@ -16,7 +16,6 @@ from hybridlog.formats.log_set import open_source
 from hybridlog.live.sources import replay
 from hybridlog.live.sources.base import Cause
 from hybridlog.live.sources.replay import ReplaySource
-from hybridlog_storage.errors import UsageError
 from hybridlog_storage.messages import Batch, Channel, Schema
 from tests import independent
 from tests.calls import Calls
@@ -288,12 +287,6 @@ def test_what_is_not_wanted_takes_its_time_all_the_same(
         play_by(clock, path, heard, monkeypatch, speed=1.0)
         assert clock.now == pytest.approx(began + 0.2, abs=replay._MIN_PAUSE_S)
         assert heard.ends == [""]
-
-
-@pytest.mark.parametrize("speed", [0.0, -1.0, float("inf"), float("nan")])
-def test_a_speed_that_is_none_is_refused(tmp_path: Path, speed: float) -> None:
-    with pytest.raises(UsageError, match="above zero"):
-        ReplaySource(tmp_path, speed=speed)
 
 
 def test_a_sink_that_fails_is_told(

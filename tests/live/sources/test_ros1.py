@@ -115,7 +115,7 @@ def test_only_topics_that_are_wanted() -> None:
         sink.wait_for(b"b", topic="/b")
         wait_for(lambda: master.calls.count("getSystemState") > 4)
     assert a.asked == []
-    assert sink.asked == [("/a", "std_msgs/String"), ("/b", "std_msgs/String")]
+    assert {*sink.asked} == {("/a", "std_msgs/String"), ("/b", "std_msgs/String")}
     assert "/a" not in master.subscribers
 
 
@@ -152,7 +152,6 @@ def test_a_topic_goes_and_comes_back() -> None:
             sink.wait_for(b"x", b"y")
     came = ("/topic", "std_msgs/String")
     assert sink.topics[:3] == [came, ("/topic",), came]
-    assert sink.taken[0].channel is sink.taken[1].channel
     assert sink.said == []
 
 
@@ -339,7 +338,6 @@ def test_a_publisher_that_dies_in_a_message_is_connected_again() -> None:
     (loss,) = sink.losses
     assert (loss.cause, loss.count) == (Cause.CONNECTION, 1)
     assert "4 of 100 bytes" in loss.detail
-    assert sink.taken[0].channel is sink.taken[1].channel
 
 
 def test_memory_grows_with_what_comes_and_not_with_what_is_announced() -> None:

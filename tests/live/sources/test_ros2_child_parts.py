@@ -15,24 +15,13 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from hybridlog.live.sources.ros2.child import qos, topics
+from hybridlog.live.sources.ros2.child import middleware as qos
+from hybridlog.live.sources.ros2.child import topics
 from hybridlog.live.sources.ros2.child.child import Child
-from hybridlog.live.sources.ros2.child.definitions import (
-    Definition,
-    Definitions,
-    UnknownTypeError,
-)
-from hybridlog.live.sources.ros2.child.middleware import (
-    VARIABLES,
-    Offer,
-    default_profile,
-    is_set_up,
-    profile,
-)
-from hybridlog.live.sources.ros2.child.outbox import Outbox
-from hybridlog.live.sources.ros2.child.qos import Profile
+from hybridlog.live.sources.ros2.child.definitions import Definition, Definitions, UnknownTypeError
+from hybridlog.live.sources.ros2.child.middleware import VARIABLES, Offer, Profile
+from hybridlog.live.sources.ros2.child.outbox import MAX_PAYLOAD, Outbox
 from hybridlog.live.sources.ros2.child.topics import Topics
-from hybridlog.live.sources.ros2.child.wire import MAX_PAYLOAD
 from hybridlog.live.sources.ros2.receiver import Receiver
 from tests.imports import ROOT, imports_of
 from tests.limits import Limit
@@ -50,7 +39,7 @@ def test_the_profile_is_there_while_ros_comes_up_and_no_longer(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     environment: dict[str, str] = {"PATH": "x"}
-    with default_profile(environment) as is_used:
+    with qos.default_profile(environment) as is_used:
         assert is_used
         [name] = {environment[variable] for variable in VARIABLES}
         tree = ET.parse(name)
@@ -65,23 +54,20 @@ def test_the_profile_is_there_while_ros_comes_up_and_no_longer(
     [("212992\n", 212992), ("1000", 1 << 17), ("", 1 << 17), ("-5", 1 << 17), ("9" * 30, 32 << 20)],
 )
 def test_sockets_are_asked_for_what_the_kernel_allows(allowed: str, size: int) -> None:
-    assert f"<receiveBufferSize>{size}<" in profile(allowed)
+    assert f"<receiveBufferSize>{size}<" in qos.profile(allowed)
 
 
 @pytest.mark.parametrize("name", [*VARIABLES, "FASTDDS_BUILTIN_TRANSPORTS", "ROS2_EASY_MODE"])
 def test_what_the_user_has_set_up_is_left_alone(tmp_path: Path, name: str) -> None:
     environment = {name: "theirs"}
-    assert is_set_up(environment, tmp_path)
-    with default_profile(environment) as is_used:
+    assert qos.is_set_up(environment, tmp_path)
+    with qos.default_profile(environment) as is_used:
         assert not is_used
         assert environment == {name: "theirs"}
     assert environment == {name: "theirs"}
-    assert not is_set_up({name: ""}, tmp_path)
-
-
-def test_a_profile_in_the_folder_is_left_alone(tmp_path: Path) -> None:
+    assert not qos.is_set_up({name: ""}, tmp_path)
     (tmp_path / "DEFAULT_FASTDDS_PROFILES.xml").touch()
-    assert is_set_up({}, tmp_path)
+    assert qos.is_set_up({}, tmp_path)
 
 
 def test_without_a_folder_for_the_profile_ros_comes_up_all_the_same(
@@ -90,7 +76,7 @@ def test_without_a_folder_for_the_profile_ros_comes_up_all_the_same(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "missing"))
     environment: dict[str, str] = {}
-    with default_profile(environment) as is_used:
+    with qos.default_profile(environment) as is_used:
         assert not is_used
         assert not environment
 
@@ -201,21 +187,16 @@ def test_what_finds_no_room_is_counted() -> None:
     assert loss.first == 10 + len(heard.taken)
 
 
-def test_a_message_larger_than_the_budget_goes_when_nothing_waits() -> None:
+def test_a_large_message_goes_if_nothing_waits_and_the_wire_takes_it(limit: Limit) -> None:
+    assert MAX_PAYLOAD < 1 << 32
+    limit(outbox_payload_bytes=5000)
     ours, theirs = socket.socketpair()
     with ours, theirs:
         outbox = Outbox(theirs, budget=1000)
         outbox.message(0, bytes(5000), 1, 0, -1)
         assert not outbox.refused
-
-
-def test_a_message_too_large_for_the_wire_is_refused(limit: Limit) -> None:
-    assert MAX_PAYLOAD < 1 << 32
-    limit(outbox_payload_bytes=10)
-    ours, theirs = socket.socketpair()
-    with ours, theirs:
         outbox = Outbox(theirs)
-        outbox.message(0, bytes(11), 1, 0, -1)
+        outbox.message(0, bytes(5001), 1, 0, -1)
         assert outbox.refused[0][0] == 1
 
 

@@ -155,10 +155,4 @@ def _parse_schema(
 
 def _is_text(value: object) -> TypeGuard[str]:
     """Tells whether a value is text that UTF-8 can encode; JSON may have lone surrogates."""
-    if not isinstance(value, str):
-        return False
-    try:
-        value.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
+    return isinstance(value, str) and value.encode(errors="ignore").decode() == value

@@ -144,12 +144,12 @@ def _parsed(body: bytes) -> tuple[tuple[object, ...], str | None]:
 
 def _value_of(answer: object) -> object:
     """The value in a ROS answer, a list of status, text and value."""
-    if not isinstance(answer, list) or len(answer) != 3 or not isinstance(answer[0], int):
-        raise PeerError("its answer is not that of a ROS node")
-    if answer[0] != 1:
-        raise RefusedError(f"it refuses: {one_line(str(answer[1]))}")
-    value: object = answer[2]
-    return value
+    match answer:
+        case [1, _, value]:
+            return value
+        case [int(), text, _]:
+            raise RefusedError(f"it refuses: {one_line(str(text))}")
+    raise PeerError("its answer is not that of a ROS node")
 
 
 # Being called.

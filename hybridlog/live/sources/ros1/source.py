@@ -231,8 +231,6 @@ class Graph:
         self._reached = reached
         self._subscriptions: dict[str, Subscription] = {}
         self._types: dict[str, str] = {}
-        self._listed: dict[str, frozenset[str]] = {}
-        self._wanted: dict[str, tuple[str, bool]] = {}
         self._hint = asyncio.Event()
         self._hinted: set[str] = set()
         self._calls = asyncio.Semaphore(_CALLS_AT_ONCE)
@@ -285,7 +283,7 @@ class Graph:
         try:
             state = await self._master.state()
             self._reached()
-            await self._learn_types(state)
+            self._types = await self._master.types()
             self._choose(context, state)
             stale = [
                 subscription
@@ -299,28 +297,10 @@ class Graph:
             self._hinted |= hinted
             raise
 
-    async def _learn_types(self, state: State) -> None:
-        """Asks for types if a topic is new or its type was unknown."""
-        before, self._listed = self._listed, state.publishers
-        if any(
-            topic not in before or self._types.get(topic, ANY) == ANY for topic in state.publishers
-        ):
-            try:
-                self._types = await self._master.types()
-            except PeerError:
-                self._listed = before
-                raise
-
     def _choose(self, context: Context, state: State) -> None:
         """Adds a subscription for each wanted topic without one."""
-        before, self._wanted = self._wanted, {}
-        for topic in state.publishers:
-            type_name = self._type_of(topic)
-            known = before.get(topic)
-            if known is None or known[0] != type_name:
-                known = (type_name, context.sink.wants(topic, type_name))
-            self._wanted[topic] = known
-            if known[1] and topic not in self._subscriptions:
+        for topic in state.publishers.keys() - self._subscriptions.keys():
+            if context.sink.wants(topic, self._type_of(topic)):
                 self._subscriptions[topic] = Subscription(context, topic)
 
     async def _refresh(self, context: Context, state: State, subscription: Subscription) -> None:
@@ -332,8 +312,7 @@ class Graph:
             context.sink.say(f"{one_line(topic)}: the ROS master refuses the subscription: {error}")
             return
         subscription.nodes = state.publishers.get(topic, frozenset())
-        type_name, is_wanted = self._wanted.get(topic, ("", True))
-        subscription.update(type_name, uris, is_wanted=is_wanted)
+        subscription.update(self._type_of(topic), uris)
 
     def _type_of(self, topic: str) -> str:
         type_name = self._types.get(topic, "")

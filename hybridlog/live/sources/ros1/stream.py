@@ -143,11 +143,7 @@ class Stream:
         if self._prefix:
             data = self._prefix + data
             self._prefix = b""
-        pos = (
-            self._cut(data, pos, now)
-            if self._gaps is None
-            else self._cut_numbered(data, pos, now, self._gaps)
-        )
+        pos = self._cut(data, pos, now)
         return pos == len(data) or self._begin(data, pos, now)
 
     def _finish(self, rest: bytes, now: int) -> None:
@@ -171,27 +167,14 @@ class Stream:
 
     def _cut(self, data: bytes, pos: int, now: int) -> int:
         """Passes on all complete messages; returns the offset of the first incomplete one."""
-        take, channel, length = self._sink.take, self._channel, u32
+        take, channel, length, gaps = self._sink.take, self._channel, u32, self._gaps
         last = len(data) - 4
         while pos <= last:
             start = pos + 4
             end = start + length(data, pos)[0]
             if end > last + 4:
                 break
-            take(channel, data[start:end], received=now)
-            pos = end
-        return pos
-
-    def _cut_numbered(self, data: bytes, pos: int, now: int, gaps: SequenceGapDetector) -> int:
-        """Like `_cut`, for messages with a sequence number."""
-        take, channel, length = self._sink.take, self._channel, u32
-        last = len(data) - 4
-        while pos <= last:
-            start = pos + 4
-            end = start + length(data, pos)[0]
-            if end > last + 4:
-                break
-            if end - start < 4:
+            if gaps is None or end - start < 4:
                 take(channel, data[start:end], received=now)
             else:
                 number = length(data, start)[0]
@@ -201,7 +184,7 @@ class Stream:
                     gaps.jump(number, self._last, now)
                 take(channel, data[start:end], received=now, sequence=number)
             pos = end
-        if gaps.waiting:
+        if gaps is not None and gaps.waiting:
             self._report(gaps.confirmed())
         return pos
 

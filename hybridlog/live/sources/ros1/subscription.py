@@ -12,9 +12,7 @@ import asyncio
 import contextlib
 import socket
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Final, Literal
-
-import msgspec
+from typing import TYPE_CHECKING, Final
 
 from hybridlog.live.sources.base import PeerError, one_line
 from hybridlog.live.sources.network import PATIENCE_S, Endpoint, Network, UnreachedError, reason_of
@@ -31,7 +29,6 @@ if TYPE_CHECKING:
 _FIRST_PAUSE_S: Final = 0.25
 _MAX_PAUSE_S: Final = 10.0
 _STABLE_S: Final = 10.0
-_MAX_CHANNELS: Final = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,11 +57,9 @@ class Subscription:
         self._context = context
         self._links: dict[str, _Link] = {}
         self._type = ""
-        self._types: dict[str, bool] = {}
-        self._channels: dict[tuple[tuple[str, str], ...], Channel] = {}
         self._reported = (False, "")
 
-    def update(self, type_name: str, uris: Iterable[str], *, is_wanted: bool) -> None:
+    def update(self, type_name: str, uris: Iterable[str]) -> None:
         """Updates the publishers, by their addresses.
 
         A connection to a publisher that is no longer listed goes on until it ends: a restarted
@@ -72,7 +67,6 @@ class Subscription:
         """
         if type_name:
             self._type = type_name
-            self._types[type_name] = is_wanted
         listed = set(uris)
         for uri, link in tuple(self._links.items()):
             link.list(is_listed=uri in listed)
@@ -95,18 +89,12 @@ class Subscription:
             self._context.sink.topic_gone(self.topic)
 
     def channel(self, fields: Mapping[str, str]) -> Channel | None:
-        """The channel of a connection, the same for the same header; None if it is unwanted."""
+        """The channel of a connection; None if it is unwanted."""
         type_name = fields.get("type", "")
         if type_name and type_name != ANY and not self._takes(type_name, fields):
             return None
-        key = tuple(sorted(fields.items()))
-        channel = self._channels.pop(key, None)
-        if channel is None:
-            channel = channel_of(self.topic, fields)
-            self._context.sink.expect(channel)
-        self._channels[key] = channel
-        if len(self._channels) > _MAX_CHANNELS:
-            del self._channels[next(iter(self._channels))]
+        channel = channel_of(self.topic, fields)
+        self._context.sink.expect(channel)
         return channel
 
     def _takes(self, type_name: str, fields: Mapping[str, str]) -> bool:
@@ -120,12 +108,7 @@ class Subscription:
                 f"{one_line(self._type)} or {one_line(type_name)} (from {publisher}); "
                 "both are recorded"
             )
-        wanted = self._types.get(type_name)
-        if wanted is None:
-            wanted = self._context.sink.wants(self.topic, type_name)
-            if len(self._types) < _MAX_CHANNELS:
-                self._types[type_name] = wanted
-        return wanted
+        return self._context.sink.wants(self.topic, type_name)
 
     async def _reconnect(self, uri: str, link: _Link) -> None:
         await link.run(self._context)
@@ -253,11 +236,6 @@ ANY: Final = "*"
 """Wildcard of subscribers, and of relays that do not know their type yet."""
 
 _MAX_FIELDS = 1000
-_Protocol = tuple[
-    Literal["TCPROS"],
-    Annotated[str, msgspec.Meta(min_length=1)],
-    Annotated[int, msgspec.Meta(ge=1, lt=65536)],
-]
 
 
 def encode_header(fields: Mapping[str, str]) -> bytes:
@@ -335,11 +313,10 @@ async def subscribe(
 
 def _place_of(protocol: object) -> Endpoint:
     """The endpoint in a publisher's answer to `requestTopic`."""
-    try:
-        _, host, port = msgspec.convert(protocol, _Protocol)
-    except msgspec.ValidationError as error:
-        raise PeerError("it does not offer the topic over TCPROS") from error
-    return Endpoint(host, port)
+    match protocol:
+        case ["TCPROS", str(host), int(port)] if host and 0 < port < 65536:
+            return Endpoint(host, port)
+    raise PeerError("it does not offer the topic over TCPROS")
 
 
 async def _exchange_headers(connected: socket.socket, caller: str, topic: str) -> dict[str, str]:

@@ -8,7 +8,7 @@ from json import dumps
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.live.sources.base import Cause, Loss, one_line
-from hybridlog.live.sources.ros2.child.wire import (
+from hybridlog.live.sources.ros2.child.outbox import (
     ENTRY,
     EVENT,
     HEADER,

@@ -18,12 +18,12 @@ from contextlib import suppress
 from json import dumps
 from pathlib import Path
 from threading import Event, Lock, Thread
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from hybridlog.formats.yaml_values import YamlError, parse_yaml, read_yaml
 from hybridlog.live.sources.base import ThreadedSource, one_line
-from hybridlog.live.sources.ros2.child.qos import DURATIONS, FOREVER, Profile
-from hybridlog.live.sources.ros2.child.wire import (
+from hybridlog.live.sources.ros2.child.middleware import DURATIONS, FOREVER, Profile
+from hybridlog.live.sources.ros2.child.outbox import (
     EVENT,
     HEADER,
     WireError,
@@ -55,23 +55,15 @@ class Ros2Source(ThreadedSource):
             `HYBRIDLOG_ROS2_PYTHON`; else `python3` if a ROS environment is sourced; else
             the current one.
         qos_overrides: YAML file with QoS profiles by topic, in the format of rosbag2.
-        domain_id: ROS domain, None for that of the environment.
     """
 
     kind = "ROS 2"
 
-    def __init__(
-        self,
-        python: str | None = None,
-        qos_overrides: Path | None = None,
-        domain_id: int | None = None,
-    ) -> None:
+    def __init__(self, python: str | None = None, qos_overrides: Path | None = None) -> None:
         super().__init__()
-        domain = os.environ.get("ROS_DOMAIN_ID") or "0"
-        self.address = f"domain {domain if domain_id is None else domain_id}"
+        self.address = f"domain {os.environ.get('ROS_DOMAIN_ID') or '0'}"
         self._python = python
         self._overrides = qos_overrides
-        self._domain_id = domain_id
         self._lock = Lock()
         self._child: Process | None = None
         self._settings: dict[str, object] = {}
@@ -96,7 +88,7 @@ class Ros2Source(ThreadedSource):
         overrides = {} if self._overrides is None else read_overrides(self._overrides)
         settings = self._settings = {"overrides": overrides}
         try:
-            child, self._python = launch(self._python, settings, self._domain_id, self._stopping)
+            child, self._python = launch(self._python, settings, self._stopping)
         except ChildError as error:
             raise SourceError(
                 f"ROS 2 does not start: {one_line(str(error))}; does `ros2 topic list` work?"
@@ -168,7 +160,7 @@ class Ros2Source(ThreadedSource):
         while not self._stopping.wait(pause):
             pause = min(2 * pause, _MAX_PAUSE_S)
             try:
-                child, _ = launch(self._python, self._settings, self._domain_id, self._stopping)
+                child, _ = launch(self._python, self._settings, self._stopping)
             except (ChildError, MissingDependencyError) as error:
                 if self._stopping.is_set():
                     break
@@ -341,17 +333,16 @@ class Process:
 
 
 def launch(
-    python: str | None, settings: Mapping[str, Any], domain_id: int | None, cancelled: Event
+    python: str | None, settings: Mapping[str, Any], cancelled: Event
 ) -> tuple[Process, str]:
     """Starts a child under the first Python that has rclpy; returns also its interpreter.
 
-    Of `candidates`, or `python` alone if it is given; `cancelled` is set to give up. Without
-    `domain_id` it is that of the environment.
+    Of `candidates`, or `python` alone if it is given; `cancelled` is set to give up.
     """
     tried = []
     for name in [python] if python else candidates(os.environ):
         try:
-            environment = environment_for(name, domain_id)
+            environment = environment_for(name)
             return Process(name, settings, environment, cancelled), name
         except ChildMissingError as error:
             tried.append(str(error))
@@ -373,25 +364,30 @@ def candidates(environment: Mapping[str, str]) -> Sequence[str]:
     return list(dict.fromkeys([*found, sys.executable]))
 
 
-def environment_for(python: str, domain_id: int | None) -> dict[str, str]:
+def environment_for(python: str) -> dict[str, str]:
     """The environment of a child."""
     found = dict(os.environ)
     if python != sys.executable:
         # The wheels set this once they have found their libraries, and the child has others.
         found.pop("_ROS_WHEELS_BOOTSTRAP_COMPLETE", None)
-    if domain_id is not None:
-        found["ROS_DOMAIN_ID"] = str(domain_id)
     return found
 
 
 MAX_DEPTH = 1_000_000
 
-_POLICIES = {
+_POLICIES: Final[dict[object, dict[str, int]]] = {
     "history": {"system_default": 0, "keep_last": 1, "keep_all": 2},
     "reliability": {"system_default": 0, "reliable": 1, "best_effort": 2},
     "durability": {"system_default": 0, "transient_local": 1, "volatile": 2},
     "liveliness": {"system_default": 0, "automatic": 1, "manual_by_topic": 3},
 }
+_VALUES: Final[dict[object, str]] = {
+    **{name: f"one of {', '.join(words)}" for name, words in _POLICIES.items()},
+    **dict.fromkeys(DURATIONS, "a duration, {sec: 1, nsec: 0}"),
+    "depth": f"a number from 1 to {MAX_DEPTH}",
+    "avoid_ros_namespace_conventions": "true or false",
+}
+"""What each policy may be, in words."""
 
 
 def read_overrides(path: Path) -> dict[str, dict[str, Any]]:
@@ -419,33 +415,20 @@ def read_overrides(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def _policy(name: object, value: object, where: str) -> int:
-    """The number of a policy."""
-    if name in DURATIONS:
-        return _duration(value, f"{where}: {name}")
-    if name == "depth":
-        if isinstance(value, bool) or not isinstance(value, int) or not 0 < value <= MAX_DEPTH:
-            raise UsageError(
-                f"{where}: depth is a number from 1 to {MAX_DEPTH}, not {reprlib.repr(value)}"
-            )
-        return value
-    if name == "avoid_ros_namespace_conventions":
-        if not isinstance(value, bool):
-            raise UsageError(f"{where}: {name} is true or false, not {reprlib.repr(value)}")
-        return value
-    words = _POLICIES.get(name) if isinstance(name, str) else None
-    if words is None:
+    """The number of a policy; of a duration, ns."""
+    match value:
+        case bool() if name == "avoid_ros_namespace_conventions":
+            return value
+        case bool():
+            pass
+        case int() if name == "depth" and 0 < value <= MAX_DEPTH:
+            return value
+        case str() if value.lower() in _POLICIES.get(name, ()):
+            return _POLICIES[name][value.lower()]
+        case {"sec": int(sec), "nsec": int(nsec), **more} if name in DURATIONS and not more:
+            if min(sec, nsec) >= 0:
+                return min(sec * 1_000_000_000 + nsec, FOREVER)
+    if name not in _VALUES:
         known = ", ".join(Profile._fields)
         raise UsageError(f"{where}: unknown policy {name!r}; choose one of {known}")
-    number = words.get(value.lower()) if isinstance(value, str) else None
-    if number is None:
-        raise UsageError(f"{where}: {name} is one of {', '.join(words)}, not {reprlib.repr(value)}")
-    return number
-
-
-def _duration(value: object, where: str) -> int:
-    """A duration in ns."""
-    if isinstance(value, dict) and set(value) == {"sec", "nsec"}:
-        sec, nsec = value["sec"], value["nsec"]
-        if all(isinstance(part, int) and part >= 0 for part in (sec, nsec)):
-            return int(min(sec * 1_000_000_000 + nsec, FOREVER))
-    raise UsageError(f"{where} is a duration, {{sec: 1, nsec: 0}}, not {reprlib.repr(value)}")
+    raise UsageError(f"{where}: {name} is {_VALUES[name]}, not {reprlib.repr(value)}")

@@ -18,9 +18,8 @@ from typing import Any
 
 from hybridlog.live.sources.ros2.child.definitions import Definitions, share_folders
 from hybridlog.live.sources.ros2.child.middleware import Middleware
-from hybridlog.live.sources.ros2.child.outbox import Outbox
+from hybridlog.live.sources.ros2.child.outbox import MAX_EVENT, Outbox, WireError, parse_object
 from hybridlog.live.sources.ros2.child.topics import Topics
-from hybridlog.live.sources.ros2.child.wire import MAX_EVENT, WireError, parse_object
 
 _LOOK_S = 0.5
 _FIRST_LOOKS_S = 0.1

@@ -7,14 +7,14 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.live.sources.ros2.child.definitions import UnknownTypeError, parse_type
-from hybridlog.live.sources.ros2.child.middleware import publisher_id
-from hybridlog.live.sources.ros2.child.qos import (
+from hybridlog.live.sources.ros2.child.middleware import (
     DEPTH,
     DEPTH_OF_ARRAYS,
     DEPTH_OF_BYTES,
     Profile,
     conflicts,
     offered_text,
+    publisher_id,
     request,
 )
 from hybridlog.live.sources.sequence_gaps import (
