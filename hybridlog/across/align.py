@@ -224,11 +224,6 @@ class Aligned:
             partner.add(columns, times, empty)
         return pa.table(columns)
 
-    def batches(self) -> Iterator[pa.RecordBatch]:
-        """The rows in Arrow record batches of bounded size."""
-        for table in self.to_tables():
-            yield from table.combine_chunks().to_batches()
-
     def to_arrow(self) -> pa.Table:
         """The rows as one Arrow table, first column log time."""
         return concatenated(list(self.to_tables()))
@@ -387,9 +382,7 @@ class _Partner:
 
 def _taken(table: pa.Table, rows: NDArray[np.int64]) -> pa.Table:
     """Rows of a table; null for -1."""
-    missing = rows < 0
-    places = pa.array(rows, mask=missing) if missing.any() else numbers(rows)
-    return table.take(places)
+    return table.take(pa.array(rows, mask=rows < 0))
 
 
 def _end_of(resolved: Resolved, clock: Clock) -> int | None:

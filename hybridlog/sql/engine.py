@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 
     from hybridlog.query.answers.completeness import Completeness
     from hybridlog.session import Asked
-    from hybridlog.sql.pieces import ScanCounts
-    from hybridlog.sql.plan import Remarks
 
 Params = Sequence[Any] | Mapping[str, Any] | None
 EVERYWHERE: Final = Question(())
@@ -257,6 +255,7 @@ class SqlAnswer:
 
     Attributes:
         columns: Names of the columns.
+        reading: What was read for it, and what it may lack.
     """
 
     def __init__(
@@ -271,7 +270,7 @@ class SqlAnswer:
         self._text = text
         self._params = params
         self._timeout = timeout
-        self._reading = Reading(usage)
+        self.reading = Reading(usage)
         self._relation: Any = None
         self._result: pa.Table | None = None
         self._prepare()
@@ -284,19 +283,9 @@ class SqlAnswer:
         """Names of the columns; empty for statements that return nothing."""
         return [] if self._relation is None else list(self._relation.columns)
 
-    @property
-    def counts(self) -> ScanCounts:
-        """Counts of what was read for it."""
-        return self._reading.counts
-
-    @property
-    def remarks(self) -> Remarks:
-        """Messages and topics that it may lack."""
-        return self._reading.remarks
-
     def sentences(self) -> list[str]:
         """Sentences about what the computed answer may lack."""
-        found = self.remarks
+        found = self.reading
         lines = []
         for topic, reason in found.undefined.items():
             lines.append(f"{topic} has no columns of fields: {reason}.")
@@ -448,7 +437,7 @@ class SqlAnswer:
     def _tried(self, call: Callable[[], _T]) -> _T:
         """The result of a call; repeated when a table was damaged or files were replaced."""
         for _ in range(_MAX_TRIES):
-            self._reading = self._connection.reading = Reading(self._reading.usage)
+            self.reading = self._connection.reading = Reading(self.reading.usage)
             try:
                 with self._explained():
                     return call()
@@ -466,7 +455,7 @@ class SqlAnswer:
             with explained(self._connection.memory):
                 yield
         except UsageError:
-            error = self._reading.error
+            error = self.reading.error
             if isinstance(error, HybridlogError):
                 raise error from None
             if error is not None:
