@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 from difflib import get_close_matches
-from functools import partial
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import pyarrow as pa
@@ -41,6 +41,7 @@ _TREE: Final = (
     "select json_serialize_sql(?::varchar, skip_null := true, skip_empty := true, "
     "skip_default := true)"
 )
+_MAX_TREES: Final = 64  # syntax trees that are kept
 _SHOW_TABLES: Final = re.compile(r"\s*show\s+tables\s*;?\s*", re.IGNORECASE)
 _NAMES: Final = (
     "select unnest(?::varchar[]) as name union select table_name from duckdb_tables() "
@@ -58,6 +59,7 @@ class SqlEngine:
         self._source = source
         self._bases: dict[int, Any] = {}
         self._content: StoreContent | None = None
+        self.tree = lru_cache(_MAX_TREES)(self._tree)
         self._lock = threading.RLock()
 
     def connect(
@@ -98,6 +100,13 @@ class SqlEngine:
             if known is None or known.scope != scope or known.snapshot is not session.look():
                 known = self._content = StoreContent(session, scope)
             return known
+
+    def _tree(self, text: str) -> str:
+        """The syntax tree of a query as JSON; `tree` keeps those of the last queries."""
+        with self._lock:
+            base = next(iter(self._bases.values()))
+            ((found,),) = base.cursor().execute(_TREE, [text]).fetchall()
+        return str(found)
 
     def forget(self) -> None:
         """Look at the tables again for the next query: some have changed or were damaged."""
@@ -240,8 +249,7 @@ class SqlConnection:
         if self._has_own:
             return EVERYTHING
         text = statement.query.strip().rstrip(";")
-        ((tree,),) = self.cursor.execute(_TREE, [text]).fetchall()
-        return usage_of(tree, {name.casefold() for name in self._names})
+        return usage_of(self.engine.tree(text), {name.casefold() for name in self._names})
 
     def close(self) -> None:
         """Close the connection."""
