@@ -224,6 +224,11 @@ class Aligned:
             partner.add(columns, times, empty)
         return pa.table(columns)
 
+    def batches(self) -> Iterator[pa.RecordBatch]:
+        """The rows in Arrow record batches of bounded size."""
+        for table in self.to_tables():
+            yield from table.combine_chunks().to_batches()
+
     def to_arrow(self) -> pa.Table:
         """The rows as one Arrow table, first column log time."""
         return concatenated(list(self.to_tables()))

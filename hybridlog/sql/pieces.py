@@ -22,8 +22,7 @@ from hybridlog.columns.fields import without
 from hybridlog.columns.layout import POINTS
 from hybridlog.columns.rows import Places, piece_of
 from hybridlog.columns.rows_file import RESTORE
-from hybridlog.query.counters import Counters
-from hybridlog.query.question import RecordedChannel
+from hybridlog.query.question import Counters, RecordedChannel
 from hybridlog.record.losses import lost_spans
 from hybridlog.schema.arrow_types import has_empty
 from hybridlog.schema.left import LeftFields

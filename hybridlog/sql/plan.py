@@ -14,7 +14,7 @@ import pyarrow.compute as pc
 from pyarrow import acero
 
 from hybridlog.columns.layout import POINTS
-from hybridlog.query.counters import Counters
+from hybridlog.query.question import Counters
 from hybridlog.query.rows import offsets_by_chunk, places_of
 from hybridlog.schema.states import State
 from hybridlog.sql.columns import (

@@ -282,9 +282,10 @@ def test_rows_with_large_messages_are_made_a_few_at_a_time(logs: Logs, limit: Li
     assert max(piece.select(beside).nbytes for piece in pieces) < 2000
 
 
-def test_other_frames(logs: Logs) -> None:
+def test_batches_and_other_frames(logs: Logs) -> None:
     aligned = logs.store.align("base", "left/pose", fields={"base": ["x"], "left/pose": ["y"]})
     table = aligned.to_arrow()
+    assert str(pa.Table.from_batches(list(aligned.batches())).to_pylist()) == str(table.to_pylist())
     polars = pytest.importorskip("polars")
     assert aligned.to_polars().equals(polars.from_arrow(table))
     assert str(aligned.to_pandas().index.dtype) == "datetime64[ns, UTC]"
