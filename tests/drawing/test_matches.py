@@ -44,7 +44,7 @@ def test_ticks_of_many_blocks(drive: Drive) -> None:
     """Elements of long arrays are asked of the messages, a chunk at a time."""
     query = drive.store.topic("drive").where("wide[3] > 0")
     wanted = drive.times[drive.wide[:, 3] > 0].tolist()
-    assert len([*match_times(query.session, query.question, query.counters)]) > 3
+    assert len([*match_times(query.session, query.question, query.counters)]) > 1
     found = Matches(query).ticks((BASE, wanted[-1] + 1), 3)
     want = Counter((time - BASE) // found["width"] for time in wanted)
     assert dict(zip(found["pixels"].tolist(), found["counts"].tolist(), strict=True)) == want
