@@ -387,9 +387,7 @@ class _Partner:
 
 def _taken(table: pa.Table, rows: NDArray[np.int64]) -> pa.Table:
     """Rows of a table; null for -1."""
-    missing = rows < 0
-    places = pa.array(rows, mask=missing) if missing.any() else numbers(rows)
-    return table.take(places)
+    return table.take(pa.array(rows, mask=rows < 0))
 
 
 def _end_of(resolved: Resolved, clock: Clock) -> int | None:

@@ -267,9 +267,7 @@ class RegularTimes:
     def tables(self, recording: str) -> Iterator[tuple[NDArray[np.int64], pa.Table]]:
         """The times in a recording."""
         for begin, end in self._spans.get(recording, []):
-            first = begin
-            while first < end:
+            for first in range(begin, end, _GRID_ROWS * self.step):
                 last = min(end, first + _GRID_ROWS * self.step)
                 times = np.arange(first, last, self.step, dtype=np.int64)
                 yield times, pa.table({TIME: numbers(times, "time")})
-                first = last if last == end else first + len(times) * self.step

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from hybridlog_storage.errors import HybridlogError, TimeError, UsageError
 
@@ -43,27 +43,13 @@ KINDS: Final[Mapping[str, Kind]] = {
 """Types of messages that are lines of a log, without `msg/`."""
 
 
-@dataclass(frozen=True, slots=True)
-class Line:
-    """A line of a log.
+Line: TypeAlias = "dict[str, Any]"
+"""A line of a log.
 
-    Attributes:
-        time: Log time, ns.
-        seq: Arrival number in its recording.
-        level: One of `LEVELS`; empty if it has none.
-        name: Name of the sender.
-        text: Its text, or the reason why it cannot be read.
-        is_whole: False if the text is cut.
-        is_readable: False if the text is that reason.
-    """
-
-    time: int
-    seq: int
-    level: str
-    name: str
-    text: str
-    is_whole: bool = True
-    is_readable: bool = True
+`time`, log time in ns; `seq`, arrival number in its recording; `text`, or the reason why it cannot
+be read, then with `problem`. Where it has them, `level`, one of `LEVELS`, and `name` of the sender;
+`cut` if the text is longer.
+"""
 
 
 def kind_of(type_name: str) -> Kind:
@@ -109,21 +95,20 @@ def lines(
 
 
 def _line(message: Message, kind: Kind) -> Line:
+    found: Line = {"time": message.log_time_ns, "seq": message.seq}
     try:
         fields = message.fields
         if not fields:
             message.content()
     except HybridlogError as error:
-        return Line(message.log_time_ns, message.seq, "", "", str(error), is_readable=False)
-    text, name = str(fields.get(kind.text, "")), str(fields.get(kind.name, ""))
-    return Line(
-        message.log_time_ns,
-        message.seq,
-        _level(fields.get("level"), kind),
-        name[:_MAX_NAME],
-        text[:MAX_TEXT],
-        is_whole=len(text) <= MAX_TEXT,
-    )
+        return {**found, "text": str(error), "problem": True}
+    text = str(fields.get(kind.text, ""))
+    more = {
+        "level": _level(fields.get("level"), kind),
+        "name": str(fields.get(kind.name, ""))[:_MAX_NAME],
+        "cut": len(text) > MAX_TEXT,
+    }
+    return {**found, "text": text[:MAX_TEXT], **{name: one for name, one in more.items() if one}}
 
 
 def _level(value: Any, kind: Kind) -> str:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 
@@ -30,37 +29,22 @@ _NONE: Final = np.empty(0)
 _PARTS = (("red", "green", "blue"), ("r", "g", "b"))
 
 
-@dataclass(frozen=True, slots=True)
-class Points:
-    """The points of a message.
+Points: TypeAlias = "dict[str, Any]"
+"""The points of a message.
 
-    Attributes:
-        xyz: float32[n, 3], metres from `origin`, in the frame of the message.
-        values: float32[n] for each name that was asked for: the value minus its `bases`. NaN
-            where a point has none. Those called `rgb` are colours, red * 65536 + green * 256
-            + blue.
-        frame: The frame's name.
-        names: Every name that can be asked for.
-        total: Points of the message.
-        dropped: Number of points that are left out, by reason.
-        every: 1 if all others are here, n if only every n-th is.
-        origin: Metres, [0, 0, 0] unless float32 would lose millimetres without it.
-        bases: For each name, 0 unless float32 would lose differences without it.
-        is_flat: True if all points have the same z, as those of a scan.
-        remarks: Sentences about what contradicts itself in the message.
-    """
-
-    xyz: NDArray[np.float32]
-    values: dict[str, NDArray[np.float32]]
-    frame: str
-    names: tuple[str, ...]
-    total: int
-    dropped: dict[str, int] = field(default_factory=dict)
-    every: int = 1
-    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    bases: dict[str, float] = field(default_factory=dict)
-    is_flat: bool = False
-    remarks: tuple[str, ...] = ()
+* `xyz`: float32[n, 3], metres from `origin`, in the frame of the message.
+* `values`: float32[n] for each name that was asked for: the value minus its base in `bases`. NaN
+  where a point has none. Those called `rgb` are colours, red * 65536 + green * 256 + blue.
+* `frame`: the frame's name.
+* `names`: every name that can be asked for.
+* `total`: points of the message.
+* `dropped`: number of points that are left out, by reason.
+* `every`: 1 if all others are here, n if only every n-th is.
+* `origin`: metres, [0, 0, 0] unless float32 would lose millimetres without it.
+* `bases`: for each name, 0 unless float32 would lose differences without it.
+* `flat`: true if all points have the same z, as those of a scan.
+* `remarks`: sentences about what contradicts itself in the message.
+"""
 
 
 def points(
@@ -115,19 +99,19 @@ def _drawn(decoded: Any, rows: NDArray[Any], values: Collection[str] | None, lim
             if values is None or name in values
         }
     dropped = {"not finite": len(rows) - finite, "out of range": finite - count}
-    return Points(
-        xyz=xyz,
-        values={name: value for name, (value, _) in chosen_values.items()},
-        frame=_frame(decoded),
-        names=tuple(offered),
-        total=len(rows),
-        dropped={why: number for why, number in dropped.items() if number},
-        every=every,
-        origin=(origin[0], origin[1], origin[2]),
-        bases={name: base for name, (_, base) in chosen_values.items()},
-        is_flat=is_scan if not len(xyz) else bool((xyz[:, 2] == xyz[0, 2]).all()),
-        remarks=tuple(remarks),
-    )
+    return {
+        "xyz": xyz,
+        "values": {name: value for name, (value, _) in chosen_values.items()},
+        "frame": _frame(decoded),
+        "names": tuple(offered),
+        "total": len(rows),
+        "dropped": {why: number for why, number in dropped.items() if number},
+        "every": every,
+        "origin": origin,
+        "bases": {name: base for name, (_, base) in chosen_values.items()},
+        "flat": is_scan if not len(xyz) else bool((xyz[:, 2] == xyz[0, 2]).all()),
+        "remarks": remarks,
+    }
 
 
 def _axes(rows: NDArray[Any]) -> list[NDArray[Any]]:

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 import pyarrow as pa
@@ -406,11 +406,8 @@ _SUMMARIES: Final = ("min", "max", "mean", "n")
 _IN_JSON: Final = ("bool", "integer", "number")
 
 
-class Field(NamedTuple):
-    """A field, as `series` takes it, and its type."""
-
-    path: str
-    type: str
+Field: TypeAlias = tuple[str, str]
+"""A field, as `series` takes it, and its type."""
 
 
 def fields_of(known: Mapping[str, str] | None, messages: Iterator[Message]) -> list[Field]:
@@ -432,14 +429,14 @@ def _defined(known: Mapping[str, str], messages: Iterator[Message]) -> Iterator[
         if "[" in path:
             continue  # within the elements of an array
         if kind in NUMERIC:
-            yield Field(path, kind)
+            yield path, kind
             continue
         summaries = (f"{path}.{name}" for name in _SUMMARIES)
-        yield from (Field(name, "summary") for name in summaries if is_summary(name, known))
+        yield from ((name, "summary") for name in summaries if is_summary(name, known))
         element = element_of(kind)
         if element in NUMERIC:
             width = _width(kind, path, values)
-            yield from (Field(f"{path}[{n}]", element) for n in range(width))
+            yield from ((f"{path}[{n}]", element) for n in range(width))
 
 
 def _width(kind: str, path: str, values: Mapping[str, Any]) -> int:
@@ -458,4 +455,4 @@ def _observed(messages: Iterator[Message]) -> Iterator[Field]:
         path, kinds = str(found["path"]), str(found["type"]).split("|")
         # A name within backquotes may have dots, which a path cannot tell from its own.
         if not found["array"] and "`" not in path and any(kind in _IN_JSON for kind in kinds):
-            yield Field(path, "|".join(kinds))
+            yield path, "|".join(kinds)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
@@ -121,23 +121,6 @@ MAX_MATCHES: Final = 20_000_000
 """Matches, and intervals, of one question."""
 
 
-@dataclass(frozen=True)
-class Ticks:
-    """The pixels with matches, in order.
-
-    Attributes:
-        width: Log time of a pixel, ns.
-        pixels: int64[n], numbers of pixels from 0.
-        counts: int64[n], number of matches in each.
-        first: int64[n], log time of the first match in each, ns since the epoch.
-    """
-
-    width: int
-    pixels: NDArray[np.int64]
-    counts: NDArray[np.int64]
-    first: NDArray[np.int64]
-
-
 class Match(NamedTuple):
     """A message that satisfies the predicate: log time, ns since the epoch, and arrival number.
 
@@ -168,14 +151,18 @@ class Matches:
         """Its memory, bytes."""
         return self._times.nbytes + self._seqs.nbytes + self._held.nbytes
 
-    def ticks(self, span: Span, pixels: int) -> Ticks:
-        """Matches by pixel; the picture is of log time `[begin, end)`, ns, not empty."""
+    def ticks(self, span: Span, pixels: int) -> dict[str, Any]:
+        """The pixels with matches; the picture is of log time `[begin, end)`, ns, not empty.
+
+        `width` is the log time of a pixel, ns. `pixels` are their numbers from 0, int64[n],
+        `counts` the matches in each, `first` the log time of the first one, ns since the epoch.
+        """
         width = _pixel_width(span, pixels)
         found = self._times[slice(*np.searchsorted(placed(self._times), span))]
         place, begins, counts = np.unique(
             (placed(found) - span[0]) // width, return_index=True, return_counts=True
         )
-        return Ticks(width, place, counts, found[begins])
+        return {"width": width, "pixels": place, "counts": counts, "first": found[begins]}
 
     def bands(self, span: Span, pixels: int) -> NDArray[np.int64]:
         """The intervals in which the predicate holds, joined where a picture cannot tell.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 
@@ -60,31 +60,19 @@ class Grid:
         return np.stack([turn * self.east, (latitude - self.latitude) * self.north], axis=1)
 
 
-@dataclass(frozen=True, slots=True)
-class Track:
-    """Positions in order of time.
+Track: TypeAlias = "dict[str, Any]"
+"""Positions in order of time.
 
-    Attributes:
-        times: int64[n], log time, ns since the epoch.
-        xy: float64[n, 2], metres: east and north of the origin of the grid, or x and y of poses
-            in their frame. NaN where no line goes: for messages without a fix, and in the
-            middle of times without messages that are longer than usual, as in a `Series`.
-        grid: The grid, with its origin at the first fix; None without any, and for poses.
-        is_geographic: False for poses.
-        messages: Number of messages.
-        fixes: Number of those that have a fix.
-        exact: True if each message is here. Else each pixel of time has its first and its last
-            one, the fixes farthest east, north, west and south, and one without a fix if it has
-            any.
-    """
-
-    times: NDArray[np.int64]
-    xy: NDArray[np.float64]
-    grid: Grid | None
-    is_geographic: bool
-    messages: int
-    fixes: int
-    exact: bool
+* `times`: int64[n], log time, ns since the epoch.
+* `xy`: float64[n, 2], metres: east and north of the origin of the grid, or x and y of poses in
+  their frame. NaN where no line goes: for messages without a fix, and in the middle of times
+  without messages that are longer than usual, as in a `Series`.
+* `grid`: the `Grid`, with its origin at the first fix; None without any, and for poses.
+* `is_geographic`: False for poses.
+* `messages`: number of messages; `fixes`: of those that have a fix.
+* `exact`: True if each message is here. Else each pixel of time has its first and its last one, the
+  fixes farthest east, north, west and south, and one without a fix if it has any.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,15 +151,15 @@ def track(query: Query, *, pixels: int, span: Span | None = None) -> Track:
         rows.thin()
     gaps, middles = rows.gaps()
     places = np.stack([rows.columns[name] for name in "xy"], axis=1)
-    return Track(
-        times=np.insert(rows.times, gaps, middles),
-        xy=np.insert(places, gaps, np.nan, axis=0),
-        grid=grid,
-        is_geographic=position.is_geographic,
-        messages=messages,
-        fixes=fixes,
-        exact=rows.exact,
-    )
+    return {
+        "times": np.insert(rows.times, gaps, middles),
+        "xy": np.insert(places, gaps, np.nan, axis=0),
+        "grid": grid,
+        "is_geographic": position.is_geographic,
+        "messages": messages,
+        "fixes": fixes,
+        "exact": rows.exact,
+    }
 
 
 def _is_position(latitude: Numbers, longitude: Numbers) -> NDArray[np.bool_]:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from stat import S_ISDIR, S_ISREG
+from stat import S_ISREG
 from typing import NamedTuple
 
 from hybridlog.formats import LOGS
@@ -154,39 +155,31 @@ class Watch:
 
 def _folders(top: Path, found: Found) -> Iterator[tuple[Path, list[_File]]]:
     """Directories below one, itself included, and the regular files in each, by name."""
-    pending, visited = [top], set()
-    while pending:
-        folder = pending.pop()
-        try:
-            about = folder.stat()
-            if (about.st_dev, about.st_ino) in visited:
-                continue
-            visited.add((about.st_dev, about.st_ino))
-            with os.scandir(folder) as listing:
-                entries = sorted(listing, key=lambda entry: entry.name)
-        except OSError as error:
-            if folder == top:
-                raise cannot_open(folder, error) from error
-            found.problems.append(cannot_open(folder, error))
+
+    def failed(error: OSError) -> None:
+        problem = cannot_open(Path(error.filename), error)
+        if Path(error.filename) == top:
+            raise problem from error
+        found.problems.append(problem)
+
+    visited = set()
+    for place, below, names in os.walk(top, onerror=failed, followlinks=True):
+        folder, about = Path(place), Path(place).stat()
+        is_known = (about.st_dev, about.st_ino) in visited
+        visited.add((about.st_dev, about.st_ino))
+        if is_known or STORE in names:
+            below.clear()
+            found.stores += [] if is_known else [folder]
             continue
-        if any(entry.name == STORE for entry in entries):
-            found.stores.append(folder)
-            continue
-        files, below = [], []
-        for entry in entries:
-            if entry.name.startswith("."):
-                continue
-            try:
-                about = entry.stat()
-            except OSError:
-                continue  # a symlink to nowhere, or a file that has just gone
-            if S_ISDIR(about.st_mode):
-                below.append(folder / entry.name)
-            elif S_ISREG(about.st_mode):
-                path = folder / entry.name
-                files.append(_File(path, about.st_size, about.st_mtime_ns, about.st_ino))
+        below[:] = sorted(name for name in below if not name.startswith("."))
+        files = []
+        for name in sorted(names):
+            with suppress(OSError):  # a symlink to nowhere, or a file that has just gone
+                about = (folder / name).stat()
+                if S_ISREG(about.st_mode) and not name.startswith("."):
+                    file = folder / name, about.st_size, about.st_mtime_ns, about.st_ino
+                    files.append(_File(*file))
         yield folder, files
-        pending += reversed(below)
 
 
 def _log_file(file: _File, problems: list[SourceError]) -> LogFile | None:

@@ -271,18 +271,18 @@ class _JoinedSource(Source):
 
     def _unspooled(self, part: LogFile) -> Source:
         """Open a compressed file, by way of a temporary one."""
-        spooled = spool(part.path)
+        path, problem = spool(part.path)
         try:
-            inner = part.open(spooled.path)
+            inner = part.open(path)
         except SourceError as error:
-            reason = spooled.problem or _without_path(error, spooled.path)
+            reason = problem or _without_path(error, path)
             raise SourceError(
                 f"{part.path}: {reason}; try to unpack it with `zstd -d` and use what comes out"
             ) from error
         finally:
-            spooled.remove()
-        if spooled.problem is not None:
-            self.damage.append(Damage(part.path, None, None, spooled.problem, None))
+            path.unlink(missing_ok=True)
+        if problem is not None:
+            self.damage.append(Damage(part.path, None, None, problem, None))
         return inner
 
     def _read(self, part: LogFile, inner: Source, done: int, size: int) -> Iterator[Batch]:

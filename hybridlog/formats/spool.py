@@ -7,7 +7,6 @@ import os
 import secrets
 import shutil
 import tempfile
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
@@ -30,18 +29,6 @@ _MIN_FREE_BYTES = 64 << 20
 _MAX_WINDOW = 1 << 27
 
 
-@dataclass(slots=True)
-class Spooled:
-    """A temporary unpacked file, and why it is cut, if it is; `remove` it once it is open."""
-
-    path: Path
-    problem: str | None
-
-    def remove(self) -> None:
-        """Remove the temporary file's name; a reader may still use the open file."""
-        self.path.unlink(missing_ok=True)
-
-
 def peek(path: Path, count: int) -> bytes:
     """The first unpacked bytes of a zstd file, fewer if it is damaged."""
     try:
@@ -57,8 +44,11 @@ def peek(path: Path, count: int) -> bytes:
         return b""
 
 
-def spool(path: Path) -> Spooled:
-    """Unpack the intact part of a zstd file to a temporary file."""
+def spool(path: Path) -> tuple[Path, str | None]:
+    """Unpack the intact part of a zstd file to a temporary one; also why that is cut, if it is.
+
+    Its name can be removed once it is open.
+    """
     try:
         with path.open("rb") as source:
             size = zstandard.frame_content_size(source.read(32))
@@ -68,31 +58,32 @@ def spool(path: Path) -> Spooled:
         raise cannot_open(path, error) from error
 
 
-def copy_start(path: Path, count: int) -> Spooled:
-    """Copy the first `count` bytes of a file to a temporary file."""
+def copy_start(path: Path, count: int) -> Path:
+    """Copy the first `count` bytes of a file to a temporary one."""
     try:
         with path.open("rb") as source:
-            return _to_temporary(path, count, partial(_copy, source, count))
+            return _to_temporary(path, count, partial(_copy, source, count))[0]
     except OSError as error:
         raise cannot_open(path, error) from error
 
 
-def _to_temporary(path: Path, size: int, fill: Callable[[IO[bytes], int], str | None]) -> Spooled:
+def _to_temporary(
+    path: Path, size: int, fill: Callable[[IO[bytes], int], str | None]
+) -> tuple[Path, str | None]:
     """Create and fill a temporary file."""
     folder = Path(tempfile.gettempdir())
     room = shutil.disk_usage(folder).free - _MIN_FREE_BYTES
     if size > room:
         raise _no_room(path, folder)
-    spooled = Spooled(folder / f"hybridlog-{secrets.token_hex(8)}", None)
-    with undone(spooled.remove):
+    made = folder / f"hybridlog-{secrets.token_hex(8)}"
+    with undone(partial(made.unlink, missing_ok=True)):
         try:
-            with open(spooled.path, "xb", opener=_private) as target:
-                spooled.problem = fill(target, room)
+            with open(made, "xb", opener=_private) as target:
+                return made, fill(target, room)
         except OSError as error:
             if error.errno in NO_SPACE:
                 raise _no_room(path, folder) from error
             raise
-    return spooled
 
 
 def _private(path: str, flags: int) -> int:

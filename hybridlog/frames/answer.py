@@ -62,11 +62,12 @@ def _groups(planner: Planner, parts: Sequence[Part] | None) -> Iterator[Iterable
     """
     decoder = Decoder(planner)
     yield decoder.empty()
-    found = None if parts is None else _values_of_tables(planner, parts)
-    if parts is not None and found is not None:
-        for part, values in zip(parts, found, strict=True):
-            yield from ([block] for block in _table_blocks(planner, part, values))
-        return
+    if parts and decoder.fits_tables and planner.question.returns_all:
+        found = planner.values_of_tables(parts, decoder.fields)
+        if found is not None:
+            for part, values in zip(parts, found, strict=True):
+                yield from ([block] for block in decoder.of_table(part, values))
+            return
     for run in planner.runs():
         yield decoder.blocks(run)
 
@@ -91,41 +92,6 @@ def stream(planner: Planner, *, at_once: bool = False) -> Iterator[pa.Table]:
             rows, size, given = 0, 0, True
     if rows or not given:
         yield _table(blocks, question)
-
-
-def _values_of_tables(planner: Planner, parts: Sequence[Part]) -> Sequence[Iterator[Values]] | None:
-    """The fields of each part, if tables of topics provide the whole answer."""
-    question = planner.question
-    if not question.returns_all or not parts:
-        return None
-    fields = _fields_of(planner)
-    from_messages = set(_own(planner)) - {"topic", "recording"}
-    if from_messages or (fields is not None and not fields):
-        return None
-    return planner.values_of_tables(parts, fields)
-
-
-def _fields_of(planner: Planner) -> list[str] | None:
-    """The requested fields, without the names of built-in columns; None for all."""
-    fields = planner.question.fields
-    if fields is None:
-        return None
-    own = {"log_time", *_own(planner)}
-    return [path for path in fields if path not in own]
-
-
-def _table_blocks(planner: Planner, part: Part, values: Iterator[Values]) -> Iterator[Block]:
-    """The messages of a part from its table, in order."""
-    rank = planner.ranks[part.recording.key] << _SEQ_BITS
-    # Tables have lists where a definition fixes the length.
-    kind = part.channels[0].arrow_type(_fields_of(planner))
-    for found in values:
-        rows = len(found.log_time)
-        planner.counters.messages += rows
-        names = {"topic": part.topic, "recording": part.recording.name}
-        own = {name: text_column(names[name], rows) for name in _own(planner)}
-        own |= _tags_of(part.recording, tag_columns(planner.question.tags), rows)
-        yield Block(part.topic, found.log_time, found.seq + rank, own, found.records.cast(kind), 0)
 
 
 def schema_of(planner: Planner) -> pa.Schema | None:
@@ -159,6 +125,8 @@ class Decoder:
     Attributes:
         channels: The channels of the messages that are read now; at first examples of all.
         own: Names of the built-in columns.
+        fields: The requested fields, without the names of built-in columns; None for all.
+        fits_tables: False if tables of topics lack a column.
     """
 
     def __init__(self, planner: Planner) -> None:
@@ -167,6 +135,9 @@ class Decoder:
         self._counters = planner.counters
         self._chosen = planner.question.fields
         self.own = _own(planner)
+        names = {"log_time", *self.own}
+        self.fields = None if self._chosen is None else [p for p in self._chosen if p not in names]
+        self.fits_tables = self.fields != [] and names <= {"log_time", "topic", "recording"}
         self._tags = tag_columns(planner.question.tags)
         self._ranks = {key: rank << _SEQ_BITS for key, rank in planner.ranks.items()}
         self._fields: list[frozenset[str] | None] = []
@@ -191,6 +162,19 @@ class Decoder:
         for number, rows in rows_by_channel(run.batch.channel):
             batch = run.batch.take(rows)
             yield self.block(number, batch, run.seq[rows], self.decoded(number, batch))
+
+    def of_table(self, part: Part, values: Iterator[Values]) -> Iterator[Block]:
+        """The messages of a part from its table, in order."""
+        names = {"topic": part.topic, "recording": part.recording.name}
+        # Tables have lists where a definition fixes the length.
+        kind = part.channels[0].arrow_type(self.fields)
+        for found in values:
+            rows = len(found.log_time)
+            self._counters.messages += rows
+            own = {name: text_column(names[name], rows) for name in self.own}
+            own |= _tags_of(part.recording, self._tags, rows)
+            order = found.seq + self._ranks[part.recording.key]
+            yield Block(part.topic, found.log_time, order, own, found.records.cast(kind), 0)
 
     def decoded(self, number: int, batch: Batch) -> Decoded:
         """The fields of messages of one channel; those that cannot be read are counted."""

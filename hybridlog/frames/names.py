@@ -40,13 +40,9 @@ def own_columns(requested: Sequence[str] | None, defined: Collection[str]) -> li
 
 def tag_columns(keys: Sequence[str]) -> dict[str, str]:
     """Names of the columns of tags, and the keys of the tags."""
-    taken = {*RESERVED, *OPTIONAL, "log_time_ns"}
     found: dict[str, str] = {}
     for key in keys:
-        name = key
-        while name in taken or name in found:
-            name += "_"
-        found[name] = key
+        found[free_name(key, {*OPTIONAL, "log_time_ns", *found})] = key
     return found
 
 

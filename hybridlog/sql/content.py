@@ -167,7 +167,7 @@ class TopicView:
             if window not in plans:
                 holds = in_window(where, window)
                 plans[window] = Plan(self.schema, self._columns, columns, holds, reading)
-            reading.remarks.add(recording)
+            reading.add(recording)
             bounds = _bounds((summary.name, source.span) for source in recording.sources)
             chosen = may_hold(bounds)
             if window is not None:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 from difflib import get_close_matches
-from functools import partial
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import pyarrow as pa
@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 
     from hybridlog.query.answers.completeness import Completeness
     from hybridlog.session import Asked
-    from hybridlog.sql.pieces import ScanCounts
-    from hybridlog.sql.plan import Remarks
 
 Params = Sequence[Any] | Mapping[str, Any] | None
 EVERYWHERE: Final = Question(())
@@ -43,6 +41,7 @@ _TREE: Final = (
     "select json_serialize_sql(?::varchar, skip_null := true, skip_empty := true, "
     "skip_default := true)"
 )
+_MAX_TREES: Final = 64  # syntax trees that are kept
 _SHOW_TABLES: Final = re.compile(r"\s*show\s+tables\s*;?\s*", re.IGNORECASE)
 _NAMES: Final = (
     "select unnest(?::varchar[]) as name union select table_name from duckdb_tables() "
@@ -60,6 +59,7 @@ class SqlEngine:
         self._source = source
         self._bases: dict[int, Any] = {}
         self._content: StoreContent | None = None
+        self.tree = lru_cache(_MAX_TREES)(self._tree)
         self._lock = threading.RLock()
 
     def connect(
@@ -100,6 +100,13 @@ class SqlEngine:
             if known is None or known.scope != scope or known.snapshot is not session.look():
                 known = self._content = StoreContent(session, scope)
             return known
+
+    def _tree(self, text: str) -> str:
+        """The syntax tree of a query as JSON; `tree` keeps those of the last queries."""
+        with self._lock:
+            base = next(iter(self._bases.values()))
+            ((found,),) = base.cursor().execute(_TREE, [text]).fetchall()
+        return str(found)
 
     def forget(self) -> None:
         """Look at the tables again for the next query: some have changed or were damaged."""
@@ -242,8 +249,7 @@ class SqlConnection:
         if self._has_own:
             return EVERYTHING
         text = statement.query.strip().rstrip(";")
-        ((tree,),) = self.cursor.execute(_TREE, [text]).fetchall()
-        return usage_of(tree, {name.casefold() for name in self._names})
+        return usage_of(self.engine.tree(text), {name.casefold() for name in self._names})
 
     def close(self) -> None:
         """Close the connection."""
@@ -257,6 +263,7 @@ class SqlAnswer:
 
     Attributes:
         columns: Names of the columns.
+        reading: What was read for it, and what it may lack.
     """
 
     def __init__(
@@ -271,7 +278,7 @@ class SqlAnswer:
         self._text = text
         self._params = params
         self._timeout = timeout
-        self._reading = Reading(usage)
+        self.reading = Reading(usage)
         self._relation: Any = None
         self._result: pa.Table | None = None
         self._prepare()
@@ -284,19 +291,9 @@ class SqlAnswer:
         """Names of the columns; empty for statements that return nothing."""
         return [] if self._relation is None else list(self._relation.columns)
 
-    @property
-    def counts(self) -> ScanCounts:
-        """Counts of what was read for it."""
-        return self._reading.counts
-
-    @property
-    def remarks(self) -> Remarks:
-        """Messages and topics that it may lack."""
-        return self._reading.remarks
-
     def sentences(self) -> list[str]:
         """Sentences about what the computed answer may lack."""
-        found = self.remarks
+        found = self.reading
         lines = []
         for topic, reason in found.undefined.items():
             lines.append(f"{topic} has no columns of fields: {reason}.")
@@ -448,7 +445,7 @@ class SqlAnswer:
     def _tried(self, call: Callable[[], _T]) -> _T:
         """The result of a call; repeated when a table was damaged or files were replaced."""
         for _ in range(_MAX_TRIES):
-            self._reading = self._connection.reading = Reading(self._reading.usage)
+            self.reading = self._connection.reading = Reading(self.reading.usage)
             try:
                 with self._explained():
                     return call()
@@ -466,7 +463,7 @@ class SqlAnswer:
             with explained(self._connection.memory):
                 yield
         except UsageError:
-            error = self._reading.error
+            error = self.reading.error
             if isinstance(error, HybridlogError):
                 raise error from None
             if error is not None:

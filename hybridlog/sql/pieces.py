@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -22,7 +22,7 @@ from hybridlog.columns.fields import without
 from hybridlog.columns.layout import POINTS
 from hybridlog.columns.rows import Places, piece_of
 from hybridlog.columns.rows_file import RESTORE
-from hybridlog.query.question import RecordedChannel
+from hybridlog.query.question import Counters, RecordedChannel
 from hybridlog.record.losses import lost_spans
 from hybridlog.schema.arrow_types import has_empty
 from hybridlog.schema.left import LeftFields
@@ -33,8 +33,6 @@ from hybridlog_storage.lazy import lazy
 from hybridlog_storage.messages import EXPIRED_IDS
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from numpy.typing import NDArray
 
     from hybridlog.columns.column_file import TablePart
@@ -52,30 +50,6 @@ _FIXED: Final = frozenset({"ros1", "cdr"})
 
 Paths = Collection[str] | None
 """Dotted paths of fields to read; None for all."""
-
-
-@dataclass(slots=True)
-class ScanCounts:
-    """What was read for a query: files, row groups by file and number, chunks, bytes decoded."""
-
-    files: set[str] = field(default_factory=set)
-    groups: set[tuple[str, int]] = field(default_factory=set)
-    chunks: int = 0
-    payload_bytes: int = 0
-
-    @property
-    def row_groups(self) -> int:
-        """Number of row groups that were read."""
-        return len(self.groups)
-
-    def add_chunk(self, _: StoredChunk) -> None:
-        """Count a chunk."""
-        self.chunks += 1
-
-    def add_group(self, path: Path, group: int) -> None:
-        """Count a row group."""
-        self.files.add(str(path))
-        self.groups.add((str(path), group))
 
 
 class Rows(NamedTuple):
@@ -189,7 +163,7 @@ class TopicOfRecording:
         if any(is_cloud(channel.channel) for channel in self.channels.values()):
             for source in (one for one in self.sources if one.has_points):
                 with suppress(StoreError):
-                    for rows in source.read((), {POINTS}, ScanCounts()):
+                    for rows in source.read((), {POINTS}, Counters()):
                         return rows.own[POINTS].type
         return None
 
@@ -201,10 +175,10 @@ class TopicOfRecording:
         ]
         return _ChunkRows(self, segment, place, (place.first, place.last), whole)
 
-    def chunk(self, segment: int, number: int, counts: ScanCounts) -> StoredChunk:
+    def chunk(self, segment: int, number: int, counters: Counters) -> StoredChunk:
         """A chunk; see `Session.chunk`."""
         return self.session.chunk(
-            self.entry, segment, self.places[segment, number], counts.add_chunk
+            self.entry, segment, self.places[segment, number], counters.add_chunk
         )
 
 
@@ -234,6 +208,7 @@ class _TableRows:
         is_whole: True if it has all arrays; else some may be summaries.
         has_summaries: True if it has summaries of all arrays that it has in full.
         has_points: True if it has the points of clouds.
+        groups: The row group, by file and number.
     """
 
     is_whole = False
@@ -245,6 +220,7 @@ class _TableRows:
         self.span = (part.first, part.last) if part.first > FIRST else None
         self.has_summaries = table.has_arrays
         self.has_points = table.points is not None
+        self.groups = {(part.file.path, part.group)}
 
     def kinds(self, paths: Paths) -> Sequence[Any]:
         """Types of the fields that it holds, at least at some paths."""
@@ -257,8 +233,7 @@ class _TableRows:
         self._source.session.reject_table(self._source.entry, self._source.topic)
         return ChangedError(f"{error} It is made again when you ask again.")
 
-    def read(self, paths: Paths, own: Collection[str], counts: ScanCounts) -> Iterator[Rows]:
-        counts.add_group(self._part.file.path, self._part.group)
+    def read(self, paths: Paths, own: Collection[str], counters: Counters) -> Iterator[Rows]:
         expired = self._source.expired
         is_whole = not (self._table.unreadable or expired or self._source.has_reduced)
         wanted = {*own} if is_whole else {*own, "state"}
@@ -284,6 +259,7 @@ class _ChunkRows:
     """The messages of a topic in a chunk; the attributes are those of `_TableRows`."""
 
     has_summaries = False
+    groups: Final = frozenset[tuple[Path, int]]()
 
     def __init__(
         self,
@@ -305,16 +281,16 @@ class _ChunkRows:
 
     @lazy
     def _kinds(self) -> Sequence[Any]:
-        return [rows.records.type for rows in self.read(None, (), ScanCounts())]
+        return [rows.records.type for rows in self.read(None, (), Counters())]
 
     def read(
         self,
         paths: Paths,
         own: Collection[str],
-        counts: ScanCounts,
+        counters: Counters,
         offsets: NDArray[np.int64] | None = None,
     ) -> Iterator[Rows]:
-        chunk = self._source.chunk(self._segment, self._place.number, counts)
+        chunk = self._source.chunk(self._segment, self._place.number, counters)
         chosen = np.ones(len(chunk.batch), np.bool_)
         if offsets is not None:
             chosen = np.isin(chunk.batch.places[0], offsets)
@@ -323,7 +299,7 @@ class _ChunkRows:
             if len(rows):
                 batch, places = chunk.batch.take(rows), Places.of([chunk]).take(rows)
                 if channel.codec.indexed and not channel.is_reduced:
-                    counts.payload_bytes += batch.payload_bytes
+                    counters.payload_bytes += batch.payload_bytes
                 yield self._rows(channel, batch, places, paths, own)
 
     def _rows(

@@ -14,6 +14,7 @@ import pyarrow.compute as pc
 from pyarrow import acero
 
 from hybridlog.columns.layout import POINTS
+from hybridlog.query.question import Counters
 from hybridlog.query.rows import offsets_by_chunk, places_of
 from hybridlog.schema.states import State
 from hybridlog.sql.columns import (
@@ -23,11 +24,13 @@ from hybridlog.sql.columns import (
     lacks,
     summary_values,
 )
-from hybridlog.sql.pieces import Rows, RowSource, ScanCounts, TopicOfRecording
+from hybridlog.sql.pieces import Rows, RowSource, TopicOfRecording
 from hybridlog.sql.usage import EVERYTHING, Usage
 from hybridlog_storage.times import END
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from numpy.typing import NDArray
 
     from hybridlog_storage.catalog import RecordingEntry
@@ -37,19 +40,27 @@ _WORD: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
 @dataclass(slots=True)
-class Remarks:
-    """Remarks about an answer: messages and topics that it may lack.
+class Reading:
+    """One execution of a query: what it reads, what it may lack, and the first error in that.
 
     Attributes:
+        usage: Fields that the query names.
+        counters: Chunks and payloads that were read.
+        groups: Row groups that were read, by file and number.
+        recordings: Recordings that were read, by id.
+        topics: Topics that were read.
         absent: Messages without fields, by topic and state.
         undefined: Topics without fields, with the reason.
-        recordings: Recordings that were read, by id.
     """
 
-    absent: Counter[tuple[str, State]] = field(default_factory=Counter)
-    undefined: dict[str, str] = field(default_factory=dict)
+    usage: Usage = EVERYTHING
+    counters: Counters = field(default_factory=Counters)
+    groups: set[tuple[Path, int]] = field(default_factory=set)
     recordings: dict[str, RecordingEntry] = field(default_factory=dict)
     topics: set[str] = field(default_factory=set)
+    absent: Counter[tuple[str, State]] = field(default_factory=Counter)
+    undefined: dict[str, str] = field(default_factory=dict)
+    error: Exception | None = None
 
     def add(self, recording: TopicOfRecording) -> None:
         """Note a topic of a recording that is read."""
@@ -58,16 +69,6 @@ class Remarks:
         for channel in recording.channels.values():
             if channel.codec.reason is not None:
                 self.undefined[recording.topic] = channel.codec.reason
-
-
-@dataclass(slots=True)
-class Reading:
-    """One execution of a query: what it reads, finds and may lack, and the first error in that."""
-
-    usage: Usage = EVERYTHING
-    counts: ScanCounts = field(default_factory=ScanCounts)
-    remarks: Remarks = field(default_factory=Remarks)
-    error: Exception | None = None
 
 
 def in_window(where: Any, window: tuple[int, int] | None) -> Any:
@@ -118,7 +119,8 @@ class Plan:
         own |= {POINTS for leaf in held if leaf.is_points}
         held = [leaf for leaf in held if not leaf.is_points]
         paths = _paths(held, summaries=source.has_summaries)
-        for rows in source.read(paths, own, self._reading.counts):
+        self._reading.groups |= source.groups
+        for rows in source.read(paths, own, self._reading.counters):
             self._remark(recording.topic, rows, lacks_arrays=bool(absent))
             if absent:
                 yield from self._with_payloads(recording, rows, absent)
@@ -149,7 +151,7 @@ class Plan:
         own = {POINTS for leaf in self._leaves.values() if leaf.is_points}
         for (_, segment, chunk), offsets in places.items():
             source = recording.chunk_rows(segment, chunk)
-            for part in source.read(paths, own, self._reading.counts, offsets):
+            for part in source.read(paths, own, self._reading.counters, offsets):
                 yield from self._finished(recording, part, where)
 
     def _finished(
@@ -214,7 +216,7 @@ class Plan:
             state = State(found["values"])
             is_told = lacks_arrays or state is State.UNREADABLE
             if is_told and state is not State.WHOLE:
-                self._reading.remarks.absent[topic, state] += found["counts"]
+                self._reading.absent[topic, state] += found["counts"]
 
 
 def _mask(batch: pa.RecordBatch, where: Any) -> Any:
@@ -260,12 +262,7 @@ def _paths(leaves: Collection[ViewColumn], *, summaries: bool = False) -> list[s
 
 def _at(records: Any, path: Sequence[str]) -> Any:
     """Values at a path, null where a struct above is; None if there are none."""
-    for name in path:
-        place = records.type.get_field_index(name) if pa.types.is_struct(records.type) else -1
-        if place < 0:
-            return None
-        records = pc.struct_field(records, [place]) if records.null_count else records.field(place)
-    return records
+    return None if _type_at(records.type, path) is None else pc.struct_field(records, [*path])
 
 
 def _type_at(kind: Any, path: Sequence[str]) -> Any:

@@ -16,14 +16,12 @@ from pydantic import Field
 from hybridlog.arrays.message_arrays import IMAGES, plain_type
 from hybridlog.drawing.images import Picture, picture
 from hybridlog.query.answers.completeness import coverage
-from hybridlog.query.answers.infer_fields import infer_fields
 from hybridlog.query.planner import match_times
 from hybridlog.query.predicate.tokens import MAX_TEXT
-from hybridlog.query.query import field_types
 from hybridlog.query.times import format_duration, format_time
 from hybridlog.record.losses import losses_of
 from hybridlog.schema.text import without_nan
-from hybridlog.view.context import SQL_MEMORY, Context
+from hybridlog.view.context import SQL_MEMORY, Context, known_fields
 from hybridlog_storage.errors import PayloadError, TimeError, TopicError, UsageError
 
 if TYPE_CHECKING:
@@ -109,10 +107,7 @@ def schema(
         is_cut = len(listed) > MAX_ROWS or len(chosen) > len(found)
         return _answer({"topics": listed[:MAX_ROWS]}, "topics", is_cut=is_cut)
     query = chosen.topic(topic)
-    known = field_types(query)
-    if known is None:
-        known = {str(one["path"]): str(one["type"]) for one in infer_fields(query)}
-    fields = [{"field": path, "type": kind} for path, kind in known.items()]
+    fields = [{"field": path, "type": kind} for path, kind in known_fields(query).items()]
     values = {"topics": query.topics, "lacks": query.remarks(is_empty=False)}
     return _answer({**values, "fields": fields[:MAX_ROWS]}, "fields", is_cut=len(fields) > MAX_ROWS)
 

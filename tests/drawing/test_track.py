@@ -86,16 +86,16 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
 def test_every_fix(store: hl.Store) -> None:
     times, position, has_fix = walk()
     got = track(store.topic("fix"), pixels=1000)
-    assert got.exact
-    assert (got.messages, got.fixes) == (COUNT, COUNT - 101)
-    assert got.grid is not None
-    assert (got.grid.latitude, got.grid.longitude) == tuple(position[0])
+    assert got["exact"]
+    assert (got["messages"], got["fixes"]) == (COUNT, COUNT - 101)
+    assert got["grid"] is not None
+    assert (got["grid"].latitude, got["grid"].longitude) == tuple(position[0])
     # One entry of NaN in the pause.
-    assert len(got.times) == COUNT + 1
-    assert got.times[3000] == times[2999] + 30_000 * MS
-    assert np.isnan(got.xy[3000]).all()
-    assert np.array_equal(np.delete(got.times, 3000), times)
-    xy = np.delete(got.xy, 3000, axis=0)
+    assert len(got["times"]) == COUNT + 1
+    assert got["times"][3000] == times[2999] + 30_000 * MS
+    assert np.isnan(got["xy"][3000]).all()
+    assert np.array_equal(np.delete(got["times"], 3000), times)
+    xy = np.delete(got["xy"], 3000, axis=0)
     assert np.array_equal(np.isnan(xy).any(axis=1), ~has_fix)
     # On a sphere that fits the ellipsoid there: half a percent is its error.
     north = np.radians(position[:, 0] - position[0, 0]) * 6_371_000
@@ -103,53 +103,57 @@ def test_every_fix(store: hl.Store) -> None:
     east *= math.cos(math.radians(48.1))
     assert np.allclose(xy[has_fix, 1], north[has_fix], rtol=5e-3, atol=1e-3)
     assert np.allclose(xy[has_fix, 0], east[has_fix], rtol=5e-3, atol=1e-3)
-    assert got.xy[777, 1] > 1000
+    assert got["xy"][777, 1] > 1000
 
 
 @pytest.mark.parametrize("pixels", [1, 7, 50, 600])
 def test_extremes_of_each_pixel_are_kept(store: hl.Store, pixels: int) -> None:
     whole = track(store.topic("fix"), pixels=1000)
     got = track(store.topic("fix"), pixels=pixels)
-    assert not got.exact
-    assert len(got.times) <= 7 * pixels + 1
-    assert (got.messages, got.fixes, got.grid) == (whole.messages, whole.fixes, whole.grid)
-    assert (np.diff(got.times) > 0).all()
-    known = dict(zip(whole.times.tolist(), map(tuple, whole.xy.tolist()), strict=True))
-    for time, (x, y) in zip(got.times.tolist(), got.xy.tolist(), strict=True):
+    assert not got["exact"]
+    assert len(got["times"]) <= 7 * pixels + 1
+    assert (got["messages"], got["fixes"], got["grid"]) == (
+        whole["messages"],
+        whole["fixes"],
+        whole["grid"],
+    )
+    assert (np.diff(got["times"]) > 0).all()
+    known = dict(zip(whole["times"].tolist(), map(tuple, whole["xy"].tolist()), strict=True))
+    for time, (x, y) in zip(got["times"].tolist(), got["xy"].tolist(), strict=True):
         if time in known and not math.isnan(x):
             assert known[time] == (x, y)
-    begin, end = BASE + 100 * MS, int(whole.times[-1]) + 1
+    begin, end = BASE + 100 * MS, int(whole["times"][-1]) + 1
     width = -(-(end - begin) // pixels)
-    is_message = whole.times != whole.times[2999] + 30_000 * MS
+    is_message = whole["times"] != whole["times"][2999] + 30_000 * MS
     for pixel in range(pixels):
-        there = whole.xy[is_message & ((whole.times - begin) // width == pixel)]
-        here = (got.times - begin) // width == pixel
+        there = whole["xy"][is_message & ((whole["times"] - begin) // width == pixel)]
+        here = (got["times"] - begin) // width == pixel
         if not len(there):
             continue
         if np.isnan(there).all():
-            assert np.isnan(got.xy[here]).all()
+            assert np.isnan(got["xy"][here]).all()
             continue
-        assert np.array_equal(np.nanmin(there, axis=0), np.nanmin(got.xy[here], axis=0))
-        assert np.array_equal(np.nanmax(there, axis=0), np.nanmax(got.xy[here], axis=0))
+        assert np.array_equal(np.nanmin(there, axis=0), np.nanmin(got["xy"][here], axis=0))
+        assert np.array_equal(np.nanmax(there, axis=0), np.nanmax(got["xy"][here], axis=0))
         if np.isnan(there).any():
-            assert np.isnan(got.xy[here]).any()
+            assert np.isnan(got["xy"][here]).any()
 
 
 def test_a_span(store: hl.Store) -> None:
     times, _, _ = walk()
     begin, end = int(times[990]), int(times[1200])
     got = track(store.topic("fix"), pixels=1000, span=(begin, end))
-    assert got.times.tolist() == times[990:1200].tolist()
-    assert (got.messages, got.fixes) == (210, 110)
-    assert track(store.topic("fix"), pixels=10, span=(0, 5)).grid is None
-    assert len(track(store.topic("fix"), pixels=10, span=(end, begin)).times) == 0
+    assert got["times"].tolist() == times[990:1200].tolist()
+    assert (got["messages"], got["fixes"]) == (210, 110)
+    assert track(store.topic("fix"), pixels=10, span=(0, 5))["grid"] is None
+    assert len(track(store.topic("fix"), pixels=10, span=(end, begin))["times"]) == 0
 
 
 def test_the_short_way_round(store: hl.Store) -> None:
     got = track(store.topic("other"), pixels=10)
-    assert np.allclose(got.xy[:3, 0], [0, 222.64, 222.64], atol=0.01)
-    assert np.isnan(got.xy[3:]).all()
-    assert (got.messages, got.fixes) == (5, 3)
+    assert np.allclose(got["xy"][:3, 0], [0, 222.64, 222.64], atol=0.01)
+    assert np.isnan(got["xy"][3:]).all()
+    assert (got["messages"], got["fixes"]) == (5, 3)
 
 
 def test_messages_that_arrive_in_pairs_have_no_gaps(tmp_path: Path) -> None:
@@ -159,13 +163,13 @@ def test_messages_that_arrive_in_pairs_have_no_gaps(tmp_path: Path) -> None:
                 time = BASE + (at // 2) * 100 * MS + at % 2 + (5000 * MS if at >= 20 else 0)
                 recorder.write(channel("/fix"), payload(48.0, 11.0), log_time=time)
         got = track(store.topic("fix"), pixels=100)
-    assert np.flatnonzero(np.isnan(got.xy[:, 0])).tolist() == [20]
+    assert np.flatnonzero(np.isnan(got["xy"][:, 0])).tolist() == [20]
 
 
 def test_json_without_a_definition(store: hl.Store) -> None:
     got = track(store.topic("json"), pixels=10)
-    assert got.fixes == 5
-    assert np.allclose(np.diff(got.xy[:, 1]), 110.6, atol=0.1)
+    assert got["fixes"] == 5
+    assert np.allclose(np.diff(got["xy"][:, 1]), 110.6, atol=0.1)
     found = fix_of(store.topic("json").at("+0s"))
     assert (found["latitude"], found["longitude"], found["altitude"]) == (10.0, 20.0, None)
     assert (found["status"], found["ellipse"], found["has_fix"]) == (None, None, True)
@@ -243,13 +247,15 @@ def test_poses_of_a_robot(tmp_path: Path) -> None:
             "pose.pose.position.", is_geographic=False
         )
         got = track(query, pixels=len(read))
-        assert (got.is_geographic, got.grid, got.exact) == (False, None, True)
-        assert got.times.tolist() == [time for time, _ in read]
-        assert got.xy.tolist() == [[pose.position.x, pose.position.y] for _, pose in read]
+        assert (got["is_geographic"], got["grid"], got["exact"]) == (False, None, True)
+        assert got["times"].tolist() == [time for time, _ in read]
+        assert got["xy"].tolist() == [[pose.position.x, pose.position.y] for _, pose in read]
         thin = track(query, pixels=10)
-        assert not thin.exact
-        assert (thin.messages, thin.fixes) == (len(read), len(read))
-        assert {tuple(place) for place in thin.xy.tolist()} <= {tuple(p) for p in got.xy.tolist()}
+        assert not thin["exact"]
+        assert (thin["messages"], thin["fixes"]) == (len(read), len(read))
+        assert {tuple(place) for place in thin["xy"].tolist()} <= {
+            tuple(p) for p in got["xy"].tolist()
+        }
         time, pose = read[200]
         found = pose_of(query.at(time), "pose.pose.position.")
         assert (found["time"], found["x"], found["y"]) == (time, pose.position.x, pose.position.y)

@@ -198,7 +198,9 @@ def written(topic: str, numbers: range) -> list[tuple[int, str, str, str]]:
 
 
 def told(some: list[Line]) -> list[tuple[int, str, str, str]]:
-    return [(line.time, line.level, line.name, line.text) for line in some]
+    return [
+        (line["time"], line.get("level", ""), line.get("name", ""), line["text"]) for line in some
+    ]
 
 
 @pytest.mark.parametrize("topic", TOPICS)
@@ -209,18 +211,18 @@ def test_pages_of_lines_meet_without_missing_or_repeating_one(odd: hl.Store, top
     time, seq = 0, -1
     while page := lines(*log, time, seq, 7):
         found += page
-        time, seq = page[-1].time, page[-1].seq
+        time, seq = page[-1]["time"], page[-1]["seq"]
     if topic == "/rosout":
         cut = found.pop()
-        assert (cut.is_readable, cut.time) == (False, log_time(len(LOGS)))
-        assert "cannot be read" in cut.text
+        assert (cut["problem"], cut["time"]) == (True, log_time(len(LOGS)))
+        assert "cannot be read" in cut["text"]
     assert told(found) == written(topic, range(len(LOGS)))
-    assert all(line.is_readable and line.is_whole for line in found)
+    assert not any("problem" in line or "cut" in line for line in found)
     back: list[Line] = []
-    time, seq = found[-1].time + 1, 0
+    time, seq = found[-1]["time"] + 1, 0
     while page := lines(*log, time, seq, 7, before=True):
         back = page + back
-        time, seq = page[0].time, page[0].seq
+        time, seq = page[0]["time"], page[0]["seq"]
     assert back == found
 
 

@@ -252,7 +252,7 @@ def test_a_playback_goes_on_from_the_key_frame(videos: hl.Store) -> None:
     played = PlayedLog(videos.query(["/json", "/gap"], ["h264"]))
     for n, wanted in ((7, [5, 6, 7]), (5, [5]), (COUNT - 1, [10, 11]), (COUNT + 5, [10, 11])):
         blocks = played.current(["/json"], BASE + n * STEP)
-        times = [time for one in blocks for time in one.batch.log_time.tolist()]
+        times = [time for one in blocks for time in one.log_time.tolist()]
         assert times == [BASE + number * STEP for number in wanted]
 
 

@@ -164,8 +164,8 @@ def test_sql(stores: tuple[hl.Store, hl.Store], query: str, *, from_chunks: bool
         expected, found = (one.to_arrow() for one in answers)
     assert found.equals(expected)
     assert found.num_rows > 10
-    assert (answers[0].counts.chunks > 0) == (from_chunks is not None)
-    assert (answers[1].counts.chunks > 0) == (from_chunks is True)
+    assert (answers[0].reading.counters.chunks_read > 0) == (from_chunks is not None)
+    assert (answers[1].reading.counters.chunks_read > 0) == (from_chunks is True)
 
 
 def test_other_readers(stores: tuple[hl.Store, hl.Store]) -> None:
@@ -458,7 +458,7 @@ def test_points_in_sql(copy: Path) -> None:
         store.index.arrays("cloud")
         answer_ = store.sql(query + " order by t")
         right = answer_.rows()
-        assert answer_.counts.chunks == 0
+        assert answer_.reading.counters.chunks_read == 0
         points = [points_of(n) for n in range(COUNT)]
         want = [(float(one["xyz"][1, 0]), len(one)) for one in points]
         assert {row[1:] for row in right} <= {*want}

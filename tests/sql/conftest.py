@@ -10,6 +10,7 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.columns import table_writer as writer
+from hybridlog.sql.engine import SqlAnswer
 from hybridlog_storage.messages import Schema
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.tables.logs import BASE, SECOND, payload, varied, write_log
@@ -42,6 +43,10 @@ def text(n: int) -> bytes:
     return b"".join(
         (struct.pack("<I", len(name)), name, struct.pack("<I", len(f64)), f64, struct.pack("<f", n))
     )
+
+
+def files_read(answer: SqlAnswer) -> int:
+    return len({path for path, _ in answer.reading.groups})
 
 
 def first_log(path: Path) -> Path:

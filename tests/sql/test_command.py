@@ -171,7 +171,7 @@ def test_unreadable_messages_are_told(tmp_path: Path) -> None:
         ((time, _, error, state),) = answer.rows()
         assert (time, state) == (BASE + 3, "unreadable")
         assert "does not fit" in error
-        assert answer.remarks.absent == {("/large", "unreadable"): 1}
+        assert answer.reading.absent == {("/large", "unreadable"): 1}
     done = run(tmp_path / "store", "select count(*) from large", "-F", "csv")
     assert done.stdout.splitlines()[1] == "6"
     assert "/large: 1 message does not fit its definition; the fields are null" in done.stderr

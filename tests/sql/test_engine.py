@@ -12,12 +12,13 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import duckdb
 import pyarrow as pa
 import pytest
 
 import hybridlog as hl
 from hybridlog.query.choice import Choice
-from hybridlog.sql import duck
+from hybridlog.sql import duck, engine
 from hybridlog.sql.engine import SqlConnection
 from hybridlog_storage.errors import (
     HybridlogError,
@@ -31,7 +32,7 @@ from hybridlog_storage.errors import (
 )
 from hybridlog_storage.messages import Channel
 from tests import places
-from tests.sql.conftest import LARGE, SCANS, scan
+from tests.sql.conftest import LARGE, SCANS, files_read, scan
 from tests.tables.logs import BASE, SECOND
 from tests.waiting import wait_for
 
@@ -213,7 +214,7 @@ def test_a_choice_of_recordings_and_a_time(store: hl.Store) -> None:
     """Views and tables show these alone, and only files of them are read."""
     count = "select count(*) from large"
     some = store.sql(count, recordings=["second"])
-    assert (some.rows(), len(some.counts.files)) == ([(40,)], 1)
+    assert (some.rows(), files_read(some)) == ([(40,)], 1)
     chosen = store.recordings(tag="site=hall")
     assert store.sql(count, recordings=chosen).rows() == [(LARGE,)]
     known = ("recording from recordings", "distinct recording from topics")
@@ -225,15 +226,16 @@ def test_a_choice_of_recordings_and_a_time(store: hl.Store) -> None:
     part = store.sql(f"{count} where i8 > -999", between=("+310ms", "+0.4s"))
     whole = f"t >= {BASE + 310_000_000} and t < {BASE + 400_000_000}"
     assert part.rows() == store.sql(f"{count} where {whole}").rows() == [(90,)]
-    assert part.counts.row_groups == 2  # one of each recording
+    assert len(part.reading.groups) == 2  # one of each recording
     first = store.sql(count, between=(BASE, BASE + SECOND))
-    assert (first.rows(), len(first.counts.files)) == ([(1000,)], 1)
-    assert [*first.remarks.recordings] == [store.entry("first").id]
+    assert (first.rows(), files_read(first)) == ([(1000,)], 1)
+    assert [*first.reading.recordings] == [store.entry("first").id]
     # A view has all its columns, and no row of a recording that lies outside.
     none = store.sql("select angle from scan", between=(BASE + 3600 * SECOND, None))
-    assert (none.rows(), none.counts.files) == ([], set())
+    assert (none.rows(), files_read(none)) == ([], 0)
     arrays = store.sql("select max(ranges[1]), count(*) from scan", between=("start", "+21ms"))
-    assert (arrays.rows(), arrays.counts.payload_bytes) == ([(10.0, 11)], 11 * len(scan(0)))
+    assert arrays.rows() == [(10.0, 11)]
+    assert arrays.reading.counters.payload_bytes == 11 * len(scan(0))
     assert store.sql(count, recordings="second").rows() == [(40,)]
     with pytest.raises(TimeError, match="A range takes two times"):
         store.sql(count, between="now")  # type: ignore[arg-type]
@@ -254,6 +256,15 @@ def test_a_damaged_chunk_is_an_error(own: hl.Store) -> None:
     assert own.sql("select max(angle) from scan").rows() == [((SCANS - 1) / 2,)]
     with pytest.raises(SegmentError, match="damaged"):
         own.sql("select max(ranges[1]) from scan").rows()
+
+
+def test_a_query_is_parsed_once(own: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    query = "select count(*) from scan where angle < 3"
+    found = own.sql(query).rows()
+    monkeypatch.setattr(engine, "_TREE", "select 1 / 'no number'")
+    assert own.sql(query).rows() == found
+    with pytest.raises(duckdb.Error):
+        own.sql(f"{query} and angle > 1")
 
 
 def test_fields_that_no_definition_fixes(tmp_path: Path) -> None:
@@ -306,7 +317,8 @@ def test_a_prompt_sees_what_a_running_recording_has_flushed(tmp_path: Path) -> N
                 opened.session.cache.drop("chunk")
                 answer = prompt.query("select sum(n) from note")
                 assert answer.rows() == [(n + 1,)]
-                assert (answer.counts.row_groups, answer.counts.chunks > 0) == (0, True)
+                assert not answer.reading.groups
+                assert answer.reading.counters.chunks_read > 0
 
 
 def test_threads_ask_at_once(store: hl.Store) -> None:
@@ -319,4 +331,4 @@ def test_threads_ask_at_once(store: hl.Store) -> None:
 def test_an_answer_that_is_left_early_reads_no_more(store: hl.Store) -> None:
     answer = store.sql("select ranges from scan limit 3")
     assert len(answer.rows()) == 3
-    assert answer.counts.row_groups < 3
+    assert len(answer.reading.groups) < 3

@@ -9,7 +9,7 @@ import hybridlog as hl
 from hybridlog.schema.arrow_types import plain_values
 from hybridlog.sql.pieces import TopicOfRecording
 from hybridlog_storage.errors import UsageError
-from tests.sql.conftest import LARGE, SCANS
+from tests.sql.conftest import LARGE, SCANS, files_read
 from tests.tables.logs import BASE, SECOND, decoded, same
 
 LATER = BASE + 3600 * SECOND
@@ -59,9 +59,9 @@ def test_decoded_chunks_say_the_same(store: hl.Store, monkeypatch: pytest.Monkey
         found = answer.to_arrow()
         assert found.schema == table.schema
         assert str(found.to_pylist()) == str(table.to_pylist())  # NaN is not equal to itself
-        assert answer.counts.row_groups == 0
-        assert answer.counts.chunks > 0
-    assert all(answer.counts.row_groups for answer in with_tables)
+        assert len(answer.reading.groups) == 0
+        assert answer.reading.counters.chunks_read > 0
+    assert all(len(answer.reading.groups) for answer in with_tables)
 
 
 PREDICATES = """
@@ -109,7 +109,7 @@ def test_pushed_filters_mean_what_duckdb_means(
 def test_time_and_recording_choose_what_is_read(store: hl.Store) -> None:
     every = store.sql("select sum(i8) from large")
     assert every.rows() == [(sum(n % 5 - 2 for n in range(LARGE)) + 200,)]
-    assert (len(every.counts.files), every.counts.row_groups) == (2, LARGE // 300 + 1)
+    assert (files_read(every), len(every.reading.groups)) == (2, LARGE // 300 + 1)
     middle = BASE + 450 * 1_000_001
     for where, files, groups in (
         (f"t = {middle}", 1, 1),
@@ -127,8 +127,8 @@ def test_time_and_recording_choose_what_is_read(store: hl.Store) -> None:
         answer = store.sql(f"select count(i8) from large where {where}")
         ((count,),) = answer.rows()
         assert (count > 0) == (groups > 0), where
-        assert (len(answer.counts.files), answer.counts.row_groups) == (files, groups), where
-        assert answer.counts.payload_bytes == 0
+        assert (files_read(answer), len(answer.reading.groups)) == (files, groups), where
+        assert answer.reading.counters.payload_bytes == 0
 
 
 def test_arrays_come_from_payloads_only_when_they_are_named(store: hl.Store) -> None:
@@ -151,7 +151,7 @@ def test_arrays_come_from_payloads_only_when_they_are_named(store: hl.Store) -> 
     ):
         answer = store.sql(query)
         answer.rows()
-        assert answer.counts.payload_bytes == messages * size, query
+        assert answer.reading.counters.payload_bytes == messages * size, query
     found = store.sql(
         "select ranges[3], list_min(ranges[41:60]), echo.far[1], echo.data[50], len(echo.data), "
         "echo.kind, ranges_summary.max, echo.data_summary.n from scan order by t"
@@ -180,7 +180,7 @@ def test_each_chunk_is_read_once(store: hl.Store) -> None:
     for read in (len(chunks), 0):  # they are in the session's cache then
         answer = store.sql("select sum(ranges[1]) from scan")
         assert answer.rows() == [(sum(range(SCANS)),)]
-        assert answer.counts.chunks == read
+        assert answer.reading.counters.chunks_read == read
     assert len(chunks) > 3
 
 

@@ -124,23 +124,6 @@ def test_a_slice_is_the_one_of_the_command_line(
     assert typed.content == app.get("slice.mcap", params=wanted).content
 
 
-def test_ranges(app: TestClient) -> None:
-    url = "slice.mcap?recording=robot&topic=/map"
-    whole = app.get(url)
-    assert whole.status_code == 200
-    tag = whole.headers["etag"]
-    assert not tag.startswith("W/")
-    last = app.get(url, headers={"Range": "bytes=-8", "If-Range": tag})
-    assert (last.status_code, last.content) == (206, b"\x89MCAP0\r\n")
-    other = app.get(url, headers={"Range": "bytes=-8", "If-Range": '"other"'})
-    assert (other.status_code, other.content) == (200, whole.content)
-    beyond = app.get(url, headers={"Range": f"bytes={len(whole.content)}-"})
-    assert beyond.status_code == 416
-    assert app.get(url, headers={"Range": "bytes=5-2"}).status_code == 400
-    head = app.head(url)
-    assert (head.headers["content-length"], head.content) == (str(len(whole.content)), b"")
-
-
 def test_the_bytes_are_the_same_when_the_file_was_lost(app: TestClient, cache: Path) -> None:
     url = "slice.mcap?recording=robot&topic=/odom"
     first = app.get(url)

@@ -51,7 +51,6 @@ class McapWriter(LogWriter):
     def __init__(self, target: Target, *, profile: str = "") -> None:
         self._sink = Sink(target)
         self._schemas: dict[Schema, int] = {}
-        self._known: dict[Channel, int] = {}
         self._ids: dict[tuple[object, ...], int] = {}  # by what is written of a channel
         try:
             self._writer = _Writer(
@@ -99,16 +98,14 @@ class McapWriter(LogWriter):
         self._writer.note_attachment(attachment.index(offset, self._sink.tell() - offset))
 
     def _channel(self, channel: Channel) -> int:
-        if channel not in self._known:
-            metadata = source_metadata(channel)
-            schema = self._schema(channel.schema)
-            said = channel.topic, channel.message_encoding, schema, tuple(sorted(metadata.items()))
-            if said not in self._ids:
-                self._ids[said] = self._writer.register_channel(
-                    channel.topic, channel.message_encoding, schema, metadata
-                )
-            self._known[channel] = self._ids[said]
-        return self._known[channel]
+        metadata = source_metadata(channel)
+        schema = self._schema(channel.schema)
+        said = channel.topic, channel.message_encoding, schema, tuple(sorted(metadata.items()))
+        if said not in self._ids:
+            self._ids[said] = self._writer.register_channel(
+                channel.topic, channel.message_encoding, schema, metadata
+            )
+        return self._ids[said]
 
     def _schema(self, schema: Schema | None) -> int:
         if schema is None:

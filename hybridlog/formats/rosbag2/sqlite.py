@@ -296,11 +296,11 @@ def _connect_whole_pages(
     """
     if page < 512 or size % page == 0:
         return _connect(path)
-    spooled = copy_start(path, size - size % page)
+    whole = copy_start(path, size - size % page)
     try:
-        return _connect(spooled.path)
+        return _connect(whole)
     finally:
-        spooled.remove()
+        whole.unlink(missing_ok=True)
 
 
 def _connect(path: Path) -> tuple[sqlite3.Connection, Path | None]:

@@ -35,20 +35,8 @@ class PlayedChannel:
     publishers: tuple[str, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Block:
-    """Messages in order of log time.
-
-    Attributes:
-        batch: The messages.
-        channels: Number of the played channel, by `batch.channel`.
-    """
-
-    batch: Batch
-    channels: Sequence[int]
-
-
-Blocks: TypeAlias = Generator[Block, None, None]
+Blocks: TypeAlias = "Generator[Batch, None, None]"
+"""Messages in order of log time; `channel` is the number of the played channel, 0 for none."""
 
 
 class PlayedLog:
@@ -113,7 +101,7 @@ class PlayedLog:
             return
         query = narrowed(self._whole, *topics).during(self._during).between(position + 1, None)
         for batch, channels in query.batches():
-            yield self._block(batch, channels)
+            yield self._numbered(batch, channels)
 
     def current(self, topics: Collection[str], position: int) -> Blocks:
         """The messages of some topics that are current at a log time, ns.
@@ -127,7 +115,7 @@ class PlayedLog:
         if found := self._latching.intersection(topics):
             latched = narrowed(self._whole, *found).between(min(position + 1, self.end), None)
             for batch, channels in latched.latched(original_times=True):
-                yield self._block(batch, channels)
+                yield self._numbered(batch, channels)
             if position >= self.end:
                 yield from self.after(found, self.end - 1)
         if position >= self.begin:
@@ -135,17 +123,18 @@ class PlayedLog:
                 if topic not in self._latching:
                     yield from self._last(topic, position)
 
-    def _last(self, topic: str, position: int) -> Iterator[Block]:
+    def _last(self, topic: str, position: int) -> Iterator[Batch]:
         """The last message of a topic until a log time, ns, if the range has one."""
         try:
             query = narrowed(self._whole, topic).at_time(position)
         except TopicError:
             return  # the topic has none yet
         for batch, channels in query.during(self._during).batches():
-            yield self._block(batch, channels)
+            yield self._numbered(batch, channels)
 
-    def _block(self, batch: Batch, channels: Sequence[RecordedChannel]) -> Block:
-        return Block(batch, [self._ids.get((c.recording.id, c.channel_id), 0) for c in channels])
+    def _numbered(self, batch: Batch, channels: Sequence[RecordedChannel]) -> Batch:
+        ids = [self._ids.get((c.recording.id, c.channel_id), 0) for c in channels]
+        return replace(batch, channel=np.array(ids, np.int32)[batch.channel])
 
 
 SLOWEST: Final = 0.01

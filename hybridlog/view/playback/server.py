@@ -24,7 +24,7 @@ from websockets.exceptions import ConnectionClosed
 
 from hybridlog.live.sources.foxglove.protocol import SUBPROTOCOLS
 from hybridlog.view.loopback import Admission, listen
-from hybridlog.view.playback.played import Block, PlaybackClock
+from hybridlog.view.playback.played import PlaybackClock
 from hybridlog.view.playback.protocol import (
     Control,
     Level,
@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from websockets.typing import Subprotocol
 
     from hybridlog.view.playback.played import Blocks, PlayedLog
+    from hybridlog_storage.messages import Batch
 
 _WITH_PLAYBACK: Final = SUBPROTOCOLS[0]
 _MAX_CLIENTS: Final = 32
@@ -107,31 +108,31 @@ class _Reading:
     def __init__(self, blocks: Blocks, executor: ThreadPoolExecutor) -> None:
         self._blocks = blocks
         self._executor = executor
-        self._block: Block | None = None
+        self._block: Batch | None = None
         self._row = 0
 
     async def next_time(self) -> int | None:
         """Log time of the next message, ns; None at the end."""
-        while self._block is None or self._row == len(self._block.batch):
+        while self._block is None or self._row == len(self._block):
             read = self._executor.submit(next, self._blocks, None)
             self._block, self._row = await asyncio.wrap_future(read), 0
             if self._block is None:
                 return None
-        return int(self._block.batch.log_time[self._row])
+        return int(self._block.log_time[self._row])
 
-    def take(self, until: int) -> tuple[Block, int]:
+    def take(self, until: int) -> tuple[Batch, int]:
         """Messages until a log time, ns, about `_MAX_SENT` bytes; the log time of the last one.
 
         At least one. Call `next_time` first.
         """
         assert self._block is not None
-        batch, row = self._block.batch, self._row
+        batch, row = self._block, self._row
         times = batch.log_time[row:]
         count = max(int(np.searchsorted(times, until, "right")), 1)
         sizes = np.cumsum(batch.length[row : row + count])
         last = int(np.searchsorted(sizes[:-1], _MAX_SENT))
         self._row += last + 1
-        return Block(batch.take(slice(row, self._row)), self._block.channels), int(times[last])
+        return batch.take(slice(row, self._row)), int(times[last])
 
     def close(self) -> None:
         """Read no more."""
@@ -376,8 +377,8 @@ class PlaybackServer:
         topics = sorted({self._topics[channel] for channel in wanted})
         reading = _Reading(self._log.current(topics, self._sent), self._executor)
         while await reading.next_time() is not None:
-            block, _ = reading.take(self._sent)
-            await self._send(clients, block, wanted)
+            batch, _ = reading.take(self._sent)
+            await self._send(clients, batch, wanted)
 
     async def _send_due(self) -> None:
         """Send all messages until the time of the clock."""
@@ -393,8 +394,8 @@ class PlaybackServer:
             if self._next > now:
                 break
             assert self._reading is not None
-            block, self._sent = self._reading.take(now)
-            await self._send(self._clients, block, self._topics)
+            batch, self._sent = self._reading.take(now)
+            await self._send(self._clients, batch, self._topics)
             self._clock.wait_for(self._sent, _LATE_S)
             self._next = await self._next_time()
         last = self._log.end if self._next is None else self._next - 1
@@ -428,20 +429,17 @@ class PlaybackServer:
             await self._broadcast_state()
 
     async def _send(
-        self, clients: Sequence[_Client], block: Block, channels: Collection[int]
+        self, clients: Sequence[_Client], batch: Batch, channels: Collection[int]
     ) -> None:
-        """Send a block of messages to the subscribers of its channels."""
-        await asyncio.gather(*(self._send_to(client, block, channels) for client in clients))
+        """Send messages to the subscribers of their channels."""
+        await asyncio.gather(*(self._send_to(client, batch, channels) for client in clients))
 
-    async def _send_to(self, client: _Client, block: Block, channels: Collection[int]) -> None:
+    async def _send_to(self, client: _Client, batch: Batch, channels: Collection[int]) -> None:
         own = {c: s for c, s in client.subscriptions.items() if c in channels}
-        subscriptions = [own.get(channel) for channel in block.channels]
-        batch = block.batch
         rows = zip(batch.channel.tolist(), batch.log_time.tolist(), strict=True)
-        for row, (index, log_time) in enumerate(rows):
-            subscription = subscriptions[index]
-            if subscription is not None:
-                await client.send(message_data(subscription, log_time, batch.payload(row)))
+        for row, (channel, log_time) in enumerate(rows):
+            if channel in own:
+                await client.send(message_data(own[channel], log_time, batch.payload(row)))
 
     def _read_subscribed(self) -> None:
         """Read the subscribed topics behind what is sent already."""

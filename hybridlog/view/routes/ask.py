@@ -8,12 +8,10 @@ from contextlib import closing, suppress
 from typing import TYPE_CHECKING, Any, Final
 
 from hybridlog.drawing.times import Match, Matches
-from hybridlog.query.answers.infer_fields import infer_fields
 from hybridlog.query.predicate.completion import complete
 from hybridlog.query.predicate.tokens import MAX_TEXT
-from hybridlog.query.query import field_types
 from hybridlog.query.topics import resolve
-from hybridlog.view.context import SQL_MEMORY, Context, route, start_of
+from hybridlog.view.context import SQL_MEMORY, Context, known_fields, route, start_of
 from hybridlog.view.question import program, question_of
 from hybridlog_storage.errors import HybridlogError, TopicError
 from hybridlog_storage.stopping import held
@@ -22,7 +20,7 @@ from hybridlog_storage.times import END
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from hybridlog.sql.plan import Remarks
+    from hybridlog.sql.plan import Reading
     from hybridlog.view.context import RequestParams
     from hybridlog.view.question import PageQuestion
 
@@ -46,10 +44,10 @@ def matches(context: Context, params: RequestParams) -> dict[str, Any]:
     found, in_force = matching.ticks(span, pixels), matching.bands(span, pixels)
     return {
         "begin": span[0] - start,
-        "width": found.width,
-        "pixels": found.pixels.tolist(),
-        "counts": found.counts.tolist(),
-        "first": (found.first - start).tolist(),
+        "width": found["width"],
+        "pixels": found["pixels"].tolist(),
+        "counts": found["counts"].tolist(),
+        "first": (found["first"] - start).tolist(),
         "bands": (in_force - start).tolist(),
     }
 
@@ -101,11 +99,7 @@ def completion(context: Context, params: RequestParams) -> dict[str, Any]:
             (name,) = resolve([topic or own], topics)
         except (TopicError, ValueError):
             return None
-        query = context.query(recording, name)
-        known = field_types(query)
-        if known is None:
-            known = {str(one["path"]): str(one["type"]) for one in infer_fields(query)}
-        return known
+        return known_fields(context.query(recording, name))
 
     found = complete(text, place, topics - {own}, fields, most=_MAX_CANDIDATES)
     offered = [[one.text, one.kind, one.type] for one in found.candidates]
@@ -139,7 +133,7 @@ def sql_answer(context: Context, text: str, seconds: float) -> dict[str, Any]:
         body = f"    print(store.sql({text!r}).to_pandas())\n"
         found = shown(table, SQL_COLUMNS)
         found["at"], found["recordings"] = _moments(
-            context, found.pop("times"), found["recordings"], answer.remarks
+            context, found.pop("times"), found["recordings"], answer.reading
         )
         return found | {
             "more": is_cut,
@@ -149,7 +143,7 @@ def sql_answer(context: Context, text: str, seconds: float) -> dict[str, Any]:
 
 
 def _moments(
-    context: Context, times: Sequence[int | None], names: Sequence[str | None], read: Remarks
+    context: Context, times: Sequence[int | None], names: Sequence[str | None], read: Reading
 ) -> tuple[list[str | None], list[str | None]]:
     """The time since the start of its recording, ns, as text, and the recording of each row.
 

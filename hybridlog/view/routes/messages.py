@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING, Any, Final
 
-from hybridlog.drawing.log import LEVELS, Kind, Line, filtered, kind_of, lines
+from hybridlog.drawing.log import LEVELS, Kind, filtered, kind_of, lines
 from hybridlog.drawing.tree import MAX_SHOWN, tree
 from hybridlog.query.query import channels_of
 from hybridlog.query.times import format_time
@@ -75,7 +75,7 @@ def log(context: Context, params: RequestParams) -> dict[str, Any]:
     found = lines(some, kind, time, seq, before, before=True)
     later = lines(some, kind, time, seq, after)
     return {
-        "lines": [_line(line, start) for line in (*found, *later)],
+        "lines": [{**line, "time": str(line["time"] - start)} for line in (*found, *later)],
         "first": len(found) < before,
         "last": len(later) < after,
     }
@@ -94,19 +94,6 @@ def _filtered(query: Query, params: RequestParams) -> tuple[Query, Kind]:
     type_name = next((schema.name for schema in schemas if schema is not None), "")
     kind = kind_of(type_name)
     return filtered(query, kind, level, text), kind
-
-
-def _line(line: Line, start: int) -> dict[str, Any]:
-    found: dict[str, Any] = {"time": str(line.time - start), "seq": line.seq, "text": line.text}
-    if line.level:
-        found["level"] = line.level
-    if line.name:
-        found["name"] = line.name
-    if not line.is_whole:
-        found["cut"] = True
-    if not line.is_readable:
-        found["problem"] = True
-    return found
 
 
 routes = [route("/message", message), route("/log", log), route("/log/count", log_count)]

@@ -54,22 +54,16 @@ def points_at(context: Context, params: RequestParams) -> Response:
         found = points(shown.message, values=[value], limit=limit)
     except (DefinitionError, PayloadError) as error:
         return packed_response({**header, "problem": str(error)}, {})
-    values = {"value": found.values[value]} if value in found.values else {}
-    columns = dict(zip("xyz", found.xyz.T, strict=True)) | values
+    xyz, all_values, bases = found.pop("xyz"), found.pop("values"), found.pop("bases")
+    values = {"value": all_values[value]} if value in all_values else {}
+    columns = dict(zip("xyz", xyz.T, strict=True)) | values
     header |= {
-        "frame": found.frame,
-        "shown": len(found.xyz),
-        "total": found.total,
-        "dropped": found.dropped,
-        "every": found.every,
-        "origin": found.origin,
-        "flat": found.is_flat,
-        "remarks": found.remarks,
-        "names": found.names,
-        "base": found.bases.get(value, 0.0),
+        **found,
+        "shown": len(xyz),
+        "base": bases.get(value, 0.0),
         "bounds": {name: bounds(array) for name, array in columns.items()},
     }
-    return packed_response(header, {"xyz": found.xyz, **values})
+    return packed_response(header, {"xyz": xyz, **values})
 
 
 def track_of(context: Context, params: RequestParams) -> Response:
@@ -84,19 +78,13 @@ def track_of(context: Context, params: RequestParams) -> Response:
     if params.has("begin") or params.has("end"):
         span = params.span(start)
     found = track(query, pixels=params.pixels(), span=span)
-    header = {
-        "grid": None if found.grid is None else asdict(found.grid),
-        "is_geographic": found.is_geographic,
-        "messages": found.messages,
-        "fixes": found.fixes,
-        "exact": found.exact,
-    }
-    offsets = found.times - start
+    offsets, xy = found.pop("times") - start, found.pop("xy")
+    header = {**found, "grid": None if found["grid"] is None else asdict(found["grid"])}
     times = offsets.astype(np.float64)
     arrays: dict[str, NDArray[np.floating[Any]]] = {
         "times": times,
         "rests": np.array([n - int(float(n)) for n in offsets.tolist()], np.float32),
-        "xy": found.xy.astype(np.float32),
+        "xy": xy.astype(np.float32),
     }
     return packed_response(header, arrays)
 
