@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from hybridlog.wording import counted
 from hybridlog_storage import copy
-from hybridlog_storage.copy_places import RECORDINGS, Directory, RefusedError
+from hybridlog_storage.copy_places import Directory, RefusedError
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import gone
 from hybridlog_storage.errors import (
@@ -26,6 +26,7 @@ from hybridlog_storage.errors import (
     StoreError,
     UsageError,
 )
+from hybridlog_storage.manifests import RECORDINGS
 
 if TYPE_CHECKING:
     from hybridlog.maintenance.report import Progress

@@ -25,6 +25,7 @@ from hybridlog_storage.cache import Cache
 from hybridlog_storage.cells import Cells, Statement, drop, put
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.errors import CatalogError, SegmentError
+from hybridlog_storage.manifests import RECORDINGS
 from hybridlog_storage.messages import EXPIRED_IDS, MARKS_CHANNEL, Channel, Schema, schema_hash
 from hybridlog_storage.segments.chunk_table import ChunkTable
 from hybridlog_storage.segments.gone_log import GoneLog, open_log
@@ -52,7 +53,6 @@ _DECODED: Final = "decoded"
 _TOPICS: Final = "topics"
 _SCHEMA: Final = "schema"
 """Kinds of the cells of sets of topics and of schemas, by hash; nothing removes them."""
-_RECORDINGS: Final = "recordings"
 _RECORDINGS_FILE: Final = Path("tables/recordings.parquet")
 _BUSY_S: Final = 1.0
 _NOTING_S: Final = 0.1
@@ -508,7 +508,7 @@ class Catalog:
         )
 
     def _read_table(self, entry: RecordingEntry, number: int, digest: str) -> ChunkTable:
-        path = self._store / _RECORDINGS / entry.id / file_of(entry, number)
+        path = self._store / RECORDINGS / entry.id / file_of(entry, number)
         try:
             with open_log(path, number) as reader:
                 is_ours = not isinstance(reader, GoneLog) or digest == reader.digest()

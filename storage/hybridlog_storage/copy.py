@@ -11,11 +11,11 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
-from hybridlog_storage.copy_places import RECORDINGS, RefusedError, Sending
+from hybridlog_storage.copy_places import RefusedError, Sending
 from hybridlog_storage.disk.directory import ListedFile, listed_files
 from hybridlog_storage.errors import RecordingExistsError, StoreError
 from hybridlog_storage.manifest import Manifest, replace
-from hybridlog_storage.manifests import MANIFEST_LOCK, WRITER_LOCK
+from hybridlog_storage.manifests import MANIFEST_LOCK, RECORDINGS, WRITER_LOCK
 from hybridlog_storage.merging import check_origin, merged, wanted
 from hybridlog_storage.stopping import pause, safe_point
 

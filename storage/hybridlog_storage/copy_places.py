@@ -27,15 +27,13 @@ from hybridlog_storage.errors import (
     unreadable,
 )
 from hybridlog_storage.manifest import digest_of, hasher
-from hybridlog_storage.manifests import DiskManifests
+from hybridlog_storage.manifests import MANIFESTS, RECORDINGS, DiskManifests
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from hybridlog_storage.manifests import Manifests
 
-RECORDINGS: Final = "recordings"
-MANIFESTS: Final = "manifests"
 MARK: Final = ".copying-"
 """Prefix of small files in `manifests` that live for a moment."""
 _PIECE: Final = 1 << 20

@@ -47,7 +47,7 @@ WAIT_S: Final = 30.0
 """Longest wait of a change for others, which take milliseconds."""
 _NO_LOCKS: Final = frozenset({errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS})
 MANIFESTS: Final = "manifests"
-_RECORDINGS: Final = "recordings"
+RECORDINGS: Final = "recordings"
 _SUFFIX: Final = ".json"
 _NEW: Final = ".new"
 _ALL: Final = ".lock"
@@ -180,7 +180,7 @@ class Manifests(ABC):
         except FileNotFoundError:
             raise RecordingGoneError(f"There is no recording {recording!r}.") from None
         try:
-            return _decoded(recording, data), version
+            return decoded(recording, data), version
         except ValueError as error:
             raise ManifestError(
                 f"The manifest of {recording} in {self.place} is damaged: {error}. {self.cure}"
@@ -226,7 +226,7 @@ class DiskManifests(Manifests):
     def __init__(self, path: Path) -> None:
         self.place, self._folder = str(path), path / MANIFESTS
         self._listed: tuple[set[str], list[str]] = set(), []
-        self._recordings = path / _RECORDINGS
+        self._recordings = path / RECORDINGS
 
     def ids(self) -> list[str]:
         """Ids of all recordings that have a manifest, sorted; also of those being removed."""
@@ -277,7 +277,7 @@ class DiskManifests(Manifests):
         with suppress(FileNotFoundError), files.folder(self._folder) as fd:
             for one in recordings:
                 with suppress(OSError, ValueError, RecordingGoneError):
-                    yield _present(_decoded(one, files.read_in(fd, f"{one}{_SUFFIX}", MAX_BYTES)))
+                    yield _present(decoded(one, files.read_in(fd, f"{one}{_SUFFIX}", MAX_BYTES)))
 
     def path(self, recording: str) -> Path:
         """The path of the manifest of a recording."""
@@ -389,8 +389,8 @@ class DiskManifests(Manifests):
     def old(self, recording: str) -> Manifest | None:
         """As of `Manifests`."""
         with suppress(OSError, ValueError):
-            found = decode(files.read_file(self._recordings / recording / MANIFEST_OLD, MAX_BYTES))
-            return found if found.id == recording else None
+            path = self._recordings / recording / MANIFEST_OLD
+            return decoded(recording, files.read_file(path, MAX_BYTES))
         return None
 
     def _drop(self, recording: str) -> None:
@@ -453,7 +453,7 @@ def ids_of(names: Iterable[str]) -> list[str]:
     return sorted(filter(is_id, ids))
 
 
-def _decoded(recording: str, data: bytes) -> Manifest:
+def decoded(recording: str, data: bytes) -> Manifest:
     """The manifest of a recording. Raises ValueError."""
     found = decode(data)
     if found.id != recording:

@@ -27,9 +27,7 @@ from typing import IO, TYPE_CHECKING, Final, Self
 from urllib.parse import unquote, urlsplit
 
 from hybridlog_storage.copy_places import (
-    MANIFESTS,
     MARK,
-    RECORDINGS,
     Place,
     RefusedError,
     read,
@@ -44,7 +42,14 @@ from hybridlog_storage.errors import (
     UsageError,
 )
 from hybridlog_storage.manifest import MAX_BYTES, Manifest, encode, hasher, is_id
-from hybridlog_storage.manifests import MANIFEST_LOCK, MANIFEST_OLD, WAIT_S, Manifests
+from hybridlog_storage.manifests import (
+    MANIFEST_LOCK,
+    MANIFEST_OLD,
+    MANIFESTS,
+    RECORDINGS,
+    WAIT_S,
+    Manifests,
+)
 from hybridlog_storage.settings import MAX_SETTINGS, StoreSettings, settings_of, settings_text
 from hybridlog_storage.settings import NAME as SETTINGS
 from hybridlog_storage.stopping import pause, safe_point
@@ -82,7 +87,7 @@ class Server(Place):
         self._host, self._options, self._root = _parts(url)
         self._held = ExitStack()
         self._scratch = Path()
-        self._found: dict[str, int] = {}  # by path, of the folder that was listed last
+        self._found: dict[str, int] = {}  # by name, of the folder that was listed last
         self.has_shell = False
 
     def __enter__(self) -> Self:
@@ -164,11 +169,8 @@ class Server(Place):
         """As of `Place`."""
         folder = f"{RECORDINGS}/{recording}"
         found = self.listed(folder)
-        self._found = {
-            name if name.startswith(folder) else f"{folder}/{name}": size
-            for name, size in found.items()
-        }
-        return {name.removeprefix(f"{folder}/"): size for name, size in self._found.items()}
+        self._found = {name.removeprefix(f"{folder}/"): size for name, size in found.items()}
+        return self._found
 
     def listed(self, path: str) -> dict[str, int]:
         """Bytes of ordinary files by name, of a folder or by a pattern."""
@@ -234,7 +236,7 @@ class Server(Place):
             sha256, digest = _digests(fd)
             if digest != sent.digest:
                 raise sent.damaged()
-            there = self._found.pop(part, 0)
+            there = self._found.pop(part.rpartition("/")[2], 0)
             for at in sent.begins(there):
                 sent.count(at, False)
                 if at < sent.size or not at:

@@ -37,6 +37,7 @@ from hybridlog_storage.manifests import (
     MANIFEST_LOCK,
     MANIFEST_OLD,
     MANIFESTS,
+    RECORDINGS,
     WRITER_LOCK,
     DiskManifests,
     Manifests,
@@ -54,7 +55,6 @@ from hybridlog_storage.stopping import pause
 LOCK: Final = WRITER_LOCK
 LOCK_WAIT_S: Final = 10.0
 """Seconds that a command waits for another one that holds its recording."""
-_RECORDINGS: Final = "recordings"
 _OF_MANIFEST: Final = frozenset({MANIFEST_LOCK, MANIFEST_OLD, f".{MANIFEST_OLD}"})
 _FOLDER: Final = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW
 _BESIDE: Final = _OF_MANIFEST | {WRITER_LOCK}
@@ -190,7 +190,7 @@ class StoreDirectory:
                     settings = StoreSettings(secrets.token_hex(16), mongo=mongo, cache_mb=cache_mb)
                     cls._make(path, settings)
             store = cls(path)
-            for folder in (MANIFESTS, _RECORDINGS):
+            for folder in (MANIFESTS, RECORDINGS):
                 with suppress(FileExistsError):
                     files.make_folder(path / folder)
                     files.sync_folder(path)
@@ -216,7 +216,7 @@ class StoreDirectory:
             return False
         if not os.access(self.path, os.W_OK | os.X_OK):
             return False
-        folders = self.path / MANIFESTS, self.path / _RECORDINGS  # a copy by hand may lack one
+        folders = self.path / MANIFESTS, self.path / RECORDINGS  # a copy by hand may lack one
         return all(os.access(one, os.W_OK | os.X_OK) or not one.exists() for one in folders)
 
     def check_writable(self) -> None:
@@ -242,7 +242,7 @@ class StoreDirectory:
     @property
     def recordings(self) -> Path:
         """Directory of all recordings."""
-        return self.path / _RECORDINGS
+        return self.path / RECORDINGS
 
     def recording(self, recording: str) -> Path:
         """Directory of a recording, by its id."""

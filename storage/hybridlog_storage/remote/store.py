@@ -32,8 +32,6 @@ from hybridlog_storage import manifest as truth
 from hybridlog_storage.cells import Cells, drop, put
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.copy_places import (
-    MANIFESTS,
-    RECORDINGS,
     Directory,
     RefusedError,
     Sending,
@@ -58,12 +56,11 @@ from hybridlog_storage.errors import (
 from hybridlog_storage.manifest import (
     MAX_BYTES,
     Manifest,
-    decode,
     digest_of,
     encode,
     with_rows,
 )
-from hybridlog_storage.manifests import Manifests, ids_of
+from hybridlog_storage.manifests import MANIFESTS, RECORDINGS, Manifests, decoded, ids_of
 from hybridlog_storage.remote.blocks import LOST, BlockCache, inode_of
 from hybridlog_storage.remote.bucket import Bucket, Object
 from hybridlog_storage.settings import MAX_SETTINGS, NONE, StoreSettings, settings_of, settings_text
@@ -246,9 +243,7 @@ class BucketManifests(Manifests):
     def _catalogued(self, recording: str) -> tuple[Manifest, str] | None:
         version, _, data = (self._cells.read(_MANIFEST, recording) or b"").partition(b"\n")
         with suppress(ValueError):
-            manifest = decode(data)
-            if manifest.id == recording:
-                return manifest, version.decode()
+            return decoded(recording, data), version.decode()
         return None
 
     def _get(self, recording: str) -> tuple[bytes, str]:
