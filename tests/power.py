@@ -124,16 +124,16 @@ class PowerCut(System):
             self._left -= 1
         self.calls += 1
 
-    def open(self, name: str, flags: int, mode: int = 0o666, *, folder: int | None = None) -> int:
+    def open(self, name: str, flags: int, mode: int = 0o666, *, dir_fd: int | None = None) -> int:
         if not flags & os.O_CREAT:
-            return super().open(name, flags, mode, folder=folder)
+            return super().open(name, flags, mode, dir_fd=dir_fd)
         self._step()
-        is_new = not _exists(name, folder)
-        fd = super().open(name, flags, mode, folder=folder)
-        if is_new and folder is not None:
+        is_new = not _exists(name, dir_fd)
+        fd = super().open(name, flags, mode, dir_fd=dir_fd)
+        if is_new and dir_fd is not None:
             number = self._new_number(os.fstat(fd))
             self._files[number] = _File()
-            self._folder(folder).pending.append((None, name, number))
+            self._folder(dir_fd).pending.append((None, name, number))
         elif flags & os.O_TRUNC:
             self._file(fd).pending.append((0, None))
         return fd
@@ -181,39 +181,42 @@ class PowerCut(System):
                 folder.durable = folder.apply(count)
                 del folder.pending[:count]
 
-    def rename(self, old: str, new: str, *, folder: int, new_folder: int) -> None:
+    def rename(self, old: str, new: str, *, src_dir_fd: int, dst_dir_fd: int) -> None:
         self._step()
-        number = self._number(os.stat(old, dir_fd=folder, follow_symlinks=False))
-        super().rename(old, new, folder=folder, new_folder=new_folder)
-        before, after = self._folder(folder), self._folder(new_folder)
+        number = self._number(os.stat(old, dir_fd=src_dir_fd, follow_symlinks=False))
+        super().rename(old, new, src_dir_fd=src_dir_fd, dst_dir_fd=dst_dir_fd)
+        before, after = self._folder(src_dir_fd), self._folder(dst_dir_fd)
         if before is after:
             before.pending.append((old, new, number))
         else:
             after.pending.append((None, new, number))
             after.left.append((before, old))
 
-    def link(self, old: str, new: str, *, folder: int, new_folder: int) -> None:
+    def link(
+        self, old: str, new: str, *, src_dir_fd: int, dst_dir_fd: int, follow_symlinks: bool
+    ) -> None:
         self._step()
-        number = self._number(os.stat(old, dir_fd=folder, follow_symlinks=False))
-        super().link(old, new, folder=folder, new_folder=new_folder)
-        self._folder(new_folder).pending.append((None, new, number))
+        number = self._number(os.stat(old, dir_fd=src_dir_fd, follow_symlinks=False))
+        places = {"src_dir_fd": src_dir_fd, "dst_dir_fd": dst_dir_fd}
+        super().link(old, new, **places, follow_symlinks=follow_symlinks)
+        self._folder(dst_dir_fd).pending.append((None, new, number))
 
-    def unlink(self, name: str, *, folder: int) -> None:
+    def unlink(self, name: str, *, dir_fd: int) -> None:
         self._step()
-        super().unlink(name, folder=folder)
-        self._folder(folder).pending.append((name, None, 0))
+        super().unlink(name, dir_fd=dir_fd)
+        self._folder(dir_fd).pending.append((name, None, 0))
 
-    def mkdir(self, name: str, mode: int, *, folder: int) -> None:
+    def mkdir(self, name: str, mode: int, *, dir_fd: int) -> None:
         self._step()
-        super().mkdir(name, mode, folder=folder)
-        number = self._new_number(os.stat(name, dir_fd=folder))
+        super().mkdir(name, mode, dir_fd=dir_fd)
+        number = self._new_number(os.stat(name, dir_fd=dir_fd))
         self._folders[number] = _Folder()
-        self._folder(folder).pending.append((None, name, number))
+        self._folder(dir_fd).pending.append((None, name, number))
 
-    def rmdir(self, name: str, *, folder: int) -> None:
+    def rmdir(self, name: str, *, dir_fd: int) -> None:
         self._step()
-        super().rmdir(name, folder=folder)
-        self._folder(folder).pending.append((name, None, 0))
+        super().rmdir(name, dir_fd=dir_fd)
+        self._folder(dir_fd).pending.append((name, None, 0))
 
     def after_cut(self, target: Path, rng: random.Random) -> None:
         """Make the folder that may be found after a cut at this moment."""

@@ -121,7 +121,7 @@ class TableFolders:
             self._merge(place, shared, waiting)
         self._publish(place, addition.files, names, old)
         with suppress(OSError), files.folder(place.parent) as fd:
-            files.system.rmdir(folder, folder=fd)
+            files.system.rmdir(folder, dir_fd=fd)
 
     def _own_files(
         self, place: Path, names: Iterable[str], goes: Callable[[str], bool]

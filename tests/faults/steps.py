@@ -204,9 +204,9 @@ class SteppedSystem(files.System):
     def __init__(self, seam: Seam) -> None:
         self._seam = seam
 
-    def open(self, name: str, flags: int, mode: int = 0o666, *, folder: int | None = None) -> int:
+    def open(self, name: str, flags: int, mode: int = 0o666, *, dir_fd: int | None = None) -> int:
         def do() -> int:
-            return super(SteppedSystem, self).open(name, flags, mode, folder=folder)
+            return super(SteppedSystem, self).open(name, flags, mode, dir_fd=dir_fd)
 
         return int(self._seam.step("create", name, do)) if flags & os.O_CREAT else do()
 
@@ -239,27 +239,30 @@ class SteppedSystem(files.System):
         # Nothing is lost of what was not synced: that is what other tests are for.
         self._seam.step("sync", _name(fd), lambda: None)
 
-    def rename(self, old: str, new: str, *, folder: int, new_folder: int) -> None:
+    def rename(self, old: str, new: str, *, src_dir_fd: int, dst_dir_fd: int) -> None:
         self._seam.step(
             "rename",
             f"{old} {new}",
-            lambda: os.rename(old, new, src_dir_fd=folder, dst_dir_fd=new_folder),
+            lambda: os.rename(old, new, src_dir_fd=src_dir_fd, dst_dir_fd=dst_dir_fd),
         )
 
-    def link(self, old: str, new: str, *, folder: int, new_folder: int) -> None:
+    def link(
+        self, old: str, new: str, *, src_dir_fd: int, dst_dir_fd: int, follow_symlinks: bool
+    ) -> None:
         def do() -> None:
-            super(SteppedSystem, self).link(old, new, folder=folder, new_folder=new_folder)
+            places = {"src_dir_fd": src_dir_fd, "dst_dir_fd": dst_dir_fd}
+            os.link(old, new, **places, follow_symlinks=follow_symlinks)
 
         self._seam.step("link", f"{old} {new}", do)
 
-    def unlink(self, name: str, *, folder: int) -> None:
-        self._seam.step("unlink", name, lambda: os.unlink(name, dir_fd=folder))
+    def unlink(self, name: str, *, dir_fd: int) -> None:
+        self._seam.step("unlink", name, lambda: os.unlink(name, dir_fd=dir_fd))
 
-    def mkdir(self, name: str, mode: int, *, folder: int) -> None:
-        self._seam.step("mkdir", name, lambda: os.mkdir(name, mode, dir_fd=folder))
+    def mkdir(self, name: str, mode: int, *, dir_fd: int) -> None:
+        self._seam.step("mkdir", name, lambda: os.mkdir(name, mode, dir_fd=dir_fd))
 
-    def rmdir(self, name: str, *, folder: int) -> None:
-        self._seam.step("rmdir", name, lambda: os.rmdir(name, dir_fd=folder))
+    def rmdir(self, name: str, *, dir_fd: int) -> None:
+        self._seam.step("rmdir", name, lambda: os.rmdir(name, dir_fd=dir_fd))
 
 
 def _name(fd: int) -> str:

@@ -23,7 +23,7 @@ import hybridlog as hl
 from benchmarks.simulator.write import write_bag
 from hybridlog.live import LiveRecording
 from hybridlog.live import recording as live
-from hybridlog_storage.disk import append_file
+from hybridlog_storage.disk.files import System
 from hybridlog_storage.errors import DatabaseError, DiskFullError, UsageError
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.mongo.collection_names import collection_of
@@ -185,8 +185,8 @@ def test_a_full_disk(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(append_file.os, "pwritev", full)
-        patch.setattr("hybridlog_storage.disk.files.os.writev", full)
+        patch.setattr(System, "pwritev", full)
+        patch.setattr(System, "writev", full)
 
         def until_refused() -> None:
             while True:
@@ -195,7 +195,7 @@ def test_a_full_disk(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
         taken = 1
         with pytest.raises(DiskFullError, match="Free some space"):
             until_refused()
-        patch.setattr("hybridlog_storage.disk.files.os.writev", os.writev)  # for the manifest
+        patch.setattr(System, "writev", os.writev)  # for the manifest
         with pytest.raises(DiskFullError):
             recording.close()
     with pytest.raises(DiskFullError):

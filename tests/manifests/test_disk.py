@@ -220,7 +220,7 @@ def test_without_hard_links_there_is_no_older_one(store: Path, calls: Calls) -> 
     manifests = DiskManifests(store)
     old = store / "recordings" / ONE.id / "manifest.old"
     assert old.read_bytes() == encode(ONE)
-    calls(os, "link", refuse)
+    calls(files.System, "link", refuse)
     manifests.change(ONE.id, tagged)
     assert manifests.read(ONE.id).tags == {"a": "b"}
 

@@ -42,10 +42,10 @@ class Steps(files.System):
         if is_late and (self._until is None or number < self._until):
             raise OSError(errno.ENOSPC, "no space left")
 
-    def open(self, name: str, flags: int, mode: int = 0o666, *, folder: int | None = None) -> int:
+    def open(self, name: str, flags: int, mode: int = 0o666, *, dir_fd: int | None = None) -> int:
         if flags & os.O_CREAT:
             self._step("create", name)
-        return super().open(name, flags, mode, folder=folder)
+        return super().open(name, flags, mode, dir_fd=dir_fd)
 
     def writev(self, fd: int, parts: Sequence[memoryview]) -> int:
         self._step("write", name_of(fd))
@@ -63,13 +63,13 @@ class Steps(files.System):
         self._step("sync", name_of(fd))
         super().sync(fd)
 
-    def rename(self, old: str, new: str, *, folder: int, new_folder: int) -> None:
+    def rename(self, old: str, new: str, *, src_dir_fd: int, dst_dir_fd: int) -> None:
         self._step("rename", new)
-        super().rename(old, new, folder=folder, new_folder=new_folder)
+        super().rename(old, new, src_dir_fd=src_dir_fd, dst_dir_fd=dst_dir_fd)
 
-    def unlink(self, name: str, *, folder: int) -> None:
+    def unlink(self, name: str, *, dir_fd: int) -> None:
         self._step("unlink", name)
-        super().unlink(name, folder=folder)
+        super().unlink(name, dir_fd=dir_fd)
 
 
 def name_of(fd: int) -> str:

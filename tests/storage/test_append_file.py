@@ -32,9 +32,9 @@ def at_opening(patch: pytest.MonkeyPatch) -> None:
 
     class Refusing(files.System):
         def open(
-            self, name: str, flags: int, mode: int = 0o666, *, folder: int | None = None
+            self, name: str, flags: int, mode: int = 0o666, *, dir_fd: int | None = None
         ) -> int:
-            fd = super().open(name, flags & ~append_file.DIRECT, mode, folder=folder)
+            fd = super().open(name, flags & ~append_file.DIRECT, mode, dir_fd=dir_fd)
             if flags & append_file.DIRECT:
                 os.close(fd)
                 raise OSError(errno.EINVAL, "no direct writes here")

@@ -48,45 +48,16 @@ mounted: Final[dict[Path, Any]] = {}
 class System:
     """The calls that change a file system. Tests replace `system`."""
 
-    def open(self, name: str, flags: int, mode: int = 0o666, *, folder: int | None = None) -> int:
-        """Open or create a file in an open folder."""
-        return os.open(name, flags | os.O_CLOEXEC, mode, dir_fd=folder)
-
-    def writev(self, fd: int, parts: Sequence[memoryview]) -> int:
-        """Write at the file's position; may write only a part."""
-        return os.writev(fd, parts)
-
-    def pwritev(self, fd: int, parts: Sequence[memoryview], position: int) -> int:
-        """Write at a position; may write only a part."""
-        return os.pwritev(fd, parts, position)
-
-    def truncate(self, fd: int, length: int) -> None:
-        """Truncate or extend a file."""
-        os.ftruncate(fd, length)
-
-    def sync(self, fd: int) -> None:
-        """Force a file, or the names in a folder, to the disk."""
-        os.fsync(fd)
-
-    def rename(self, old: str, new: str, *, folder: int, new_folder: int) -> None:
-        """Rename a file; replaces a file of the new name."""
-        os.rename(old, new, src_dir_fd=folder, dst_dir_fd=new_folder)
-
-    def link(self, old: str, new: str, *, folder: int, new_folder: int) -> None:
-        """Give a file a second name."""
-        os.link(old, new, src_dir_fd=folder, dst_dir_fd=new_folder, follow_symlinks=False)
-
-    def unlink(self, name: str, *, folder: int) -> None:
-        """Remove a file."""
-        os.unlink(name, dir_fd=folder)
-
-    def mkdir(self, name: str, mode: int, *, folder: int) -> None:
-        """Create a folder."""
-        os.mkdir(name, mode, dir_fd=folder)
-
-    def rmdir(self, name: str, *, folder: int) -> None:
-        """Remove an empty folder."""
-        os.rmdir(name, dir_fd=folder)
+    open = staticmethod(os.open)
+    writev = staticmethod(os.writev)
+    pwritev = staticmethod(os.pwritev)
+    truncate = staticmethod(os.ftruncate)
+    sync = staticmethod(os.fsync)
+    rename = staticmethod(os.rename)
+    link = staticmethod(os.link)
+    unlink = staticmethod(os.unlink)
+    mkdir = staticmethod(os.mkdir)
+    rmdir = staticmethod(os.rmdir)
 
 
 system: System = System()
@@ -116,7 +87,7 @@ def open_file(path: Path, flags: int, mode: int = 0o666) -> int:
     if not flags & _WRITES and (found := _mounted(path)) is not None:
         return cast("int", found[0].open(found[1]))
     with folder(path.parent) as fd:
-        return system.open(path.name, flags | os.O_NOFOLLOW | os.O_NONBLOCK, mode, folder=fd)
+        return system.open(path.name, flags | os.O_NOFOLLOW | os.O_NONBLOCK, mode, dir_fd=fd)
 
 
 def read_file(path: Path, most: int) -> bytes:
@@ -127,7 +98,7 @@ def read_file(path: Path, most: int) -> bytes:
 def read_in(folder: int, name: str, most: int) -> bytes:
     """Read a small ordinary file of an open folder; as `read_file`."""
     flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK
-    return _content(system.open(name, flags, folder=folder), most, name)
+    return _content(system.open(name, flags, dir_fd=folder), most, name)
 
 
 def _content(fd: int, most: int, path: Path | str) -> bytes:
@@ -304,25 +275,25 @@ def most_open(most: int) -> int:
 def make_folder(path: Path, mode: int = 0o777) -> None:
     """Create a folder; the umask applies."""
     with folder(path.parent) as fd:
-        system.mkdir(path.name, mode, folder=fd)
+        system.mkdir(path.name, mode, dir_fd=fd)
 
 
 def rename(old: Path, new: Path) -> None:
     """Give a file or a folder of the store another name, in another folder, too."""
     with folder(old.parent) as fd, folder(new.parent) as new_fd:
-        system.rename(old.name, new.name, folder=fd, new_folder=new_fd)
+        system.rename(old.name, new.name, src_dir_fd=fd, dst_dir_fd=new_fd)
 
 
 def link(old: Path, new: Path) -> None:
     """Give a file of the store a second name."""
     with folder(old.parent) as fd, folder(new.parent) as new_fd:
-        system.link(old.name, new.name, folder=fd, new_folder=new_fd)
+        system.link(old.name, new.name, src_dir_fd=fd, dst_dir_fd=new_fd, follow_symlinks=False)
 
 
 def unlink(path: Path) -> None:
     """Remove a file."""
     with folder(path.parent) as fd:
-        system.unlink(path.name, folder=fd)
+        system.unlink(path.name, dir_fd=fd)
 
 
 def sync_folder(path: Path) -> None:
@@ -351,7 +322,7 @@ def _remove(parent: int, name: str) -> None:
         return
     except OSError:  # a file or a symlink
         with suppress(FileNotFoundError):
-            system.unlink(name, folder=parent)
+            system.unlink(name, dir_fd=parent)
         return
     try:
         for inner in sorted(os.listdir(fd)):  # noqa: PTH208 - of a handle
@@ -359,7 +330,7 @@ def _remove(parent: int, name: str) -> None:
     finally:
         os.close(fd)
     with suppress(FileNotFoundError):
-        system.rmdir(name, folder=parent)
+        system.rmdir(name, dir_fd=parent)
 
 
 def _mounted(path: Path) -> tuple[Any, tuple[str, ...]] | None:
