@@ -349,7 +349,7 @@ def read_again(directory: StoreDirectory, catalog: Catalog, entry: RecordingEntr
     """Read the files of a recording again, after one of them was not what its entry says."""
     is_open = directory.is_recorded(entry.id)
     now = describe_now(directory, catalog, entry.id, is_open=is_open)
-    catalog.put(now, waits=False)
+    catalog.put(now)
     for number, _, _ in entry.spans:
         try:
             catalog.table(entry, number)

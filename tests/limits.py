@@ -56,7 +56,7 @@ PLACES = {
     "playback_sent": "hybridlog.view.playback.server._MAX_SENT",
     "sql_seconds": "hybridlog.view.routes.ask.SQL_SECONDS",
     "export_piece_bytes": "hybridlog.view.routes.export.PIECE",
-    "catalog_busy_s": "hybridlog_storage.catalog._BUSY_S",
+    "catalog_busy_s": "hybridlog_storage.cells._WAIT_S",
     "matches": "hybridlog.drawing.times.MAX_MATCHES",
     "direct_flag": "hybridlog_storage.disk.append_file.DIRECT",
     "copy_wait_s": "hybridlog_storage.copy_places.LOCK_WAIT_S",

@@ -170,7 +170,7 @@ class StoreFiles:
         found = described_of(*known)
         is_noted = self.catalog.recording(recording) == (found.files, found.entry)
         if found.entry.status not in UNFINISHED or not is_noted:
-            self.catalog.put(found, waits=False)
+            self.catalog.put(found)
         return found.summary
 
     def _known(self, recording: str) -> tuple[RecordingEntry, str, str] | None:
@@ -226,7 +226,7 @@ class StoreFiles:
             if directory.has(recording):
                 raise
             return None  # another process has just removed it
-        catalog.put(described, waits=False)
+        catalog.put(described)
         return described
 
 

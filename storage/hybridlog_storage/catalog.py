@@ -54,8 +54,6 @@ _TOPICS: Final = "topics"
 _SCHEMA: Final = "schema"
 """Kinds of the cells of sets of topics and of schemas, by hash; nothing removes them."""
 _RECORDINGS_FILE: Final = Path("tables/recordings.parquet")
-_BUSY_S: Final = 1.0
-_NOTING_S: Final = 0.1
 _MAX_TABLES: Final = 64 << 20  # bytes of chunk tables in memory
 _FEW: Final = 100  # cells that are read one by one
 _T = TypeVar("_T")
@@ -334,11 +332,8 @@ class Catalog:
             except OSError as error:
                 raise durability.explain(error, self.recordings_file, "removing") from error
 
-    def put(self, described: Described, *, waits: bool = True) -> None:
-        """Insert or replace a recording.
-
-        A question has `waits=False`: it does not wait for other processes.
-        """
+    def put(self, described: Described) -> None:
+        """Insert or replace a recording."""
         entry, summary = described.entry, described.summary
         if entry.status != "open":
             self.has_changed = True
@@ -360,7 +355,7 @@ class Catalog:
             if index:  # until it is compared with the index
                 yield put(_INDEX, entry.id, _body(["", "", damage]))
 
-        self._cells.write(statements, _BUSY_S if waits else _NOTING_S)
+        self._cells.write(statements)
 
     def put_summaries(
         self,
@@ -369,7 +364,7 @@ class Catalog:
         *,
         is_change: bool,
     ) -> None:
-        """Note summaries that manifests have made, at once; no question waits for it.
+        """Note summaries that manifests have made, at once.
 
         `topics` are by hash; `is_change` says that a summary differs, in more than its look, from
         what was known.
@@ -384,7 +379,7 @@ class Catalog:
             for one in summaries:
                 yield put(_SUMMARY, one.id, _summary_body(one))
 
-        self._cells.write(statements, _NOTING_S)
+        self._cells.write(statements)
 
     def put_indexed(self, recordings: Collection[str], index: str) -> None:
         """Note that an index is complete for recordings, as long as they look the same."""
@@ -394,19 +389,19 @@ class Catalog:
                 if one.indexed_by != index:
                     yield put(_INDEX, one.id, _body([index, one.look, self._index(one.id)[2]]))
 
-        self._cells.write(statements, _NOTING_S)
+        self._cells.write(statements)
 
     def put_damage(self, recording: str, damage: Mapping[tuple[int, int], str]) -> None:
         """Store the unreadable chunks of a recording: reason by segment and number."""
         rows = [(*place, reason) for place, reason in sorted(damage.items())]
-        self._cells.write(lambda: [put(_INDEX, recording, _body(["", "", rows]))], _BUSY_S)
+        self._cells.write(lambda: [put(_INDEX, recording, _body(["", "", rows]))])
 
     def put_decoded(
         self, recording: str, number: int, digest: str, decoded: Mapping[int, ChannelStats]
     ) -> None:
         """Store the results of decoding a segment, from `decoded_in`."""
         cell = put(_DECODED, recording, encode((digest, decoded)), number)
-        self._cells.write(lambda: [cell], _BUSY_S)
+        self._cells.write(lambda: [cell])
 
     def remove(self, recording: str) -> None:
         """Remove a recording."""
@@ -414,7 +409,7 @@ class Catalog:
         self._remove_recordings_file()
         self._tables.drop("table", recording)
         kinds = (_SUMMARY, _ENTRY, _INDEX, _DECODED)
-        self._cells.write(lambda: [drop(kind, recording) for kind in kinds], _BUSY_S)
+        self._cells.write(lambda: [drop(kind, recording) for kind in kinds])
 
     # Answers.
 

@@ -31,7 +31,7 @@ _TABLE: Final = (
 )
 _SELECT: Final = "SELECT kind, key, number, body, crc FROM cells WHERE kind = ? AND "
 _ASIDE: Final = ("-journal", "-wal", "-shm")  # what SQLite would read or write, too
-_READ_S: Final = 0.1
+_WAIT_S: Final = 0.5  # for other processes, once: then memory takes the place of the file
 _MAX_BYTES: Final = 1 << 28  # of a cell
 _MAX_COPIED: Final = 1 << 30  # bytes of a file that is read into memory
 _ERRORS: Final = (sqlite3.DatabaseError, UnicodeDecodeError, OSError)
@@ -113,7 +113,7 @@ class Cells:
         opened = _connected(f"file:{quote(os.fsencode(self._path.absolute()))}?mode=rw")
         try:
             if not self._is_ours(opened):
-                with _transaction(opened, _READ_S):
+                with _transaction(opened):
                     if not opened.execute("SELECT 1 FROM sqlite_master").fetchall():  # it is new
                         self._fill(opened)
             if not self._is_ours(opened):
@@ -193,11 +193,11 @@ class Cells:
 
         return self._run(work)
 
-    def write(self, make: Callable[[], Iterable[Statement]], wait_s: float = 0) -> None:
+    def write(self, make: Callable[[], Iterable[Statement]]) -> None:
         """Change cells by the statements of `make`; meanwhile no other process changes any."""
 
         def work(opened: sqlite3.Connection) -> None:
-            with _transaction(opened, wait_s):
+            with _transaction(opened):
                 for statement in make():
                     opened.execute(*statement)
 
@@ -210,9 +210,8 @@ class Cells:
 
 
 @contextmanager
-def _transaction(opened: sqlite3.Connection, wait_s: float) -> Iterator[None]:
+def _transaction(opened: sqlite3.Connection) -> Iterator[None]:
     try:
-        opened.execute(f"PRAGMA busy_timeout = {int(wait_s * 1000)}")
         opened.execute("BEGIN IMMEDIATE")
         yield
         opened.execute("COMMIT")
@@ -220,14 +219,11 @@ def _transaction(opened: sqlite3.Connection, wait_s: float) -> Iterator[None]:
         with suppress(sqlite3.Error):
             opened.rollback()
         raise
-    finally:
-        with suppress(sqlite3.Error):
-            opened.execute(f"PRAGMA busy_timeout = {int(_READ_S * 1000)}")
 
 
 def _connected(address: str = ":memory:") -> sqlite3.Connection:
     made = sqlite3.connect(
-        address, uri=True, timeout=_READ_S, isolation_level=None, check_same_thread=False
+        address, uri=True, timeout=_WAIT_S, isolation_level=None, check_same_thread=False
     )
     try:
         made.text_factory = bytes  # damaged text is no error

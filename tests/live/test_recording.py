@@ -195,7 +195,6 @@ def test_a_full_disk(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
         taken = 1
         with pytest.raises(DiskFullError, match="Free some space"):
             until_refused()
-        patch.setattr(System, "writev", os.writev)  # for the manifest
         with pytest.raises(DiskFullError):
             recording.close()
     with pytest.raises(DiskFullError):

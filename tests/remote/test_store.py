@@ -421,7 +421,7 @@ def test_hostile_catalogs(published: str, proxy: Proxy) -> None:
 
         def listed(*rows: Any) -> int:
             body = rows[0] if isinstance(rows[0], bytes) else json.dumps(rows).encode()
-            cells.write(lambda: [put("tables", recording, body)], 0)
+            cells.write(lambda: [put("tables", recording, body)])
             return sum(recording in name for own in cells.tables().values() for name in own)
 
         assert listed(row) == 1
@@ -438,7 +438,7 @@ def test_hostile_catalogs(published: str, proxy: Proxy) -> None:
         ):
             assert listed(bad) == 0
         for body in (b"", b"x", manifest[:-9] + b"0" * 9, manifest.replace(b"run", b"fun")):
-            cells.write(lambda body=body: [put("manifest", recording, body)], 0)  # type: ignore[misc]
+            cells.write(lambda body=body: [put("manifest", recording, body)])  # type: ignore[misc]
             directory.manifests._known.clear()
             assert directory.manifests.read(recording).id == recording
 
