@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.manifest import File, Manifest, decode, encode
 from hybridlog_storage.manifests import MANIFEST_OLD, manifests_at
 
@@ -33,6 +34,12 @@ def id_of(store: Path, name: str) -> str:
 def segment(store: Path, name: str, number: int = 0) -> Path:
     """A sealed segment of the recording of a name."""
     return folder(store, name) / f"{number:06d}.mcap"
+
+
+def segments(store: Path, recording: str) -> list[tuple[int, Path]]:
+    """Number and path of each sealed segment of a recording, by its id."""
+    sealed = StoreDirectory(store).listing(recording).sealed.items()
+    return [(number, store / "recordings" / recording / name) for number, name in sealed]
 
 
 def manifest_of(folder: Path) -> Path:

@@ -109,7 +109,7 @@ class Made:
                 writer.add_extra(json_metadata(LOSSES_METADATA, {"rows": [LOSS]}))
         self.end = {"status": "complete", "losses": []}
         writer.close()
-        self.segments = [path for _, path in directory.segments(self.id)]
+        self.segments = [path for _, path in places.segments(directory.path, self.id)]
         assert len(self.segments) == segments
 
     def _announce(self, group: Any) -> None:

@@ -308,7 +308,9 @@ class Place:
 
 
 def place_in_the_middle(store: hl.Store) -> Place:
-    number, path = store.directory.segments(places.id_of(store.directory.path, "short"))[1]
+    number, path = places.segments(
+        store.directory.path, places.id_of(store.directory.path, "short")
+    )[1]
     with SegmentReader(path, number) as reader:
         chunks = reader.summary().chunks
     chunk = chunks[len(chunks) // 2]
@@ -453,7 +455,9 @@ def test_a_chunk_that_is_listed_otherwise_than_it_is(
     store: hl.Store, said: Counter[Message], place: int, change: Callable[[int], int]
 ) -> None:
     """Checksum and all: the manifest knows the file by its digest."""
-    (_, path), *_ = store.directory.segments(places.id_of(store.directory.path, "short"))
+    (_, path), *_ = places.segments(
+        store.directory.path, places.id_of(store.directory.path, "short")
+    )
     list_otherwise(path, place, change)
     with reopened(store) as opened:
         assert content(fetched(opened, "short")) == said

@@ -595,7 +595,7 @@ class Machine(RuleBasedStateMachine):
     def lose_a_segment(self, which: int, segment: int, reopened: bool) -> None:
         recording = self.chosen(which)
         known = self.model[recording]
-        segments = self.store.directory.segments(recording)
+        segments = places.segments(self.store.directory.path, recording)
         if not segments:
             return
         number, path = segments[segment % len(segments)]
@@ -678,7 +678,7 @@ class Machine(RuleBasedStateMachine):
         recording = self.chosen(which, can_crash)
         known = self.model[recording]
         entry = self.store.entry(recording)
-        number, path = self.store.directory.segments(recording)[-1]
+        number, path = places.segments(self.store.directory.path, recording)[-1]
         content = path.read_bytes()
         laid = Laid.out(content)
         cut = len(content) if part == "sealed" else laid.cut(spot, part)

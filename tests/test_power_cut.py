@@ -187,11 +187,11 @@ def test_the_model_loses_what_is_not_synced(tmp_path: Path) -> None:
     root.mkdir()
     power = PowerCut(root)
     with files.folder(root) as fd:
-        one = power.open("one", 0o102, folder=fd)
+        one = power.open("one", 0o102, dir_fd=fd)
         power.writev(one, [memoryview(b"x" * 1000)])
         power.sync(one)
         power.writev(one, [memoryview(b"y" * 1000)])
-        power.rename("one", "two", folder=fd, new_folder=fd)
+        power.rename("one", "two", src_dir_fd=fd, dst_dir_fd=fd)
     contents, names = set(), set()
     for seed in range(40):
         target = tmp_path / str(seed)

@@ -145,7 +145,7 @@ def test_segments_pass_the_official_readers(store: hl.Store) -> None:
     assert sorted(r.id for r in store.recordings()) == store.directory.ids()
     for entry in store.recordings():
         counted = 0
-        for _, path in store.directory.segments(entry.id):
+        for _, path in places.segments(store.directory.path, entry.id):
             data = path.read_bytes()
             list(StreamReader(io.BytesIO(data), validate_crcs=True).records)
             reader = make_reader(io.BytesIO(data), validate_crcs=True)

@@ -17,6 +17,7 @@ import hybridlog as hl
 from benchmarks.simulator.topics import RobotConfig
 from benchmarks.simulator.write import write_bag
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests import places
 from tests.data import DATA
 
 HERE = Path(__file__).parent / "second_opinion"
@@ -108,7 +109,7 @@ def test_another_reader_sees_the_same_messages(store: hl.Store, reader: Path) ->
     # Which segment a message lies in, the index says.
     ours: dict[Path, list[hl.Message]] = defaultdict(list)
     for entry in store.recordings():
-        paths = dict(store.directory.segments(entry.id))
+        paths = dict(places.segments(store.directory.path, entry.id))
         for number, path in paths.items():
             ours[path] = []
             topics = sorted({c.topic for c in entry.channels})
@@ -141,7 +142,7 @@ def test_another_reader_refuses_what_was_altered(
 ) -> None:
     """The test above can fail: a flipped bit in a chunk is no match."""
     entry = next(r for r in store.recordings() if r.name == "none")
-    _, path = store.directory.segments(entry.id)[0]
+    _, path = places.segments(store.directory.path, entry.id)[0]
     data = bytearray(path.read_bytes())
     data[int(store.catalog.table(entry, 0).chunks["offset"][0]) + 200] ^= 4
     altered = tmp_path / "altered.mcap"

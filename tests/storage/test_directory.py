@@ -18,6 +18,7 @@ import pytest
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import LOCK, Holder, StoreDirectory
 from hybridlog_storage.errors import HeldError, TopicError
+from tests import places
 from tests.waiting import at_once
 
 
@@ -59,9 +60,9 @@ def test_segments_are_told_by_their_numbers(store: StoreDirectory) -> None:
              "000001.mcap.tmp", "1.bag", "writer.lock"]  # fmt: skip
     for name in names:
         (recording / name).write_bytes(b"")
-    assert [n for n, _ in store.segments("r")] == [2, 10]
+    assert [n for n, _ in places.segments(store.path, "r")] == [2, 10]
     assert [*store.listing("r").open] == [3]
-    assert store.segments("nothing") == []
+    assert places.segments(store.path, "nothing") == []
 
 
 HOLD = """

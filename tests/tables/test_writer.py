@@ -23,6 +23,7 @@ from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.messages import Schema
 from hybridlog_storage.segments.segment_reader import SegmentReader
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests import places
 from tests.calls import Calls
 from tests.indexed import documents_of
 from tests.limits import Limit
@@ -200,7 +201,7 @@ def test_messages_that_nobody_can_read(store: hl.Store, tmp_path: Path) -> None:
 
 def chunks_of(store: hl.Store, entry: RecordingEntry) -> list[Any]:
     found = []
-    for number, path in store.directory.segments(entry.id):
+    for number, path in places.segments(store.directory.path, entry.id):
         with SegmentReader(path, number) as reader:
             summary = reader.summary()
             found += [(reader.read_chunk(place), summary.channels) for place in summary.chunks]

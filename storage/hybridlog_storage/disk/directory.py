@@ -380,11 +380,6 @@ class StoreDirectory:
         except OSError as error:
             raise unreadable(error, self.path, f"The store {self.path}") from error
 
-    def segments(self, recording: str) -> list[tuple[int, Path]]:
-        """Number and path of each sealed segment of a recording, in order."""
-        path = self.recording(recording)
-        return [(number, path / name) for number, name in self.listing(recording).sealed.items()]
-
     @property
     def mongod(self) -> Path:
         """Directory of the embedded MongoDB."""
