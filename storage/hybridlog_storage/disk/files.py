@@ -316,20 +316,17 @@ def remove_tree(path: Path) -> None:
 
 
 def _remove(parent: int, name: str) -> None:
-    try:
-        fd = os.open(name, _FOLDER | os.O_NOFOLLOW, dir_fd=parent)
-    except FileNotFoundError:
-        return
-    except OSError:  # a file or a symlink
-        with suppress(FileNotFoundError):
-            system.unlink(name, dir_fd=parent)
-        return
-    try:
-        for inner in sorted(os.listdir(fd)):  # noqa: PTH208 - of a handle
-            _remove(fd, inner)
-    finally:
-        os.close(fd)
     with suppress(FileNotFoundError):
+        try:
+            fd = os.open(name, _FOLDER | os.O_NOFOLLOW, dir_fd=parent)
+        except OSError:  # a file or a symlink
+            system.unlink(name, dir_fd=parent)
+            return
+        try:
+            for inner in sorted(os.listdir(fd)):  # noqa: PTH208 - of a handle
+                _remove(fd, inner)
+        finally:
+            os.close(fd)
         system.rmdir(name, dir_fd=parent)
 
 

@@ -128,13 +128,8 @@ class BlockCache:
         with self.writing():
             self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
             fd = _opened(self.paths(bucket, about)[0])
-            try:
-                if os.fstat(fd).st_size != about.size:
-                    os.ftruncate(fd, about.size)
-                os.utime(fd)
-            except BaseException:
-                os.close(fd)
-                raise
+            os.ftruncate(fd, about.size)
+            os.utime(fd)
             return CachedFile(fd, self, bucket, about)
 
     def paths(self, bucket: Bucket, about: Object) -> tuple[Path, Path]:
