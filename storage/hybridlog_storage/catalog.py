@@ -325,12 +325,9 @@ class Catalog:
     def _remove_recordings_file(self) -> None:
         """Remove the list of ended recordings, which is wrong now."""
         if not self.is_in_memory:
-            try:
+            removing = durability.explained(self.recordings_file, "removing")
+            with removing, suppress(FileNotFoundError):
                 files.unlink(self.recordings_file)
-            except FileNotFoundError:
-                pass
-            except OSError as error:
-                raise durability.explain(error, self.recordings_file, "removing") from error
 
     def put(self, described: Described) -> None:
         """Insert or replace a recording."""

@@ -345,15 +345,8 @@ class DiskManifests(Manifests):
         _make_file(folder / MANIFEST_LOCK)
 
     def _get(self, recording: str) -> tuple[bytes, str]:
-        path = self.path(recording)
-        try:
-            return files.read_file(path, MAX_BYTES), ""
-        except FileNotFoundError:
-            raise
-        except OSError as error:
-            if odd := _odd(path):
-                raise ManifestError(odd) from error
-            raise unreadable(error, path) from error
+        with _plainly(self.path(recording)):
+            return files.read_file(self.path(recording), MAX_BYTES), ""
 
     @contextmanager
     def _alone(self, recording: str) -> Iterator[None]:
@@ -394,15 +387,8 @@ class DiskManifests(Manifests):
         return None
 
     def _drop(self, recording: str) -> None:
-        path = self.path(recording)
-        try:
-            files.unlink(path)
-        except FileNotFoundError:
-            pass
-        except OSError as error:
-            if odd := _odd(path):
-                raise ManifestError(odd) from error
-            raise durability.explain(error, path, "removing") from error
+        with suppress(FileNotFoundError), _plainly(self.path(recording), "removing"):
+            files.unlink(self.path(recording))
 
     def _delete_files(self, recording: str) -> None:
         folder = self._recordings / recording
@@ -498,14 +484,22 @@ def _make_file(path: Path) -> None:
 
 
 def _opened(path: Path, flags: int) -> int:
-    try:
+    with _plainly(path, "locking"):
         return files.open_file(path, flags)
+
+
+@contextmanager
+def _plainly(path: Path, changing: str = "") -> Iterator[None]:
+    """Say what is odd of a file's place, or why the system refuses; not that it is missing."""
+    try:
+        yield
     except FileNotFoundError:
         raise
     except OSError as error:
         if odd := _odd(path):
-            raise StoreError(odd) from error
-        raise durability.explain(error, path, "locking") from error
+            raise ManifestError(odd) from error
+        explained = durability.explain(error, path, changing)
+        raise (explained if changing else unreadable(error, path)) from error
 
 
 def _odd(path: Path) -> str:

@@ -21,7 +21,7 @@ import shlex
 import subprocess
 import tempfile
 import time
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Final, Self
 from urllib.parse import unquote, urlsplit
@@ -41,7 +41,7 @@ from hybridlog_storage.errors import (
     StoreError,
     UsageError,
 )
-from hybridlog_storage.manifest import MAX_BYTES, Manifest, encode, hasher, is_id
+from hybridlog_storage.manifest import MAX_BYTES, Manifest, encode, hasher
 from hybridlog_storage.manifests import (
     MANIFEST_LOCK,
     MANIFEST_OLD,
@@ -49,6 +49,7 @@ from hybridlog_storage.manifests import (
     RECORDINGS,
     WAIT_S,
     Manifests,
+    ids_of,
 )
 from hybridlog_storage.settings import MAX_SETTINGS, StoreSettings, settings_of, settings_text
 from hybridlog_storage.settings import NAME as SETTINGS
@@ -124,9 +125,7 @@ class Server(Place):
         """As of `Place`; with a shell, as of a directory there."""
         folders = RECORDINGS, MANIFESTS, f"{RECORDINGS}/{recording}"
         self.sftp(*(f"-mkdir {folder}" for folder in folders))
-        with ExitStack() as held:
-            if self.has_shell:
-                held.enter_context(self._locked(recording))
+        with self._locked(recording) if self.has_shell else nullcontext():
             yield
 
     @contextmanager
@@ -360,8 +359,7 @@ class _ServerManifests(Manifests):
 
     def ids(self) -> list[str]:
         """Ids of all recordings that have a manifest, sorted."""
-        names = (Path(name) for name in self._server.listed(MANIFESTS))
-        return sorted(name.stem for name in names if name.suffix == ".json" and is_id(name.stem))
+        return ids_of(Path(name).name for name in self._server.listed(MANIFESTS))
 
     def _create(self, manifest: Manifest) -> None:
         exists = RecordingExistsError(f"There is a recording {manifest.id} already.")
