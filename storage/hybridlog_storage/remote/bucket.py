@@ -32,6 +32,12 @@ from hybridlog_storage.errors import (
 from hybridlog_storage.lazy import lazy
 from hybridlog_storage.remote import address_of
 
+try:
+    import obstore.store
+    from obstore import exceptions
+except ImportError as error:
+    raise MissingDependencyError("Buckets need obstore: pip install 'hybridlog[remote]'") from error
+
 if TYPE_CHECKING:
     from obstore import GetOptions, PutMode
     from obstore.store import ObjectStore
@@ -115,7 +121,6 @@ class Bucket:
 
         `prefix` has whole parts of names: `recordings/` has what is below it.
         """
-        import obstore
 
         def listed() -> list[Object]:
             pages = obstore.list(self._reading, prefix or None, chunk_size=_PAGE)
@@ -135,8 +140,6 @@ class Bucket:
         return self._get(name, {}, most)
 
     def _get(self, name: str, options: GetOptions, most: int) -> tuple[Object, bytes]:
-        import obstore
-
         def read() -> tuple[Object, bytes]:
             answer = obstore.get(self._reading, name, options=options)
             data = bytes(next(iter(answer.stream(most + 1)), b""))
@@ -168,8 +171,6 @@ class Bucket:
 
     def put(self, name: str, size: int, pieces: Iterable[Buffer]) -> Object:
         """Write an object, which takes the place of one of its name; not if `pieces` raises."""
-        import obstore
-
         self._check("create")
         if size <= PART_BYTES:
             return Object(name, size, self._put(name, b"".join(pieces), "overwrite"))
@@ -179,8 +180,6 @@ class Bucket:
 
     def delete(self, names: Sequence[str]) -> None:
         """Delete objects; those that do not exist are left out."""
-        import obstore
-
         if not names:
             return
         try:
@@ -194,8 +193,6 @@ class Bucket:
 
         One that ignores it is refused: writers would overwrite each other in silence.
         """
-        from obstore.exceptions import NotSupportedError
-
         if type(mode) in self._honoured:
             return
         name, is_made = f"probe-{secrets.token_hex(8)}", mode == "create"
@@ -207,7 +204,7 @@ class Bucket:
         except (FileNotFoundError, ObjectChangedError, ObjectExistsError):
             self._honoured.add(type(mode))
             return
-        except NotSupportedError:
+        except exceptions.NotSupportedError:
             pass
         finally:
             if is_made:
@@ -219,8 +216,6 @@ class Bucket:
         )
 
     def _put(self, name: str, content: bytes, mode: PutMode) -> str:
-        import obstore
-
         put = partial(obstore.put, self._writing, name, content, mode=mode, use_multipart=False)
         return self._again(name, lambda: _version(put()))
 
@@ -229,13 +224,11 @@ class Bucket:
 
         Writers have conditions, and see what a request did whose answer was lost.
         """
-        from obstore.exceptions import GenericError
-
         for attempt in range(_TRIES):
             with self._explained(name):
                 try:
                     return work()
-                except GenericError as error:
+                except exceptions.GenericError as error:
                     if attempt + 1 == _TRIES or _CUT.search(str(error)) is None:
                         raise
         raise AssertionError
@@ -246,8 +239,6 @@ class Bucket:
     @contextmanager
     def _explained(self, name: str) -> Iterator[None]:
         """Raise errors of the library as errors of this program."""
-        from obstore import exceptions
-
         _check_process(self.address)
         try:
             yield
@@ -304,19 +295,12 @@ def _check_process(address: str) -> None:
 def _opened(address: str, timeout_s: int) -> ObjectStore:
     _check_process(address)
     try:
-        from obstore.exceptions import BaseError
-        from obstore.store import from_url
-    except ImportError as error:
-        raise MissingDependencyError(
-            "Buckets need obstore: pip install 'hybridlog[remote]'"
-        ) from error
-    try:
-        return from_url(
+        return obstore.store.from_url(
             address,
             client_options={"timeout": timedelta(seconds=timeout_s), "allow_http": _allows_http()},
             retry_config={"max_retries": 6, "retry_timeout": timedelta(seconds=_RETRY_S)},
         )
-    except (BaseError, ValueError) as error:
+    except (exceptions.BaseError, ValueError) as error:
         raise UsageError(f"{address} cannot be opened: {_reason(error)}") from error
 
 

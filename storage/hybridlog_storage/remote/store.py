@@ -199,8 +199,8 @@ class BucketManifests(Manifests):
                 self._cells.load(catalog)
             if changed or not self.number:
                 self.number += 1
-                lost = self._bucket.lost
-                lost -= {name for name in lost if name.split("/")[1] in changed}
+                lost = [*self._bucket.lost]  # which other threads add to
+                self._bucket.lost -= {name for name in lost if name.split("/")[1] in changed}
             self._look_at = time.monotonic() + LOOK_EVERY_S * (1 + len(found) // 1000)
 
     def ids(self) -> list[str]:
@@ -502,8 +502,7 @@ class RemoteDirectory(StoreDirectory):
                         lost.add(about.name)
                     if is_lost or recording is not None:  # others are to notice it, too
                         self.source.cache.forget(self.bucket, about)
-        self.bucket.lost.clear()
-        self.bucket.lost.update(lost)
+        self.bucket.lost = lost
         return bool(lost)
 
     def listing(self, recording: str) -> Listing:
