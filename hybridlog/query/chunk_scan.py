@@ -206,7 +206,7 @@ class ChunkScan:
     ) -> Iterator[tuple[ChunkTask, MessageRun, ChunkTask | None]]:
         counters = self._plan.counters
         upcoming = iter(tasks)
-        if tasks and self._session.segment(*tasks[0].key[:2]).is_fetched:
+        if self._session.directory.is_remote:
             upcoming = self._announced(upcoming)
         loading: deque[tuple[ChunkTask, Callable[[], _Loaded]]] = deque()
         while True:

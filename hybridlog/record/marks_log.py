@@ -95,11 +95,6 @@ class _MarksLog(SegmentReader):
         """Their log times, as of a segment."""
         return {MARKS_CHANNEL: np.sort(self.read_chunk(place).batch.log_time)}
 
-    @property
-    def is_fetched(self) -> bool:
-        """False: they are in memory, also those of a store in a bucket."""
-        return False
-
     def fetch(self, places: Iterable[ChunkPlace]) -> None:
         """Do nothing: they are in memory."""
 

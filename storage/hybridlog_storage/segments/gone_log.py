@@ -119,11 +119,6 @@ class GoneLog(SegmentReader):
     def fetch(self, places: Iterable[ChunkPlace]) -> None:
         """Nothing: rows are read in larger pieces."""
 
-    @property
-    def is_fetched(self) -> bool:
-        """False: rows are read in larger pieces."""
-        return False
-
     def read_chunk(self, place: ChunkPlace) -> StoredChunk:
         """The rows that are left of a chunk."""
         check_wanted()

@@ -347,11 +347,6 @@ class SegmentReader:
                 progress(at)
         return found.hexdigest()
 
-    @property
-    def is_fetched(self) -> bool:
-        """True if the file lies in a bucket, where each request takes long."""
-        return files.is_fetched(self._fd)
-
     def fetch(self, places: Iterable[ChunkPlace]) -> None:
         """Announce chunks that will be read, so that a bucket is asked once for all of them."""
         with suppress(OSError):  # what is missing is told when it is read
