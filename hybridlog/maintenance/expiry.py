@@ -60,7 +60,6 @@ def expire(
     digests: Mapping[int, str] = MappingProxyType({}),
     copy: str = "",
     check: Check = lambda _: None,
-    version: int = 0,
     progress: Progress | None = None,
     make_room: Callable[[], bool] = lambda: False,
     is_followed: bool = False,
@@ -95,7 +94,7 @@ def expire(
     for log in late:
         while True:
             try:
-                made = _rows_of(directory, recording, log, version)
+                made = _rows_of(directory, recording, log)
                 _go(directory, recording, {log.number: made}, check, copy)
                 freed -= sum(one.bytes for one in made)
             except DiskFullError:
@@ -163,13 +162,13 @@ def make_rows(
                 _list(directory, recording, {log.number: _rows_of(directory, recording, log)})
 
 
-def _rows_of(
-    directory: StoreDirectory, recording: str, log: File, version: int = 0
-) -> tuple[File, ...]:
+def _rows_of(directory: StoreDirectory, recording: str, log: File) -> tuple[File, ...]:
     """Write the rows of a log, in place of what a crash has left of such."""
     path, left = directory.recording(recording), directory.listing(recording).rows
-    _remove(path, [name for name in left if int(name[:6]) == log.number])
-    return write_rows(path, replace(log, gone="expired"), path, version=version)
+    directory.drop(recording, [name for name in left if int(name[:6]) == log.number])
+    version = secrets.randbelow(9 * 10**8) + 1 if directory.is_remote else 0  # others do it, too
+    with directory.adding(recording) as into:
+        return write_rows(path, replace(log, gone="expired"), into, version=version)
 
 
 def _go(
@@ -182,7 +181,7 @@ def _go(
     """Let the manifest say that logs are gone, then delete them."""
     if made:
         now = _list(directory, recording, made, check, {"gone": "expired", "copy": copy})
-        _remove(directory.recording(recording), [now.logs[number].name for number in made])
+        directory.drop(recording, [now.logs[number].name for number in made])
 
 
 def _list(
@@ -193,11 +192,11 @@ def _list(
     values: Mapping[str, str] = MappingProxyType({}),
 ) -> Manifest:
     """List the rows of logs, where there are new ones, and change the lines of the logs."""
-    path, manifests = directory.recording(recording), directory.manifests
+    manifests = directory.manifests
 
     def how(now: Manifest) -> Manifest:
         check(now)
-        if not made.keys() <= now.logs.keys():
+        if not all(number in now.logs and now.logs[number].is_here for number in made):
             raise ChangedError(f"{now.name}: a segment has gone meanwhile.")
         for number, rows in made.items():
             line = replace(now.logs[number], **values)
@@ -205,12 +204,12 @@ def _list(
         return now
 
     try:
-        files.sync_folder(path)
         return manifests.change(recording, how)
     finally:
         with suppress(StoreError):  # or else the next opening does it
             listed = {file.name for file in manifests.read(recording).files}
-            _remove(path, [f.name for rows in made.values() for f in rows if f.name not in listed])
+            new = [file.name for rows in made.values() for file in rows]
+            directory.drop(recording, [name for name in new if name not in listed])
 
 
 def let_go(
@@ -252,7 +251,7 @@ def let_go(
         )
 
     changed = directory.manifests.change(recording, how)
-    _remove(directory.recording(recording), [file.name for file in gone])
+    directory.drop(recording, [file.name for file in gone])
     return changed
 
 
@@ -272,13 +271,14 @@ def write_rows(recording: Path, line: File, into: Path, *, version: int = 0) -> 
             raise SegmentError(f"{reader.path} has attachments of its log")
         begin = front(reader, summary, line)
         writer = RowsWriter(into, line, summary.channels, begin, version)
+        reader.fetch(summary.chunks)
         try:
             for place in summary.chunks:
                 writer.add(reader.read_chunk(place))
             return writer.close()
         except BaseException as error:
             writer.discard()
-            _remove(into, writer.names)
+            durability.remove(into, writer.names)
             if isinstance(error, OSError):
                 raise durability.explain(error, into, "writing rows to") from error
             raise
@@ -305,18 +305,6 @@ def without_payloads(
 def may_go(log: File) -> bool:
     """True if a log may go before its recording: the first one of a group stays."""
     return log.is_here and log.number != log.group and bool(log.parts)
-
-
-def _remove(folder: Path, names: Collection[str]) -> None:
-    """Remove files, if they are there; after an error, the next opening removes the others."""
-    try:
-        for name in names:
-            with suppress(FileNotFoundError):
-                files.unlink(folder / name)
-        if names:
-            files.sync_folder(folder)
-    except OSError as error:
-        raise durability.explain(error, folder, "removing files of") from error
 
 
 def _remove_arrays(directory: StoreDirectory, manifest: Manifest, going: Collection[File]) -> None:

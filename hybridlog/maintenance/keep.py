@@ -244,14 +244,15 @@ class Keeper:
                 )
                 done = step.bytes, dict[int, str]()
             else:
-                at_hand = self._directory.at_hand(step.id, step.segments, check)
-                with at_hand as (here, version):
-                    how = {
-                        **how,
-                        "make_room": partial(use_spare, self._directory),
-                        "is_followed": is_own,
-                    }
-                    done = expire(here, step.id, step.segments, check=check, version=version, **how)
+                done = expire(
+                    self._directory,
+                    step.id,
+                    step.segments,
+                    check=check,
+                    make_room=partial(use_spare, self._directory),
+                    is_followed=is_own,
+                    **how,
+                )
             self._changed(step.id)
         return done
 

@@ -21,7 +21,7 @@ import re
 import secrets
 import stat
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -291,18 +291,14 @@ class StoreDirectory:
         return self.looks([recording]).get(recording, "")
 
     @contextmanager
-    def at_hand(
-        self,
-        recording: str,
-        segments: Collection[int] = (),
-        check: Callable[[Manifest], object] = lambda _: None,
-    ) -> Iterator[tuple[StoreDirectory, int]]:
-        """A directory where files of a recording can be changed, within `writing`: this one.
+    def adding(self, recording: str) -> Iterator[Path]:
+        """A folder whose new files become those of a recording, within `writing`: its own here."""
+        yield self.recording(recording)
+        files.sync_folder(self.recording(recording))
 
-        With it comes a number for the names of new files of rows. `segments` has the numbers of
-        those that are changed; `check` gets the newest manifest before, and raises to leave it.
-        """
-        yield self, 0
+    def drop(self, recording: str, names: Collection[str]) -> None:
+        """Remove files of a recording, if they are there."""
+        durability.remove(self.recording(recording), names)
 
     def listed_bytes(self) -> int | None:
         """Bytes of all files, by manifests alone; None where the disk says it."""

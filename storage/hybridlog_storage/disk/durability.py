@@ -10,8 +10,8 @@ never meets a half-made one.
 from __future__ import annotations
 
 import errno
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from hybridlog_storage.disk import files
@@ -48,6 +48,16 @@ def publish(temporary: Path, final: Path) -> None:
     """Durably give a synced file its final name in its folder; a file of that name is replaced."""
     files.rename(temporary, final)
     files.sync_folder(final.parent)
+
+
+def remove(folder: Path, names: Collection[str]) -> None:
+    """Remove files, if they are there; after an error, the next opening removes the others."""
+    with explained(folder, "removing files of"):
+        for name in names:
+            with suppress(FileNotFoundError):
+                files.unlink(folder / name)
+        if names:
+            files.sync_folder(folder)
 
 
 def write_new(final: Path, content: bytes) -> None:

@@ -21,7 +21,6 @@ import time
 import zlib
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, cast
 
@@ -46,11 +45,13 @@ from hybridlog_storage.disk.directory import (
 )
 from hybridlog_storage.errors import (
     BucketError,
+    DiskFullError,
     ManifestError,
     ObjectChangedError,
     ObjectExistsError,
     RecordingExistsError,
     RecordingGoneError,
+    ResourceError,
     StoreError,
 )
 from hybridlog_storage.manifest import (
@@ -58,7 +59,6 @@ from hybridlog_storage.manifest import (
     Manifest,
     digest_of,
     encode,
-    with_rows,
 )
 from hybridlog_storage.manifests import MANIFESTS, RECORDINGS, Manifests, decoded, ids_of
 from hybridlog_storage.remote.blocks import LOST, BlockCache, inode_of
@@ -554,51 +554,22 @@ class RemoteDirectory(StoreDirectory):
         yield
 
     @contextmanager
-    def at_hand(
-        self,
-        recording: str,
-        segments: Collection[int] = (),
-        check: Callable[[Manifest], object] = lambda _: None,
-    ) -> Iterator[tuple[StoreDirectory, int]]:
-        """As of a directory: a hidden one on the disk, of which all that is new becomes objects."""
-        before = self.manifests.read(recording)
-        listed = {one.path: one for one in listed_files(before)}
-        # Others may do the same, so all that is made here has names of its own.
-        version = 1 + secrets.randbelow(9 * 10**8)
+    def adding(self, recording: str) -> Iterator[Path]:
+        """As of a directory: one on the disk, whose files become objects."""
         with tempfile.TemporaryDirectory(prefix="hybridlog-") as place:
-            here = StoreDirectory.create(Path(place) / "store")
-            here.manifests.create(before)
-            disk = Directory(here.path)
-            for number in segments:
-                if number in before.logs and before.logs[number].is_here:
-                    disk.send(Sending(self.source, recording, *listed[before.logs[number].name]))
-            yield here, version
-            after = here.manifests.read(recording)
-            made = {one.path: one for one in listed_files(after)}
-            new = made.keys() - listed.keys()
+            into, here = Path(place) / RECORDINGS / recording, Directory(Path(place))
+            files.make_folders(into)
             try:
-                for path in new:
-                    self.source.send(Sending(disk, recording, *made[path]))
-                self.manifests.change(recording, partial(_brought, before, after, check))
-            except BaseException:
-                with suppress(BucketError):
-                    self.bucket.delete([f"{RECORDINGS}/{recording}/{path}" for path in new])
-                raise
-        left = listed.keys() - made.keys()
-        self.bucket.delete([f"{RECORDINGS}/{recording}/{path}" for path in left])
+                yield into
+            except DiskFullError as error:  # of this disk, where nothing can be deleted
+                raise ResourceError(str(error)) from error
+            for name, size in here.sizes(recording).items():
+                digest = digest_of(here.pieces(f"{RECORDINGS}/{recording}/{name}", 0, size))
+                self.source.send(Sending(here, recording, name, size, digest))
 
-
-def _brought(
-    before: Manifest, after: Manifest, check: Callable[[Manifest], object], now: Manifest
-) -> Manifest:
-    """The newest manifest with what was changed in a copy of an older one."""
-    check(now)
-    for number, log in after.logs.items():
-        if log != before.logs[number]:
-            if now.logs.get(number) != before.logs[number]:
-                raise StoreError(f"Files of {now.name} were replaced meanwhile. Try again.")
-            now = with_rows(now, log, after.rows[number])
-    return now
+    def drop(self, recording: str, names: Collection[str]) -> None:
+        """Delete objects of a recording, if they are there."""
+        self.bucket.delete([f"{RECORDINGS}/{recording}/{name}" for name in names])
 
 
 def _objects(body: bytes) -> list[Object]:
