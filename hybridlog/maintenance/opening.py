@@ -31,7 +31,6 @@ from hybridlog.entries import (
 )
 from hybridlog.snapshot import UNFINISHED, Snapshot
 from hybridlog_storage.catalog import Catalog, Described
-from hybridlog_storage.disk import durability, files
 from hybridlog_storage.errors import (
     DiskFullError,
     HeldError,
@@ -244,7 +243,6 @@ def _lost(directory: StoreDirectory, name: str) -> str:
 
 def recover(directory: StoreDirectory, recording: str, report: RepairReport) -> bool:
     """Finish the interrupted work on a recording that this process has locked; False if gone."""
-    path = directory.recording(recording)
     try:
         manifest = directory.manifests.read(recording)
     except RecordingGoneError:
@@ -252,11 +250,7 @@ def recover(directory: StoreDirectory, recording: str, report: RepairReport) -> 
         report.removed.append(removed.name)
         return False
     listing = directory.listing(recording)
-    for one in listing.left_over(manifest):
-        try:
-            files.unlink(path / one)
-        except OSError as error:
-            raise durability.explain(error, path / one, "removing") from error
+    directory.drop(recording, listing.left_over(manifest))
     recovered = recover_segments(directory, recording, listing, manifest)
     inventory = take_inventory(directory, recording)
     is_empty = not (inventory.listing.sealed or manifest.logs or manifest.marks)

@@ -170,13 +170,10 @@ class Source(Place):
         """A handle of a file, or of a copy of it that is gone in the end; errors as `pieces`."""
         with tempfile.TemporaryFile() as file:
             os.fchmod(file.fileno(), 0o666)  # which copies of it have, less their umask
-            try:
+            with durability.explained(Path(tempfile.gettempdir()), "copying by way of"):
                 for piece in self.pieces(name, 0, size):
                     file.write(piece)
                 file.flush()
-            except OSError as error:
-                folder = Path(tempfile.gettempdir())
-                raise durability.explain(error, folder, "copying by way of") from error
             yield file.fileno()
 
 

@@ -392,15 +392,12 @@ class DiskManifests(Manifests):
 
     def _delete_files(self, recording: str) -> None:
         folder = self._recordings / recording
-        try:
+        explained = durability.explained(folder, "deleting")
+        with explained, suppress(FileNotFoundError):  # or somebody else has finished
             for name in files.names(folder):
                 if name != MANIFEST_LOCK:
                     files.remove_tree(folder / name)
             files.sync_folder(folder)
-        except FileNotFoundError:
-            return  # somebody else has finished
-        except OSError as error:
-            raise durability.explain(error, folder, "deleting") from error
 
     def _forget(self, recording: str, *, says_so: bool) -> None:
         # A copy may have created it anew meanwhile, if somebody else has finished the removal.
