@@ -7,7 +7,7 @@ the status; what people said of the recording there stays (`merging`).
 from __future__ import annotations
 
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
@@ -232,14 +232,12 @@ class _Copy:
         manifests = self._target.manifests
         self._check_files()
         if not self._is_there:
-            try:
-                with manifests.creating() as create:
-                    made = merged(here, there, brought)
-                    made = replace(made, name=self._how.named(made.name))
-                    create(made)
+            # Another process may be faster.
+            with suppress(RecordingExistsError), manifests.creating() as create:
+                made = merged(here, there, brought)
+                made = replace(made, name=self._how.named(made.name))
+                create(made)
                 return made
-            except RecordingExistsError:
-                pass  # another process was faster
         return manifests.change(here.id, lambda now: merged(here, now, brought))
 
     def _check_files(self) -> None:
