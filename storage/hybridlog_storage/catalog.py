@@ -53,7 +53,6 @@ _DECODED: Final = "decoded"
 _TOPICS: Final = "topics"
 _SCHEMA: Final = "schema"
 """Kinds of the cells of sets of topics and of schemas, by hash; nothing removes them."""
-_RECORDINGS_FILE: Final = Path("tables/recordings.parquet")
 _MAX_TABLES: Final = 64 << 20  # bytes of chunk tables in memory
 _FEW: Final = 100  # cells that are read one by one
 _T = TypeVar("_T")
@@ -293,6 +292,7 @@ class Catalog:
 
     `in_memory` leaves the file as it is, for a store that this user cannot write; `cells` are given
     if they lie elsewhere. `has_changed` says that this process has changed an ended recording.
+    `recordings_file` lists these for other readers; it is removed when they change.
     """
 
     def __init__(
@@ -306,14 +306,10 @@ class Catalog:
         self.is_in_memory = in_memory or cells is not None
         self.has_changed = False
         self._store = store
+        self.recordings_file = store / "tables/recordings.parquet"
         self._cells = cells or Cells(store / CATALOG, store_id, writes=not in_memory)
         self._topics: dict[str, tuple[TopicType, ...]] = {}
         self._tables = Cache(_MAX_TABLES)
-
-    @property
-    def recordings_file(self) -> Path:
-        """The list of ended recordings for other readers; it is removed when they change."""
-        return self._store / _RECORDINGS_FILE
 
     def close(self) -> None:
         """Close the file."""

@@ -154,7 +154,8 @@ class StoreDirectory:
 
     With `is_remote` it stands for a place in a bucket, see `remote.store`. People call it `place`;
     another process opens it by its `address`. `cells` are those of its catalog, None for those in
-    its file; `when_empty` is the sentence for a store without recordings.
+    its file; `when_empty` is the sentence for a store without recordings; `mongod` is the folder of
+    the embedded MongoDB.
     """
 
     is_remote: ClassVar[bool] = False
@@ -163,6 +164,7 @@ class StoreDirectory:
 
     def __init__(self, path: Path, *, read_only: bool = False) -> None:
         self.path, self.place, self.address = path, str(path), str(path.absolute())
+        self.recordings, self.mongod = path / RECORDINGS, path / "mongod"
         self.manifests: Manifests = DiskManifests(path)
         self.read_only = read_only
         self.settings = read_settings(path)
@@ -238,11 +240,6 @@ class StoreDirectory:
             with durability.explained(self.path, "writing settings of"):
                 write_settings(self.path, settings)
             self.settings = settings
-
-    @property
-    def recordings(self) -> Path:
-        """Directory of all recordings."""
-        return self.path / RECORDINGS
 
     def recording(self, recording: str) -> Path:
         """Directory of a recording, by its id."""
@@ -375,11 +372,6 @@ class StoreDirectory:
             return
         except OSError as error:
             raise unreadable(error, self.path, f"The store {self.path}") from error
-
-    @property
-    def mongod(self) -> Path:
-        """Directory of the embedded MongoDB."""
-        return self.path / "mongod"
 
     @contextmanager
     def retaining(self) -> Iterator[bool]:

@@ -405,6 +405,7 @@ class RemoteDirectory(StoreDirectory):
         self.place = self.address = address
         self.cells, self.bucket = self.source.cells, self.source.bucket
         self.path, self.read_only = Path(address), read_only
+        self.recordings = self.path / RECORDINGS
         self.when_empty = f"The store is empty: `hybridlog copy {address}` fills it from a disk."
         # No server that a bucket names is asked.
         self.settings = replace(self._read_settings()[1], mongo=NONE)
