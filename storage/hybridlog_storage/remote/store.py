@@ -399,6 +399,7 @@ class RemoteDirectory(StoreDirectory):
     """A store in a bucket, `s3://lab/store`: read like a directory, changed by its manifests."""
 
     is_remote: ClassVar[bool] = True
+    is_writable = False  # nothing is mended, or noted for others, without being asked to
 
     def __init__(self, address: str, *, read_only: bool = False) -> None:
         self.source = mount(address)
@@ -435,11 +436,6 @@ class RemoteDirectory(StoreDirectory):
             new = StoreSettings(secrets.token_hex(16), mongo=NONE)
             mount(address).bucket.create(SETTINGS, settings_text(new))
         return cls(address)
-
-    @property
-    def is_writable(self) -> bool:
-        """False: nothing is mended, or noted for others, without being asked to."""
-        return False
 
     def check_writable(self) -> None:
         """Raise: files are not written here one by one."""
