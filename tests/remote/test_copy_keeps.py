@@ -16,7 +16,7 @@ from hybridlog.maintenance.copying import CopyOptions
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.remote import directory_of
-from hybridlog_storage.remote.bucket import Bucket, Object
+from hybridlog_storage.remote.bucket import Object
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.remote.conftest import BEGIN, SCAN
 from tests.remote.server import Proxy
@@ -96,15 +96,3 @@ def test_what_did_not_arrive_as_sent(
     read = [path for method, path, _ in proxy.requests if method == "GET" and ".mcap" in path]
     assert has_digests or read
     assert states(address) == {"whole": COUNT}
-
-
-def test_only_fields_mend_a_damaged_copy(robot: hl.Store, address: str) -> None:
-    """With the whole file, as it was there; tables may be lost, since the messages answer."""
-    robot.copy(address)
-    lose(address, "000001.mcap")
-    files.mounted.clear()
-    Bucket(address).delete([one.name for one in Bucket(address).objects("tables")])
-    assert robot.copy(address, options=CopyOptions(only_fields=True)).copied == ["run"]
-    assert states(address) == {"whole": COUNT}
-    with hl.open(address) as there:
-        assert there.topic("scan").where("n < 10").count() == 10
