@@ -340,7 +340,8 @@ class Catalog:
         def statements() -> Iterator[Statement]:
             for digest, schema in known.items():
                 if self._cells.read(_SCHEMA, digest) is None:
-                    yield put(_SCHEMA, digest, _schema_body(schema))
+                    head = _body([schema.name, schema.encoding])
+                    yield put(_SCHEMA, digest, head + b"\n" + bytes(schema.data))
             yield put(_TOPICS, summary.topics, topics_to_json(described.topics).encode())
             yield put(_ENTRY, entry.id, _body([described.files, plain]))
             yield put(_SUMMARY, entry.id, _summary_body(summary))
@@ -492,7 +493,7 @@ class Catalog:
             number,
             digest + file_of(entry, number),
             make=lambda: self._read_table(entry, number, digest),
-            size_of=_size,
+            size_of=lambda table: int(table.chunks.nbytes + table.parts.nbytes),
         )
 
     def _read_table(self, entry: RecordingEntry, number: int, digest: str) -> ChunkTable:
@@ -544,10 +545,6 @@ def _indexed(body: bytes | None) -> _Indexed:
     return _read(_INDEX_OF, body) or ("", "", [])
 
 
-def _schema_body(schema: Schema) -> bytes:
-    return _body([schema.name, schema.encoding]) + b"\n" + bytes(schema.data)
-
-
 def file_of(entry: RecordingEntry, number: int) -> str:
     """Name of the file of a sealed segment; of one that is gone, of its first file of rows."""
     return entry.files.get(str(number)) or sealed_name(number)
@@ -573,10 +570,6 @@ def channel_entry(channel_id: int, channel: Channel, reason: str | None) -> Chan
         reason=reason,
         is_indexed=channel.is_indexed,
     )
-
-
-def _size(table: ChunkTable) -> int:
-    return int(table.chunks.nbytes + table.parts.nbytes)
 
 
 def _least(a: int | None, b: int | None) -> int | None:

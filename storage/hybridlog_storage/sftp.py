@@ -297,7 +297,8 @@ class Server(Place):
         called now and then with the id of the process; what it raises ends that.
         """
         root = self._root.replace("\\", "\\\\").replace('"', '\\"')
-        script = "\n".join([f'-@mkdir "{root}"', f'@cd "{root}"', *map(_silent, lines), ""])
+        silent = [f"-@{line[1:]}" if line.startswith("-") else f"@{line}" for line in lines]
+        script = "\n".join([f'-@mkdir "{root}"', f'@cd "{root}"', *silent, ""])
         host = self._host
         if ":" in host:
             user, at, host = host.rpartition("@")
@@ -510,11 +511,6 @@ def _quoted(name: str) -> str:
         raise RefusedError(f"sftp cannot send {name!r}: it has odd characters in its name.")
     escaped = re.sub(r'(["\\\\])', r"\\\1", name)
     return f'"{escaped}"'
-
-
-def _silent(line: str) -> str:
-    """A command that is not printed."""
-    return f"-@{line[1:]}" if line.startswith("-") else f"@{line}"
 
 
 def _path(recording: str) -> str:
