@@ -10,7 +10,7 @@ from pathlib import Path
 
 from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.manifest import File, Manifest, decode, encode
-from hybridlog_storage.manifests import MANIFEST_OLD, manifests_at
+from hybridlog_storage.manifests import MANIFEST_OLD, Manifests, manifests_at
 
 
 def root(store: Path) -> Path:
@@ -34,6 +34,12 @@ def id_of(store: Path, name: str) -> str:
 def segment(store: Path, name: str, number: int = 0) -> Path:
     """A sealed segment of the recording of a name."""
     return folder(store, name) / f"{number:06d}.mcap"
+
+
+def begin(manifests: Manifests, one: Manifest) -> None:
+    """Create the manifest of a new recording."""
+    with manifests.creating() as create:
+        create(one)
 
 
 def segments(store: Path, recording: str) -> list[tuple[int, Path]]:

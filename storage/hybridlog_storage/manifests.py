@@ -103,11 +103,6 @@ class Manifests(ABC):
         """
         return self._change(recording, lambda now: how(_present(now)))
 
-    def create(self, manifest: Manifest) -> None:
-        """Create the manifest of a new recording; errors as of `creating`."""
-        with self.creating() as create:
-            create(manifest)
-
     @contextmanager
     def creating(self) -> Iterator[Callable[[Manifest], None]]:
         """Create manifests; on a disk nobody else can create one meanwhile."""

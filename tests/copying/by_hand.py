@@ -30,6 +30,7 @@ from hybridlog_storage.remote.store import BucketStore
 from hybridlog_storage.settings import StoreSettings, write_settings
 from hybridlog_storage.sftp import Server
 from tests.copying.server import Sshd
+from tests.places import begin
 from tests.remote.conftest import new_address
 from tests.remote.server import Proxy
 
@@ -132,7 +133,7 @@ class Store:
         """Make a recording with all its files."""
         for file in listed_files(manifest):
             self.write(f"recordings/{manifest.id}/{file.path}", bytes_of(file.path))
-        self.place.manifests.create(manifest)
+        begin(self.place.manifests, manifest)
 
     def write(self, name: str, content: bytes) -> None:
         if self.bucket is not None:

@@ -32,6 +32,7 @@ from tests.copying.by_hand import (
     without_payloads,
 )
 from tests.copying.server import Sshd
+from tests.places import begin
 
 Pair = tuple[Store, Store]
 FILE = listed("000000.mcap")
@@ -149,7 +150,7 @@ def test_another_recording_of_its_id_is_refused(pair: Pair, what: str) -> None:
         "file": Manifest(RECORDING, "other", 1, files=(replace(FILE, parts={}),)),
     }[what]
     with target.place.working(RECORDING):
-        target.place.manifests.create(other)
+        begin(target.place.manifests, other)
     with pytest.raises(RefusedError, match="another recording, other, has its id"):
         copy(source.source, target.place, RECORDING)
     assert target.manifests().read(RECORDING) == other

@@ -16,6 +16,7 @@ from tests.copying.by_hand import RECORDING, Makes, recording
 from tests.copying.server import Sshd
 from tests.copying.test_any_place import as_of
 from tests.limits import Limit
+from tests.places import begin
 
 
 def test_urls(sshd: dict[str, Sshd], tmp_path: Path) -> None:
@@ -138,6 +139,6 @@ def test_names_there(make: Makes, kind: str) -> None:
     assert target.place.names() == set()
     for name in ('a"b', "back\\slash", "\u00e4 \U0001f916", "tab\there"):
         one = replace(recording(), id=new_id("x"), name=name, files=())
-        source.place.manifests.create(one)
+        begin(source.place.manifests, one)
         copy(source.source, target.place, one.id)
     assert target.place.names() == {'a"b', "back\\slash", "\u00e4 \U0001f916", "tab\there"}

@@ -12,6 +12,7 @@ from hybridlog_storage.manifests import DiskManifests, Manifests
 from hybridlog_storage.remote.bucket import Bucket
 from hybridlog_storage.remote.store import BucketManifests, BucketStore
 from tests.calls import Calls
+from tests.places import begin
 from tests.remote.server import Proxy
 
 
@@ -36,18 +37,18 @@ def spoil(manifests: Manifests, one: Manifest, data: bytes | None) -> None:
 
 def test_a_recording_begins_once(manifests: Manifests) -> None:
     one, other = begun(), begun("other")
-    manifests.create(one)
-    manifests.create(other)
+    begin(manifests, one)
+    begin(manifests, other)
     assert manifests.ids() == sorted([one.id, other.id])
     assert manifests.read(one.id) == one
     with pytest.raises(StoreError, match="already"):
-        manifests.create(replace(one, name="another"))
+        begin(manifests, replace(one, name="another"))
     assert manifests.read(one.id) == one
 
 
 def test_a_change_is_there_when_it_returns(manifests: Manifests) -> None:
     one = begun()
-    manifests.create(one)
+    begin(manifests, one)
     changed = manifests.change(one.id, lambda now: replace(now, tags={"a": "b"}))
     assert changed == replace(one, tags={"a": "b"}, changes=1)
     assert manifests.read(one.id) == changed
@@ -55,7 +56,7 @@ def test_a_change_is_there_when_it_returns(manifests: Manifests) -> None:
 
 def test_what_changes_nothing_writes_nothing(manifests: Manifests) -> None:
     one = begun()
-    manifests.create(one)
+    begin(manifests, one)
     assert manifests.change(one.id, lambda now: now) == one
     assert manifests.change(one.id, lambda now: replace(now, name="run")) == one
     assert manifests.read(one.id).changes == 0
@@ -63,14 +64,14 @@ def test_what_changes_nothing_writes_nothing(manifests: Manifests) -> None:
 
 def test_who_it_is_never_changes(manifests: Manifests) -> None:
     one = begun()
-    manifests.create(one)
+    begin(manifests, one)
     manifests.change(one.id, lambda now: replace(begun("other"), created=2, changes=7))
     assert manifests.read(one.id) == replace(one, name="other", changes=1)
 
 
 def test_what_a_change_raises_ends_it(manifests: Manifests) -> None:
     one = begun()
-    manifests.create(one)
+    begin(manifests, one)
 
     def refuse(now: Manifest) -> Manifest:
         raise FileNotFoundError(now.name)
@@ -91,14 +92,14 @@ def test_nothing_is_created_by_a_change(manifests: Manifests) -> None:
             manifests.change(recording, lambda now: now)
         with pytest.raises(RecordingGoneError):
             manifests.remove(recording)
-    manifests.create(begun())
+    begin(manifests, begun())
     assert len(manifests.ids()) == 1
 
 
 def test_what_is_removed_is_gone_and_can_be_copied_here_again(manifests: Manifests) -> None:
     one, other = begun(), begun("other")
-    manifests.create(one)
-    manifests.create(other)
+    begin(manifests, one)
+    begin(manifests, other)
     manifests.remove(one.id)
     assert manifests.ids() == [other.id]
     for ask in (manifests.read, manifests.remove):
@@ -106,7 +107,7 @@ def test_what_is_removed_is_gone_and_can_be_copied_here_again(manifests: Manifes
             ask(one.id)
     with pytest.raises(RecordingGoneError):
         manifests.change(one.id, lambda now: replace(now, name="back"))
-    manifests.create(one)
+    begin(manifests, one)
     assert manifests.read(one.id) == one
 
 
@@ -114,7 +115,7 @@ def test_a_removal_that_was_interrupted_can_be_finished(
     manifests: Manifests, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one = begun()
-    manifests.create(one)
+    begin(manifests, one)
     with monkeypatch.context() as patch:
         patch.setattr(type(manifests), "_delete_files", lambda *_: 1 / 0)
         with pytest.raises(ZeroDivisionError):
@@ -132,14 +133,14 @@ def test_a_removal_spares_what_was_copied_here_meanwhile(
     manifests: Manifests, calls: Calls
 ) -> None:
     one = begun()
-    manifests.create(one)
+    begin(manifests, one)
     others: list[str] = []
 
     def meanwhile(recording: str, **_: object) -> None:
         if not others:
             others.append(recording)
             manifests.remove(recording)
-            manifests.create(one)
+            begin(manifests, one)
 
     calls(manifests, "_forget", meanwhile)
     manifests.remove(one.id)
@@ -151,7 +152,7 @@ def test_a_removal_spares_what_was_copied_here_meanwhile(
 @pytest.mark.parametrize("what", ["cut", "flipped", "of another", "lost"])
 def test_a_damaged_one_is_named_and_made_again(manifests: Manifests, what: str) -> None:
     one = begun()
-    manifests.create(one)
+    begin(manifests, one)
     manifests.change(one.id, lambda now: replace(now, tags={"a": "b"}))
     manifests.change(one.id, lambda now: replace(now, tags={"a": "c"}))
     data = encode(manifests.read(one.id))
@@ -189,7 +190,7 @@ def test_a_damaged_one_is_named_and_made_again(manifests: Manifests, what: str) 
 
 def test_of_changes_at_once_none_is_lost(manifests: Manifests) -> None:
     one = begun()
-    manifests.create(one)
+    begin(manifests, one)
 
     def add(first: int) -> None:
         for at in range(first, first + 10):
@@ -208,7 +209,7 @@ def test_of_changes_at_once_none_is_lost(manifests: Manifests) -> None:
 def test_an_edit_in_a_bucket_takes_two_requests(address: str, proxy: Proxy) -> None:
     manifests = BucketStore(Bucket(address)).manifests
     one = begun()
-    manifests.create(one)
+    begin(manifests, one)
     manifests.change(one.id, lambda now: replace(now, name="first"))  # tries the server once
     proxy.reset()
     manifests.change(one.id, lambda now: replace(now, name="next"))
@@ -221,7 +222,7 @@ def test_an_edit_in_a_bucket_takes_two_requests(address: str, proxy: Proxy) -> N
 def test_a_change_whose_answer_is_lost_is_made_once(address: str, proxy: Proxy) -> None:
     manifests = BucketStore(Bucket(address)).manifests
     one = begun()
-    manifests.create(one)
+    begin(manifests, one)
     for number in range(1, 4):
         proxy.reset()
         proxy.spoil = lambda n, at=number: "lost" if n == at else ""

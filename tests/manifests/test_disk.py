@@ -28,6 +28,7 @@ from hybridlog_storage.manifest import Manifest, encode, new_id, replace
 from hybridlog_storage.manifests import DiskManifests
 from tests.calls import Calls
 from tests.limits import Limit
+from tests.places import begin
 from tests.power import dies, each_cut
 
 ONE = Manifest(new_id("run"), "run", 1)
@@ -44,7 +45,7 @@ def store(tmp_path: Path) -> Path:
     place.mkdir()
     (place / "hybridlog.toml").touch()
     manifests = DiskManifests(place)
-    manifests.create(ONE)
+    begin(manifests, ONE)
     manifests.change(ONE.id, lambda now: replace(now, name="first"))
     (place / "recordings" / ONE.id / "000000.mcap").write_bytes(b"x" * 5000)
     return place
@@ -113,7 +114,7 @@ def test_nothing_comes_back_after_a_removal(store: Path) -> None:
 OTHER = Manifest(new_id("other"), "other", 2)
 WORKS: dict[str, Callable[[DiskManifests], object]] = {
     "change": lambda m: m.change(ONE.id, tagged),
-    "create": lambda m: m.create(OTHER),
+    "create": lambda m: begin(m, OTHER),
     "remove": lambda m: m.remove(ONE.id),
 }
 
@@ -127,7 +128,7 @@ def check(place: Path, what: str) -> None:
         assert manifests.change(ONE.id, tagged).tags == {"a": "b"}
     elif what == "create":
         if OTHER.id not in ids:
-            manifests.create(OTHER)
+            begin(manifests, OTHER)
         assert manifests.read(OTHER.id) == OTHER
         assert manifests.read(ONE.id).name == "first"
         manifests.change(OTHER.id, tagged)
@@ -192,12 +193,12 @@ def test_a_full_disk_refuses_the_change_and_nothing_else(
         with pytest.raises(DiskFullError, match="Free some space"):
             manifests.change(ONE.id, tagged)
         with pytest.raises(DiskFullError):
-            manifests.create(OTHER)
+            begin(manifests, OTHER)
         assert manifests.read(ONE.id) == before
         assert manifests.ids() == [ONE.id]
         assert {*names(store)} - {*had} <= {f"recordings/{OTHER.id}/manifest.lock"}
     assert manifests.change(ONE.id, tagged).changes == before.changes + 1
-    manifests.create(OTHER)
+    begin(manifests, OTHER)
 
 
 def test_without_locks_it_can_only_be_read(store: Path, calls: Calls) -> None:
