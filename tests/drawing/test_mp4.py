@@ -308,7 +308,7 @@ def test_export_writes_a_file_a_topic(store: hl.Store, tmp_path: Path) -> None:
     assert "/none: " in done.err
     done = answer("export", tmp_path / "i", "-F", "mp4", "-r", "images", store=store.directory.path)
     assert sorted(one.stem for one in (tmp_path / "i").iterdir()) == ["compressed", "mixed", "odd"]
-    assert "\n/grows has pictures of 64 x 48, then of 64 x 96" in done.err
+    assert "\n/grows: /grows has pictures of 64 x 48, then of 64 x 96" in done.err
     assert len(read(out / "cam.mp4")[1]) == COUNT
     split = ("fetch", "-t", "/cam", "-o", tmp_path / "cam.mp4", "--split-by", "recording")
     answer(*split, store=store.directory.path)
