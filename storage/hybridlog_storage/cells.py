@@ -31,7 +31,7 @@ _TABLE: Final = (
 )
 _SELECT: Final = "SELECT kind, key, number, body, crc FROM cells WHERE kind = ? AND "
 _ASIDE: Final = ("-journal", "-wal", "-shm")  # what SQLite would read or write, too
-_WAIT_S: Final = 0.5  # for other processes, once: then memory takes the place of the file
+_WAIT_S: Final = 0.1  # for other processes, once: then memory takes the place of the file
 _MAX_BYTES: Final = 1 << 28  # of a cell
 _MAX_COPIED: Final = 1 << 30  # bytes of a file that is read into memory
 _ERRORS: Final = (sqlite3.DatabaseError, UnicodeDecodeError, OSError)

@@ -516,6 +516,6 @@ def test_odd_scans_are_counted(scans: hl.Store) -> None:
     query = scans.topic("/even")
     assert len(query.to_numpy()) == 30
     assert query.counters.unreadable == 1
-    assert scans.topic("/even").between("+1.9s", None).limit(0).to_numpy() == []
+    assert len(scans.topic("/even").between("+1.9s", None).limit(0).to_numpy()) == 0
     with pytest.raises(PayloadError, match="does not fit"):
         scans.topic("/even").between("+1.9s", None).to_numpy()

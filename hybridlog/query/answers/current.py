@@ -289,12 +289,14 @@ def next_time(session: Session, recording: RecordingEntry, topic: str, moment: i
     planner = Planner(session, Question((topic,), (recording.id,)))
     if recording.span is None or not session.channels_of(recording, [topic]):
         return None
-    begin, width, stop = max(moment, recording.span[0]), _FIRST_LOOK, span_of(*recording.span)[1]
+    begin, stop = min(max(moment, recording.span[0]), END - 1), span_of(*recording.span)[1]
+    width = _FIRST_LOOK
     for part in planner.split():
         while begin < stop:
             end = min(begin + width, END)
             with suppress(SegmentError):
                 times = planner.times(replace(part, bounds=(begin, end)))
+                times = times[times >= moment]  # ranges place the last time before another one
                 if len(times):
                     return int(times[0])
             begin, width = end, 4 * width
