@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from hybridlog.cli import output
 from hybridlog.cli.answers import print_end
 from hybridlog.query.question import Counters
 from tests.independent import Seen, read_bag, read_mcap
@@ -158,6 +159,7 @@ def test_messages_that_do_not_fit_are_counted(store: Path, tmp_path: Path) -> No
 
 
 def test_the_closing_line_counts_what_is_given(capsys: pytest.CaptureFixture[str]) -> None:
+    output.begin(None)
     print_end(Counters(messages=251, reduced=12), 0.1, verbose=True)
     assert capsys.readouterr().err.startswith("239 messages, ")
 

@@ -30,6 +30,7 @@ from hybridlog.maintenance.edit import mark_now
 from hybridlog.maintenance.retention import MIN_SEGMENT
 from hybridlog.maintenance.sizes import disk_bytes
 from hybridlog.record.marks import MARKS
+from hybridlog_storage.disk import files
 from hybridlog_storage.errors import DiskFullError, PayloadError
 from hybridlog_storage.messages import Channel, Schema
 from tests.live.speaker import Speaker
@@ -125,9 +126,10 @@ class Robot:
 
     def run(self) -> None:
         """Go through the part; a part that is to be killed goes on until then."""
-        writev, pwritev = os.writev, os.pwritev
-        os.writev = lambda *words: self.write(writev, *words)  # type: ignore[assignment]
-        os.pwritev = lambda *words: self.write(pwritev, *words)  # type: ignore[assignment]
+        system: Any = files.system
+        writev, pwritev = system.writev, system.pwritev
+        system.writev = lambda *words: self.write(writev, *words)
+        system.pwritev = lambda *words: self.write(pwritev, *words)
         self.recorder.start()
         if self.part == "box":  # a ring waits for its triggers
             wait_for(lambda: self.recorder._follower._task.seen is not None)

@@ -28,7 +28,7 @@ from hybridlog.live.recording import LiveOptions
 from hybridlog.live.state import choose, read, running, summary_of
 from hybridlog.record.losses import Cause, Loss
 from hybridlog.record.marks import MARKS
-from hybridlog_storage.disk import append_file
+from hybridlog_storage.disk import append_file, files
 from hybridlog_storage.errors import (
     DiskFullError,
     PayloadError,
@@ -208,7 +208,7 @@ def test_a_disk_that_has_room_for_little_more(
             return pwritev(fd, [pieces[0][:4096]], position)
         raise OSError(errno.ENOSPC, "full")
 
-    monkeypatch.setattr(append_file.os, "pwritev", full)
+    monkeypatch.setattr(files.system, "pwritev", full)
     for number in range(200):
         robot.speaker.say(channel, scan(number, 400_000))
         if robot.recorder.wait(0.01):
@@ -242,7 +242,7 @@ def test_a_disk_without_room_for_a_message_leaves_no_recording(
         raise OSError(errno.ENOSPC, "full")
 
     with monkeypatch.context() as patch:
-        patch.setattr(append_file.os, "pwritev", full)
+        patch.setattr(files.system, "pwritev", full)
         for number in range(200):
             robot.speaker.say(text_channel(), noise.randbytes(3_000_000), number)
             if robot.recorder.wait(0.01):

@@ -415,7 +415,8 @@ def _telling_lines(log: str) -> list[str]:
     lines = [line for line in map(str.strip, log.splitlines()) if line]
     causes = [line for line in lines if any(sign in line for sign in _OTHER_CAUSES)]
     errors = [line for line in lines if not re.search(r'"s":"[DIW]', line)]  # or not mongod's
+    part = slice(-300, None) if causes else slice(300)  # which is said at the end of a line
     return [
-        re.sub(r'^{.*?"msg":"(.*?)",?(.*)}$', r"\1 \2", line)[:300].strip()
+        re.sub(r'^{.*?"msg":"(.*?)",?(.*)}$', r"\1 \2", line)[part].strip()
         for line in (causes or errors or lines)[-4:]
     ]
