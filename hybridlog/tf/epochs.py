@@ -18,7 +18,7 @@ from hybridlog.query.times import format_time
 from hybridlog.schema.column import STAMP
 from hybridlog.tf import TYPES
 from hybridlog.tf.rows import transforms_of
-from hybridlog_storage.times import BEGIN
+from hybridlog_storage.times import BEGIN, END
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -33,7 +33,7 @@ _FALL_NS: Final = _SECOND
 _TOGETHER_NS: Final = 2 * _SECOND
 _RETURN_NS: Final = 10 * _SECOND
 _LEAST_STAMPS: Final = 100  # of a topic that alone has stamps
-_ROOM: Final = 7 * 10**18  # ns, in which stamps of all epochs have room side by side
+_ROOM: Final = 49 * 10**17  # ns beyond all stamps, those of 2106 too; for all epochs together
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,15 +157,15 @@ def _is_epoch(topics: Sequence[Stamps], falls: Sequence[Times], start: int, begi
             continue
         lasting.append(len(log_time))
         place = int(fall.searchsorted(begin))
-        if place == len(fall) or fall[place] > begin + _TOGETHER_NS:
+        if place == len(fall) or int(fall[place]) > begin + _TOGETHER_NS:
             continue
         at = int(log_time.searchsorted(fall[place]))
-        end = int(log_time.searchsorted(fall[place] + _RETURN_NS, "right"))
-        distance = log_time[first:end] - stamp[first:end]
+        end = int(log_time.searchsorted(min(int(fall[place]) + _RETURN_NS, END), "right"))
+        distance = log_time[first:end].astype(np.float64) - stamp[first:end]
         before, behind = distance[: at - first], distance[at - first :]
         if behind[0] <= before.max():
             continue  # stamps of several clocks
-        if bool((behind < before[-1] + (behind[0] - before[-1]) // 2).any()):
+        if bool((behind < (before[-1] + behind[0]) / 2).any()):
             return False
         fallen += 1
     is_sole = len(lasting) == 1 and lasting[0] < _LEAST_STAMPS

@@ -60,7 +60,7 @@ class Trees:
         self.epochs = epochs_of(session, recording.id)
         names = only or sorted(session.look([recording.id]).topics_of(recording))
         found: dict[str, list[str]] = {}
-        for topic, name in _types_of(session, recording, names).items():
+        for topic, name in sorted(_types_of(session, recording, names).items()):
             above, _, last = topic.lstrip("/").rpartition("/")
             if is_of_transforms(name) and (only or plain_type(name).startswith("foxglove.")):
                 found.setdefault("", []).append(topic)

@@ -62,6 +62,20 @@ def test_disorder_is_no_epoch(by: float) -> None:
     assert not len(found_in([seconds(time.tolist(), mixed.tolist())] * 2))
 
 
+def test_one_topic_that_returns_is_disorder_for_all() -> None:
+    time = np.arange(0, 60, 0.1)
+    falls = seconds(time.tolist(), (time - np.where(time >= 30, 25, 0)).tolist())
+    back = seconds(time.tolist(), (time - np.where((time >= 30) & (time < 35), 5, 0)).tolist())
+    assert (found_in([falls]) / S).tolist() == [30]
+    assert not len(found_in([falls, back]))
+
+
+def test_stamps_at_the_end_of_time() -> None:
+    log = 2**63 - 1 - 20 * S + np.arange(15) * S
+    fallen = np.where(np.arange(15) < 12, 1000 * S, 0) + np.arange(15) * S
+    assert found_in([(log, fallen)] * 2).tolist() == [log[12]]
+
+
 @needs_data
 @pytest.mark.parametrize("name", ["ouster.mcap", "auv_ros2.mcap"])
 def test_logs_of_several_clocks_have_one_epoch(tmp_path: Path, name: str) -> None:
@@ -77,6 +91,7 @@ def store(tmp_path: Path) -> Iterator[hl.Store]:
     messages: list[Said] = []
     for run in range(2):
         at = BEGIN + run * 20 * S
+        messages += [("/tf_static", tf("base", "cam", 0, 7), at)] * (not run)
         for n in range(1, 6):
             messages += [("/tf", tf("map", "base", n * S, 100 * run + n), at + n * S)]
             for topic in ("/a", "/b"):
@@ -119,12 +134,26 @@ def test_a_run_without_the_other_topic_has_no_match(tmp_path: Path) -> None:
         assert rows["b.point.x"].to_pylist() == [7] * 5 + [None] * 5
 
 
+def test_nothing_is_interpolated_across(tmp_path: Path) -> None:
+    messages: list[Said] = []
+    for run in range(2):
+        for n in range(1, 6):
+            at = BEGIN + run * 20 * S + n * S
+            topics = ("/a", "/b") if (run, n) != (0, 5) else ("/a",)
+            messages += [(topic, point("base", n * S, n), at) for topic in topics]
+    with hl.open(tmp_path / "store", create=True, mongo="none") as store:
+        recorded(store, "loop", messages)
+        rows = store.align("/a", ["/b"], how="interpolate", clock="header").to_arrow()
+        assert rows["b.point.x"].to_pylist() == [1, 2, 3, 4, None, 1, 2, 3, 4, 5]
+
+
 def test_transforms_are_of_the_same_run(store: hl.Store) -> None:
     query = store.topic("/a").in_frame("map")
     xs = query.to_arrow()["point.x"].to_pylist()
     assert xs == [2, 4, 6, 8, 10, 202, 204, 208, 210]
     assert AGAIN in " ".join(query.remarks())
     assert store.tf().transform("map", "base", 2 * S).translation[0] == 102  # of the last run
+    assert store.tf().transform("base", "cam", 2 * S).translation[0] == 7
 
 
 def test_the_clock_of_a_simulation_decides(tmp_path: Path) -> None:

@@ -73,6 +73,7 @@ def test_each_robot_has_its_tree(store: hl.Store, tmp_path: Path) -> None:
             ("/a/tf", tf("odom", "base", at, 1), at),
             ("/b/tf", tf("odom", "base", at, 50), at),
             ("/tf_static", tf("map", "odom", at, 100), at),
+            ("/tf", tf("odom", "base", at, 9), at),
             ("/motion", moved("odom", "base", at, 7000), at),
             ("/a/cam/p", point("base", at), at),
             ("/b/p", point("base", at), at),
@@ -85,12 +86,12 @@ def test_each_robot_has_its_tree(store: hl.Store, tmp_path: Path) -> None:
         assert store.tf(of=topic).transform("odom", "base", at).translation[0] == odom
     assert places(store.topic("/p").in_frame("map")) == [100]
     assert places(store.topic("/b/p").in_frame("odom", tf_topics=["/a/tf"])) == [1]
-    assert store.tf().names == ["map", "odom"]
+    assert store.tf().names == ["map", "odom", "base"]
     assert store.tf(topics=["/motion"]).transform("odom", "base", at).translation[0] == 7000
     path = tmp_path / "store"
     rows = [json.loads(line) for line in run("tf", "-F", "jsonl", store=path).out.splitlines()]
     assert [(row["tree"], row["frame"]) for row in rows] == [
-        ("/tf_static", "map"), ("/tf_static", "odom"),
+        ("/tf", "map"), ("/tf", "odom"), ("/tf", "base"),
         ("/a/tf", "map"), ("/a/tf", "odom"), ("/a/tf", "base"),
         ("/b/tf", "map"), ("/b/tf", "odom"), ("/b/tf", "base"),
     ]  # fmt: skip
@@ -133,6 +134,18 @@ def test_topics_that_give_a_frame_two_parents(store: hl.Store) -> None:
     assert store.tf().transform("map", "odom", at).translation[0] == 3
 
 
+def test_topics_that_give_a_frame_a_parent_one_after_the_other(store: hl.Store) -> None:
+    messages = [("/tf", tf("odom", "base", BEGIN + n, 1), BEGIN + n) for n in range(2)]
+    with store.start("x") as recording:
+        channel = Channel("/fox", "json", MOVING.schema)
+        recording.write(channel, said(9, "map", "base", (3, 0, 0)), log_time=BEGIN + 9 * S)
+        for topic, message, at in messages:
+            data = bytes(ROS2.serialize_cdr(message, TF))
+            recording.write(ros_channel(topic, TF, 2), data, log_time=at)
+    frame = store.tf().frames["base"]
+    assert (frame.parents, frame.conflict) == (("odom", "map"), "")
+
+
 def test_a_static_transform_that_changes(store: hl.Store) -> None:
     later = BEGIN + 10 * S
     messages = [("/tf_static", tf("map", "base", 5, x), BEGIN + n) for n, x in enumerate((1, 1))]
@@ -170,6 +183,9 @@ def test_a_stamp_of_zero_is_no_time(store: hl.Store) -> None:
     sets = store.sync(["/a", "/b"])
     assert [tuple(m.fields["point"]["x"] for m in one) for one in sets] == [(1, 1), (2, 2), (4, 4)]
     assert "2 without a time on the clock" in " ".join(sets.remarks())
+    (entry,) = store.recordings()
+    known = [c.stats.first_stamp for c in entry.channels if c.stats.first_stamp is not None]
+    assert min(known) == S
     query = store.topic("/a").clock("header")
     assert places(query.between("+0s", "+1.5s")) == [1, 2]  # begins at the first that is set
     whole = query.between(None, None)

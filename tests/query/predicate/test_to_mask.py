@@ -98,6 +98,13 @@ def test_decimal_literals_are_those_of_float32() -> None:
         assert mask_of_objects(parse(text), types, rows).tolist() == wanted, text
 
 
+def test_a_literal_beyond_float32_is_no_infinity() -> None:
+    records = pa.array([{"v": np.inf}], pa.struct([("v", pa.float32())]))
+    found = to_mask(parse("v == 1e300"), {"v": "float32"}, records)
+    assert found is not None
+    assert not found.any()
+
+
 def test_times_are_nanoseconds() -> None:
     table = pa.record_batch(
         {
