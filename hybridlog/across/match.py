@@ -88,8 +88,7 @@ def match(
         found = has_before | has_after
     elif how == "interpolate":
         is_exact = has_before & (earlier == 0)
-        near = np.True_ if apart is None else later - earlier <= apart
-        found = is_exact | (has_before & has_after & near)
+        found = is_exact | (has_before & has_after)
         distance = np.where(is_exact | (-earlier >= later), earlier, later)
         after = np.where(is_exact, before, after)
     if how != "interpolate":

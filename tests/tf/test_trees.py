@@ -46,11 +46,12 @@ Said = tuple[str, Any, int]  # topic, message, log time
 
 
 def recorded(store: hl.Store, name: str, messages: Sequence[Said]) -> None:
+    kinds = {topic: message.__msgtype__ for topic, message, _ in messages}
+    channels = {topic: ros_channel(topic, kind, 2) for topic, kind in kinds.items()}
     with store.start(name) as recording:
         for topic, message, at in messages:
-            kind = message.__msgtype__
-            data = bytes(ROS2.serialize_cdr(message, kind))
-            recording.write(ros_channel(topic, kind, 2), data, log_time=at)
+            data = bytes(ROS2.serialize_cdr(message, kinds[topic]))
+            recording.write(channels[topic], data, log_time=at)
 
 
 @pytest.fixture
