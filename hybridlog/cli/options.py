@@ -245,6 +245,10 @@ class Topics(Ranged):
             raise click.UsageError("Missing TOPIC; `hybridlog info` lists the topics.")
         return found
 
+    def named(self, asked: Store | Recordings) -> tuple[str, ...]:
+        """The topics as typed, and those of the types."""
+        return (*self.topics, *(asked.topics(*self.topic_type) if self.topic_type else ()))
+
     def query(self, store: Store) -> Query:
         """The query about these topics, recordings, times and predicates."""
         query = self.bounded(query_of(store, self.topics, self.choice, self.topic_type))

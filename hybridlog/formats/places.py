@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from hybridlog.formats.answer import Answer
 from hybridlog.formats.writing import Sink, Target
@@ -30,6 +31,7 @@ def write_tum(answer: Answer, target: Target) -> None:
     with Sink(target) as sink:
         for table, columns in _places(answer, _pose_among):
             rows = table.select(columns).drop_null()
+            rows = rows.filter(pc.not_equal(rows[columns[0]].cast(pa.int64()), 0))  # is not set
             left_out += table.num_rows - rows.num_rows
             times = rows[columns[0]].cast(pa.int64()).to_pylist()
             numbers = np.stack([rows[name].to_numpy() for name in columns[1:]], axis=1)

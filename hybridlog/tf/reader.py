@@ -223,11 +223,15 @@ def _frames(rows: pa.Table, topics: Sequence[str], invalid: Counter[str]) -> dic
         (one.indices.to_numpy(), one.dictionary.to_pylist())
         for one in (column.dictionary_encode() for column in columns)
     )
-    good = _valid(
-        np.asarray(known, object)[child], np.asarray(above, object)[parent], pose, invalid
-    )
     stamps, static, log_time = (
         rows[name].to_numpy() for name in ("stamp", "is_static", "log_time")
+    )
+    good = _valid(
+        np.asarray(known, object)[child],
+        np.asarray(above, object)[parent],
+        pose,
+        (stamps == 0) & ~static,
+        invalid,
     )
     made: dict[str, Frame] = {}
     by_child = np.argsort(child, kind="stable")
@@ -291,7 +295,11 @@ def _conflict(name: str, topics: Sequence[str], rows: pa.Table) -> str:
 
 
 def _valid(
-    child: NDArray[np.object_], parent: NDArray[np.object_], pose: Transform, invalid: Counter[str]
+    child: NDArray[np.object_],
+    parent: NDArray[np.object_],
+    pose: Transform,
+    unset: NDArray[np.bool_],
+    invalid: Counter[str],
 ) -> NDArray[np.bool_]:
     """Mask of the valid transforms; each of the others is counted by its first reason."""
     with np.errstate(all="ignore"):
@@ -300,6 +308,7 @@ def _valid(
         reasons = {
             "a frame without a name": (child == "") | (parent == ""),
             "a frame that is its own parent": child == parent,
+            "a stamp of zero, which is not set": unset,
             "numbers that are not finite": ~finite,
             "a rotation that is no unit quaternion": np.abs(norm - 1) > _MAX_NORM_ERROR,
         }

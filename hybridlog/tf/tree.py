@@ -170,6 +170,9 @@ class FrameTree:
     invalid: Mapping[str, int] = field(default_factory=dict)
     remarks: Sequence[str] = ()
 
+    def __repr__(self) -> str:
+        return f"<FrameTree {listed(self.names, 5)}>"
+
     @property
     def names(self) -> list[str]:
         """All frames: roots first, then each below its parent."""
@@ -247,7 +250,7 @@ class FrameTree:
             target: The frame of the results.
             source: The frame in which points are given.
             times: n times on the clock of header stamps: integers, ns since the epoch, or
-                datetimes of numpy, pandas or Arrow.
+                datetimes of numpy, pandas or Arrow. Zero is not set, and has no transform.
             extrapolate: How long before the first and after the last transform of a frame
                 that one holds; None for not at all.
 
@@ -264,9 +267,11 @@ class FrameTree:
         hold = 0 if extrapolate is None else parse_duration(extrapolate)
         made = identity(len(times))
         made.translation[:] = made.rotation[:] = np.nan
-        missing: Counter[str] = Counter()
-        for begin in range(0, len(times), _BLOCK):
-            block = np.arange(begin, min(begin + _BLOCK, len(times)))
+        known = np.flatnonzero(times)
+        unset = len(times) - len(known)
+        missing = Counter({"a stamp of zero, which is not set": unset} if unset else {})
+        for begin in range(0, len(known), _BLOCK):
+            block = known[begin : begin + _BLOCK]
             for rows, upwards in self._paths(given, times, block, ()):
                 for own, downwards in self._paths(wanted, times, rows, ()):
                     used = _until_common(upwards, downwards)

@@ -152,7 +152,7 @@ def test_a_static_transform_that_changes(store: hl.Store) -> None:
     messages = [("/tf_static", tf("map", "base", 5, x), BEGIN + n) for n, x in enumerate((1, 1))]
     recorded(store, "x", [*messages, ("/tf_static", tf("map", "base", 5, 2), later)])
     tree = store.tf()
-    times = [0, BEGIN, later - 1, later, later + S]
+    times = [5, BEGIN, later - 1, later, later + S]
     assert tree.lookup("map", "base", times).translation[:, 0].tolist() == [1, 1, 1, 2, 2]
     assert "base is static and changed 1 time: until 2023" in " ".join(tree.problems())
 
@@ -229,3 +229,27 @@ def test_odd_arguments_and_a_closed_store(store: hl.Store) -> None:
     for asked in (query.count, query.to_arrow, store.topics):
         with pytest.raises(UsageError, match="is closed: open it again"):
             asked()
+
+
+def test_an_unset_stamp_has_no_transform(store: hl.Store, tmp_path: Path) -> None:
+    messages: list[Said] = [
+        ("/tf", tf("map", "base", 0, -1000), BEGIN),
+        *(("/tf", tf("map", "base", BEGIN + n * S, 1), BEGIN + n * S) for n in range(2)),
+        ("/tf_static", tf("base", "cam", 0, 5), BEGIN),
+        *(("/p", point("cam", n * (BEGIN + S)), BEGIN + S) for n in range(2)),
+    ]
+    recorded(store, "x", messages)
+    for frame, wanted in (("map", 6), ("base", 5)):
+        query = store.topic("/p").in_frame(frame)
+        assert places(query) == [None, wanted]
+        assert "1 message without a transform to " in " ".join(query.remarks())
+        assert "a stamp of zero, which is not set" in " ".join(query.remarks())
+    tree = store.tf()
+    assert tree.invalid == {"a stamp of zero, which is not set": 1}
+    assert tree.frames["base"].stamps.tolist() == [BEGIN, BEGIN + S]
+    assert repr(tree) == "<FrameTree map, base, cam>"
+    path = tmp_path / "store"
+    said = run("tf", "map", "--topic-type", "PointStamped", "-F", "jsonl", store=path)
+    assert [json.loads(line)["x"] for line in said.lines] == [None, 6]
+    rows = run("align", "--to", "/p", "--topic-type", "TFMessage", "-F", "jsonl", store=path)
+    assert all("transforms" in line for line in rows.lines)

@@ -116,7 +116,7 @@ def align_command(given: _Given) -> None:
 def _aligned(store: Store, given: _Given) -> Aligned:
     """A row for each message of a topic."""
     base = given.base or ""
-    queries = _queries(store, [base, *given.topics], given.choice, given.beside)
+    queries = _queries(store, [base, *given.named(store)], given.choice, given.beside)
     for text in given.where:
         places, predicate = _named(queries, text, "--where wants TOPIC: PREDICATE")
         for place in places:

@@ -66,13 +66,14 @@ def tf_command(given: _Given) -> None:
     pitch and yaw in rad; by default at the latest time that has a transform. Rows of times
     without one are empty, and the reasons are printed.
     """
-    if given.target is None and (given.topic or given.between):
+    if given.target is None and (given.topic or given.topic_type or given.between):
         raise UsageError("Times are those of a transform: name its TARGET and SOURCE frames.")
     from hybridlog.tf.reader import trees_in
 
     with given.opened(snapshot=True) as store:
         chosen = given.recordings_in(store).check()
-        query = given.bounded(chosen.topic(*given.topic)) if given.topic else None
+        topics = given.named(chosen)
+        query = given.bounded(chosen.topic(*topics)) if topics else None
         if query is not None and len(query.topics) > 1:
             raise UsageError(f"Times are those of one topic, not of {listed(query.topics)}.")
         only = chosen.topic(*given.tf_topic).topics if given.tf_topic else ()
@@ -101,7 +102,7 @@ def _show_transforms(given: _Given, target: str, trees: Trees, query: Query | No
 
         asked = query.session, query.question, query.counters
         frames, stamps, log_time = frames_and_stamps(*asked)
-        source = frames[0] if source is None and len(frames) == 1 else source
+        source = frames[0] if source is None and len(frames) == 1 and frames[0] else source
     if source is None:
         raise UsageError("A transform has two frames: name TARGET and SOURCE.")
     if query is None or log_time is None:
@@ -145,7 +146,7 @@ def _times(
 def _show_trees(trees: Mapping[str, FrameTree], given: _Given) -> None:
     """Show the frames of trees, by a topic of each, which is a column if there are several."""
     if given.to_form != SCREEN:
-        given.answer([_with_name(name, tree, trees) for name, tree in trees.items()])
+        given.answer([_with_name(name, tree) for name, tree in trees.items()])
         return
     frames = (
         (topic, "  " * depth + name, tree.frames.get(name), tree.span[0])
@@ -157,12 +158,10 @@ def _show_trees(trees: Mapping[str, FrameTree], given: _Given) -> None:
     remarks(dict.fromkeys(text for tree in trees.values() for text in tree.problems()))
 
 
-def _with_name(topic: str, tree: FrameTree, trees: Mapping[str, FrameTree]) -> pa.Table:
+def _with_name(topic: str, tree: FrameTree) -> pa.Table:
     import pyarrow as pa
 
     table = tree.to_arrow()
-    if len(trees) == 1:
-        return table
     return table.add_column(0, "tree", pa.array([topic] * len(table), pa.string()))
 
 
