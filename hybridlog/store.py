@@ -462,9 +462,7 @@ class Store:
         Raises:
             TopicError: No topic is of these types.
         """
-        from hybridlog.query.choosing import topics_of_types
-
-        return topics_of_types(self.session, types) if types else self.session.topics_of()
+        return self.recordings().topics(*types) if types else self.session.topics_of()
 
     def attachments(self, recording: str | RecordingEntry) -> list[StoredAttachment]:
         """The attachments of a recording's log, in their order.

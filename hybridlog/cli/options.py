@@ -245,13 +245,15 @@ class Topics(Ranged):
             raise click.UsageError("Missing TOPIC; `hybridlog info` lists the topics.")
         return found
 
-    def named(self, asked: Store | Recordings) -> tuple[str, ...]:
-        """The topics as typed, and those of the types."""
-        return (*self.topics, *(asked.topics(*self.topic_type) if self.topic_type else ()))
+    def named(self, store: Store) -> tuple[str, ...]:
+        """The topics as typed, and those of the types in the chosen recordings."""
+        if not self.topic_type:
+            return self.topics
+        return (*self.topics, *self.recordings_in(store).topics(*self.topic_type))
 
     def query(self, store: Store) -> Query:
         """The query about these topics, recordings, times and predicates."""
-        query = self.bounded(query_of(store, self.topics, self.choice, self.topic_type))
+        query = self.bounded(query_of(store, self.named(store), self.choice))
         for predicate in self.where:
             query = query.where(predicate)
         if self.strict:
@@ -436,17 +438,13 @@ def recordings_of(store: Store, choice: Choice) -> Recordings:
     return chosen if choice.is_everything else chosen.check()
 
 
-def query_of(
-    store: Store, topics: Sequence[str] | None, choice: Choice, types: Sequence[str] = ()
-) -> Query:
+def query_of(store: Store, topics: Sequence[str] | None, choice: Choice) -> Query:
     """A query of some topics, as typed, of the chosen recordings; without any topic, of all.
 
     Short names and globs are resolved among the topics of these recordings alone.
     """
     chosen = None if choice.is_everything else recordings_of(store, choice)
     asked = store if chosen is None else chosen
-    if types:
-        topics = [*(topics or ()), *asked.topics(*types)]
     if not topics:
         return asked.all_topics()
     try:

@@ -77,9 +77,7 @@ def choose(session: Session, choice: Choice) -> Chosen:
     return Chosen(choosing.summaries, "")
 
 
-def topics_of_types(
-    session: Session, types: Sequence[str], recordings: Sequence[str] | None = None
-) -> list[str]:
+def topics_of_types(session: Session, types: Sequence[str], recordings: Sequence[str]) -> list[str]:
     """The topics of recordings, by id, with messages of some types, as `--type` names these.
 
     Raises:

@@ -214,7 +214,7 @@ def _follow(query: Query, choices: _Choices) -> None:
 def _query(store: Store, choices: _Choices) -> Query:
     from hybridlog.query.predicate.parser import names_topics
 
-    query = choices.bounded(query_of(store, choices.topics, choices.choice, choices.topic_type))
+    query = choices.bounded(query_of(store, choices.named(store), choices.choice))
     query = query.clock(choices.clock)
     near: str | tuple[str, str] | None = choices.within
     if (choices.before, choices.after) != (None, None):

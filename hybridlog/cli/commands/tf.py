@@ -14,6 +14,7 @@ from hybridlog.cli.output import remarks, short_duration
 from hybridlog.cli.render import Column, print_table
 from hybridlog.wording import counted, listed
 from hybridlog_storage.errors import IncompleteError, UsageError
+from hybridlog_storage.times import END
 
 _MAX_TIMES = 10_000_000
 
@@ -72,7 +73,7 @@ def tf_command(given: _Given) -> None:
 
     with given.opened(snapshot=True) as store:
         chosen = given.recordings_in(store).check()
-        topics = given.named(chosen)
+        topics = given.named(store)
         query = given.bounded(chosen.topic(*topics)) if topics else None
         if query is not None and len(query.topics) > 1:
             raise UsageError(f"Times are those of one topic, not of {listed(query.topics)}.")
@@ -93,23 +94,21 @@ def tf_command(given: _Given) -> None:
 
 
 def _show_transforms(given: _Given, target: str, trees: Trees, query: Query | None) -> None:
+    from hybridlog.tf.reader import frames_and_stamps
+
     source, extrapolate = given.source, given.extrapolate
-    tree, log_time = trees.tree(None if query is None else query.topics[0]), None
+    topic = None if query is None else query.topics[0]
+    tree = trees.tree(topic)
     if query is None:
         stamps = _times(tree, given, given.span if given.step else given.between)
+        log_time = 0 * stamps + END  # of the last epoch
     else:
-        from hybridlog.tf.reader import frames_and_stamps
-
         asked = query.session, query.question, query.counters
         frames, stamps, log_time = frames_and_stamps(*asked)
         source = frames[0] if source is None and len(frames) == 1 and frames[0] else source
     if source is None:
         raise UsageError("A transform has two frames: name TARGET and SOURCE.")
-    if query is None or log_time is None:
-        found = tree.lookup(target, source, stamps, extrapolate=extrapolate)
-    else:
-        way = query.topics[0], target, source
-        found = trees.lookup(*way, stamps, log_time, extrapolate=extrapolate)
+    found = trees.lookup(topic, target, source, stamps, log_time, extrapolate=extrapolate)
     if len(found) == 1 and found.missing:
         tree.transform(target, source, int(stamps[0]), extrapolate=extrapolate)
     given.answer([found.to_arrow()])
