@@ -65,7 +65,7 @@ class Shared(ABC):
         self.entries: dict[str, RecordingEntry] = {}
         self.schemas = {schema_hash(MARK_SCHEMA): MARK_SCHEMA}
         self.channels: dict[str, tuple[RecordingEntry, dict[str, list[RecordedChannel]]]] = {}
-        self.epochs: dict[str, tuple[RecordingEntry, list[int]]] = {}
+        self.epochs: dict[str, tuple[RecordingEntry, Any]] = {}
         self._segments: dict[tuple[str, str], SegmentReader] = {}
         self._rows: dict[tuple[Path, frozenset[tuple[str, ...]]], RecordingRows] = {}
         self._opening = threading.Lock()

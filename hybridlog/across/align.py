@@ -152,7 +152,7 @@ class Aligned:
             found.append(
                 f"{counted(len(lines) - _MAX_NAMES, 'more column')} are empty in some rows."
             )
-        found += dict.fromkeys(text for one in self._readers for text in one.remarks.values())
+        found += dict.fromkeys(text for one in self._readers for text in one.remarks)
         for question in questions:
             others = tuple(topic for topic in question.namesakes if topic not in topics)
             found += remarks(self._session, replace(question, namesakes=others), is_empty=False)

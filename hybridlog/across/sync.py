@@ -93,7 +93,7 @@ class Synced(Sequence[tuple["Message", ...]]):
                 for q in questions
             ]
             epochs = readers[0].epochs(recording)
-            self._restarts |= dict.fromkeys(readers[0].remarks.values())
+            self._restarts |= dict.fromkeys(readers[0].remarks)
             read = [_times_of(one, recording, self.counters) for one in readers]
             near = min((one for one in (limit, epochs.apart) if one is not None), default=None)
             rows = approximate_sets([time[order] for _, time, order in read], near)

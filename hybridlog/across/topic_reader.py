@@ -67,7 +67,7 @@ class TopicReader:
         self.prefix = prefix
         self.is_apart = is_apart
         self.counters = Counters()
-        self.remarks: dict[str, str] = {}
+        self._epochs: dict[str, Epochs] = {}
         self.is_by_log_time = clock == "log"
         self._session = session
         known = session.field_types(question.topics, question.recordings)
@@ -130,15 +130,17 @@ class TopicReader:
                     yield self._times(table, recording), table
 
     def epochs(self, recording: str) -> Epochs:
-        """The epochs of the times of the messages beside a recording."""
+        """The epochs of a recording on the clock, looked up once."""
         if self._time != STAMP:
-            return Epochs(np.empty(0, np.int64))
-        found = epochs_of(self._session, recording)
-        if len(found.begins):
-            snapshot = self._session.snapshot()
-            name = snapshot.summaries[snapshot.by_id[recording]].name
-            self.remarks[recording] = found.sentence(name)
-        return found
+            return Epochs("", np.empty(0, np.int64))
+        if recording not in self._epochs:
+            self._epochs[recording] = epochs_of(self._session, recording)
+        return self._epochs[recording]
+
+    @property
+    def remarks(self) -> list[str]:
+        """Sentences about recordings whose times start again, as far as they were read."""
+        return [one.sentence() for one in self._epochs.values() if len(one.begins)]
 
     def _times(self, table: pa.Table, recording: str) -> NDArray[np.int64]:
         """Times of messages on the clock, ns, those of other epochs far apart.
@@ -148,10 +150,8 @@ class TopicReader:
         times = _ns(table[self._time])
         if self._time != STAMP:
             return times
-        own = times
-        if not self.is_apart:
-            own = times + self.epochs(recording).offsets(_ns(table[TIME]))
-        return np.where((times == 0) | (times == UNKNOWN), UNKNOWN, own)
+        offsets = 0 if self.is_apart else self.epochs(recording).offsets(_ns(table[TIME]))
+        return np.where((times == 0) | (times == UNKNOWN), UNKNOWN, times + offsets)
 
     def by_clock(self, recording: str) -> Block:
         """The messages beside a recording that have a time, in memory, by their times."""

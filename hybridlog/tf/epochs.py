@@ -41,9 +41,11 @@ class Epochs:
     """The epochs of a recording.
 
     Attributes:
+        name: That of the recording.
         begins: int64[n], log times at which all but the first begin, ns, ascending.
     """
 
+    name: str
     begins: Times
 
     @property
@@ -56,16 +58,16 @@ class Epochs:
         return self.begins.searchsorted(log_time, "right")
 
     def offsets(self, log_time: Times) -> Times:
-        """What keeps the stamps of messages apart from those of other epochs, if added, ns."""
+        """Offsets, ns, that set the stamps of each epoch apart from those of all others."""
         return self.number(log_time) * (_ROOM // max(len(self.begins), 1))
 
-    def sentence(self, name: str) -> str:
+    def sentence(self) -> str:
         """A sentence about a recording with several."""
         first, more = format_time(int(self.begins[0])), len(self.begins) - 1
         often = f", and {more} more times" if more > 1 else ", and once more" if more else ""
         return (
-            f"Header stamps of {name} start again at {first}{often} (log time): nothing before "
-            "belongs to anything behind."
+            f"Header stamps of {self.name} start again at {first}{often} (log time): messages "
+            "from before and after are not matched."
         )
 
 
@@ -80,7 +82,8 @@ def epochs_of(session: Session, recording: str) -> Epochs:
     entry = session.entry_of(summary)
     known = session.shared.epochs.get(recording)
     if known is not None and known[0] is entry:
-        return Epochs(np.array(known[1], np.int64))
+        found: Epochs = known[1]
+        return found
     kinds = {channel.topic: plain_type(channel.type) for channel in entry.channels}
     skews: dict[str, list[int]] = defaultdict(list)
     for channel in entry.channels:
@@ -88,8 +91,8 @@ def epochs_of(session: Session, recording: str) -> Epochs:
         if entry.is_decoded and channel.stats.stamped:
             skews[channel.topic] += [skew for skew in ends if skew is not None]
     if not entry.is_decoded:
-        found = session.channels_of(entry, {*kinds})
-        has = [c for c in found if any(path.path == STAMP for path in c.codec.paths())]
+        channels = session.channels_of(entry, {*kinds})
+        has = [c for c in channels if any(path.path == STAMP for path in c.codec.paths())]
         skews |= {one.channel.topic: [] for one in has}
     may_fall = not (entry.is_decoded and skews) or any(
         max(skew, default=0) - min(skew, default=0) > _FALL_NS for skew in skews.values()
@@ -102,8 +105,9 @@ def epochs_of(session: Session, recording: str) -> Epochs:
         moving = [t for t, kind in kinds.items() if kind in TYPES and not t.endswith("tf_static")]
         topics = [*((topic, "stamp") for topic in skews), *((topic, "") for topic in moving)]
         begins = found_in([_stamps(session, recording, *one) for one in topics])
-    session.shared.epochs[recording] = entry, begins.tolist()
-    return Epochs(begins)
+    found = Epochs(summary.name, begins)
+    session.shared.epochs[recording] = entry, found
+    return found
 
 
 def _stamps(session: Session, recording: str, topic: str, field: str) -> Stamps:

@@ -25,7 +25,7 @@ from hybridlog.query.planner import Planner
 from hybridlog.query.times import decoded_time
 from hybridlog.schema.arrow_types import with_values
 from hybridlog.tf.reader import Trees
-from hybridlog.tf.transform import Transform, placed
+from hybridlog.tf.transform import Transform, placed, unknown
 from hybridlog_storage.errors import DefinitionError, PayloadError, TopicError, UsageError
 
 if TYPE_CHECKING:
@@ -188,7 +188,7 @@ class _Looked:
         log_time: NDArray[np.int64],
     ) -> Transform:
         """The transforms from some frames at some times; NaN where there are none."""
-        made = Transform(np.full((len(times), 3), np.nan), np.full((len(times), 4), np.nan))
+        made = unknown(len(times))
         missing: Counter[str] = Counter()
         pairs = [*zip(recordings, frames, strict=True)]
         for pair in dict.fromkeys(pairs):
@@ -199,9 +199,8 @@ class _Looked:
                 self._refuse(trees)
                 missing["no such frame in the recording"] += len(rows)
                 continue
-            own = times[rows], log_time[rows]
             try:
-                found = trees.lookup(self._topic, self.target, frame, *own)
+                found = trees.lookup(self._topic, self.target, frame, times[rows], log_time[rows])
             except TopicError:
                 missing[f"no frame {frame!r} among the transforms"] += len(rows)
                 continue

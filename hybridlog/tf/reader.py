@@ -20,7 +20,7 @@ from hybridlog.query.question import Counters, Question
 from hybridlog.tf import is_of_transforms
 from hybridlog.tf.epochs import epochs_of
 from hybridlog.tf.rows import transforms_of
-from hybridlog.tf.transform import Transform
+from hybridlog.tf.transform import Transform, unknown
 from hybridlog.tf.tree import Frame, FrameTree, Lookup
 from hybridlog.wording import counted, listed
 from hybridlog_storage.errors import TopicError
@@ -111,18 +111,17 @@ class Trees:
         They are those of the epochs of the log times.
         """
         number = self.epochs.number(log_time)
-        if not len(times) or (number == number[0]).all():
-            tree = self.tree(topic, number[0] if len(times) else -1)
-            return tree.lookup(target, source, times, extrapolate=extrapolate)
-        made = Transform(np.full((len(times), 3), np.nan), np.full((len(times), 4), np.nan))
+        epochs = np.unique(number).tolist() or [-1]
+        if len(epochs) == 1:
+            return self.tree(topic, *epochs).lookup(target, source, times, extrapolate=extrapolate)
+        made = unknown(len(times))
         missing = Counter[str]()
-        for epoch in np.unique(number).tolist():
-            own = np.flatnonzero(number == epoch)
-            tree = self.tree(topic, epoch)
+        for epoch in epochs:
+            own, tree = np.flatnonzero(number == epoch), self.tree(topic, epoch)
             try:
                 found = tree.lookup(target, source, times[own], extrapolate=extrapolate)
             except TopicError:
-                missing["no such frame before or after the stamps start again"] += len(own)
+                missing["no such frame before its stamps start again, or after"] += len(own)
                 continue
             made.translation[own], made.rotation[own] = found.translation, found.rotation
             missing.update(found.missing)
@@ -160,10 +159,10 @@ class Trees:
             numbers = self.epochs.number(rows["log_time"].to_numpy())
             is_static = rows["is_static"].to_numpy()
             rows = rows.filter(pa.array((numbers == epoch) | (is_static & (numbers < epoch))))
-            lacks.append(self.epochs.sentence(self._recording.name))
+            lacks.append(self.epochs.sentence())
         frames = _frames(rows, topics, invalid)
         lacks += [
-            f"{counted(one.late, 'transform')} of {name} came after one of a later time: sorted in."
+            f"{counted(one.late, 'transform')} of {name} came behind newer ones: sorted in."
             for name, one in frames.items()
             if one.late
         ]

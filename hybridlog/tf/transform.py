@@ -87,6 +87,11 @@ def identity(count: int) -> Transform:
     return Transform(np.zeros((count, 3)), rotation)
 
 
+def unknown(count: int) -> Transform:
+    """Transforms that are not known."""
+    return Transform(np.full((count, 3), np.nan), np.full((count, 4), np.nan))
+
+
 def placed(pose: Any) -> Transform:
     """The transform of a pose of a message, of which JSON may have a part only."""
     at, turn = (getattr(pose, name, None) for name in ("position", "orientation"))

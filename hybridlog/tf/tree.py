@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from hybridlog.query.times import format_time, parse_duration, parse_time, units_of
-from hybridlog.tf.transform import Transform, identity, interpolated
+from hybridlog.tf.transform import Transform, identity, interpolated, unknown
 from hybridlog.wording import counted, listed
 from hybridlog_storage.errors import TopicError, TransformError, UsageError
 
@@ -265,8 +265,7 @@ class FrameTree:
         wanted, given = self.check(target), self.check(source)
         times = _nanoseconds(times)
         hold = 0 if extrapolate is None else parse_duration(extrapolate)
-        made = identity(len(times))
-        made.translation[:] = made.rotation[:] = np.nan
+        made = unknown(len(times))
         known = np.flatnonzero(times)
         unset = len(times) - len(known)
         missing = Counter({"a stamp of zero, which is not set": unset} if unset else {})

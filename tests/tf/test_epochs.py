@@ -171,6 +171,6 @@ def test_the_clock_of_a_simulation_decides(tmp_path: Path) -> None:
 
 def test_stamps_of_many_epochs_are_apart() -> None:
     log = np.arange(1000, dtype=np.int64)
-    epochs = Epochs(log[1:])
+    epochs = Epochs("x", log[1:])
     assert np.diff(epochs.offsets(log)).min() > 2 * (epochs.apart or 0) - 2 > 10**15
     assert epochs.offsets(log).max() < 2**63 - 2 * 10**18
