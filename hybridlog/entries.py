@@ -522,7 +522,7 @@ def lost_in_crash(manifest: Manifest, after: Sealed) -> list[truth.Loss]:
 
 
 def described(inventory: Inventory) -> Manifest:
-    """A manifest of what a recording's segments say about it, which lists no files yet."""
+    """A manifest made of what the segments of a recording say about it; it lists no files yet."""
     for _, summary in sorted(inventory.summaries.items()):
         said = summary.recording
         known = {name: said.get(name) for name in ("id", "name", "tags", "source", "created")}

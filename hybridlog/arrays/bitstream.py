@@ -108,7 +108,7 @@ class _Bits:
         self._at = 0
 
     def take(self, count: int) -> int:
-        """Some bits as a number; ValueError if the unit is cut short."""
+        """The next `count` bits as a number; ValueError if the unit ends before."""
         self._at += count
         if self._at > len(self._bits):
             raise ValueError

@@ -98,7 +98,7 @@ def _reads() -> bool:
 
 
 def _repairs(store: Store, doing: str, *, verifies: bool) -> list[str]:
-    """What was repaired since the last call, what cannot be, and what is not there."""
+    """Sentences about repairs since the last call, what cannot be mended, and what is missing."""
     repairs, found = store.repairs, list[str]()
     for recording, segments in repairs.recovered.items():
         kept = counted(sum(one.messages for one in segments), "message")

@@ -29,7 +29,7 @@ class Bar:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Remove it."""
+        """Remove the bar."""
         if self._bar is not None:
             self._bar.stop()
             self._bar = None

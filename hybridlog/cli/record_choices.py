@@ -197,7 +197,7 @@ class RecordChoices(Between, Latched, InStore, AsJson, Quiet):
         return self.ros2 or (self.ros1, self.foxglove, self.replay) != (None, None, None)
 
     def matchers(self) -> tuple[TopicMatcher | None, TopicMatcher | None]:
-        """The topics, and those without index documents; new ones, as each counts its uses."""
+        """Matchers of topics and of those without documents; new at each call, since they count."""
         from hybridlog.query.topics import matcher
 
         chosen = matcher(self.topics, self.exclude) if self.topics or self.exclude else None

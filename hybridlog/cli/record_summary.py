@@ -1,4 +1,4 @@
-"""What `hybridlog record` tells of a recording at its end."""
+"""The row with which `hybridlog record` sums up a recording, and its columns."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ COLUMNS: Final = [
         order=2,
     ),
 ]
-"""Of a table of the rows of `row_of`."""
+"""Columns of the table of such rows."""
 
 
 def fields_of(row: Mapping[str, Any]) -> list[tuple[str, object]]:

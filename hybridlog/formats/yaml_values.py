@@ -71,7 +71,7 @@ def _value(
     anchors: dict[str | None, object],
     lines: dict[tuple[int, object], int],
 ) -> Any:
-    """The value that begins with an event, of this and the next ones."""
+    """The value that this event begins, and the following ones complete."""
     import yaml
 
     if isinstance(event, yaml.AliasEvent):

@@ -227,7 +227,7 @@ class TopicState:
 
 @dataclass(slots=True)
 class TopicCounts:
-    """What was received and lost of a topic."""
+    """Counts of messages of a topic that were received and lost."""
 
     topic: str
     type: str = ""

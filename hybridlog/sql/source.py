@@ -25,7 +25,7 @@ _COMPARED: Final[Mapping[str, Callable[..., NDArray[np.bool_]]]] = {
     ">": lambda _, high, value: high > value,
     ">=": lambda _, high, value: high >= value,
 }
-"""Whether a comparison may hold for values between two bounds."""
+"""By operator, a test if a comparison may hold for values between a low and a high bound."""
 
 
 class TopicDataset(ds.Dataset, PyArrowDatasetSource):  # type: ignore[misc] # without types
@@ -73,7 +73,7 @@ class TopicDataset(ds.Dataset, PyArrowDatasetSource):  # type: ignore[misc] # wi
 
 
 def _may_hold(node: Node, bounds: Bounds) -> NDArray[np.bool_]:
-    """Which parts may have rows for which a filter holds."""
+    """Mask of the parts that may have rows for which a filter holds."""
     match node:
         case Binary(op="AND", left=left, right=right):
             return _may_hold(left, bounds) & _may_hold(right, bounds)

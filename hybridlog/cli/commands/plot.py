@@ -123,4 +123,4 @@ _COLUMNS = [
     Column("greatest", lambda line: _ends(line.series)[1], "right"),
     Column("", _line, "whole", lambda line: _line(line, _LETTERS // 3)),
 ]
-"""Of each line: its least and greatest value, and a sparkline."""
+"""Columns of the lines on a terminal: name, least and greatest value, sparkline."""

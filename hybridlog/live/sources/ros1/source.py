@@ -236,7 +236,7 @@ class Graph:
         self._calls = asyncio.Semaphore(_CALLS_AT_ONCE)
 
     def hint(self, topic: str) -> None:
-        """Polls soon: the publishers of a topic may have changed."""
+        """Let the master be polled soon, since the publishers of a topic may have changed."""
         if topic in self._subscriptions:
             self._hinted.add(topic)
             self._hint.set()

@@ -387,7 +387,7 @@ _VALUES: Final[dict[object, str]] = {
     "depth": f"a number from 1 to {MAX_DEPTH}",
     "avoid_ros_namespace_conventions": "true or false",
 }
-"""What each policy may be, in words."""
+"""Values that a policy may have, in words, by its name."""
 
 
 def read_overrides(path: Path) -> dict[str, dict[str, Any]]:
