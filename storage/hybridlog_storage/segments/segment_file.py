@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -178,10 +178,8 @@ class SegmentFile:
         disk when this returns.
         """
         path = directory / f"{number:06d}{OPEN_SUFFIX}"
-        try:
+        with durability.explained(path, "creating"):
             file = AppendFile.create(path)
-        except OSError as error:
-            raise durability.explain(error, path, "creating") from error
         segment = cls(path, number, file, group=group)
         try:
             segment._append([START])
@@ -378,12 +376,8 @@ class SegmentFile:
         with self._explained("writing"):
             self._file.append(parts)
 
-    @contextmanager
-    def _explained(self, doing: str) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            raise durability.explain(error, self.path, doing) from error
+    def _explained(self, doing: str) -> AbstractContextManager[None]:
+        return durability.explained(self.path, doing)
 
     def tail(self, at: int) -> bytes:
         """The last records of a file with `at` bytes of data: the end of data, the summary."""

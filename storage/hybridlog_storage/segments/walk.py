@@ -108,7 +108,7 @@ class Walk:
 
     @property
     def damaged(self) -> list[Damage]:
-        """What cannot be read, in file order."""
+        """Places that cannot be read, in file order."""
         return [*self._damaged, *([] if self._stopped is None else [self._stopped])]
 
     def go_on(self) -> None:
