@@ -190,6 +190,8 @@ def test_what_a_power_cut_left_is_recovered_behind_the_new_recording(
     replay = ("--replay", logs / "robot.bag", "--flush-interval", "100ms")
     with recorder(store, *replay) as process:
         until_it_speaks(process)
+        with hl.open(store, read_only=True) as seen:
+            wait_for(lambda: seen.recordings()[0].messages)  # it may speak before it has written
         process.kill()
     program = (sys.executable, "-c", RECOVERS_WHEN_TOLD, str(told))
     with recorder(store, *replay, "--speed", 0.1, program=program) as process:
