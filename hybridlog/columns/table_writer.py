@@ -61,6 +61,7 @@ _ARENA = 8 << 20  # bytes of chunks collected: each topic's part costs a millise
 _ROWS = 1 << 18  # messages collected
 _PENDING = 16 << 20  # bytes of rows waiting in memory
 _LEFT = _PENDING // 4  # bytes of the smallest topics, which continue to wait for more rows
+_PIECES = 32  # pieces of a topic that become one: small ones take far more than their bytes
 LONG_ROWS = 10_000
 """Number of rows from which a topic has files of its own."""
 LONG_BYTES = 1 << 20
@@ -118,6 +119,16 @@ class _Topic:
         """Bytes of the rows in memory."""
         return sum(piece.size for piece in self.pieces)
 
+    def add(self, piece: Piece) -> None:
+        """Add rows of the segment in work."""
+        self.pieces.append(piece)
+        self.rows += piece.rows
+        kind = piece.segment, piece.has_arrays
+        alike = [one for one in self.pieces if (one.segment, one.has_arrays) == kind]
+        if len(alike) >= _PIECES:
+            others = [one for one in self.pieces if (one.segment, one.has_arrays) != kind]
+            self.pieces = [*others, self.joined(alike)]
+
     def take(self) -> list[Piece]:
         """Remove and return the rows in memory."""
         found, self.pieces = self.pieces, []
@@ -142,8 +153,8 @@ class _Topic:
             columns = self.points.with_points(columns, decoded.arrow())
         return copied(columns)
 
-    def table(self, pieces: list[Piece]) -> Any:
-        """Rows in order of log time and arrival."""
+    def joined(self, pieces: list[Piece]) -> Piece:
+        """Rows as one piece, of the segment of the first one."""
         import pyarrow as pa
 
         from hybridlog.columns.fields import joined as joined_columns
@@ -157,11 +168,20 @@ class _Topic:
         own = {
             name: pa.concat_arrays([piece.own[name] for piece in pieces]) for name in pieces[0].own
         }
+        bad = sum(piece.unreadable for piece in pieces)
+        return Piece(pieces[0].segment, own, fields, bad, has_arrays=pieces[0].has_arrays)
+
+    def table(self, pieces: list[Piece]) -> Any:
+        """Rows in order of log time and arrival."""
+        import pyarrow as pa
+
+        piece = self.joined(pieces)
+        own = piece.own
         columns = {
             name: pa.repeat(pa.scalar(value), len(own["t"]))
             for name, value in (("recording", self.recording), ("topic", self.name))
         }
-        table = as_table(columns | own, fields)
+        table = as_table(columns | {**own}, piece.fields)
         order = order_of(own["t"].to_numpy(), own["seq"].to_numpy())
         return table if order is None else table.take(pa.array(order))
 
@@ -303,8 +323,7 @@ class TableWriter:
                     columns=topic.columns,
                 )
                 piece.has_arrays = topic.has_arrays and state is State.WHOLE
-                topic.pieces.append(piece)
-                topic.rows += piece.rows
+                topic.add(piece)
         self._spill()
 
     def _by_topic(

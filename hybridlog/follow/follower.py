@@ -28,7 +28,7 @@ from hybridlog.maintenance.expiry import make_rows
 from hybridlog.maintenance.report import reporter
 from hybridlog.maintenance.retention import Rules
 from hybridlog.maintenance.tables import missing
-from hybridlog_storage.catalog import decoded_in, file_of
+from hybridlog_storage.catalog import ChannelStats, file_of
 from hybridlog_storage.errors import (
     DatabaseError,
     DiskFullError,
@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from hybridlog.index.indexing import Decoded, Documents
+    from hybridlog.index.indexing import Documents
     from hybridlog.maintenance.report import Progress
     from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
@@ -172,7 +172,7 @@ class _Segment:
         is_wanted: Whether documents are made.
         opened: Its file while it grows.
         chunks: Number of chunks that were read.
-        decoded: Results of decoding each chunk.
+        decoded: Results of decoding, by channel.
         is_decoded: Whether these are known already; then only rows are made.
         is_sent: Whether all of them were handed to the sender.
     """
@@ -180,7 +180,7 @@ class _Segment:
     is_wanted: bool
     opened: OpenSegment | None = None
     chunks: int = 0
-    decoded: list[Decoded] = field(default_factory=list)
+    decoded: dict[int, ChannelStats] = field(default_factory=dict)
     is_decoded: bool = False
     is_sent: bool = True
 
@@ -415,8 +415,7 @@ class Follower:
         segment.chunks = chunks[-1].number + 1
         if segment.is_decoded:
             return
-        documents, decoded = self._indexer.documents_of(chunks, channels)
-        segment.decoded += decoded
+        documents = self._indexer.documents_of(chunks, channels, segment.decoded)
         messages = sum(len(chunk.batch) for chunk in chunks)
         if not segment.is_wanted and self._target.is_wanted:
             return  # they are there already
@@ -435,9 +434,8 @@ class Follower:
         segment = self._segments.pop(number)
         self._tables.cut(number, digest)
         if not segment.is_decoded:
-            decoded = decoded_in(segment.decoded)
             with suppress(HybridlogError):  # it is derived, and the disk may be full
-                self._catalog.put_decoded(self._entry.id, number, digest, decoded)
+                self._catalog.put_decoded(self._entry.id, number, digest, segment.decoded)
         if self._sender is not None and segment.is_wanted and segment.is_sent:
             self._sender.ended[str(number)] = digest
         self._ended.add(number)

@@ -16,17 +16,13 @@ from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.column import STAMP
 from hybridlog.schema.index_bodies import bodies_of
 from hybridlog_storage.catalog import ChannelStats
-from hybridlog_storage.messages import Channel
+from hybridlog_storage.messages import EXPIRED_IDS, Channel
 from hybridlog_storage.mongo.index_documents import DocumentAssembler, Placed
 from hybridlog_storage.ordering import run_starts
 from hybridlog_storage.segments.chunk import StoredChunk
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-
-Decoded = dict[int, ChannelStats]
-"""Results of decoding, by channel."""
 
 
 class Documents(NamedTuple):
@@ -53,22 +49,24 @@ class ChunkIndexer:
         self._parts: dict[int, tuple[Codec, DocumentAssembler, bool]] = {}
 
     def documents_of(
-        self, chunks: Sequence[StoredChunk], channels: Mapping[int, Channel]
-    ) -> tuple[list[Documents], list[Decoded]]:
-        """Make all index documents of some chunks, and the results of decoding each chunk.
+        self,
+        chunks: Sequence[StoredChunk],
+        channels: Mapping[int, Channel],
+        decoded: dict[int, ChannelStats],
+    ) -> list[Documents]:
+        """Make all index documents of some chunks; add the results of decoding, by channel.
 
         They equal those of each chunk alone. Several chunks of few messages take little longer
         than one.
         """
         placed = Placed.of(chunks)
         documents: list[Documents] = []
-        decoded: list[Decoded] = [{} for _ in chunks]
         for channel_id, rows in rows_by_channel(placed.batch.channel):
             channel = channels[channel_id]
             codec, assembler, stamped = self._part(channel_id, channel)
             is_indexed = channel.is_indexed and self._has_documents
             batch = placed.batch.take(rows)
-            found = _Results(placed.number[rows])
+            found = _Results(len(rows))
             tables: list[NDArray[np.uint8]] = []
             for group in bodies_of(codec, batch, found.surplus):
                 found.unreadable[group.rows] = group.error is not None
@@ -84,11 +82,11 @@ class ChunkIndexer:
                     own, values = stamps_of(codec, batch.take(left))
                     found.stamped[left[own]] = True
                     found.stamps[left[own]] = values
-            for place, of_chunk in found.by_chunk(batch.log_time):
-                decoded[place][channel_id] = of_chunk
+            known = decoded.setdefault(channel_id % EXPIRED_IDS, ChannelStats())
+            known.add(found.stats(batch.log_time))
             if tables:
                 documents.append(Documents(channel.topic, tables))
-        return documents, decoded
+        return documents
 
     def _part(self, channel_id: int, channel: Channel) -> tuple[Codec, DocumentAssembler, bool]:
         part = self._parts.get(channel_id)
@@ -114,10 +112,7 @@ def rows_by_channel(channel: NDArray[np.int32]) -> Iterator[tuple[int, NDArray[n
 
 
 class _Results:
-    """Results of decoding messages of one channel.
-
-    Args:
-        number: intp[n], index of each message's chunk; ascending.
+    """Results of decoding `messages` of one channel.
 
     Attributes:
         unreadable: bool[n], messages that cannot be read.
@@ -126,27 +121,23 @@ class _Results:
         stamps: int64[n], the stamps.
     """
 
-    def __init__(self, number: NDArray[np.intp]) -> None:
-        self._number = number
-        self.unreadable, self.surplus, self.stamped = np.zeros((3, len(number)), np.bool_)
-        self.stamps = np.zeros(len(number), np.int64)
+    def __init__(self, messages: int) -> None:
+        self.unreadable, self.surplus, self.stamped = np.zeros((3, messages), np.bool_)
+        self.stamps = np.zeros(messages, np.int64)
 
-    def by_chunk(self, log_time: NDArray[np.int64]) -> Iterator[tuple[int, ChannelStats]]:
-        """The chunks with messages, and the results of each."""
-        begins = run_starts(self._number).tolist()
-        for begin, end in zip(begins, [*begins[1:], len(log_time)], strict=True):
-            rows = begin + np.flatnonzero(self.stamped[begin:end])
-            stamps = self.stamps[rows]
-            skew = (log_time[rows] - stamps)[stamps != 0]
-            found = ChannelStats(
-                unreadable=int(self.unreadable[begin:end].sum()),
-                surplus=int(self.surplus[begin:end].sum()),
-                stamped=len(stamps),
-                unset=len(stamps) - len(skew),
-                skew_sum=float(skew.sum(dtype=np.float64)),  # integers could overflow
-            )
-            if len(skew):
-                known = stamps[stamps != 0]
-                found.first_stamp, found.last_stamp = int(known.min()), int(known.max())
-                found.skew_min, found.skew_max = int(skew.min()), int(skew.max())
-            yield int(self._number[begin]), found
+    def stats(self, log_time: NDArray[np.int64]) -> ChannelStats:
+        """The results as statistics; the sum of skews is exact."""
+        stamps = self.stamps[self.stamped]
+        known = stamps[stamps != 0]
+        skew = (log_time[self.stamped] - stamps)[stamps != 0]
+        found = ChannelStats(
+            unreadable=int(self.unreadable.sum()),
+            surplus=int(self.surplus.sum()),
+            stamped=len(stamps),
+            unset=len(stamps) - len(skew),
+            skew_sum=(int((skew >> 32).sum()) << 32) + int((skew & 0xFFFF_FFFF).sum()),
+        )
+        if len(skew):
+            found.first_stamp, found.last_stamp = int(known.min()), int(known.max())
+            found.skew_min, found.skew_max = int(skew.min()), int(skew.max())
+        return found

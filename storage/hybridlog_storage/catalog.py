@@ -10,9 +10,8 @@ are read from the footers of segments.
 from __future__ import annotations
 
 import json
-import math
-from collections import Counter, defaultdict
-from collections.abc import Collection, Container, Iterable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Collection, Container, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -100,13 +99,6 @@ class ChannelStats:
             setattr(self, name, _least(getattr(self, name), getattr(other, name)))
         for name in ("last", "last_publish", "last_stamp", "skew_max"):
             setattr(self, name, _greatest(getattr(self, name), getattr(other, name)))
-
-
-_STORED: Final[dict[str, Any]] = {
-    "messages": 0, "payload_bytes": 0, "first": None, "last": None, "first_publish": None,
-    "last_publish": None,
-}  # fmt: skip
-"""Statistics that a chunk table has without decoding."""
 
 
 @dataclass(slots=True, repr=False)
@@ -245,7 +237,7 @@ def channel_totals(
 ) -> dict[int, ChannelStats]:
     """Statistics of the channels of a segment.
 
-    `decoded` is from `decoded_in`, None before messages are decoded; `silent` has the ids of
+    `decoded` has the results of decoding, None before messages are decoded; `silent` has the ids of
     channels without publish times.
     """
     names = ("channel", "messages", "payload_bytes", "first", "last")
@@ -259,20 +251,6 @@ def channel_totals(
             stats.first_publish, stats.last_publish = published
         if decoded is not None and channel % EXPIRED_IDS in decoded:
             stats.add(decoded[channel % EXPIRED_IDS])
-    return found
-
-
-def decoded_in(chunks: Iterable[Mapping[int, ChannelStats]]) -> dict[int, ChannelStats]:
-    """Join what decoding has found out of each chunk, by the channels that messages came on."""
-    found: dict[int, ChannelStats] = {}
-    sums = defaultdict[int, list[float]](list)
-    for one in chunks:
-        for number, stats in one.items():
-            channel = number % EXPIRED_IDS
-            found.setdefault(channel, ChannelStats()).add(replace(stats, **_STORED))
-            sums[channel].append(stats.skew_sum)
-    for channel, stats in found.items():
-        stats.skew_sum = math.fsum(sums[channel])  # exact, whatever the order of chunks
     return found
 
 
@@ -393,8 +371,9 @@ class Catalog:
     def put_decoded(
         self, recording: str, number: int, digest: str, decoded: Mapping[int, ChannelStats]
     ) -> None:
-        """Store the results of decoding a segment, from `decoded_in`."""
-        cell = put(_DECODED, recording, encode((digest, decoded)), number)
+        """Store the results of decoding a segment."""
+        rounded = {n: replace(one, skew_sum=float(one.skew_sum)) for n, one in decoded.items()}
+        cell = put(_DECODED, recording, encode((digest, rounded)), number)
         self._cells.write(lambda: [cell])
 
     def remove(self, recording: str) -> None:
