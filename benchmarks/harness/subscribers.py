@@ -13,7 +13,6 @@ import numpy as np
 from benchmarks import usage
 from benchmarks.backends.base import Backend, BackendFailedError
 from benchmarks.harness.publisher import TOKEN
-from hybridlog_storage.buffers import new_memory
 
 if TYPE_CHECKING:
     from benchmarks.harness.counters import Counters
@@ -140,8 +139,8 @@ def _at_hand(load: Load) -> memoryview:
         # Every page is looked at once, so that no subscriber waits for it to be mapped.
         np.frombuffer(mapped, np.uint8)[::4096].max(initial=0)
         return mapped
-    memory = new_memory(size)
+    memory = np.empty(size, np.uint8)  # in huge pages
     with load.payloads.open("rb") as stream:
-        if stream.readinto(memory) != size:
+        if stream.readinto(memory.data) != size:
             raise OSError(f"{load.payloads} was cut short.")
-    return memoryview(memory).toreadonly()
+    return memory.data.toreadonly()

@@ -8,7 +8,6 @@ import numpy as np
 
 from hybridlog.schema.column import Arrays, Column, Scalars
 from hybridlog.schema.definition import Instant, Primitive
-from hybridlog_storage.buffers import buffers
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -101,7 +100,7 @@ class Source:
         stride = _even_stride(start, least=2)
         if not stride:
             return self._join(start.tolist(), [size] * rows)
-        joined = buffers.take(rows * size)[: rows * size]
+        joined = np.empty(rows * size, np.uint8)
         view: NDArray[np.uint8] = np.ndarray(
             (rows, size), np.uint8, buffer=self.buffer, offset=int(start[0]), strides=(stride, 1)
         )
@@ -110,7 +109,7 @@ class Source:
 
     def _join(self, start: list[int], size: list[int]) -> NDArray[np.uint8]:
         total = sum(size)
-        joined = buffers.take(total)[:total]
+        joined = np.empty(total, np.uint8)
         content = np.frombuffer(self.buffer, np.uint8)
         to = 0
         for at, count in zip(start, size, strict=True):

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import mmap
 import os
 import stat
 from collections.abc import Sequence
@@ -21,7 +22,6 @@ from typing import Self
 import numpy as np
 from blake3 import blake3
 
-from hybridlog_storage.buffers import buffers
 from hybridlog_storage.disk import files
 from hybridlog_storage.messages import Buffer
 
@@ -41,7 +41,8 @@ class AppendFile:
         """Bytes in the file."""
         self._fd = fd
         self._hasher = None if position else blake3()  # of all that was appended
-        self._stage = buffers.take(_STAGE) if direct else None
+        # Whole pages, as direct writes need them.
+        self._stage = np.frombuffer(mmap.mmap(-1, _STAGE), np.uint8) if direct else None
         self._filled = 0  # bytes in the stage
         self._written = 0  # byte of the file up to which whole blocks are written
 

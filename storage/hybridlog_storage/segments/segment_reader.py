@@ -18,7 +18,6 @@ import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, Metadata, MetadataIndex
 
-from hybridlog_storage.buffers import buffers
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import SegmentError, exhausted
@@ -361,15 +360,15 @@ class SegmentReader:
                 f"{self.path} ends at byte {self.size}, but bytes {offset} to "
                 f"{offset + length} are referred to: the file was cut short."
             )
-        buffer = buffers.take(length).data
+        buffer = np.empty(length, np.uint8).data
         try:
-            count = files.preadv(self._fd, [buffer[:length]], offset)
+            count = files.preadv(self._fd, [buffer], offset)
         except OSError as error:
             raise SegmentError(f"{self.path} cannot be read: {error.strerror}.") from error
         if count < length:
             raise SegmentError(f"{self.path} gives {count} bytes of {length} at {offset}.")
         self.bytes_read += length
-        return buffer[:length]
+        return buffer
 
 
 def places_of(table: ChunkTable) -> list[ChunkPlace]:
