@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from hybridlog.frames import columns as columns_module
 from hybridlog.frames.answer import Block, table_of
 from hybridlog.frames.frame import frame_of
-from hybridlog.schema.arrow_columns import records_array
-from hybridlog.schema.arrow_objects import values_array
+from hybridlog.schema.arrow_columns import records_array, values_array
 from hybridlog.schema.arrow_types import common_type, converted, extremes, plain_values
 from hybridlog.schema.column import Arrays, Column, Records, Scalars, Strings
 

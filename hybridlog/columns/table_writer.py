@@ -78,7 +78,7 @@ def load() -> None:
     import hybridlog.columns.clouds
     import hybridlog.columns.left_rows
     import hybridlog.columns.parquet_file
-    import hybridlog.schema.arrow_objects  # noqa: F401
+    import hybridlog.schema.arrow_columns  # noqa: F401
 
     pa.array([0]).to_numpy(zero_copy_only=False)  # loads pandas, if it is installed
 

@@ -13,8 +13,7 @@ from hybridlog.frames.answer import Block, Decoder, text_column
 from hybridlog.frames.columns import flat, summary_array, with_summaries
 from hybridlog.frames.names import arranged, free_name, summary_of
 from hybridlog.index.indexing import rows_by_channel
-from hybridlog.schema.arrow_columns import structs
-from hybridlog.schema.arrow_objects import below, values_array
+from hybridlog.schema.arrow_columns import below, structs, values_array
 from hybridlog.schema.arrow_types import plain_values
 
 if TYPE_CHECKING:

@@ -17,8 +17,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from hybridlog.schema.arrow_columns import lists, structs
-from hybridlog.schema.arrow_objects import EXACT, json_array
+from hybridlog.schema.arrow_columns import EXACT, json_array, lists, structs
 from hybridlog.schema.column import Scalars, offsets
 from hybridlog.schema.summary import summarise
 

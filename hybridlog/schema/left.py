@@ -72,7 +72,7 @@ class LeftFields(Objects):
     def arrow(self) -> pa.StructArray:
         """The messages as an Arrow array; arrays of which only a summary is left are null."""
         if not self.is_typed:
-            from hybridlog.schema.arrow_objects import objects_array
+            from hybridlog.schema.arrow_columns import objects_array
 
             return objects_array(self._documents(summaries=False), self.wanted())
         return self._narrowed(self._records(()), self._empty.arrow().type)

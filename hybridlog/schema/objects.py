@@ -99,7 +99,7 @@ class Objects:
 
     def arrow(self) -> pa.StructArray:
         """The messages as an Arrow array; see `Decoded.arrow`."""
-        from hybridlog.schema.arrow_objects import objects_array
+        from hybridlog.schema.arrow_columns import objects_array
 
         return objects_array(self.plain(whole=True), self.wanted())
 

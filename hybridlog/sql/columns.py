@@ -17,8 +17,7 @@ import pyarrow as pa
 
 from hybridlog.columns.fields import LIMIT
 from hybridlog.columns.layout import OWN_COLUMNS, column_names
-from hybridlog.schema.arrow_columns import structs
-from hybridlog.schema.arrow_objects import json_array
+from hybridlog.schema.arrow_columns import json_array, structs
 from hybridlog.schema.arrow_types import (
     COMPUTED_AS,
     common_type,
