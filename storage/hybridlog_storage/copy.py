@@ -108,7 +108,6 @@ class _Copy:
         self._new: set[str] = set()  # paths of files that the manifest there did not list
         self._proved: dict[str, str] = {}  # digests by path
         self._is_there = False  # its manifest
-        self._damaged: set[int] = set()  # numbers of logs that have lost rows there
 
     def known(self) -> Copied | None:
         """The result if there is nothing to copy, found without a lock; None if there is."""
@@ -136,14 +135,12 @@ class _Copy:
             sizes = target.sizes(here.id)
             there = self._find(sizes)
             check_origin(here, there)
-            self._damaged = self._find_damaged(there, sizes)
-            believed = self._believed(there)
-            logs = self._wanted(believed)
+            logs = self._wanted(there)
             if logs and self._how.prepare is not None:
                 here, self._others = stack.enter_context(self._how.prepare(here, logs))
                 logs = [here.logs[log.number] for log in logs]
-            copied = Copied(here, there is None, lacking=_lacking(here, believed))
-            self._bring(here, believed, logs, sizes, copied)
+            copied = Copied(here, there is None, lacking=_lacking(here, there))
+            self._bring(here, there, logs, sizes, copied)
             copied.manifest = self._publish(here, there, {log.number for log in logs})
             self._clear(there, copied.manifest, sizes)
             if self._how.proved is not None:
@@ -152,26 +149,6 @@ class _Copy:
 
     def _wanted(self, there: Manifest | None) -> list[File]:
         return wanted(self._here, there, awaited=self._how.prepare is None)
-
-    def _believed(self, there: Manifest | None) -> Manifest | None:
-        """The manifest there without the logs that are to come again."""
-        files = () if there is None else there.files
-        left = tuple(file for file in files if file.number not in self._damaged)
-        return there and replace(there, files=left)
-
-    def _find_damaged(self, there: Manifest | None, sizes: Mapping[str, int]) -> set[int]:
-        """Numbers of logs that are here, and are gone there with rows that are not here."""
-        if there is None:
-            return set()
-        gone = {n for n, log in there.logs.items() if not log.is_here}
-        gone &= {n for n, log in self._here.logs.items() if log.is_here}
-        return {
-            number
-            for one in {*listed_files(there)} - {*listed_files(self._here)}
-            if (number := int(one.path[:6])) in gone
-            and (self._must_prove or sizes.get(one.path) != one.bytes)
-            and not self._is_whole(one, sizes)
-        }
 
     def _is_whole(self, file: ListedFile, sizes: Mapping[str, int]) -> bool:
         reads = file.path not in self._new
@@ -261,7 +238,7 @@ class _Copy:
                 made = replace(made, name=self._how.named(made.name))
                 create(made)
                 return made
-        return manifests.change(here.id, lambda now: merged(here, self._believed(now), brought))
+        return manifests.change(here.id, lambda now: merged(here, now, brought))
 
     def _check_files(self) -> None:
         """Raise if files are no longer there: a removal that ends takes them along."""

@@ -4,9 +4,9 @@
 `sha256sum` answers, it is as in a directory: the folder of the recording is locked meanwhile,
 what has arrived is proved there, and a manifest is replaced under its lock if it is unchanged.
 
-Where only sftp is allowed, what has arrived is read back. Copies wait for each other while they
-replace a manifest, by making the folder `manifests/.copying-<id>`; but an edit by a program on
-the server between the last look at the manifest and its replacement is lost.
+Where only sftp is allowed, what has arrived is read back, and there are no locks: an edit by a
+program on the server, or by another copy, between the last look at a manifest and its replacement
+is lost.
 """
 
 from __future__ import annotations
@@ -14,13 +14,11 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import random
 import re
 import secrets
 import shlex
 import subprocess
 import tempfile
-import time
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Final, Self
@@ -384,16 +382,14 @@ class _ServerManifests(Manifests):
             if server.has_shell:
                 self._put_by_shell(recording, new, version, changed)
                 return
-            with self._locked(recording):
-                now = ""
-                with suppress(FileNotFoundError):
-                    now = self._get(recording)[1]
-                if now != version:
-                    raise changed
-                if not version:
-                    server.put(b"", f"{RECORDINGS}/{recording}/{MANIFEST_LOCK}")
-                mark = f"{RECORDINGS}/{MARK}{secrets.token_hex(8)}"  # as `touch` does
-                server.sftp(f"rename {new} {_path(recording)}", f"-mkdir {mark}", f"-rmdir {mark}")
+            now = ""
+            with suppress(FileNotFoundError):
+                now = self._get(recording)[1]
+            if now != version:
+                raise changed
+            if not version:
+                server.put(b"", f"{RECORDINGS}/{recording}/{MANIFEST_LOCK}")
+            server.move(new, _path(recording))
         except BaseException:
             with suppress(StoreError):
                 server.drop(new)
@@ -407,11 +403,10 @@ class _ServerManifests(Manifests):
         lock = f"{folder}/{MANIFEST_LOCK}" if version else f"{MANIFESTS}/.lock"
         sync = f"{{ sync {folder} {RECORDINGS} {MANIFESTS} || sync; }}"
         is_same = f'test "$(sha256sum 2> /dev/null < {final})" = "{version and version + "  -"}"'
-        # From a touched folder readers see that a recording has come.
         script = (
             f"{sync} && {{ {is_same} || exit {_CHANGED}; : >> {folder}/{MANIFEST_LOCK}; "
             f"ln -f {final} {folder}/{MANIFEST_OLD} 2> /dev/null; "
-            f"mv {new} {final} && touch {RECORDINGS}; }} && {sync}"
+            f"mv {new} {final}; }} && {sync}"
         )
         code, said = self._server.shell(
             f"exec flock -w {WAIT_S:.0f} {lock} sh -c {shlex.quote(script)} 2>&1"
@@ -423,28 +418,6 @@ class _ServerManifests(Manifests):
                 f"{address}: a manifest cannot be written ({said.strip()[:500]}), or another "
                 f"process has held {lock} for {WAIT_S:.0f} s."
             )
-
-    @contextmanager
-    def _locked(self, recording: str) -> Iterator[None]:
-        """Keep other copies away, where there is no shell; for less than a second."""
-        server, lock = self._server, f"{MANIFESTS}/{MARK}{recording}"
-        end = time.monotonic() + WAIT_S
-        while True:
-            try:
-                server.sftp(f"mkdir {lock}")
-                break
-            except StoreError as error:
-                if time.monotonic() > end:
-                    raise HeldError(
-                        f"{server.address}/{lock} says that another process copies. If none does, "
-                        "remove this folder.",
-                        is_recording=False,
-                    ) from error
-            pause(random.uniform(0, 1))  # noqa: S311 - so that others come first
-        try:
-            yield
-        finally:
-            server.sftp(f"-rmdir {lock}")
 
     def _drop(self, recording: str) -> None:
         raise StoreError(f"Recordings of {self._server.address} can only be removed there.")

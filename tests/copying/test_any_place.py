@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
-from pathlib import Path
 from typing import Any, NoReturn
 
 import pytest
@@ -290,26 +289,6 @@ def test_files_that_expire_there_meanwhile_are_not_told(pair: Pair) -> None:
     how = How(progress=meanwhile, proved=told.append)
     copy(source.source, target.place, RECORDING, how)
     assert [{*one} for one in told] == [{0, 1, 2}]
-
-
-@pytest.mark.parametrize("kind", ["directory", "shell", "sftp"])
-def test_a_store_is_known_by_what_was_just_made_in_it(
-    make: Makes, kind: str, sshd: dict[str, Sshd], tmp_path: Path
-) -> None:
-    source = make("directory")
-    source.begin(recording())
-    assert source.folder is not None
-    assert isinstance(source.place, Directory)
-    (tmp_path / "other").symlink_to(source.folder)
-    with ExitStack() as held:
-        target: Place = Directory(tmp_path / "other")
-        if kind != "directory":
-            server = sshd[kind]
-            target = held.enter_context(Server(server.url(source.folder), server.ssh))
-        with source.place.marked() as mark:
-            assert target.sees(mark)
-            assert not make(kind).place.sees(mark)
-        assert not target.sees(mark)
 
 
 @pytest.mark.parametrize("kind", ["directory", "bucket"])

@@ -58,19 +58,6 @@ def test_recordings_are_removed_there_alone(make: Makes, kind: str) -> None:
         target.place.manifests._drop(RECORDING)
 
 
-def test_a_lock_that_a_kill_has_left_is_named(make: Makes, limit: Limit) -> None:
-    limit(server_wait_s=0.2)
-    source, target = make("directory"), make("sftp")
-    source.begin(recording())
-    source.place.manifests.change(RECORDING, lambda now: replace(now, **as_of(recording(3))))
-    copy(source.source, target.place, RECORDING)
-    assert target.folder is not None
-    (target.folder / "manifests" / f".copying-{RECORDING}").mkdir()
-    source.place.manifests.change(RECORDING, lambda now: replace(now, **as_of(recording())))
-    with pytest.raises(HeldError, match="remove this folder"):
-        copy(source.source, target.place, RECORDING)
-
-
 def test_a_copy_waits_for_another_one(make: Makes, limit: Limit) -> None:
     limit(copy_wait_s=0.2, server_copy_wait_s=1)
     for kind in ("directory", "shell"):
