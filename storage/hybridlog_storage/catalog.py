@@ -53,7 +53,6 @@ _TOPICS: Final = "topics"
 _SCHEMA: Final = "schema"
 """Kinds of the cells of sets of topics and of schemas, by hash; nothing removes them."""
 _MAX_TABLES: Final = 64 << 20  # bytes of chunk tables in memory
-_FEW: Final = 100  # cells that are read one by one
 _T = TypeVar("_T")
 _COUNTS: Final = (
     "messages", "payload_bytes", "unreadable", "surplus", "stamped", "unset", "skew_sum",
@@ -388,9 +387,9 @@ class Catalog:
 
     def summaries(self, recordings: Collection[str] | None = None) -> list[RecordingSummary]:
         """Summaries of recordings by id, None for all; unordered, without damaged ones."""
-        indexed = self._bodies(_INDEX, recordings)
+        indexed = self._cells.each(_INDEX, recordings)
         found = []
-        for recording, body in self._bodies(_SUMMARY, recordings).items():
+        for recording, body in self._cells.each(_SUMMARY, recordings).items():
             summary = _read(_SUMMARY_OF, body)
             if summary is None or summary.id != recording or self._set(summary.topics) is None:
                 continue
@@ -400,13 +399,6 @@ class Catalog:
                     summary = summary._replace(indexed_by=index)
             found.append(summary)
         return found
-
-    def _bodies(self, kind: str, recordings: Collection[str] | None) -> dict[str, bytes]:
-        """The cells of some recordings by id; None for all."""
-        if recordings is not None and len(recordings) <= _FEW:
-            return {one: body for one in recordings if (body := self._cells.read(kind, one))}
-        every = self._cells.each(kind)
-        return every if recordings is None else {o: every[o] for o in recordings if o in every}
 
     def topics(self, digest: str) -> tuple[TopicType, ...]:
         """A set of topics and their types, by its hash, which a summary has."""
@@ -434,7 +426,7 @@ class Catalog:
 
     def damaged(self, recordings: Collection[str]) -> set[str]:
         """Those of some recordings, by id, that are known to have unreadable chunks."""
-        known = self._bodies(_INDEX, recordings)
+        known = self._cells.each(_INDEX, recordings)
         return {recording for recording, body in known.items() if _indexed(body)[2]}
 
     def damage(self, recording: str) -> dict[tuple[int, int], str]:

@@ -9,10 +9,11 @@ is killed may leave a damaged file.
 
 from __future__ import annotations
 
+import json
 import os
 import sqlite3
 import stat
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from threading import RLock
@@ -30,22 +31,13 @@ _TABLE: Final = (
     "PRIMARY KEY(kind, key, number)) WITHOUT ROWID"
 )
 _SELECT: Final = "SELECT kind, key, number, body, crc FROM cells WHERE kind = ? AND "
+_AMONG: Final = "key IN (SELECT value FROM json_each(?))"
 _ASIDE: Final = ("-journal", "-wal", "-shm")  # what SQLite would read or write, too
 _WAIT_S: Final = 0.1  # for other processes, once: then memory takes the place of the file
 _MAX_BYTES: Final = 1 << 28  # of a cell
 _MAX_COPIED: Final = 1 << 30  # bytes of a file that is read into memory
 _ERRORS: Final = (sqlite3.DatabaseError, UnicodeDecodeError, OSError)
 """Those of SQLite, of a message that has damaged text, and of the file's place."""
-_TROUBLES: Final = (
-    sqlite3.SQLITE_BUSY,
-    sqlite3.SQLITE_CANTOPEN,
-    sqlite3.SQLITE_FULL,
-    sqlite3.SQLITE_IOERR,
-    sqlite3.SQLITE_LOCKED,
-    sqlite3.SQLITE_PERM,
-    sqlite3.SQLITE_PROTOCOL,
-)
-"""Faults of a disk or of other processes, not of the file."""
 _T = TypeVar("_T")
 
 
@@ -58,6 +50,13 @@ def put(kind: str, key: str, body: bytes, number: int = 0) -> Statement:
 def drop(kind: str, key: str) -> Statement:
     """A statement that removes the cells of a kind and key, whatever their number."""
     return "DELETE FROM cells WHERE kind = ? AND key = ?", (kind, key)
+
+
+def _is_trouble(error: Exception) -> bool:
+    """True for a fault of the disk or of other processes: the file may be whole."""
+    if isinstance(error, sqlite3.OperationalError):
+        return error.sqlite_errorcode != sqlite3.SQLITE_ERROR  # such as an unknown format
+    return isinstance(error, OSError)
 
 
 def _checksum(kind: bytes, key: bytes, number: int, body: bytes) -> int:
@@ -154,24 +153,14 @@ class Cells:
                 try:
                     return work(self._use())
                 except _ERRORS as error:
-                    is_damaged = self._is_damage(error)
                     self.close()
-                    if is_damaged and self._path is not None:
-                        with suppress(OSError):
-                            files.remove_tree(self._path)
-                    else:
+                    if not self._writes or _is_trouble(error):
                         break
+                    assert self._path is not None
+                    with suppress(OSError):
+                        files.remove_tree(self._path)
             self._writes, self._path = False, None
             return work(self._use())
-
-    def _is_damage(self, error: Exception) -> bool:
-        """False if the file may be as it should be: locked, read-only, on a full disk."""
-        if isinstance(error, OSError) or not self._writes:
-            return False
-        code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_CORRUPT) & 0xFF
-        if code == sqlite3.SQLITE_READONLY:
-            return os.access(self._path or "", os.W_OK)  # its first bytes say so
-        return code not in _TROUBLES
 
     # Cells.
 
@@ -180,9 +169,11 @@ class Cells:
         found = self._found(f"{_SELECT} key = ? AND number = ?", kind, key, number)
         return next(iter(found.values()), None)
 
-    def each(self, kind: str) -> dict[str, bytes]:
-        """All cells of a kind by key."""
-        return self._found(f"{_SELECT} TRUE", kind)
+    def each(self, kind: str, keys: Collection[str] | None = None) -> dict[str, bytes]:
+        """Cells of a kind by key; all without keys."""
+        if keys is None:
+            return self._found(f"{_SELECT} TRUE", kind)
+        return self._found(f"{_SELECT} {_AMONG}", kind, json.dumps([*keys]))
 
     def _found(self, query: str, *values: object) -> dict[str, bytes]:
         def work(opened: sqlite3.Connection) -> dict[str, bytes]:

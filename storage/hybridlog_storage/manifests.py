@@ -20,7 +20,6 @@ from __future__ import annotations
 import errno
 import os
 import random
-import stat
 import time
 from abc import ABC, abstractmethod
 from contextlib import ExitStack, contextmanager, suppress
@@ -46,6 +45,7 @@ if TYPE_CHECKING:
 WAIT_S: Final = 30.0
 """Longest wait of a change for others, which take milliseconds."""
 _NO_LOCKS: Final = frozenset({errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS})
+_ODD: Final = frozenset({0, errno.EISDIR, errno.ELOOP, errno.ENOTDIR})  # no file, or no folder
 MANIFESTS: Final = "manifests"
 RECORDINGS: Final = "recordings"
 _SUFFIX: Final = ".json"
@@ -220,19 +220,11 @@ class DiskManifests(Manifests):
 
     def __init__(self, path: Path) -> None:
         self.place, self._folder = str(path), path / MANIFESTS
-        self._listed: tuple[set[str], list[str]] = set(), []
         self._recordings = path / RECORDINGS
 
     def ids(self) -> list[str]:
         """Ids of all recordings that have a manifest, sorted; also of those being removed."""
-        names, (before, ids) = self._names(self._folder), self._listed
-        come = [name for name in names if name not in before]
-        gone = before.difference(names) if len(before) + len(come) > len(names) else set()
-        if come or gone:
-            left = {*ids_of(gone)}
-            ids = sorted([*(one for one in ids if one not in left), *ids_of(come)])
-            self._listed = (before - gone).union(come), ids
-        return [*ids]
+        return ids_of(self._names(self._folder))
 
     def without(self) -> list[str]:
         """Names of folders in `recordings` without a manifest, sorted: lost, or copied by hand.
@@ -263,16 +255,7 @@ class DiskManifests(Manifests):
         except FileNotFoundError:
             return []
         except OSError as error:
-            if odd := _odd(folder / _ALL):
-                raise StoreError(odd) from error
             raise unreadable(error, folder) from error
-
-    def each(self, recordings: Iterable[str]) -> Iterator[Manifest]:
-        """As of `Manifests`, faster than one by one."""
-        with suppress(FileNotFoundError), files.folder(self._folder) as fd:
-            for one in recordings:
-                with suppress(OSError, ValueError, RecordingGoneError):
-                    yield _present(decoded(one, files.read_in(fd, f"{one}{_SUFFIX}", MAX_BYTES)))
 
     def path(self, recording: str) -> Path:
         """The path of the manifest of a recording."""
@@ -283,24 +266,16 @@ class DiskManifests(Manifests):
 
         While a recording begins, nothing is removed.
         """
-        if not (self._left() or self._bare()):
+        if not self._bare():
             return
         explained = durability.explained(self._folder, "clearing")
         with suppress(HeldError), explained, self._all_locked(wait_s=0):
-            for path, lock in self._left():
-                with suppress(FileNotFoundError, HeldError), _locked(lock, 0):
-                    files.unlink(path)
             for folder in self._bare():
                 with ExitStack() as held, suppress(FileNotFoundError, HeldError):
                     if WRITER_LOCK in files.names(folder):  # a copy may begin there
                         held.enter_context(_locked(folder / WRITER_LOCK, 0))
+                    files.remove_tree(self._folder / f".{folder.name}{_NEW}")
                     files.remove_tree(folder)
-
-    def _left(self) -> list[tuple[Path, Path]]:
-        """Manifests that are being written, or were when their writers died, and their locks."""
-        names = [one for one in self._names(self._folder) if one.endswith(_NEW)]
-        folders = [self._recordings / one[1 : -len(_NEW)] for one in names]
-        return [(self._folder / n, f / MANIFEST_LOCK) for n, f in zip(names, folders, strict=True)]
 
     def _bare(self) -> list[Path]:
         """Folders without a manifest that hold only locks."""
@@ -330,8 +305,6 @@ class DiskManifests(Manifests):
             self._make_lock(folder)
             with _locked(folder / MANIFEST_LOCK):
                 self._write(path, data)
-            with files.folder(self._recordings) as fd:
-                os.utime(fd)  # from which readers see that a recording has come
 
     def _make_lock(self, folder: Path) -> None:
         files.make_folders(folder)
@@ -482,25 +455,16 @@ def _opened(path: Path, flags: int) -> int:
 
 @contextmanager
 def _plainly(path: Path, changing: str = "") -> Iterator[None]:
-    """Say what is odd of a file's place, or why the system refuses; not that it is missing."""
+    """Say why the system refuses something of a file; not that it is missing."""
     try:
         yield
     except FileNotFoundError:
         raise
     except OSError as error:
-        if odd := _odd(path):
-            raise ManifestError(odd) from error
+        if error.errno in _ODD:
+            raise ManifestError(
+                f"{path} is a link, or of another kind than a store has there: move it out of the "
+                "store, then run `hybridlog verify --repair`."
+            ) from error
         explained = durability.explain(error, path, changing)
         raise (explained if changing else unreadable(error, path)) from error
-
-
-def _odd(path: Path) -> str:
-    """The problem of a file's place or folder that is no file or folder; empty without one."""
-    for place, fits in ((path.parent, stat.S_ISDIR), (path, stat.S_ISREG)):
-        with suppress(OSError):
-            if not fits(files.status(place).st_mode):
-                return (
-                    f"{place} is a link, or of another kind than a store has there: move it out "
-                    "of the store, then run `hybridlog verify --repair`."
-                )
-    return ""

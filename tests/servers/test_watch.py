@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import signal
 import subprocess
@@ -35,7 +34,6 @@ def arrive(robot: Path, lab: Path, label: str) -> None:
     coming = places.manifest_of(there).with_name(".coming")
     shutil.copy(places.manifest_of(folder), coming)
     coming.rename(places.manifest_of(there))
-    os.utime(places.root(lab))
 
 
 def test_what_comes_into_a_store_is_indexed_once_by_several_that_watch(

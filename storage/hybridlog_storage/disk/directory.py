@@ -250,12 +250,12 @@ class StoreDirectory:
         return self.manifests.ids()
 
     def changed(self) -> tuple[int, bool]:
-        """Time at which a recording came or went last, ns, and if that is a while ago.
+        """Time at which a manifest came, changed or went last, ns, and if that is a while ago.
 
         Within a tick of the file system's clock another change would show the same time.
         """
         try:
-            changed = files.status(self.recordings).st_mtime_ns
+            changed = files.status(self.path / MANIFESTS).st_mtime_ns
         except OSError:
             return 0, False
         return changed, _is_a_tick_ago(changed)

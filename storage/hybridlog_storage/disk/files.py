@@ -92,16 +92,7 @@ def open_file(path: Path, flags: int, mode: int = 0o666) -> int:
 
 def read_file(path: Path, most: int) -> bytes:
     """Read a small ordinary file, up to `most` bytes and one more, to notice larger files."""
-    return _content(open_file(path, os.O_RDONLY), most, path)
-
-
-def read_in(folder: int, name: str, most: int) -> bytes:
-    """Read a small ordinary file of an open folder; as `read_file`."""
-    flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK
-    return _content(system.open(name, flags, dir_fd=folder), most, name)
-
-
-def _content(fd: int, most: int, path: Path | str) -> bytes:
+    fd = open_file(path, os.O_RDONLY)
     try:
         if not stat.S_ISREG(os.fstat(fd).st_mode):
             raise OSError(0, "it is not an ordinary file", str(path))
