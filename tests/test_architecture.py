@@ -93,7 +93,6 @@ ALLOWED = {
         "hybridlog.schema.codec",
         "hybridlog.schema.left",
         "hybridlog.schema.protobuf_codec",
-        "hybridlog.schema.summary",
         "hybridlog.query",
         "hybridlog.sql",
         "hybridlog.tf",

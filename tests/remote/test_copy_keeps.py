@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import struct
 from collections import Counter
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +19,6 @@ from hybridlog_storage.remote.bucket import Object
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.remote.conftest import BEGIN, SCAN
 from tests.remote.server import Proxy
-from tests.remote.test_store import lose
 
 THEN = CopyOptions(then_expire=True)
 COUNT = 60
@@ -50,24 +48,6 @@ def test_messages_have_addresses(robot: hl.Store, address: str) -> None:
     robot.copy(address)
     with pytest.raises(UsageError, match=f"bucket of {address};"):
         choose(directory_of(Path(address)), [])
-
-
-def test_a_lost_manifest_is_brought_back(robot: hl.Store, address: str) -> None:
-    """With what was added there since, as far as the catalog knows."""
-    robot.copy(address)
-    with hl.open(address) as there:
-        there.edit("run", tag={"seen": "yes"})
-        there.mark("run", "+1s", "lab")
-        there.pin("run", "+1s", "+2s", topics=["scan"], reason="mine")
-        before = replace(there.entry("run"), flushed={})
-    lose(address, ".json")
-    files.mounted.clear()
-    assert robot.copy(address).known == ["run"]
-    files.mounted.clear()
-    with hl.open(address) as there:
-        assert not there.verify().findings
-        assert before.pins
-        assert replace(there.entry("run"), flushed={}) == before
 
 
 @pytest.mark.parametrize("has_digests", [True, False])

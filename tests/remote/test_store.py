@@ -128,40 +128,6 @@ def test_a_change_is_one_manifest(
         assert not store.verify().findings
 
 
-def test_two_who_change_at_once(here: Path, address: str, proxy: Proxy) -> None:
-    publish_all(here, address, ("run", "short-0"))
-    one = hl.open(address)
-    is_first = True
-
-    def other(*words: str) -> None:
-        command = [sys.executable, "-m", "hybridlog", *words, "--store", address]
-        subprocess.run(command, check=True, capture_output=True)
-
-    def meanwhile(_: int) -> str:
-        nonlocal is_first
-        method, name, _ = proxy.requests[-1]
-        if method == "PUT" and name.endswith(".json") and is_first:
-            is_first = False
-            other("tag", "run", "b=2")
-        return ""
-
-    proxy.spoil = meanwhile
-    one.edit("run", tag={"a": "1"})
-    assert not is_first
-    proxy.reset()
-    proxy.old_lists = {}
-    assert one.entry("run").tags == {"place": "lab", "a": "1", "b": "2"}
-    other("tag", "short-0", "c=3")
-    one.edit("short-0", tag={"d": "4"})  # the listing that it sees is from before
-    one.close()
-    proxy.reset()
-    files.mounted.clear()
-    with hl.open(address) as last:
-        assert last.entry("run").tags == {"place": "lab", "a": "1", "b": "2"}
-        assert last.entry("short-0").tags == {"c": "3", "d": "4"}
-        assert not last.verify().findings
-
-
 def test_marks_pins_and_rules(here: Path, address: str, proxy: Proxy) -> None:
     publish_all(here, address, ("run", "more"))
     with hl.open(address) as store:

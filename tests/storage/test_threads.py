@@ -41,21 +41,6 @@ def test_what_runs_is_waited_for_again_after_an_interruption() -> None:
         signal.signal(signal.SIGALRM, before)
 
 
-def test_what_waits_is_not_begun_when_it_is_cancelled() -> None:
-    go, done = threading.Event(), []
-    threads = Threads(1, "test")
-    first = threads.submit(go.wait, 30)
-    second = threads.submit(done.append, True)
-    threading.Timer(0.1, go.set).start()
-    threads.shutdown(wait=True, cancel_futures=True)
-    assert first.result() is True
-    assert second.cancelled()
-    assert done == []
-    with pytest.raises(RuntimeError):
-        threads.submit(done.append, True)
-    threads.shutdown()
-
-
 def test_threads_get_one_value_of_a_lazy_attribute() -> None:
     both = threading.Barrier(2)
 
