@@ -17,9 +17,9 @@ from hybridlog.schema.column import STAMP
 from hybridlog.schema.index_bodies import bodies_of
 from hybridlog_storage.catalog import ChannelStats
 from hybridlog_storage.messages import EXPIRED_IDS, Channel
-from hybridlog_storage.mongo.index_documents import DocumentAssembler, Placed
+from hybridlog_storage.mongo.index_documents import DocumentAssembler
 from hybridlog_storage.ordering import run_starts
-from hybridlog_storage.segments.chunk import StoredChunk
+from hybridlog_storage.segments.chunk import Placed, StoredChunk
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

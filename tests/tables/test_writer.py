@@ -293,7 +293,7 @@ def test_whatever_fails_the_recording_goes_on(
     error: Exception,
 ) -> None:
     if place == "add":
-        calls.fail(TableWriter, "_collect", error)
+        calls.fail(TableWriter, "_by_topic", error)
     elif place == "publish":
         calls.fail(TableFolders, "_change", error)
     else:
