@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.columns.fields import FieldShape
-    from hybridlog.schema.codec import Codec, Decoded
+    from hybridlog.schema.codec import Decoded
     from hybridlog_storage.segments.chunk import Placed
 
 
@@ -60,17 +60,15 @@ class Piece:
 
 def piece_of(
     placed: Placed,
-    codec: Codec,
+    decoded: Decoded | None,
     state: State,
     *,
-    has_publish_time: Mapping[int, bool],
+    has_publish_time: bool,
     columns: Callable[[Decoded], Any],
-    fields: set[str] | None = None,
 ) -> Piece:
-    """Rows of messages of one topic and state.
+    """Rows of decoded messages of one topic and state, which readable ones have.
 
-    Readable ones have that state. `channel` of the batch has ids; `has_publish_time` is by these.
-    `columns` turns fields into columns; `fields` are paths of those wanted, None for all.
+    `columns` turns fields into columns. Without a definition nothing is decoded.
     """
     import pyarrow as pa
     import pyarrow.compute as pc
@@ -81,8 +79,7 @@ def piece_of(
     count = len(batch)
     errors: list[str | None] = [None] * count
     found, surplus = None, no_rows()
-    if codec.indexed:
-        decoded = codec.columns_of(batch, fields)
+    if decoded is not None:
         surplus = decoded.surplus
         for bad in decoded.unreadable:
             for row in bad.rows.tolist():
@@ -94,7 +91,6 @@ def piece_of(
     states = pa.repeat(pa.scalar(str(state)), count)
     if error.null_count < count:
         states = pc.if_else(error.is_null(), states, State.UNREADABLE.value)
-    silent = [n for n in np.unique(batch.channel).tolist() if not has_publish_time[n]]
     ref = {
         "seg": pa.array(placed.segment),
         "chunk": pa.array(placed.chunk.astype(np.int32)),
@@ -105,7 +101,7 @@ def piece_of(
         "log_time": pa.array(batch.log_time // 1000).view(pa.timestamp("us", "UTC")),
         "t": pa.array(batch.log_time),
         "seq": pa.array(placed.seq),
-        "pub": pa.array(batch.publish_time, mask=np.isin(batch.channel, silent)),
+        "pub": pa.array(batch.publish_time, mask=np.full(count, not has_publish_time)),
         "stamp": pa.nulls(count, pa.int64()) if stamps is None else stamps.view(pa.int64()),
         "channel": pa.array(batch.channel % EXPIRED_IDS),
         "state": states,

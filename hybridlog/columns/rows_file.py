@@ -33,7 +33,7 @@ from hybridlog_storage.segments.chunk import Placed
 from hybridlog_storage.segments.segment_file import rows_name
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Mapping
     from pathlib import Path
 
     from hybridlog.schema.codec import Codec
@@ -169,7 +169,7 @@ class RowsWriter:
             if kind not in self._of_kind:
                 self._of_kind[kind] = codec_for(self._channels[numbers[0]]), FieldShape()
             own = placed.take(np.flatnonzero(np.isin(chunk.batch.channel, numbers)))
-            table = _table(own, numbers, *self._of_kind[kind])
+            table = _table(own, *self._of_kind[kind])
             file = self._file(kind, table.schema)
             file.rows += table.num_rows
             file.tables.append(table)
@@ -207,16 +207,16 @@ class RowsWriter:
         file.writer.close([section], sync=True)
 
 
-def _table(placed: Placed, channels: Sequence[int], codec: Codec, shape: FieldShape) -> pa.Table:
+def _table(placed: Placed, codec: Codec, shape: FieldShape) -> pa.Table:
     """Rows of messages of one type in a chunk."""
     is_reduced = isinstance(codec, LeftCodec)
     if is_reduced:
         placed = placed._replace(batch=with_rows(placed.batch))
     piece = piece_of(
         placed,
-        codec,
+        codec.columns_of(placed.batch) if codec.indexed else None,
         State.REDUCED if is_reduced else State.EXPIRED,
-        has_publish_time=dict.fromkeys(channels, True),  # those that have none repeat log times
+        has_publish_time=True,  # channels that have none repeat log times
         columns=lambda decoded: columns_from(decoded, shape),
     )
     batch = placed.batch

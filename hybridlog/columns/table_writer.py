@@ -1,7 +1,6 @@
 """Writes the tables of a recording during indexing.
 
-Chunks are collected and decoded by columns, 8 MiB at a time. Rows
-remain in memory until their segment is sealed, or until there are too many. Then they
+Rows remain in memory until their segment is sealed, or until there are too many. Then they
 become row groups of an unfinished file of their topic. Topics with few rows wait until the
 recording has ended, and go to files that recordings share.
 
@@ -14,13 +13,11 @@ import errno
 import logging
 import shutil
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
-
-import numpy as np
 
 from hybridlog.columns.layout import (
     POINTS,
@@ -33,31 +30,25 @@ from hybridlog.columns.layout import (
     type_prefix,
 )
 from hybridlog.columns.rows import Piece, as_table, columns_from, piece_of
-from hybridlog.index.indexing import rows_by_channel
-from hybridlog.schema.codec import Codec, no_rows
+from hybridlog.schema.codec import no_rows
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.left import LeftFields
 from hybridlog.schema.states import State, encoding_of, state_of
 from hybridlog_storage.disk import files
 from hybridlog_storage.ordering import order_of
-from hybridlog_storage.segments.chunk import Placed
 from hybridlog_storage.settings import read_settings
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from hybridlog.columns.fields import FieldShape
+    from hybridlog.index.indexing import Messages
     from hybridlog.schema.codec import Decoded
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.messages import Channel
-    from hybridlog_storage.segments.chunk import StoredChunk
 
 GROUP_ROWS: Final = 131_072
 """Maximum number of rows in a row group."""
 GROUP_BYTES: Final = 32 << 20
 """Maximum bytes of the columns of a row group in memory."""
-_ARENA = 8 << 20  # bytes of chunks collected: each topic's part costs a millisecond
-_ROWS = 1 << 18  # messages collected
 _PENDING = 16 << 20  # bytes of rows waiting in memory
 _LEFT = _PENDING // 4  # bytes of the smallest topics, which continue to wait for more rows
 _PIECES = 32  # pieces of a topic that become one: small ones take far more than their bytes
@@ -224,31 +215,24 @@ class TableWriter:
         self._numbers = 0
         self._has_ended = False
         self.problem = ""  # why no table was written
-        self._held: list[StoredChunk] = []  # of one segment
-        self._channels: dict[int, Channel] = {}
         self._topics: dict[tuple[str, str], _Topic] = {}
-        self._of_channel: dict[int, tuple[_Topic, Codec, State] | None] = {}  # None: unwanted
         self._cut: dict[int, str] = {}  # digests of the closed ones
 
-    def add(self, chunk: StoredChunk, channels: Mapping[int, Channel]) -> None:
-        """Add the messages of a chunk."""
+    def add(self, messages: Iterable[Messages]) -> None:
+        """Add messages of one segment."""
         if self._has_ended:
             return
         with self._harmless():
-            self._channels.update(channels)
-            if self._held and self._held[0].segment != chunk.segment:
-                self._decode()
-            self._held.append(chunk)
-            batches = [one.batch for one in self._held]
-            if sum(len(b.buffer) for b in batches) >= _ARENA or sum(map(len, batches)) >= _ROWS:
-                self._decode()
+            for one in messages:
+                if self._wanted is None or one.channel.topic in self._wanted:
+                    self._add(one)
+            self._spill()
 
     def cut(self, segment: int, digest: str) -> None:
         """Finish the files of a segment; topics with few rows wait for the next one."""
         if self._has_ended:
             return
         with self._harmless():
-            self._decode()
             self._cut[segment] = digest
             for topic in self._topics.values():
                 with self._only(topic):
@@ -260,7 +244,6 @@ class TableWriter:
         """Finish all tables; topics with another number of messages keep an older one."""
         if not self._has_ended:
             with self._harmless():
-                self._decode()
                 self._close(entry)
         self.discard()
 
@@ -270,8 +253,6 @@ class TableWriter:
         for topic in self._topics.values():
             topic.give_up()
         self._topics.clear()
-        self._of_channel.clear()
-        self._held.clear()
         with suppress(OSError):
             files.remove_tree(self._parts)
 
@@ -285,48 +266,27 @@ class TableWriter:
             _log.warning("No tables of recording %s were written: %s", self._name, self.problem)
             self.discard()
 
-    # From chunks to rows in memory.
-
-    def _decode(self) -> None:
-        """Make rows of the collected messages."""
-        if not self._held:
-            return
-        placed, self._held = Placed.of(self._held), []
-        has_publish_time = {n: one.has_publish_time for n, one in self._channels.items()}
-        for (topic, codec, state), rows in self._by_topic(placed.batch.channel).items():
-            with self._only(topic):
-                piece = piece_of(
-                    placed.take(np.concatenate(rows)),
-                    codec,
-                    state,
-                    has_publish_time=has_publish_time,
-                    columns=topic.columns,
-                )
-                piece.arrays = piece.rows if topic.has_arrays and state is State.WHOLE else 0
-                topic.add(piece)
-        self._spill()
-
-    def _by_topic(
-        self, channel: NDArray[np.int32]
-    ) -> Mapping[tuple[_Topic, Codec, State], list[NDArray[np.intp]]]:
-        """Rows of messages, grouped by topic and encoding."""
-        found: dict[tuple[_Topic, Codec, State], list[NDArray[np.intp]]] = {}
-        for number, rows in rows_by_channel(channel):
-            if number not in self._of_channel:
-                self._of_channel[number] = self._kind_of(self._channels[number])
-            kind = self._of_channel[number]
-            if kind is not None and not kind[0].has_failed:
-                found.setdefault(kind, []).append(rows)
-        return found
-
-    def _kind_of(self, channel: Channel) -> tuple[_Topic, Codec, State] | None:
-        if self._wanted is not None and channel.topic not in self._wanted:
-            return None
+    def _add(self, messages: Messages) -> None:
+        """Make rows of messages."""
+        channel = messages.channel
         key = channel.topic, table_schema_of(channel)
-        if key not in self._topics:
+        topic = self._topics.get(key)
+        if topic is None:
             arrays = channel.topic in self._arrays
-            self._topics[key] = _Topic(self._recording, channel, arrays=arrays)
-        return self._topics[key], codec_for(channel), state_of(channel.message_encoding)
+            topic = self._topics[key] = _Topic(self._recording, channel, arrays=arrays)
+        if topic.has_failed:
+            return
+        with self._only(topic):
+            state = state_of(channel.message_encoding)
+            piece = piece_of(
+                messages.placed,
+                messages.decoded,
+                state,
+                has_publish_time=channel.has_publish_time,
+                columns=topic.columns,
+            )
+            piece.arrays = piece.rows if topic.has_arrays and state is State.WHOLE else 0
+            topic.add(piece)
 
     @contextmanager
     def _only(self, topic: _Topic) -> Iterator[None]:

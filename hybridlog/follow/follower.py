@@ -50,7 +50,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from hybridlog.index.indexing import Documents
     from hybridlog.maintenance.report import Progress
     from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
@@ -60,7 +59,8 @@ if TYPE_CHECKING:
     from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentReader
 
 _SEND_BYTES: Final = 8 << 20  # documents that are sent together, at most
-_GROUP_BYTES: Final = 1 << 20  # content of small chunks that are decoded together
+_GROUP_BYTES: Final = 8 << 20  # content of chunks that are decoded together
+_GROUP_ROWS: Final = 1 << 17  # messages that are decoded together
 _RETRY_S: Final = 2.0  # between attempts after the database has failed
 
 
@@ -113,15 +113,15 @@ class _Sender:
         self._size = self._added = 0
         self.ended: dict[str, str] = {}
 
-    def add(self, documents: Iterable[Documents], messages: int) -> None:
-        """Add the documents of some messages.
+    def add(self, documents: Iterable[tuple[str, NDArray[np.uint8]]], messages: int) -> None:
+        """Add the documents of some messages, in tables of their topics.
 
         Raises:
             HybridlogError: An earlier sending has failed.
         """
-        for part in documents:
-            self._documents[part.topic] += part.tables
-            self._size += part.size
+        for topic, table in documents:
+            self._documents[topic].append(table)
+            self._size += table.size
         self._added += messages
         if self._size >= _SEND_BYTES:
             self.send()
@@ -233,7 +233,7 @@ class Follower:
         self._done = done
         self._until = until
         self._progress = progress
-        self._indexer = ChunkIndexer(entry.id, has_documents=self._target.is_wanted)
+        self._indexer = ChunkIndexer(entry.id)
         self._sender: _Sender | None = None
         self._retry_at = 0.0
         self._indexed = 0
@@ -384,7 +384,7 @@ class Follower:
         self, number: int, reader: SegmentReader, places: Iterable[ChunkPlace]
     ) -> Iterator[list[StoredChunk]]:
         """The chunks of a segment that can be read and were not; small ones together."""
-        segment, size = self._segments[number], 0
+        segment, size, rows = self._segments[number], 0, 0
         group: list[StoredChunk] = []
         for place in [one for one in places if one.number >= segment.chunks]:
             if not segment.is_decoded:
@@ -396,9 +396,10 @@ class Follower:
                     self._damage[number, place.number] = str(error)
                 continue
             size += len(chunk.batch.buffer)
-            if group and size > _GROUP_BYTES:
+            rows += len(chunk.batch)
+            if group and (size > _GROUP_BYTES or rows > _GROUP_ROWS):
                 yield group
-                group, size = [], len(chunk.batch.buffer)
+                group, size, rows = [], len(chunk.batch.buffer), len(chunk.batch)
             group.append(chunk)
         if group:
             yield group
@@ -407,12 +408,16 @@ class Follower:
         self, segment: _Segment, chunks: Sequence[StoredChunk], channels: Mapping[int, Channel]
     ) -> None:
         """Make rows, results of decoding and documents of chunks of one segment."""
-        for chunk in chunks:
-            self._tables.add(chunk, channels)
+        found = self._indexer.messages_in(chunks, channels)
+        self._tables.add(found)
         segment.chunks = chunks[-1].number + 1
         if segment.is_decoded:
             return
-        documents = self._indexer.documents_of(chunks, channels, segment.decoded)
+        documents = [
+            (one.channel.topic, table)
+            for one in found
+            for table in self._indexer.take(one, segment.decoded, has_documents=segment.is_wanted)
+        ]
         messages = sum(len(chunk.batch) for chunk in chunks)
         if not segment.is_wanted and self._target.is_wanted:
             return  # they are there already

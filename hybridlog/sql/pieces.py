@@ -311,11 +311,10 @@ class _ChunkRows:
             wanted.update(NEEDED)
         piece = piece_of(
             placed,
-            channel.codec,
+            channel.codec.columns_of(placed.batch, wanted) if channel.codec.indexed else None,
             channel.state,
-            has_publish_time={channel.channel_id: channel.channel.has_publish_time},
+            has_publish_time=channel.channel.has_publish_time,
             columns=records_of,
-            fields=wanted,
         )
         columns = piece.own if points is None else {**piece.own, POINTS: points}
         none = pa.nulls(piece.rows, pa.struct([]))

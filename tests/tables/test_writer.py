@@ -18,6 +18,7 @@ from hybridlog.columns.layout import OWN_COLUMNS, TABLES, parts_folder
 from hybridlog.columns.table_writer import TableWriter
 from hybridlog.columns.tables import Tables
 from hybridlog.columns.topic_table import TableRows
+from hybridlog.index.indexing import ChunkIndexer
 from hybridlog.maintenance import tables as making
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.messages import Schema
@@ -107,8 +108,8 @@ def test_tables_are_what_the_messages_say(
     pending: int,
 ) -> None:
     limit(
-        table_arena_bytes=arena,
-        table_collected_rows=rows,
+        group_bytes=arena,
+        group_rows=rows,
         table_pending_bytes=pending,
         table_left_bytes=pending // 4,
     )
@@ -216,23 +217,22 @@ def close(writer: TableWriter, entry: RecordingEntry) -> None:
 
 def waiting(writer: TableWriter) -> int:
     """Rows in memory."""
-    pieces = (piece.rows for topic in writer._topics.values() for piece in topic.pieces)
-    return sum(len(chunk.batch) for chunk in writer._held) + sum(pieces)
+    return sum(piece.rows for topic in writer._topics.values() for piece in topic.pieces)
 
 
 def test_memory_does_not_grow_with_the_recording(
     store: hl.Store, tmp_path: Path, limit: Limit
 ) -> None:
-    limit(table_pending_bytes=200_000, table_left_bytes=50_000, table_arena_bytes=20_000)
+    limit(table_pending_bytes=200_000, table_left_bytes=50_000)
     most = []
     for count in (2000, 8000):
         said = [(BASE + n, f"/{n % 3}", payload(n)) for n in range(count)]
         path = write_log(tmp_path / f"{count}.mcap", said)
         entry = store.record(path, name=str(count), settings=SMALL_CHUNKS).entry
         writer = TableWriter(store.directory.path, entry.id, entry.name, topics_of(entry))
-        held = []
+        held, indexer = [], ChunkIndexer(entry.id)
         for chunk, channels in chunks_of(store, entry):
-            writer.add(chunk, channels)
+            writer.add(indexer.messages_in([chunk], channels))
             held.append(waiting(writer))
         close(writer, entry)
         most.append(max(held))
@@ -245,7 +245,7 @@ def test_memory_does_not_grow_with_the_recording(
 def test_chunks_that_come_late_are_put_in_their_place(
     store: hl.Store, tmp_path: Path, limit: Limit
 ) -> None:
-    limit(table_pending_bytes=100_000, table_left_bytes=20_000, table_arena_bytes=20_000)
+    limit(table_pending_bytes=100_000, table_left_bytes=20_000)
     said = [(BASE + n, "/a" if n % 9 else "/b", varied(n)) for n in range(4000)]
     write_log(tmp_path / "log.mcap", said)
     settings = SegmentSettings(chunk_size=4096, segment_size=1 << 17)
@@ -254,11 +254,9 @@ def test_chunks_that_come_late_are_put_in_their_place(
     chunks = chunks_of(store, entry)
     making.remove(store.directory, entry.id)
     writer = TableWriter(store.directory.path, entry.id, entry.name)
-    late = chunks[3::5]
-    for chunk, channels in [c for c in chunks if not any(c is other for other in late)]:
-        writer.add(chunk, channels)
-    for chunk, channels in late:
-        writer.add(chunk, channels)
+    indexer, late = ChunkIndexer(entry.id), chunks[3::5]
+    for chunk, channels in [c for c in chunks if not any(c is other for other in late)] + late:
+        writer.add(indexer.messages_in([chunk], channels))
     close(writer, entry)
     assert compare(store) == 4000
     table = table_of(store)
@@ -293,7 +291,7 @@ def test_whatever_fails_the_recording_goes_on(
     error: Exception,
 ) -> None:
     if place == "add":
-        calls.fail(TableWriter, "_by_topic", error)
+        calls.fail(TableWriter, "_spill", error)
     elif place == "publish":
         calls.fail(TableFolders, "_change", error)
     else:
@@ -312,7 +310,7 @@ def test_whatever_fails_the_recording_goes_on(
 def test_too_many_topics_for_the_files_of_a_process(
     store: hl.Store, tmp_path: Path, limit: Limit
 ) -> None:
-    limit(table_pending_bytes=1, table_left_bytes=0, table_open_files=3, table_arena_bytes=1)
+    limit(table_pending_bytes=1, table_left_bytes=0, table_open_files=3, group_bytes=1)
     said = [(BASE + n, f"/{n % 10}", varied(n)) for n in range(200)]
     write_log(tmp_path / "log.mcap", said)
     entry = store.record(tmp_path / "log.mcap", name="log", settings=SMALL_CHUNKS).entry
