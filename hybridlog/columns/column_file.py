@@ -403,12 +403,6 @@ class _Source:
     def tell(self) -> int:
         return self._position
 
-    def seekable(self) -> bool:
-        return True
-
-    def readable(self) -> bool:
-        return True
-
     def close(self) -> None:
         """Do nothing: the file remains open as long as its reader."""
 

@@ -137,9 +137,6 @@ class _Sink:
         files.write_all(self._fd, [bytes(self._waiting)])
         self._waiting.clear()
 
-    def flush(self) -> None:
-        """Do nothing: buffered bytes are written in larger pieces."""
-
     def tell(self) -> int:
         return self._position
 

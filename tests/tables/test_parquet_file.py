@@ -121,6 +121,9 @@ def test_encodings(recorded: hl.Store) -> None:
     for name in ("state", "channel", "header.frame_id", "i8"):
         assert "RLE_DICTIONARY" in found[name].encodings, name
     assert {column.compression for column in found.values()} == {"ZSTD"}
+    # DuckDB 2.0 answers `b > 2.0` wrongly from those of floats with NaN.
+    assert found["i8"].statistics.has_min_max
+    assert found["f64"].statistics is None
 
 
 @pytest.mark.parametrize(

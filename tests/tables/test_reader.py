@@ -136,17 +136,6 @@ def test_a_segment_more_or_less_is_noticed(recorded: hl.Store, tables: Tables) -
     assert tables.of(entry, entry.channels[0].topic) is None
 
 
-def test_memory_of_columns_is_bounded(recorded: hl.Store) -> None:
-    (entry,) = recorded.recordings()
-    cache = Cache(30_000)
-    tables = Tables(recorded.directory.path, cache)
-    table = tables.of(entry, "/large")
-    assert table is not None
-    for name in ("i8", "f64", "t", "nine", "covariance", "many"):
-        list(table.scan([name]))
-        assert 0 < cache._size <= 30_000
-
-
 def test_files_are_closed_when_they_are_forgotten(recorded: hl.Store) -> None:
     root = recorded.directory.path  # other tests of this process may hold files of theirs
 

@@ -162,19 +162,6 @@ def test_few_rows_a_segment_wait_for_more(store: hl.Store, tmp_path: Path, limit
     assert compare(store) == 12_000
 
 
-def test_a_topic_with_files_shares_one_for_its_last_rows(
-    store: hl.Store, tmp_path: Path, limit: Limit
-) -> None:
-    limit(long_table_rows=1000)
-    said = [(BASE + n, "/a" if n < 1100 else "/b", varied(n)) for n in range(3000)]
-    said += [(BASE + 3000 + n, "/a", varied(n)) for n in range(5)]
-    write_log(tmp_path / "log.mcap", said)
-    settings = SegmentSettings(chunk_size=4096, segment_size=1 << 17)
-    store.record(tmp_path / "log.mcap", name="log", settings=settings)
-    assert compare(store) == 3005
-    assert len(table_of(store).files) == 2
-
-
 @pytest.mark.parametrize("count", [40, 1200])
 def test_unreadable_messages_say_why(store: hl.Store, tmp_path: Path, count: int) -> None:
     said = [(BASE + n, "/a", varied(n)[:-1] if n % 3 == 1 else varied(n)) for n in range(count)]
