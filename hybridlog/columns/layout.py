@@ -142,11 +142,6 @@ class Section:
         """True if all rows have arrays in full."""
         return self.arrays == self.rows
 
-    @property
-    def place(self) -> tuple[int, str, str]:
-        """Its place in the order of a file."""
-        return self.begin, self.id, self.topic
-
 
 @dataclass(frozen=True, slots=True)
 class About:

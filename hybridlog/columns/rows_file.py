@@ -20,23 +20,22 @@ from hybridlog.columns.layout import Section, table_schema_of
 from hybridlog.columns.left_rows import digest_in, with_rows
 from hybridlog.columns.parquet_file import ParquetFileWriter
 from hybridlog.columns.rows import as_table, columns_from, piece_of
+from hybridlog.index.indexing import ChunkIndexer
 from hybridlog.schema.arrow_columns import structs
-from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.left import LeftCodec
-from hybridlog.schema.states import State, state_of
+from hybridlog.schema.states import State
 from hybridlog_storage.cache import Cache
 from hybridlog_storage.errors import StoreError
 from hybridlog_storage.lazy import lazy
 from hybridlog_storage.manifest import File, Part, rows_line
 from hybridlog_storage.ordering import distinct, run_starts
-from hybridlog_storage.segments.chunk import Placed
 from hybridlog_storage.segments.segment_file import rows_name
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-    from hybridlog.schema.codec import Codec
+    from hybridlog.index.indexing import Messages
     from hybridlog_storage.messages import Channel
     from hybridlog_storage.segments.chunk import StoredChunk
 
@@ -151,28 +150,23 @@ class RowsWriter:
         self._channels = channels
         self._front = front
         self._version = version
-        self._of_kind: dict[_Kind, tuple[Codec, FieldShape]] = {}
+        self._indexer = ChunkIndexer(folder.name)
+        self._shapes: dict[_Kind, FieldShape] = {}
         self._open: dict[tuple[_Kind, pa.Schema], _OpenFile] = {}
         self.names: list[str] = []
         """Names of the files, the first one first."""
 
     def add(self, chunk: StoredChunk) -> None:
         """Add the messages of a chunk."""
-        by_kind: dict[_Kind, list[int]] = {}
-        for number in distinct(chunk.batch.channel).tolist():
-            channel = self._channels[number]
-            is_reduced = state_of(channel.message_encoding) is State.REDUCED
+        for messages in self._indexer.messages_in([chunk], self._channels):
+            channel = messages.channel
+            is_reduced = isinstance(messages.codec, LeftCodec)
             kind = channel.topic, table_schema_of(channel), is_reduced
-            by_kind.setdefault(kind, []).append(number)
-        placed = Placed.of([chunk])
-        for kind, numbers in by_kind.items():
-            if kind not in self._of_kind:
-                self._of_kind[kind] = codec_for(self._channels[numbers[0]]), FieldShape()
-            own = placed.take(np.flatnonzero(np.isin(chunk.batch.channel, numbers)))
-            table = _table(own, *self._of_kind[kind])
+            table = _table(messages, self._shapes.setdefault(kind, FieldShape()))
             file = self._file(kind, table.schema)
             file.rows += table.num_rows
             file.tables.append(table)
+        for file in self._open.values():  # between chunks: none is in two row groups
             if sum(one.nbytes for one in file.tables) >= _GROUP_BYTES:
                 file.flush()
 
@@ -207,19 +201,18 @@ class RowsWriter:
         file.writer.close([section], sync=True)
 
 
-def _table(placed: Placed, codec: Codec, shape: FieldShape) -> pa.Table:
+def _table(messages: Messages, shape: FieldShape) -> pa.Table:
     """Rows of messages of one type in a chunk."""
-    is_reduced = isinstance(codec, LeftCodec)
-    if is_reduced:
-        placed = placed._replace(batch=with_rows(placed.batch))
+    state, batch = State.EXPIRED, messages.placed.batch
+    if isinstance(messages.codec, LeftCodec):
+        state, batch = State.REDUCED, with_rows(batch)
     piece = piece_of(
-        placed,
-        codec.columns_of(placed.batch) if codec.indexed else None,
-        State.REDUCED if is_reduced else State.EXPIRED,
+        messages.placed,
+        messages.decoded,
+        state,
         has_publish_time=True,  # channels that have none repeat log times
         columns=lambda decoded: columns_from(decoded, shape),
     )
-    batch = placed.batch
     surplus = np.zeros(piece.rows, np.bool_)
     surplus[piece.surplus] = True
     if (left := batch.left) is None:
