@@ -8,7 +8,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pytest
 
@@ -19,7 +18,6 @@ from hybridlog.columns.table_writer import TableWriter
 from hybridlog.columns.tables import Tables
 from hybridlog.columns.topic_table import TableRows
 from hybridlog.index.indexing import ChunkIndexer
-from hybridlog.maintenance import tables as making
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.messages import Schema
 from hybridlog_storage.segments.segment_reader import SegmentReader
@@ -227,33 +225,6 @@ def test_memory_does_not_grow_with_the_recording(
     assert most[0] < 1000
     assert most[1] <= most[0] + 50
     assert compare(store) == 10_000
-
-
-def test_chunks_that_come_late_are_put_in_their_place(
-    store: hl.Store, tmp_path: Path, limit: Limit
-) -> None:
-    limit(table_pending_bytes=100_000, table_left_bytes=20_000)
-    said = [(BASE + n, "/a" if n % 9 else "/b", varied(n)) for n in range(4000)]
-    write_log(tmp_path / "log.mcap", said)
-    settings = SegmentSettings(chunk_size=4096, segment_size=1 << 17)
-    entry = store.record(tmp_path / "log.mcap", name="log", settings=settings).entry
-    assert entry.segments > 1
-    chunks = chunks_of(store, entry)
-    making.remove(store.directory, entry.id)
-    writer = TableWriter(store.directory.path, entry.id, entry.name)
-    indexer, late = ChunkIndexer(entry.id), chunks[3::5]
-    for chunk, channels in [c for c in chunks if not any(c is other for other in late)] + late:
-        writer.add(indexer.messages_in([chunk], channels))
-    close(writer, entry)
-    assert compare(store) == 4000
-    table = table_of(store)
-    parts = table.parts  # they are merged when they are read
-    assert any(one.last > other.first for one, other in itertools.pairwise(parts))
-    bounds = [BASE + 100, BASE + 350, BASE + 2000]
-    spans = [(bounds[0], bounds[1]), (bounds[2], bounds[2] + 1)]
-    found = np.concatenate([block.t for block in table.scan(spans=spans)])
-    want = [t for t, topic, _ in said if topic == "/a" and any(a <= t < b for a, b in spans)]
-    assert found.tolist() == want
 
 
 def test_the_last_room_is_the_segments_alone(store: hl.Store, tmp_path: Path, limit: Limit) -> None:
