@@ -700,12 +700,12 @@ def _rows_of(inventory: Inventory, number: int) -> tuple[File | None, Sequence[F
     name = inventory.listing.sealed[number]
     if not is_rows(name):
         return None, ()
-    from hybridlog.columns.rows_file import lines_of
+    from hybridlog.columns.rows_file import line_of
 
     with GoneLog(inventory.path / name, number) as reader:
         log = reader.log
     others = sorted(n for n in inventory.listing.rows if int(n[:6]) == number and n != name)
-    return log, lines_of(inventory.path, log, [name, *others])
+    return log, [line_of(inventory.path, log, one) for one in (name, *others)]
 
 
 def sealed_of(inventory: Inventory, number: int) -> Sealed:

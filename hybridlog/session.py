@@ -561,13 +561,6 @@ class Session:
             self._entries[entry.id] = now
             raise _changed(entry)
 
-    def expired_fields(
-        self, recording: RecordingEntry, topic: str, chunks: Mapping[tuple[int, int], int]
-    ) -> TopicTable:
-        """The fields of a topic in chunks that are gone, see `RecordingRows.expired_fields`."""
-        rows = self.shared.rows(recording)
-        return rows.expired_fields(topic, chunks, self.tables.opened)
-
     def table(self, recording: RecordingEntry, topic: str) -> TopicTable | None:
         """The table of a topic; None without one. A missing one is noted for `OpenStore.mend`."""
         if recording.status in UNFINISHED or (topic == MARKS and recording.marks):

@@ -189,11 +189,6 @@ class Shared(ABC):
                 reader = self._segments[key] = open_log(path / name, number, self._rows_of(entry))
             return reader
 
-    def rows(self, entry: RecordingEntry) -> RecordingRows:
-        """Rows of logs that are gone, shared by all of a recording as it is now."""
-        with self._opening:
-            return self._rows_of(entry)
-
     def _rows_of(self, entry: RecordingEntry) -> RecordingRows:
         gone = frozenset((name, entry.digests[number]) for number, name in entry.files.items())
         key = self.directory.recording(entry.id), gone

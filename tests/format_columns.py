@@ -43,17 +43,12 @@ class Columns:
         """The rows of a chunk, in the order of its messages."""
         found: list[dict[str, Any]] = []
         for listed in self._listed:
-            file, about = self._checked(self._folder / listed["name"], listed)
-            for group, chunks in enumerate(about["of_rows"]["chunks"]):
-                numbers = [number for number, count in chunks for _ in range(count)]
-                if chunk in numbers:
-                    rows = file.read_row_group(group).to_pylist()
-                    pairs = zip(numbers, rows, strict=True)
-                    found += [row for number, row in pairs if number == chunk]
+            rows = self._checked(self._folder / listed["name"], listed).to_pylist()
+            found += [row for row in rows if row["ref"]["chunk"] == chunk]
         return sorted(found, key=lambda row: row["ref"]["off"])
 
-    def _checked(self, path: Path, listed: Mapping[str, Any]) -> tuple[pq.ParquetFile, Any]:
-        """A file whose checksums are right, and what it says of itself."""
+    def _checked(self, path: Path, listed: Mapping[str, Any]) -> pa.Table:
+        """The rows of a file whose checksums are right."""
         demand(path.is_file(), "a file of rows is missing")
         data = path.read_bytes()
         demand(len(data) == listed["bytes"] and data[-4:] == b"PAR1", "the size of a file")
@@ -64,10 +59,17 @@ class Columns:
         demand(seal == zlib.crc32(footer), "the checksum of a footer")
         file = pq.ParquetFile(pa.BufferReader(data), page_checksum_verification=True)
         about = json.loads(file.metadata.metadata[b"hybridlog"])
-        demand(about["version"] == 3, "the version of a file")
+        demand(about["version"] == 4, "the version of a file")
         (section,) = about["sections"]
         demand(section["id"] == self._recording, "a file of another recording")
-        rows = sum(part[0] for part in listed["parts"].values())
-        demand(section["counts"] == [rows, 0, 0], "the rows of a file")
-        demand(about["of_rows"]["parts"] == listed["parts"], "the parts of a file")
-        return file, about
+        demand(section["rows"] == file.metadata.num_rows, "the rows of a file")
+        table = file.read()
+        parts: dict[str, list[int]] = {}
+        for row in table.to_pylist():
+            parts.setdefault(str(row["channel"]), []).append(row["t"])
+        listed_parts = {n: [part[0], *part[2:]] for n, part in listed["parts"].items()}
+        demand(
+            {n: [len(own), min(own), max(own)] for n, own in parts.items()} == listed_parts,
+            "the parts of a file",
+        )
+        return table

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import hybridlog as hl
 from hybridlog.schema.codec import Codec
@@ -26,15 +25,17 @@ def documents_of(store: hl.Store, *topics: str) -> list[dict[str, Any]]:
     return sorted(found, key=lambda one: bytes(one["_id"]))
 
 
-def groups_of(
-    codec: Codec, *payloads: bytes, surplus: NDArray[np.bool_] | None = None
-) -> list[BodyGroup]:
-    """The bodies of documents of payloads."""
+def batch_of(*payloads: bytes) -> Batch:
+    """Messages with some payloads."""
     length = np.array([len(payload) for payload in payloads], np.int64)
     none = np.zeros(len(payloads), np.int64)
     places = b"".join(payloads), np.cumsum(length) - length, length
-    batch = Batch(*places, none.astype(np.int32), none, none, none.astype(np.uint32))
-    return [*bodies_of(codec, batch, surplus)]
+    return Batch(*places, none.astype(np.int32), none, none, none.astype(np.uint32))
+
+
+def groups_of(codec: Codec, *payloads: bytes) -> list[BodyGroup]:
+    """The bodies of documents of payloads."""
+    return [*bodies_of(codec, batch_of(*payloads))]
 
 
 def index_fields(codec: Codec, payload: bytes) -> dict[str, object]:

@@ -162,9 +162,13 @@ class ColumnFile:
     def _column(self, group: int, leaf: int) -> Any:
         return self._parquet.metadata.row_group(group).column(leaf)
 
-    def table(self) -> pa.Table:
-        """All rows."""
-        numbers = range(len(self.leaves))
+    def numbers(self, *paths: str) -> list[int]:
+        """Numbers of the columns at some paths in Parquet's order."""
+        return [number for number, leaf in enumerate(self.leaves) if leaf.path in paths]
+
+    def table(self, leaves: Sequence[int] | None = None) -> pa.Table:
+        """All rows, or some columns of them."""
+        numbers = range(len(self.leaves)) if leaves is None else leaves
         groups = [self.read(group, numbers) for group in range(len(self.groups))]
         table = pa.concat_tables(groups) if groups else self.schema.empty_table()
         return table.replace_schema_metadata(None)
@@ -187,14 +191,17 @@ class ColumnFile:
             raise self._damaged(StoreError("a row group has the wrong number of rows"))
         return table
 
-    def check(self) -> str:
-        """Read every value; returns BLAKE3 of all bytes."""
+    def digest(self) -> str:
+        """BLAKE3 of all bytes."""
         try:
-            digest = self._source.digest()
+            return self._source.digest()
         except (OSError, StoreError) as error:
             raise self._damaged(error) from error
+
+    def check(self) -> str:
+        """Read every value; returns BLAKE3 of all bytes."""
         self.table()
-        return digest
+        return self.digest()
 
     def _damaged(self, error: Exception) -> HybridlogError:
         if isinstance(error, OSError):
@@ -300,7 +307,7 @@ class ColumnFile:
 
     def parts(self, begin: int, rows: int) -> Iterator[TablePart]:
         """Row groups with some rows of one topic."""
-        time = next(number for number, leaf in enumerate(self.leaves) if leaf.top == "t")
+        (time,) = self.numbers("t")
         before = 0
         for group, own in enumerate(self.groups):
             low, high = max(begin, before), min(begin + rows, before + own)
@@ -395,12 +402,6 @@ class _Source:
 
     def tell(self) -> int:
         return self._position
-
-    def seekable(self) -> bool:
-        return True
-
-    def readable(self) -> bool:
-        return True
 
     def close(self) -> None:
         """Do nothing: the file remains open as long as its reader."""

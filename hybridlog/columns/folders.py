@@ -187,7 +187,7 @@ class TableFolders:
 
     def _write(self, path: Path, pieces: Iterable[_Piece]) -> None:
         """Write a shared file, and give it its name by one rename."""
-        pieces = sorted(pieces, key=lambda piece: piece[0].place)
+        pieces = sorted(pieces, key=lambda one: (one[0].begin, one[0].id, one[0].topic))
         found = [section for section, _ in pieces]
         schema = pieces[0][1].schema
         table = pa.concat_tables(

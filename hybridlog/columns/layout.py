@@ -17,10 +17,10 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import chain, count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
@@ -63,7 +63,7 @@ OWN: Final = b"hybridlog.own"
 """Metadata of a column that is none of a field, besides `OWN_COLUMNS`."""
 ABOUT: Final = b"hybridlog"
 """Metadata of a file: an `About` as JSON."""
-VERSION: Final = 3
+VERSION: Final = 4
 RESERVED: Final = frozenset(OWN_COLUMNS)
 """Names that no column of a field has."""
 POINTS: Final = "points"
@@ -121,9 +121,18 @@ def column_names(
         yield name, column
 
 
-class TopicCounts(NamedTuple):
-    """Rows of a topic in a file, those without fields, and those that have arrays in full."""
+@dataclass(frozen=True, slots=True)
+class Section:
+    """Rows of one topic of one recording in a file; `begin` is of the recording, ns.
 
+    `segments` has the digest of each segment with rows in it, by its number as text. So many rows
+    are `unreadable`, and have `arrays` in full.
+    """
+
+    id: str
+    topic: str
+    begin: int
+    segments: Mapping[str, str]
     rows: int
     unreadable: int = 0
     arrays: int = 0
@@ -133,45 +142,13 @@ class TopicCounts(NamedTuple):
         """True if all rows have arrays in full."""
         return self.arrays == self.rows
 
-    def plus(self, other: TopicCounts) -> TopicCounts:
-        """The counts of the rows of both."""
-        return TopicCounts(*map(sum, zip(self, other, strict=True)))
-
-
-@dataclass(frozen=True, slots=True)
-class Section:
-    """Rows of one topic of one recording in a file; `begin` is of the recording, ns.
-
-    `segments` has the digest of each segment with rows in it, by its number as text.
-    """
-
-    id: str
-    topic: str
-    begin: int
-    segments: Mapping[str, str]
-    counts: TopicCounts
-
-    @property
-    def rows(self) -> int:
-        """All rows."""
-        return self.counts.rows
-
-    @property
-    def place(self) -> tuple[int, str, str]:
-        """Its place in the order of a file."""
-        return self.begin, self.id, self.topic
-
 
 @dataclass(frozen=True, slots=True)
 class About:
-    """The description of a file of tables, in the file.
-
-    `of_rows` is what a file of rows says of them besides; empty in a table.
-    """
+    """The description of a file of columns, in the file."""
 
     sections: Sequence[Section]
     version: int = VERSION
-    of_rows: Mapping[str, Any] = field(default_factory=dict, repr=False)
 
     def has(self, recording: str) -> bool:
         """True if it has rows of a recording."""

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 import pyarrow as pa
@@ -21,7 +21,6 @@ from hybridlog.columns.layout import ABOUT, About, Section
 from hybridlog.schema.arrow_types import is_bytes
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import files
-from hybridlog_storage.manifest import hasher
 
 if TYPE_CHECKING:
     from hybridlog_storage.messages import Buffer
@@ -77,25 +76,14 @@ class ParquetFileWriter:
         """Write a row group."""
         self._writer.write_table(table, row_group_size=max(table.num_rows, 1))
 
-    def close(
-        self,
-        sections: Sequence[Section],
-        *,
-        rows: Mapping[str, Any] | None = None,
-        sync: bool = False,
-    ) -> tuple[int, str]:
-        """Finish the file, with its sections in order; returns its bytes, and BLAKE3 of them.
-
-        `rows` is what a file of rows says of them besides.
-        """
+    def close(self, sections: Sequence[Section], *, sync: bool = False) -> None:
+        """Finish the file, with its sections in order."""
         try:
             self._sink.end_body()
-            about = About(sections, of_rows=dict(rows or {}))
-            self._writer.add_key_value_metadata(
-                {ABOUT.decode(): msgspec.json.encode(about).decode()}
-            )
+            about = msgspec.json.encode(About(sections))
+            self._writer.add_key_value_metadata({ABOUT.decode(): about.decode()})
             self._writer.close()
-            return self._sink.finish(sync=sync)
+            self._sink.finish(sync=sync)
         except BaseException:
             self.discard()
             raise
@@ -116,7 +104,6 @@ class _Sink:
         self._waiting = bytearray()
         self._most = _WRITTEN
         self._position = 0
-        self._digest = hasher()
 
     def write(self, data: Buffer) -> int:
         """Write bytes."""
@@ -133,14 +120,13 @@ class _Sink:
         self._flush()
         self._most = sys.maxsize
 
-    def finish(self, *, sync: bool) -> tuple[int, str]:
-        """Seal the footer, write all remaining bytes; return size and digest of the file."""
+    def finish(self, *, sync: bool) -> None:
+        """Seal the footer, and write all remaining bytes."""
         self._waiting[:0] = crc32(self._waiting).to_bytes(4, "little")
         self._flush()
         if sync:
             files.system.sync(self._fd)
         self.abandon()
-        return self._position + 4, self._digest.hexdigest()
 
     def abandon(self) -> None:
         if self._fd >= 0:
@@ -148,13 +134,8 @@ class _Sink:
         self._fd = -1
 
     def _flush(self) -> None:
-        data = bytes(self._waiting)
-        files.write_all(self._fd, [data])
-        self._digest.update(data)
+        files.write_all(self._fd, [bytes(self._waiting)])
         self._waiting.clear()
-
-    def flush(self) -> None:
-        """Do nothing: buffered bytes are written in larger pieces."""
 
     def tell(self) -> int:
         return self._position

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -11,21 +11,21 @@ from hybridlog.schema.codec import no_rows, stamp_array
 from hybridlog.schema.left import LeftFields
 from hybridlog.schema.states import State
 from hybridlog_storage.messages import EXPIRED_IDS
+from hybridlog_storage.ordering import distinct
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Mapping
 
     from numpy.typing import NDArray
 
     from hybridlog.columns.fields import FieldShape
-    from hybridlog.schema.codec import Codec, Decoded
-    from hybridlog_storage.messages import Batch
-    from hybridlog_storage.segments.chunk import StoredChunk
+    from hybridlog.schema.codec import Decoded
+    from hybridlog_storage.segments.chunk import Placed
 
 
 @dataclass(slots=True)
 class Piece:
-    """Rows of a topic in a segment.
+    """Rows of a topic in some segments; so many are `unreadable`, and have `arrays` in full.
 
     Attributes:
         own: The columns that every table has, by name.
@@ -33,12 +33,12 @@ class Piece:
         surplus: Rows of messages with bytes left over behind them.
     """
 
-    segment: int
+    segments: set[int]
     own: Mapping[str, Any]
     fields: Any
     unreadable: int = 0
+    arrays: int = 0
     surplus: NDArray[np.intp] = field(default_factory=no_rows)
-    has_arrays: bool = False
 
     @property
     def rows(self) -> int:
@@ -51,61 +51,35 @@ class Piece:
         arrays = [*self.own.values(), *([] if self.fields is None else [self.fields])]
         return sum(int(array.nbytes) for array in arrays)
 
+    def fields_as(self, kind: Any) -> Any:
+        """The fields; without any, nulls of a type."""
+        import pyarrow as pa
 
-class Places(NamedTuple):
-    """Where messages lie in a segment.
-
-    Attributes:
-        chunk: int32[n], number of the chunk.
-        offset: int64[n], byte where the payload starts in it.
-        seq: int64[n], arrival numbers.
-    """
-
-    chunk: NDArray[np.int32]
-    offset: NDArray[np.int64]
-    seq: NDArray[np.int64]
-
-    @classmethod
-    def of(cls, chunks: Sequence[StoredChunk]) -> Places:
-        """Those of all messages of some chunks."""
-        numbers = np.array([chunk.number for chunk in chunks], np.int32)
-        return cls(
-            np.repeat(numbers, [len(chunk.batch) for chunk in chunks]),
-            np.concatenate([chunk.batch.places[0] for chunk in chunks]),
-            np.concatenate([chunk.seq for chunk in chunks]),
-        )
-
-    def take(self, rows: NDArray[np.intp]) -> Places:
-        """Those of the selected messages."""
-        return Places._make(column[rows] for column in self)
+        return pa.nulls(self.rows, kind) if self.fields is None else self.fields
 
 
 def piece_of(
-    segment: int,
-    batch: Batch,
-    places: Places,
-    codec: Codec,
+    placed: Placed,
+    decoded: Decoded | None,
     state: State,
     *,
-    has_publish_time: Mapping[int, bool],
+    has_publish_time: bool,
     columns: Callable[[Decoded], Any],
-    fields: set[str] | None = None,
 ) -> Piece:
-    """Rows of messages of one topic and state.
+    """Rows of decoded messages of one topic and state, which readable ones have.
 
-    Readable ones have that state. `channel` of the batch has ids; `has_publish_time` is by these.
-    `columns` turns fields into columns; `fields` are paths of those wanted, None for all.
+    `columns` turns fields into columns. Without a definition nothing is decoded.
     """
     import pyarrow as pa
     import pyarrow.compute as pc
 
     from hybridlog.columns.fields import without
 
+    batch = placed.batch
     count = len(batch)
     errors: list[str | None] = [None] * count
     found, surplus = None, no_rows()
-    if codec.indexed:
-        decoded = codec.columns_of(batch, fields)
+    if decoded is not None:
         surplus = decoded.surplus
         for bad in decoded.unreadable:
             for row in bad.rows.tolist():
@@ -117,25 +91,25 @@ def piece_of(
     states = pa.repeat(pa.scalar(str(state)), count)
     if error.null_count < count:
         states = pc.if_else(error.is_null(), states, State.UNREADABLE.value)
-    silent = [n for n in np.unique(batch.channel).tolist() if not has_publish_time[n]]
     ref = {
-        "seg": pa.array(np.full(count, segment, np.int32)),
-        "chunk": pa.array(places.chunk),
-        "off": pa.array(places.offset),
-        "len": pa.array(batch.places[1].astype(np.int32)),
+        "seg": pa.array(placed.segment),
+        "chunk": pa.array(placed.chunk.astype(np.int32)),
+        "off": pa.array(placed.offset),
+        "len": pa.array(placed.length.astype(np.int32)),
     }
     own = {
         "log_time": pa.array(batch.log_time // 1000).view(pa.timestamp("us", "UTC")),
         "t": pa.array(batch.log_time),
-        "seq": pa.array(places.seq),
-        "pub": pa.array(batch.publish_time, mask=np.isin(batch.channel, silent)),
+        "seq": pa.array(placed.seq),
+        "pub": pa.array(batch.publish_time, mask=np.full(count, not has_publish_time)),
         "stamp": pa.nulls(count, pa.int64()) if stamps is None else stamps.view(pa.int64()),
         "channel": pa.array(batch.channel % EXPIRED_IDS),
         "state": states,
         "error": error,
         "ref": pa.StructArray.from_arrays([*ref.values()], names=[*ref]),
     }
-    return Piece(segment, own, found, count - error.null_count, surplus)
+    unreadable = count - error.null_count
+    return Piece({*distinct(placed.segment).tolist()}, own, found, unreadable, surplus=surplus)
 
 
 def columns_from(decoded: Decoded, shape: FieldShape) -> Any:

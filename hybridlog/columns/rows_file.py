@@ -7,30 +7,50 @@ behind the message. Unlike a table it is never made again.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final
+from dataclasses import dataclass, field
+from hashlib import sha256
+from typing import TYPE_CHECKING, Final
 
+import numpy as np
 import pyarrow as pa
 
 from hybridlog.columns.column_file import ColumnFile
+from hybridlog.columns.fields import FieldShape
+from hybridlog.columns.layout import Section, table_schema_of
+from hybridlog.columns.left_rows import digest_in, with_rows
+from hybridlog.columns.parquet_file import ParquetFileWriter
+from hybridlog.columns.rows import as_table, columns_from, piece_of
+from hybridlog.index.indexing import ChunkIndexer
+from hybridlog.schema.arrow_columns import structs
+from hybridlog.schema.left import LeftCodec
+from hybridlog.schema.states import State
 from hybridlog_storage.cache import Cache
 from hybridlog_storage.errors import StoreError
-from hybridlog_storage.manifest import File, Part, hasher, rows_line
+from hybridlog_storage.lazy import lazy
+from hybridlog_storage.manifest import File, Part, rows_line
+from hybridlog_storage.ordering import distinct, run_starts
+from hybridlog_storage.segments.segment_file import rows_name
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Mapping
     from pathlib import Path
 
+    from hybridlog.index.indexing import Messages
+    from hybridlog_storage.messages import Channel
+    from hybridlog_storage.segments.chunk import StoredChunk
+
 RESTORE: Final = " Restore it from a copy; `hybridlog verify` shows what is affected."
+_GROUP_BYTES: Final = 4 << 20  # of a row group in memory
+_LEVEL: Final = 3  # of zstd: 9 takes 1 to 5 % less, for much more time
+_MAX_OPEN = 8  # files of different columns: each row group of them waits in memory
+_Kind = tuple[str, str, bool]  # topic, hash of its definition, whether messages are reduced
 
 
 class RowsFile(ColumnFile):
-    """One file of rows: messages of a topic. Thread safe.
-
-    `places` has the row group of each chunk, its first row and number of rows there.
-    """
+    """One file of rows: messages of a topic. Thread safe."""
 
     def __init__(self, folder: Path, listed: File, cache: Cache | None = None) -> None:
-        self.listed = listed
+        self._listed = listed
         self._cache = cache or Cache()
         path = folder / listed.name
         try:
@@ -42,16 +62,11 @@ class RowsFile(ColumnFile):
         rows = sum(part.messages for part in listed.parts.values())
         if (self.size_bytes, self.rows) != (listed.bytes, rows):
             raise self._other()
-        try:
-            self.topic = self.about.sections[0].topic
-            self.places = self._read_places(self.about.of_rows["chunks"])
-        except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
-            raise StoreError(f"The description in {path} is invalid: {error!r}.") from error
 
     def check(self) -> str:
         """As of `ColumnFile`; it is the file that the manifest lists."""
         digest = super().check()
-        if digest != self.listed.digest:
+        if digest != self._listed.digest:
             raise self._other()
         return digest
 
@@ -60,17 +75,16 @@ class RowsFile(ColumnFile):
             f"The file of rows {self.path} is not the one that the manifest lists.{RESTORE}"
         )
 
-    def _read_places(self, chunks: Any) -> dict[int, tuple[int, int, int]]:
+    @lazy
+    def places(self) -> dict[int, tuple[int, int, int]]:
+        """The row group of each chunk, its first row and number of rows there."""
         found: dict[int, tuple[int, int, int]] = {}
-        if len(chunks) != len(self.groups):
-            raise ValueError("its row groups and its chunks differ")
-        for group, inside in enumerate(chunks):
-            at = 0
-            for chunk, rows in inside:
-                found[int(chunk)] = (group, at, int(rows))
-                at += int(rows)
-            if at != self.groups[group]:
-                raise ValueError("its row groups and its chunks differ")
+        for group, rows in enumerate(self.groups):
+            chunks = self.read(group, self.numbers("ref.chunk"))["ref"].combine_chunks()
+            numbers = chunks.field("chunk").to_numpy()
+            starts = run_starts(numbers).tolist()
+            for begin, end in zip(starts, [*starts[1:], rows], strict=True):
+                found[int(numbers[begin])] = group, begin, end - begin
         return found
 
     def of_chunk(self, chunk: int) -> pa.StructArray:
@@ -88,12 +102,129 @@ class RowsFile(ColumnFile):
         return found.slice(begin, rows)
 
 
-def lines_of(folder: Path, log: File, names: Iterable[str]) -> list[File]:
-    """Lines of a manifest for files of rows of a log that none lists, from the first file on."""
-    found = []
-    for name in names:
-        about = ColumnFile(folder / name).about
-        data = (folder / name).read_bytes()
-        parts = {int(n): Part(*part) for n, part in about.of_rows["parts"].items()}
-        found.append(rows_line(log, name, len(data), hasher(data).hexdigest(), parts))
-    return found
+def line_of(folder: Path, log: File, name: str) -> File:
+    """The line of a manifest for a file of rows of a log."""
+    file = ColumnFile(folder / name)
+    rows = file.table(file.numbers("t", "channel", "ref.len")).combine_chunks()
+    t, channel = rows["t"].to_numpy(), rows["channel"].to_numpy()
+    size = rows["ref"].combine_chunks().field("len").to_numpy()
+    parts = {}
+    for number in distinct(channel).tolist():
+        own = channel == number
+        times = t[own]
+        parts[number] = Part(len(times), int(size[own].sum()), int(times.min()), int(times.max()))
+    return rows_line(log, name, file.size_bytes, file.digest(), parts)
+
+
+@dataclass(slots=True)
+class _OpenFile:
+    """A file that is being written; `tables` wait for a row group."""
+
+    topic: str
+    writer: ParquetFileWriter
+    rows: int = 0
+    tables: list[pa.Table] = field(default_factory=list)
+
+    def flush(self) -> None:
+        self.writer.write(pa.concat_tables(self.tables).combine_chunks())
+        self.tables.clear()
+
+
+class RowsWriter:
+    """Writes what is left of the messages of a log.
+
+    Nobody else writes such files in `folder`, which is named by the id of the recording. `front`
+    begins the first file (see `gone_log`), whose name has the number `version`; others follow.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        log: File,
+        channels: Mapping[int, Channel],
+        front: bytes,
+        version: int = 0,
+    ) -> None:
+        self._folder = folder
+        self._log = log
+        self._channels = channels
+        self._front = front
+        self._version = version
+        self._indexer = ChunkIndexer(folder.name)
+        self._shapes: dict[_Kind, FieldShape] = {}
+        self._open: dict[tuple[_Kind, pa.Schema], _OpenFile] = {}
+        self.names: list[str] = []
+        """Names of the files, the first one first."""
+
+    def add(self, chunk: StoredChunk) -> None:
+        """Add the messages of a chunk."""
+        for messages in self._indexer.messages_in([chunk], self._channels):
+            channel = messages.channel
+            is_reduced = isinstance(messages.codec, LeftCodec)
+            kind = channel.topic, table_schema_of(channel), is_reduced
+            table = _table(messages, self._shapes.setdefault(kind, FieldShape()))
+            file = self._file(kind, table.schema)
+            file.rows += table.num_rows
+            file.tables.append(table)
+        for file in self._open.values():  # between chunks: none is in two row groups
+            if sum(one.nbytes for one in file.tables) >= _GROUP_BYTES:
+                file.flush()
+
+    def close(self) -> tuple[File, ...]:
+        """Finish all files, force them to the disk, and return their lines of the manifest."""
+        while self._open:
+            self._finish(self._open.popitem()[1])
+        return tuple(line_of(self._folder, self._log, name) for name in self.names)
+
+    def discard(self) -> None:
+        """Remove the files that are not finished."""
+        for file in self._open.values():
+            file.writer.discard()
+
+    def _file(self, kind: _Kind, schema: pa.Schema) -> _OpenFile:
+        found = self._open.get((kind, schema))
+        if found is None:
+            if len(self._open) >= _MAX_OPEN:
+                self._finish(self._open.pop(next(iter(self._open))))
+            name = rows_name(self._log.number, self._version + len(self.names))
+            front = b"" if self.names else self._front
+            self.names.append(name)
+            writer = ParquetFileWriter(self._folder / name, schema, level=_LEVEL, front=front)
+            found = self._open[kind, schema] = _OpenFile(kind[0], writer)
+        return found
+
+    def _finish(self, file: _OpenFile) -> None:
+        if file.tables:
+            file.flush()
+        digests = {str(self._log.number): self._log.digest}
+        section = Section(self._folder.name, file.topic, 0, digests, file.rows)
+        file.writer.close([section], sync=True)
+
+
+def _table(messages: Messages, shape: FieldShape) -> pa.Table:
+    """Rows of messages of one type in a chunk."""
+    state, batch = State.EXPIRED, messages.placed.batch
+    if isinstance(messages.codec, LeftCodec):
+        state, batch = State.REDUCED, with_rows(batch)
+    piece = piece_of(
+        messages.placed,
+        messages.decoded,
+        state,
+        has_publish_time=True,  # channels that have none repeat log times
+        columns=lambda decoded: columns_from(decoded, shape),
+    )
+    surplus = np.zeros(piece.rows, np.bool_)
+    surplus[piece.surplus] = True
+    if (left := batch.left) is None:
+        about = [(len(p), sha256(p).digest()) for p in map(batch.payload, range(len(batch)))]
+    else:
+        about = [digest_in(left, row) for row in range(len(batch))]
+    ref = piece.own["ref"]
+    more = {
+        **dict(zip([field.name for field in ref.type], ref.flatten(), strict=True)),
+        "sequence": pa.array(batch.sequence),
+        "size": pa.array([size for size, _ in about], pa.uint64()),
+        "sha256": pa.array([digest for _, digest in about], pa.binary()),
+        "surplus": pa.array(surplus),
+    }
+    return as_table({**piece.own, "ref": structs(more, piece.rows)}, piece.fields)

@@ -1,7 +1,6 @@
 """Writes the tables of a recording during indexing.
 
-Chunks are collected and decoded by columns, 8 MiB at a time. Rows
-remain in memory until their segment is sealed, or until there are too many. Then they
+Rows remain in memory until their segment is sealed, or until there are too many. Then they
 become row groups of an unfinished file of their topic. Topics with few rows wait until the
 recording has ended, and go to files that recordings share.
 
@@ -13,52 +12,43 @@ from __future__ import annotations
 import errno
 import logging
 import shutil
-from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
-
-import numpy as np
 
 from hybridlog.columns.layout import (
     POINTS,
     RESERVED,
     SUFFIX,
     Section,
-    TopicCounts,
     parts_folder,
     shape_folder,
     table_schema_of,
     type_prefix,
 )
-from hybridlog.columns.rows import Piece, Places, as_table, columns_from, piece_of
-from hybridlog.index.indexing import rows_by_channel
-from hybridlog.schema.codec import Codec, no_rows
+from hybridlog.columns.rows import Piece, as_table, columns_from, piece_of
+from hybridlog.schema.codec import no_rows
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.left import LeftFields
 from hybridlog.schema.states import State, encoding_of, state_of
 from hybridlog_storage.disk import files
-from hybridlog_storage.disk.copying import joined
 from hybridlog_storage.ordering import order_of
 from hybridlog_storage.settings import read_settings
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from hybridlog.columns.fields import FieldShape
+    from hybridlog.index.indexing import Messages
     from hybridlog.schema.codec import Decoded
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.messages import Channel
-    from hybridlog_storage.segments.chunk import StoredChunk
 
 GROUP_ROWS: Final = 131_072
 """Maximum number of rows in a row group."""
 GROUP_BYTES: Final = 32 << 20
 """Maximum bytes of the columns of a row group in memory."""
-_ARENA = 8 << 20  # bytes of chunks collected: each topic's part costs a millisecond
-_ROWS = 1 << 18  # messages collected
 _PENDING = 16 << 20  # bytes of rows waiting in memory
 _LEFT = _PENDING // 4  # bytes of the smallest topics, which continue to wait for more rows
 _PIECES = 32  # pieces of a topic that become one: small ones take far more than their bytes
@@ -104,7 +94,6 @@ class _Topic:
         decoded = codec.columns(b"", none, none) if codec.indexed else None
         self.none = structs({}, 0) if decoded is None else self.shape.columns(decoded.arrow())
         """No fields, with the columns that the definition fixes."""
-        self.is_wanted = True
         self.rows = 0
         self.pieces: list[Piece] = []
         """Rows in memory."""
@@ -119,25 +108,40 @@ class _Topic:
         """Bytes of the rows in memory."""
         return sum(piece.size for piece in self.pieces)
 
+    @property
+    def is_long(self) -> bool:
+        """True if the rows in memory have a file of their own."""
+        return sum(one.rows for one in self.pieces) >= LONG_ROWS or self.size >= LONG_BYTES
+
     def add(self, piece: Piece) -> None:
-        """Add rows of the segment in work."""
+        """Add rows."""
         self.pieces.append(piece)
         self.rows += piece.rows
-        kind = piece.segment, piece.has_arrays
-        alike = [one for one in self.pieces if (one.segment, one.has_arrays) == kind]
-        if len(alike) >= _PIECES:
-            others = [one for one in self.pieces if (one.segment, one.has_arrays) != kind]
-            self.pieces = [*others, self.joined(alike)]
+        if len(self.pieces) >= _PIECES:
+            self.pieces = [self.take()]
 
-    def take(self) -> list[Piece]:
-        """Remove and return the rows in memory."""
-        found, self.pieces = self.pieces, []
-        return found
+    def take(self) -> Piece:
+        """Remove and return the rows in memory, of which there are some."""
+        import pyarrow as pa
+
+        from hybridlog.columns.fields import joined
+
+        pieces, self.pieces = self.pieces, []
+        fields = joined([self.none, *(piece.fields_as(self.none.type) for piece in pieces)])
+        own = {
+            name: pa.concat_arrays([piece.own[name] for piece in pieces]) for name in pieces[0].own
+        }
+        return Piece(
+            set[int]().union(*(piece.segments for piece in pieces)),
+            own,
+            fields,
+            sum(piece.unreadable for piece in pieces),
+            sum(piece.arrays for piece in pieces),
+        )
 
     def give_up(self) -> None:
         """Make no table of the topic."""
-        self.has_failed = self.is_wanted
-        self.is_wanted = False
+        self.has_failed, self.rows = True, 0
         self.pieces.clear()
         self.finished.clear()
         for file in self.files:
@@ -153,77 +157,43 @@ class _Topic:
             columns = self.points.with_points(columns, decoded.arrow())
         return copied(columns)
 
-    def joined(self, pieces: list[Piece]) -> Piece:
-        """Rows as one piece, of the segment of the first one."""
-        import pyarrow as pa
-
-        from hybridlog.columns.fields import joined as joined_columns
-
-        missing = (pa.nulls(piece.rows, self.none.type) for piece in pieces)
-        found = [
-            none if piece.fields is None else piece.fields
-            for piece, none in zip(pieces, missing, strict=True)
-        ]
-        fields = joined_columns([self.none, *found])
-        own = {
-            name: pa.concat_arrays([piece.own[name] for piece in pieces]) for name in pieces[0].own
-        }
-        bad = sum(piece.unreadable for piece in pieces)
-        return Piece(pieces[0].segment, own, fields, bad, has_arrays=pieces[0].has_arrays)
-
-    def table(self, pieces: list[Piece]) -> Any:
+    def table(self, piece: Piece) -> Any:
         """Rows in order of log time and arrival."""
         import pyarrow as pa
 
-        piece = self.joined(pieces)
-        own = piece.own
-        columns = {
-            name: pa.repeat(pa.scalar(value), len(own["t"]))
-            for name, value in (("recording", self.recording), ("topic", self.name))
-        }
-        table = as_table(columns | {**own}, piece.fields)
-        order = order_of(own["t"].to_numpy(), own["seq"].to_numpy())
+        names = {"recording": self.recording, "topic": self.name}
+        columns = {name: pa.repeat(pa.scalar(value), piece.rows) for name, value in names.items()}
+        table = as_table({**columns, **piece.own}, piece.fields)
+        order = order_of(piece.own["t"].to_numpy(), piece.own["seq"].to_numpy())
         return table if order is None else table.take(pa.array(order))
 
 
-def _counts(pieces: Sequence[Piece]) -> TopicCounts:
-    return TopicCounts(
-        sum(piece.rows for piece in pieces),
-        sum(piece.unreadable for piece in pieces),
-        sum(piece.rows for piece in pieces if piece.has_arrays),
-    )
-
-
 class _File:
-    """An unfinished file of one topic."""
+    """An unfinished file of one topic; its attributes are those of a piece."""
 
-    def __init__(self, path: Path, topic: _Topic, schema: Any) -> None:
+    def __init__(self, path: Path, schema: Any) -> None:
         from hybridlog.columns.parquet_file import ParquetFileWriter
 
         self.path = path
         self.schema = schema
         self.segments: set[int] = set()
-        self._topic = topic
-        self._counts = TopicCounts(0)
+        self.rows = self.unreadable = self.arrays = 0
         self._writer = ParquetFileWriter(path, schema)
+        self.discard = self._writer.discard
 
-    def write(self, table: Any, pieces: list[Piece]) -> None:
+    def write(self, table: Any, piece: Piece) -> None:
         """Write rows as row groups."""
         step = _rows_of_group(table)
         for begin in range(0, table.num_rows, step):
             self._writer.write(table.slice(begin, step))
-        self.segments.update(piece.segment for piece in pieces)
-        self._counts = self._counts.plus(_counts(pieces))
+        self.segments |= piece.segments
+        self.rows += piece.rows
+        self.unreadable += piece.unreadable
+        self.arrays += piece.arrays
 
-    def close(self, digests: Mapping[int, str]) -> None:
+    def close(self, section: Section) -> None:
         """Finish the file."""
-        segments = {str(number): digests[number] for number in sorted(self.segments)}
-        section = Section(self._topic.recording, self._topic.name, 0, segments, self._counts)
         self._writer.close([section])
-
-    def discard(self) -> None:
-        """Delete the unfinished file."""
-        self._writer.discard()
 
 
 class TableWriter:
@@ -245,26 +215,30 @@ class TableWriter:
         self._numbers = 0
         self._has_ended = False
         self.problem = ""  # why no table was written
-        self._held: list[StoredChunk] = []  # of one segment
-        self._channels: dict[int, Channel] = {}
         self._topics: dict[tuple[str, str], _Topic] = {}
-        self._of_channel: dict[int, tuple[_Topic, Codec, State]] = {}
         self._cut: dict[int, str] = {}  # digests of the closed ones
 
-    def add(self, chunk: StoredChunk, channels: Mapping[int, Channel]) -> None:
-        """Add the messages of a chunk."""
+    def add(self, messages: Iterable[Messages]) -> None:
+        """Add messages of one segment."""
         if self._has_ended:
             return
         with self._harmless():
-            self._channels.update(channels)
-            self._collect(chunk)
+            for one in messages:
+                if self._wanted is None or one.channel.topic in self._wanted:
+                    self._add(one)
+            self._spill()
 
     def cut(self, segment: int, digest: str) -> None:
-        """Register that a segment gets no more messages."""
-        if not self._has_ended:
-            with self._harmless():
-                self._decode()
-                self._cut_segment(segment, digest)
+        """Finish the files of a segment; topics with few rows wait for the next one."""
+        if self._has_ended:
+            return
+        with self._harmless():
+            self._cut[segment] = digest
+            for topic in self._topics.values():
+                with self._only(topic):
+                    if topic.is_long or any(segment in one.segments for one in topic.files):
+                        self._write(topic)
+                    self._finish(topic)
 
     def close(self, entry: RecordingEntry) -> None:
         """Finish all tables; topics with another number of messages keep an older one."""
@@ -279,8 +253,6 @@ class TableWriter:
         for topic in self._topics.values():
             topic.give_up()
         self._topics.clear()
-        self._of_channel.clear()
-        self._held.clear()
         with suppress(OSError):
             files.remove_tree(self._parts)
 
@@ -294,64 +266,27 @@ class TableWriter:
             _log.warning("No tables of recording %s were written: %s", self._name, self.problem)
             self.discard()
 
-    # From chunks to rows in memory.
-
-    def _collect(self, chunk: StoredChunk) -> None:
-        if self._held and self._held[0].segment != chunk.segment:
-            self._decode()
-        self._held.append(chunk)
-        batches = [one.batch for one in self._held]
-        if sum(len(b.buffer) for b in batches) >= _ARENA or sum(map(len, batches)) >= _ROWS:
-            self._decode()
-
-    def _decode(self) -> None:
-        """Make rows of the collected messages."""
-        if not self._held:
+    def _add(self, messages: Messages) -> None:
+        """Make rows of messages."""
+        channel = messages.channel
+        key = channel.topic, table_schema_of(channel)
+        topic = self._topics.get(key)
+        if topic is None:
+            arrays = channel.topic in self._arrays
+            topic = self._topics[key] = _Topic(self._recording, channel, arrays=arrays)
+        if topic.has_failed:
             return
-        held, self._held = self._held, []
-        batch, places = joined([chunk.batch for chunk in held]), Places.of(held)
-        has_publish_time = {n: one.has_publish_time for n, one in self._channels.items()}
-        for topic, codec, state, rows in self._by_topic(batch.channel):
-            with self._only(topic):
-                piece = piece_of(
-                    held[0].segment,
-                    batch.take(rows),
-                    places.take(rows),
-                    codec,
-                    state,
-                    has_publish_time=has_publish_time,
-                    columns=topic.columns,
-                )
-                piece.has_arrays = topic.has_arrays and state is State.WHOLE
-                topic.add(piece)
-        self._spill()
-
-    def _by_topic(
-        self, channel: NDArray[np.int32]
-    ) -> Iterator[tuple[_Topic, Codec, State, NDArray[np.intp]]]:
-        """Rows of messages, grouped by topic and encoding."""
-        found: dict[tuple[_Topic, Codec, State], list[NDArray[np.intp]]] = {}
-        for number, rows in rows_by_channel(channel):
-            kind = self._topic_of(number)
-            if kind[0].is_wanted:
-                found.setdefault(kind, []).append(rows)
-        for kind, parts in found.items():
-            yield *kind, np.concatenate(parts)
-
-    def _topic_of(self, number: int) -> tuple[_Topic, Codec, State]:
-        found = self._of_channel.get(number)
-        if found is None:
-            channel = self._channels[number]
-            schema = table_schema_of(channel)
-            topic = self._topics.get((channel.topic, schema))
-            if topic is None:
-                arrays = channel.topic in self._arrays
-                topic = _Topic(self._recording, channel, arrays=arrays)
-                self._topics[channel.topic, schema] = topic
-                topic.is_wanted = self._wanted is None or channel.topic in self._wanted
+        with self._only(topic):
             state = state_of(channel.message_encoding)
-            found = self._of_channel[number] = topic, codec_for(channel), state
-        return found
+            piece = piece_of(
+                messages.placed,
+                messages.decoded,
+                state,
+                has_publish_time=channel.has_publish_time,
+                columns=topic.columns,
+            )
+            piece.arrays = piece.rows if topic.has_arrays and state is State.WHOLE else 0
+            topic.add(piece)
 
     @contextmanager
     def _only(self, topic: _Topic) -> Iterator[None]:
@@ -384,14 +319,15 @@ class TableWriter:
 
     def _write(self, topic: _Topic) -> None:
         """Write rows to an unfinished file of a topic."""
-        if pieces := topic.take():
+        if topic.pieces:
             self._check_room()
-            table = topic.table(pieces)
+            piece = topic.take()
+            table = topic.table(piece)
             file = next((one for one in topic.files if one.schema == table.schema), None)
             if file is None:
-                file = _File(self._new_part(), topic, table.schema)
+                file = _File(self._new_part(), table.schema)
                 topic.files.append(file)
-            file.write(table, pieces)
+            file.write(table, piece)
 
     def _new_part(self) -> Path:
         if not self._numbers:
@@ -405,49 +341,43 @@ class TableWriter:
         if shutil.disk_usage(self._root).free < _RESERVE:
             raise OSError(errno.ENOSPC, f"the disk needs {_RESERVE >> 20} MiB free; make room")
 
-    def _cut_segment(self, segment: int, digest: str) -> None:
-        """Finish the files of a segment; topics with few rows wait for the next one."""
-        self._cut[segment] = digest
-        for topic in self._topics.values():
-            with self._only(topic):
-                if _are_long(topic.pieces) or any(segment in one.segments for one in topic.files):
-                    self._write(topic)
-                self._finish(topic)
-
     def _finish(self, topic: _Topic) -> None:
         """Finish a topic's files of closed segments."""
         for file in [one for one in topic.files if one.segments <= self._cut.keys()]:
             topic.files.remove(file)
-            file.close(self._cut)
+            file.close(self._section(topic, file))
             folder = shape_folder(topic.type, file.schema)
             place = self._parts / folder / file.path.name
             files.make_folders(place.parent)
             files.rename(file.path, place)
             topic.finished.append((folder, place))
 
+    def _section(self, topic: _Topic, found: Piece | _File, begin: int = 0) -> Section:
+        """What a file says of rows in it."""
+        digests = {str(number): self._cut[number] for number in sorted(found.segments)}
+        counts = found.rows, found.unreadable, found.arrays
+        return Section(self._recording, topic.name, begin, digests, *counts)
+
     def _close(self, entry: RecordingEntry) -> None:
         from hybridlog.columns.folders import Addition, TableFolders
 
-        self._decode()
         incomplete = self._incomplete(entry)
         begin = min((first for _, first, _ in entry.spans), default=entry.created)
-        additions: dict[str, Addition] = {}
+        additions = defaultdict[str, Addition](Addition)
         for topic in sorted(self._topics.values(), key=lambda topic: topic.name):
             if topic.name in incomplete:
                 topic.give_up()
             with self._only(topic):
-                if _are_long(topic.pieces):
+                if topic.is_long:
                     self._write(topic)
                     self._finish(topic)
-                elif pieces := topic.take():
-                    table = topic.table(pieces)
-                    numbers = sorted({piece.segment for piece in pieces})
-                    digests = {str(number): self._cut[number] for number in numbers}
-                    section = Section(self._recording, topic.name, begin, digests, _counts(pieces))
-                    folder = shape_folder(topic.type, table.schema)
-                    additions.setdefault(folder, Addition()).pieces.append((section, table))
+                elif topic.pieces:
+                    piece = topic.take()
+                    table = topic.table(piece)
+                    rows = self._section(topic, piece, begin), table
+                    additions[shape_folder(topic.type, table.schema)].pieces.append(rows)
             for folder, path in topic.finished:
-                additions.setdefault(folder, Addition()).files.append(path)
+                additions[folder].files.append(path)
         replaced: set[str] = set()
         if self._wanted is not None:
             # An older table may be the only copy of fields in a damaged chunk.
@@ -461,21 +391,11 @@ class TableWriter:
     def _incomplete(self, entry: RecordingEntry) -> set[str]:
         """Topics that can have no table."""
         rows: Counter[str] = Counter()
-        failed = set()
         for topic in self._topics.values():
-            if topic.is_wanted:
-                rows[topic.name] += topic.rows
-            elif topic.has_failed:
-                failed.add(topic.name)
+            rows[topic.name] += topic.rows
         messages = entry.messages_by_topic()
         names = [*rows] if self._wanted is None else self._wanted
-        return failed | {name for name in names if rows[name] != messages[name]}
-
-
-def _are_long(pieces: Sequence[Piece]) -> bool:
-    """True if rows of a topic have a file of their own."""
-    rows, size = sum(piece.rows for piece in pieces), sum(piece.size for piece in pieces)
-    return rows >= LONG_ROWS or size >= LONG_BYTES
+        return {name for name in names if rows[name] != messages[name]}
 
 
 def _rows_of_group(table: Any) -> int:

@@ -27,7 +27,6 @@ from hybridlog.columns.layout import (
     SUFFIX,
     TABLES,
     Section,
-    TopicCounts,
     parts_folder,
     type_prefix,
 )
@@ -65,16 +64,13 @@ class _Folder(Listing):
         self._shared: list[int] = []  # numbers in the names of shared files
         self._own: dict[str, list[str]] = {}  # files of long topics, by recording
         self._files: dict[str, tuple[tuple[int, int, int], ColumnFile | None]] = {}
-        self._rows: dict[tuple[str, str], list[TopicRows]] = {}  # by recording and topic
+        self.rows: dict[tuple[str, str], list[TopicRows]] = {}
+        """The rows in the files that were looked at, by recording and topic."""
 
     @property
     def damaged(self) -> list[str]:
         """Files that were looked at and cannot be read."""
         return [str(self._path / name) for name, (_, file) in self._files.items() if file is None]
-
-    def rows(self, recording: str, topic: str) -> list[TopicRows]:
-        """The rows of a topic in the files that were looked at."""
-        return self._rows.get((recording, topic), [])
 
     def look(self, recording: RecordingEntry | None) -> None:
         """Open files that may have rows of a recording, or all, if they are new or replaced."""
@@ -90,7 +86,7 @@ class _Folder(Listing):
                     break
 
     def _drop_replaced(self) -> None:
-        before, self._files, self._rows = self._files, {}, {}
+        before, self._files, self.rows = self._files, {}, {}
         for name, (identity, file) in before.items():
             if name in self.names and identity == _identity(self.names[name]):
                 self._add(name, identity, file)
@@ -123,7 +119,7 @@ class _Folder(Listing):
         if file is not None:
             for begin, section in file.sections():
                 rows = TopicRows(file, begin, section)
-                self._rows.setdefault((section.id, section.topic), []).append(rows)
+                self.rows.setdefault((section.id, section.topic), []).append(rows)
 
 
 def _identity(status: os.stat_result) -> tuple[int, int, int]:
@@ -194,19 +190,17 @@ class Tables:
 
     def whole(self, file: ColumnFile, *, arrays: bool) -> TopicTable:
         """All rows of a file, as if of one topic; with `arrays`, all count as rows with arrays."""
-        unreadable = sum(section.counts.unreadable for section in file.about.sections)
-        counts = TopicCounts(file.rows, unreadable, file.rows if arrays else 0)
+        unreadable = sum(section.unreadable for section in file.about.sections)
         parts = [TablePart(file, group, 0, rows) for group, rows in enumerate(file.groups)]
-        return TopicTable("", parts, counts, self.opened)
+        return TopicTable(parts, self.opened, unreadable=unreadable, has_arrays=arrays)
 
     def check(self, recording: RecordingEntry, topic: str) -> TopicTable:
         """The table of a topic in a recording; FileNotFoundError if these segments have none."""
         if recording.status == "open" or not self.can_have(recording, topic):
             raise FileNotFoundError
         with self._lock:
-            self._look(recording, [topic])
+            rows = self._look(recording, [topic])[topic]
             folders = self._folders.of(self._types_of(recording, topic))
-            rows = self._known_rows(recording, topic)
             damaged = [path for folder in folders for path in folder.damaged]
         table = self._table(recording, topic, rows)
         if table is None:
@@ -232,69 +226,20 @@ class Tables:
     def sections_of(self, recording: RecordingEntry) -> list[TopicRows]:
         """The rows of a recording in files."""
         topics = sorted({channel.topic for channel in recording.channels})
-        with self._lock:
-            self._look(recording, topics)
-            return [rows for topic in topics for rows in self._known_rows(recording, topic)]
+        return [rows for own in self._look(recording, topics).values() for rows in own]
 
     def lacking(self, recording: RecordingEntry, topics: Collection[str]) -> set[str]:
         """Topics of which files lack messages, whatever their definitions are."""
         try:
-            with self._lock:
-                self._look(recording, topics)
-                return {
-                    topic
-                    for topic in topics
-                    if not self._has_rows(recording, topic)
-                    or not all(one.is_of(recording) for one in self._known_rows(recording, topic))
-                }
+            found = self._look(recording, topics)
         except StoreError:
             return set(topics)
-
-    def _look(self, recording: RecordingEntry, topics: Collection[str]) -> None:
-        """Look at the folders of some topics, once for all, if rows of them are missing."""
-        types = set[str]()
-        for topic in topics:
-            own = self._types_of(recording, topic)
-            if not own <= self._looked_at or not self._has_rows(recording, topic):
-                types |= own
-        if types:
-            self._folders.look()
-            for folder in self._folders.of(types):
-                folder.look(recording)
-            self._looked_at |= types
-
-    def _has_rows(self, recording: RecordingEntry, topic: str) -> bool:
-        """True if the files that were looked at have as many rows as the catalog messages."""
-        rows = self._known_rows(recording, topic)
-        return sum(one.section.rows for one in rows) == self._messages_of(recording, topic)
-
-    def _known_rows(self, recording: RecordingEntry, topic: str) -> list[TopicRows]:
-        folders = self._folders.of(self._types_of(recording, topic))
-        return [rows for folder in folders for rows in folder.rows(recording.id, topic)]
-
-    def _messages_of(self, recording: RecordingEntry, topic: str) -> int:
-        return sum(one.stats.messages for one in self._channels_of(recording, topic))
-
-    def _types_of(self, recording: RecordingEntry, topic: str) -> set[str]:
-        return {channel.type for channel in self._channels_of(recording, topic)}
-
-    def _table(
-        self, recording: RecordingEntry, topic: str, found: Sequence[TopicRows]
-    ) -> TopicTable | None:
-        """The table of a topic from some files; None without rows of it, or with stale ones."""
-        if not found or not all(rows.is_of(recording) for rows in found):
-            return None
-        counts = TopicCounts(*map(sum, zip(*(one.section.counts for one in found), strict=True)))
-        parts = [part for one in found for part in one.file.parts(one.begin, one.section.rows)]
-        if any(one.id >= EXPIRED_IDS for one in self._channels_of(recording, topic)):
-            counts = counts._replace(arrays=0)  # what has expired is in no answer
-        table = TopicTable(topic, parts, counts, self.opened)
-        if len(table.files) > 1:
-            try:
-                table.fields()
-            except UnfitError as error:
-                raise StoreError(f"The tables of {topic} have no common type: {error}.") from error
-        return table
+        return {
+            topic
+            for topic, rows in found.items()
+            if not self._is_whole(recording, topic, rows)
+            or not all(one.is_of(recording) for one in rows)
+        }
 
     def of_sealed(
         self, recording: RecordingEntry, topic: str, messages: Mapping[int, int]
@@ -309,10 +254,9 @@ class Tables:
             place = parts_folder(self._root, recording.id)
             known = self._sealed.setdefault(recording.id, _Folders(place, self.opened))
             known.look()
-            folders = known.of(self._types_of(recording, topic))
-            for folder in folders:
+            for folder in known.of(self._types_of(recording, topic)):
                 folder.look(None)
-            rows = [rows for folder in folders for rows in folder.rows(recording.id, topic)]
+            rows = self._rows_in(known, recording, topic)
             while len(self._sealed) > _MAX_RUNNING:
                 self._sealed.popitem(last=False)
         try:
@@ -323,6 +267,60 @@ class Tables:
         if table is None or table.rows != sum(messages.get(number, 0) for number in segments):
             return None  # its files are just getting their names
         return table, segments
+
+    def _look(
+        self, recording: RecordingEntry, topics: Collection[str]
+    ) -> dict[str, list[TopicRows]]:
+        """The rows of topics in files, after a look at the folders of those that lack some."""
+        with self._lock:
+            types = set[str]()
+            for topic in topics:
+                own = self._types_of(recording, topic)
+                rows = self._rows_in(self._folders, recording, topic)
+                if not own <= self._looked_at or not self._is_whole(recording, topic, rows):
+                    types |= own
+            if types:
+                self._folders.look()
+                for folder in self._folders.of(types):
+                    folder.look(recording)
+                self._looked_at |= types
+            return {one: self._rows_in(self._folders, recording, one) for one in topics}
+
+    def _rows_in(self, folders: _Folders, recording: RecordingEntry, topic: str) -> list[TopicRows]:
+        """The rows of a topic in the files of some folders that were looked at."""
+        own = folders.of(self._types_of(recording, topic))
+        return [rows for folder in own for rows in folder.rows.get((recording.id, topic), [])]
+
+    def _is_whole(self, recording: RecordingEntry, topic: str, rows: Collection[TopicRows]) -> bool:
+        """True if the files have as many rows as the catalog messages."""
+        return sum(one.section.rows for one in rows) == self._messages_of(recording, topic)
+
+    def _messages_of(self, recording: RecordingEntry, topic: str) -> int:
+        return sum(one.stats.messages for one in self._channels_of(recording, topic))
+
+    def _types_of(self, recording: RecordingEntry, topic: str) -> set[str]:
+        return {channel.type for channel in self._channels_of(recording, topic)}
+
+    def _table(
+        self, recording: RecordingEntry, topic: str, found: Sequence[TopicRows]
+    ) -> TopicTable | None:
+        """The table of a topic from some files; None without rows of it, or with stale ones."""
+        if not found or not all(rows.is_of(recording) for rows in found):
+            return None
+        # Arrays that have expired are in no answer.
+        is_expired = any(one.id >= EXPIRED_IDS for one in self._channels_of(recording, topic))
+        table = TopicTable(
+            [part for one in found for part in one.file.parts(one.begin, one.section.rows)],
+            self.opened,
+            unreadable=sum(one.section.unreadable for one in found),
+            has_arrays=not is_expired and all(one.section.has_arrays for one in found),
+        )
+        if len(table.files) > 1:
+            try:
+                table.fields()
+            except UnfitError as error:
+                raise StoreError(f"The tables of {topic} have no common type: {error}.") from error
+        return table
 
     def _channels_of(self, recording: RecordingEntry, topic: str) -> list[ChannelEntry]:
         """The channels of a topic; those of the recording asked about last are at hand."""

@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.columns.column_file import ColumnFile, OpenFiles, TablePart
-    from hybridlog.columns.layout import TopicCounts
     from hybridlog.query.intervals import Span
 
 _MAX_TYPES: Final = 64  # sets of fields whose types are kept for a table
@@ -81,11 +80,16 @@ class TopicTable:
     """All messages of a topic in a recording; `has_arrays` if they are in full, but for bytes."""
 
     def __init__(
-        self, topic: str, parts: Sequence[TablePart], counts: TopicCounts, opened: OpenFiles
+        self,
+        parts: Sequence[TablePart],
+        opened: OpenFiles,
+        *,
+        unreadable: int = 0,
+        has_arrays: bool = False,
     ) -> None:
-        self.topic = topic
-        self.rows, self.unreadable, _ = counts
-        self.has_arrays = counts.has_arrays
+        self.rows = sum(part.rows for part in parts)
+        self.unreadable = unreadable
+        self.has_arrays = has_arrays
         self.files = list({part.file.number: part.file for part in parts}.values())
         self._opened = opened
         self._parts = parts

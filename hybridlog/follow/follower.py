@@ -50,7 +50,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from hybridlog.index.indexing import Documents
     from hybridlog.maintenance.report import Progress
     from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
@@ -60,7 +59,8 @@ if TYPE_CHECKING:
     from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentReader
 
 _SEND_BYTES: Final = 8 << 20  # documents that are sent together, at most
-_GROUP_BYTES: Final = 1 << 20  # content of small chunks that are decoded together
+_GROUP_BYTES: Final = 8 << 20  # content of chunks that are decoded together
+_GROUP_ROWS: Final = 1 << 17  # messages that are decoded together
 _RETRY_S: Final = 2.0  # between attempts after the database has failed
 
 
@@ -71,8 +71,8 @@ class IndexTarget:
     Attributes:
         database: The index; None if it is unavailable now, or the recording gets none.
         failure: Why it is unavailable now; None if it is not, or the recording gets none.
-        renew: Another connection to the index, after one has failed; starts the embedded
-            MongoDB again if that has ended. Raises `DatabaseError`.
+        renew: Returns the index, connected again if that was lost; starts the embedded MongoDB
+            again if that has ended. Raises `DatabaseError`.
     """
 
     database: Database | None = None
@@ -113,15 +113,15 @@ class _Sender:
         self._size = self._added = 0
         self.ended: dict[str, str] = {}
 
-    def add(self, documents: Iterable[Documents], messages: int) -> None:
-        """Add the documents of some messages.
+    def add(self, documents: Iterable[tuple[str, NDArray[np.uint8]]], messages: int) -> None:
+        """Add the documents of some messages, in tables of their topics.
 
         Raises:
             HybridlogError: An earlier sending has failed.
         """
-        for part in documents:
-            self._documents[part.topic] += part.tables
-            self._size += part.size
+        for topic, table in documents:
+            self._documents[topic].append(table)
+            self._size += table.size
         self._added += messages
         if self._size >= _SEND_BYTES:
             self.send()
@@ -170,19 +170,19 @@ class _Segment:
 
     Attributes:
         is_wanted: Whether documents are made.
+        sender: Who gets them; another one lacks some.
         opened: Its file while it grows.
         chunks: Number of chunks that were read.
         decoded: Results of decoding, by channel.
         is_decoded: Whether these are known already; then only rows are made.
-        is_sent: Whether all of them were handed to the sender.
     """
 
     is_wanted: bool
+    sender: _Sender | None
     opened: OpenSegment | None = None
     chunks: int = 0
     decoded: dict[int, ChannelStats] = field(default_factory=dict)
     is_decoded: bool = False
-    is_sent: bool = True
 
 
 class Follower:
@@ -233,9 +233,8 @@ class Follower:
         self._done = done
         self._until = until
         self._progress = progress
-        self._indexer = ChunkIndexer(entry.id, has_documents=self._target.is_wanted)
+        self._indexer = ChunkIndexer(entry.id)
         self._sender: _Sender | None = None
-        self._renewed: Database | None = None
         self._retry_at = 0.0
         self._indexed = 0
         self._gap: DatabaseError | None = None  # why the index has missed something
@@ -286,27 +285,16 @@ class Follower:
         """
         self._connect()
         self._check_cut()
-        listing = self._directory.listing(self._entry.id)
-        pending = {*listing.open, *listing.sealed} - self._ended
         manifest = self._directory.manifests.read(self._entry.id)
-        logs = manifest.logs
-        for number in sorted(pending):
-            segment = self._segment(number)
-            opened = segment.opened = segment.opened or OpenSegment(self._path, number)
-            opened.follow()
-            table = opened.flushed.table
-            for group in self._groups(number, opened.reader, places_of(table)):
-                self._take(segment, group, opened.channels)
-                if self.is_stopped:
-                    return
-            if number in logs and number in listing.sealed:
-                self._end_segment(number, logs[number].digest)
-        for number, log in logs.items():
-            if not (log.is_here or number in self._ended or self.is_stopped):
-                path = self._path / manifest.rows[number][0].name
-                with open_log(path, number, RecordingRows(self._path)) as gone:
-                    self._read_segment(self._entry, gone, log.digest)
-        self._send()
+        listing = self._directory.listing(self._entry.id).choosing(manifest)
+        with suppress(TimeoutError):
+            for number in sorted({*listing.open, *listing.sealed} - self._ended):
+                if number in listing.sealed and number in manifest.logs:
+                    digest = manifest.logs[number].digest
+                    self._read_sealed(number, listing.sealed[number], digest)
+                else:
+                    self._read_open(number)
+            self._send()
 
     def finish(self, entry: RecordingEntry) -> RecordingEntry:
         """Make the rest of what is derived of a recording that has ended.
@@ -325,7 +313,11 @@ class Follower:
             self._retry_at = 0.0
             self._connect()
             self._check_cut()
-            self._read_sealed(entry)
+            self._entry, done = entry, 0
+            for number in [n for n, _, _ in entry.spans if n not in self._ended]:
+                if (digest := entry.digests.get(str(number))) is not None:
+                    report = reporter(self._progress, entry.name, entry.stored_bytes, done)
+                    done += self._read_sealed(number, file_of(entry, number), digest, report)
             if self._sender is not None and self._gap is None:
                 self._sender.ended.update(entry.digests)  # also of segments without messages
             self._send(wait=True)
@@ -338,56 +330,61 @@ class Follower:
             self.discard()
         return entry
 
-    def _segment(self, number: int) -> _Segment:
-        is_wanted = self._target.is_wanted and str(number) not in self._done
-        return self._segments.setdefault(number, _Segment(is_wanted=is_wanted))
-
     def discard(self) -> None:
         """Leave the rest to the next follower."""
         self._stop_sending()
         self._tables.discard()
         self._segments.clear()
 
-    def _read_sealed(self, entry: RecordingEntry) -> None:
-        rows, done = RecordingRows(self._path), 0
-        for number in [n for n, _, _ in entry.spans if str(n) in entry.digests]:
-            with open_log(self._path / file_of(entry, number), number, rows) as reader:
-                report = reporter(self._progress, entry.name, entry.stored_bytes, done)
-                if number not in self._ended:
-                    digest = entry.digests[str(number)]
-                    self._read_segment(entry, reader, digest, report)
-                done += reader.size
-                report(reader.size)
+    def _segment(self, number: int) -> _Segment:
+        is_wanted = self._target.is_wanted and str(number) not in self._done
+        return self._segments.setdefault(number, _Segment(is_wanted, self._sender))
 
-    def _read_segment(
+    def _read_open(self, number: int) -> None:
+        """Read what a segment has got since the last time."""
+        segment = self._segment(number)
+        opened = segment.opened = segment.opened or OpenSegment(self._path, number)
+        opened.follow()
+        self._read(number, opened.reader, places_of(opened.flushed.table), opened.channels)
+
+    def _read_sealed(
+        self, number: int, name: str, digest: str, report: Callable[[int], None] = lambda _: None
+    ) -> int:
+        """Read what is left of a sealed segment; returns its bytes."""
+        with open_log(self._path / name, number, RecordingRows(self._path)) as reader:
+            summary = reader.summary()
+            segment = self._segment(number)
+            places = summary.chunks
+            if not segment.is_wanted and self._catalog.decoded(self._entry, number) is not None:
+                segment.is_decoded = True
+                if self._topics is not None:
+                    wanted = {one.id for one in self._entry.channels if one.topic in self._topics}
+                    places = [one for one in places if not wanted.isdisjoint(one.channels)]
+            self._read(number, reader, places, summary.channels, report)
+        self._end_segment(number, digest)
+        report(reader.size)
+        return reader.size
+
+    def _read(
         self,
-        entry: RecordingEntry,
+        number: int,
         reader: SegmentReader,
-        digest: str,
+        places: Iterable[ChunkPlace],
+        channels: Mapping[int, Channel],
         report: Callable[[int], None] = lambda _: None,
     ) -> None:
-        """Read what is left of a sealed segment."""
-        number = reader.number
-        summary = reader.summary()
-        segment = self._segment(number)
-        places = summary.chunks
-        if not segment.is_wanted and self._catalog.decoded(entry, number) is not None:
-            segment.is_decoded = True
-            if self._topics is not None:
-                wanted = {one.id for one in entry.channels if one.topic in self._topics}
-                places = [one for one in places if not wanted.isdisjoint(one.channels)]
+        """Read those chunks of a segment that were not; TimeoutError if it is to stop."""
         for group in self._groups(number, reader, places):
-            if time.monotonic() > self._until:
+            if self.is_stopped or time.monotonic() > self._until:
                 raise TimeoutError
-            self._take(segment, group, summary.channels)
+            self._take(self._segments[number], group, channels)
             report(group[-1].offset)
-        self._end_segment(number, digest)
 
     def _groups(
         self, number: int, reader: SegmentReader, places: Iterable[ChunkPlace]
     ) -> Iterator[list[StoredChunk]]:
         """The chunks of a segment that can be read and were not; small ones together."""
-        segment, size = self._segments[number], 0
+        segment, size, rows = self._segments[number], 0, 0
         group: list[StoredChunk] = []
         for place in [one for one in places if one.number >= segment.chunks]:
             if not segment.is_decoded:
@@ -399,9 +396,10 @@ class Follower:
                     self._damage[number, place.number] = str(error)
                 continue
             size += len(chunk.batch.buffer)
-            if group and size > _GROUP_BYTES:
+            rows += len(chunk.batch)
+            if group and (size > _GROUP_BYTES or rows > _GROUP_ROWS):
                 yield group
-                group, size = [], len(chunk.batch.buffer)
+                group, size, rows = [], len(chunk.batch.buffer), len(chunk.batch)
             group.append(chunk)
         if group:
             yield group
@@ -410,12 +408,16 @@ class Follower:
         self, segment: _Segment, chunks: Sequence[StoredChunk], channels: Mapping[int, Channel]
     ) -> None:
         """Make rows, results of decoding and documents of chunks of one segment."""
-        for chunk in chunks:
-            self._tables.add(chunk, channels)
+        found = self._indexer.messages_in(chunks, channels)
+        self._tables.add(found)
         segment.chunks = chunks[-1].number + 1
         if segment.is_decoded:
             return
-        documents = self._indexer.documents_of(chunks, channels, segment.decoded)
+        documents = [
+            (one.channel.topic, table)
+            for one in found
+            for table in self._indexer.take(one, segment.decoded, has_documents=segment.is_wanted)
+        ]
         messages = sum(len(chunk.batch) for chunk in chunks)
         if not segment.is_wanted and self._target.is_wanted:
             return  # they are there already
@@ -424,7 +426,7 @@ class Follower:
             return
         self.made += len(chunks)
         if self._sender is None:
-            segment.is_sent, self._gap = False, self.failure
+            segment.sender, self._gap = None, self.failure
         else:
             with self._noting_failure():
                 self._sender.add(documents, messages)
@@ -436,7 +438,7 @@ class Follower:
         if not segment.is_decoded:
             with suppress(HybridlogError):  # it is derived, and the disk may be full
                 self._catalog.put_decoded(self._entry.id, number, digest, segment.decoded)
-        if self._sender is not None and segment.is_wanted and segment.is_sent:
+        if segment.is_wanted and segment.sender is self._sender is not None:
             self._sender.ended[str(number)] = digest
         self._ended.add(number)
 
@@ -469,7 +471,7 @@ class Follower:
             if database is None:
                 if target.renew is None:
                     return
-                database = self._renewed = target.renew()
+                database = target.renew()
             state = IndexState(database)
             if state.one(self._entry.key) is None:
                 state.begin(self._entry)
@@ -490,8 +492,6 @@ class Follower:
             self.failure = error if isinstance(error, DatabaseError) else DatabaseError(str(error))
             if self._sender is not None:
                 self._gap = self.failure  # of what was sent, some may be lost
-                for segment in self._segments.values():
-                    segment.is_sent = False
             self._stop_sending()
             self._retry_at = time.monotonic() + _RETRY_S
 
@@ -499,9 +499,6 @@ class Follower:
         if self._sender is not None:
             self._sender.close()
             self._indexed, self._sender = self.indexed, None
-        if self._renewed is not None:
-            self._renewed.close()
-            self._renewed = None
 
 
 def make_rows_ahead(

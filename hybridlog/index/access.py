@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from functools import wraps
+from functools import partial, wraps
 from typing import TYPE_CHECKING, NamedTuple, ParamSpec, TypeVar
 
 from hybridlog_storage.errors import (
@@ -157,6 +157,7 @@ class IndexAccess:
         """The index, for a new recording; it may lack other recordings, or be unavailable."""
         from hybridlog.follow.follower import IndexTarget
 
+        renew = partial(self.connect, brings=False)
         # Those that a crash has cut are brought into the index by another opening.
         try:
             database = self.database_for(purpose, writes=True, brings=self._recovers)
@@ -164,8 +165,8 @@ class IndexAccess:
             why = self.unavailable if isinstance(self.unavailable, DatabaseError) else error
             # It does without MongoDB if none is wanted, or ours does not start.
             has_none = self._named in {EMBEDDED, NONE} and not isinstance(why, ConnectionLostError)
-            return IndexTarget(failure=None if has_none else why, renew=self._another_again)
-        return IndexTarget(database, renew=self._another_again)
+            return IndexTarget(failure=None if has_none else why, renew=renew)
+        return IndexTarget(database, renew=renew)
 
     def connect(self, *, brings: bool = True) -> Database:
         """Connect to the index and bring it up to date; once more if the connection breaks."""
@@ -243,8 +244,8 @@ class IndexAccess:
 
         return without_secrets(uri)
 
-    def another(self) -> Database:
-        """An additional connection; starts the embedded MongoDB if it is not running."""
+    def _another(self) -> Database:
+        """A new connection; starts the embedded MongoDB if it is not running."""
         from hybridlog.index import consent
 
         if self._uri is None:
@@ -278,12 +279,6 @@ class IndexAccess:
         if self._mongod.damage is not None:
             self._shared.repairs.damage.append(self._mongod.damage)
         return uri
-
-    def _another_again(self) -> Database:
-        """An additional connection to the index, after one has failed."""
-        with self._connecting:
-            self._open()
-        return self.another()
 
     def _reached(self, *, brings: bool) -> Database | None:
         """The index, connected when it is needed; `brings` it up to date first."""
@@ -319,26 +314,26 @@ class IndexAccess:
         return database
 
     def _open(self) -> Database:
-        """Connect, and check that the database belongs to this store."""
+        """The database, connected again if it is lost; it belongs to this store."""
         from hybridlog_storage.mongo.index_state import IndexState, other_store
 
-        database = self.connected
-        if database is None:
-            if self._database is not None:
-                self._database.close()
-            database = self._database = self.another()
-            state, store_id = IndexState(database), self._directory.settings.store_id
-            self.may_write = database.may_write()
-            owner = state.owner()
-            if owner is not None and owner.store != store_id:
-                if self._uri != EMBEDDED:
-                    raise other_store(database)
-                database.drop_all()  # the store is a copy that has an id of its own now
-                owner = None
-            if owner is None and self.may_write:
-                owner = self.claim(database)
-            self.id = "" if owner is None else owner.made
-            self._owns = owner is not None and owner.place == self._own_place
+        if (database := self.connected) is not None:
+            return database
+        if self._database is not None:
+            self._database.close()
+        database = self._database = self._another()
+        state, store_id = IndexState(database), self._directory.settings.store_id
+        self.may_write = database.may_write()
+        owner = state.owner()
+        if owner is not None and owner.store != store_id:
+            if self._uri != EMBEDDED:
+                raise other_store(database)
+            database.drop_all()  # the store is a copy that has an id of its own now
+            owner = None
+        if owner is None and self.may_write:
+            owner = self.claim(database)
+        self.id = "" if owner is None else owner.made
+        self._owns = owner is not None and owner.place == self._own_place
         return database
 
 

@@ -1,102 +1,114 @@
-"""Makes index documents from chunks, as a pure function.
+"""Decodes the messages of a recording, once for its tables, index documents and statistics.
 
-`documents_of` makes the index disposable: it needs only chunks and their channels.
-`record`, recovery, `index rebuild` and `verify` all call it.
+All that is derived of them needs only chunks and their channels, so it is disposable.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hybridlog.schema.codec import Codec, stamps_of
+from hybridlog.schema.codec import stamps_of
 from hybridlog.schema.codecs import codec_for
-from hybridlog.schema.column import STAMP
-from hybridlog.schema.index_bodies import bodies_of
+from hybridlog.schema.column import STAMP, Records, header_stamps
+from hybridlog.schema.index_bodies import MAX_BYTES, bodies_in
+from hybridlog.schema.states import encoding_of
 from hybridlog_storage.catalog import ChannelStats
+from hybridlog_storage.lazy import lazy
 from hybridlog_storage.messages import EXPIRED_IDS, Channel
-from hybridlog_storage.mongo.index_documents import DocumentAssembler, Placed
+from hybridlog_storage.mongo.index_documents import DocumentAssembler
 from hybridlog_storage.ordering import run_starts
-from hybridlog_storage.segments.chunk import StoredChunk
+from hybridlog_storage.segments.chunk import Placed, StoredChunk
 
 if TYPE_CHECKING:
+    from collections.abc import Hashable
+
     from numpy.typing import NDArray
 
+    from hybridlog.schema.codec import Codec, Decoded
 
-class Documents(NamedTuple):
-    """Index documents of one topic; tables are uint8[k, width], a whole BSON document a row."""
+_LARGE = MAX_BYTES >> 5  # bytes of a payload whose fields may be too large for a document
 
-    topic: str
-    tables: list[NDArray[np.uint8]]
 
-    @property
-    def size(self) -> int:
-        """Bytes of all documents."""
-        return sum(table.size for table in self.tables)
+class Messages:
+    """Messages of some chunks, on channels that are alike: `channel` is one of them."""
+
+    def __init__(self, channel: Channel, codec: Codec, placed: Placed) -> None:
+        self.channel = channel
+        self.codec = codec
+        self.placed = placed
+
+    @lazy
+    def decoded(self) -> Decoded | None:
+        """The messages decoded; None where these have no fields."""
+        return self.codec.columns_of(self.placed.batch) if self.codec.indexed else None
 
 
 class ChunkIndexer:
-    """Makes the index documents of the chunks of a recording, given by its id or key.
+    """Decodes the chunks of a recording, given by its id or key, and makes its documents."""
 
-    Without `has_documents`, it makes only the results of decoding, for the catalog.
-    """
-
-    def __init__(self, recording: str, *, has_documents: bool = True) -> None:
+    def __init__(self, recording: str) -> None:
         self._key = recording[-16:]
-        self._has_documents = has_documents
-        self._parts: dict[int, tuple[Codec, DocumentAssembler, bool]] = {}
+        self._kinds: dict[int, tuple[Hashable, Channel, Codec]] = {}  # by channel
+        self._assemblers: dict[tuple[str, bool], DocumentAssembler] = {}
 
-    def documents_of(
-        self,
-        chunks: Sequence[StoredChunk],
-        channels: Mapping[int, Channel],
-        decoded: dict[int, ChannelStats],
-    ) -> list[Documents]:
-        """Make all index documents of some chunks; add the results of decoding, by channel.
-
-        They equal those of each chunk alone. Several chunks of few messages take little longer
-        than one.
-        """
+    def messages_in(
+        self, chunks: Sequence[StoredChunk], channels: Mapping[int, Channel]
+    ) -> list[Messages]:
+        """The messages of some chunks; several chunks of few take little longer than one."""
         placed = Placed.of(chunks)
-        documents: list[Documents] = []
-        for channel_id, rows in rows_by_channel(placed.batch.channel):
-            channel = channels[channel_id]
-            codec, assembler, stamped = self._part(channel_id, channel)
-            is_indexed = channel.is_indexed and self._has_documents
-            batch = placed.batch.take(rows)
-            found = _Results(len(rows))
-            tables: list[NDArray[np.uint8]] = []
-            for group in bodies_of(codec, batch, found.surplus):
-                found.unreadable[group.rows] = group.error is not None
-                if group.stamps is not None:
-                    found.stamped[group.rows] = True
-                    found.stamps[group.rows] = group.stamps
-                if is_indexed:
-                    row = rows[group.rows]
-                    tables.append(assembler.assemble(placed, row, group.body, group.error))
-            if stamped:
-                left = np.flatnonzero(~found.stamped)
-                if len(left):
-                    own, values = stamps_of(codec, batch.take(left))
-                    found.stamped[left[own]] = True
-                    found.stamps[left[own]] = values
-            known = decoded.setdefault(channel_id % EXPIRED_IDS, ChannelStats())
-            known.add(found.stats(batch.log_time))
-            if tables:
-                documents.append(Documents(channel.topic, tables))
-        return documents
+        alike: dict[Hashable, tuple[Channel, Codec, list[NDArray[np.intp]]]] = {}
+        for number, rows in rows_by_channel(placed.batch.channel):
+            if number not in self._kinds:
+                self._kinds[number] = _kind_of(channels[number])
+            kind, channel, codec = self._kinds[number]
+            alike.setdefault(kind, (channel, codec, []))[2].append(rows)
+        return [
+            Messages(channel, codec, placed.take(np.concatenate(own)))
+            for channel, codec, own in alike.values()
+        ]
 
-    def _part(self, channel_id: int, channel: Channel) -> tuple[Codec, DocumentAssembler, bool]:
-        part = self._parts.get(channel_id)
-        if part is None:
-            codec = codec_for(channel)
-            paths = codec.paths()
-            stamped = any(one.path == STAMP and one.type == "time" for one in paths)
-            assembler = DocumentAssembler(self._key, channel)
-            part = self._parts[channel_id] = codec, assembler, stamped
-        return part
+    def take(
+        self, messages: Messages, decoded: dict[int, ChannelStats], *, has_documents: bool
+    ) -> list[NDArray[np.uint8]]:
+        """Make documents, and add the results of decoding by channel.
+
+        Returns uint8[k, width] each, a whole BSON document a row; none without `has_documents`.
+        """
+        channel, placed = messages.channel, messages.placed
+        batch, found = placed.batch, _Results(len(placed.batch))
+        tables = []
+        if has_documents and channel.is_indexed:
+            key = channel.topic, channel.has_publish_time
+            if key not in self._assemblers:
+                self._assemblers[key] = DocumentAssembler(self._key, channel)
+            for group in bodies_in(messages.decoded, len(batch)):
+                found.unreadable[group.rows] = group.error is not None
+                made = self._assemblers[key].assemble(placed, group.rows, group.body, group.error)
+                tables.append(made)
+        elif messages.decoded is not None:
+            for bad in messages.decoded.unreadable:
+                found.unreadable[bad.rows] = True
+            large = np.flatnonzero(placed.length > _LARGE)
+            for group in bodies_in(messages.codec.columns_of(batch.take(large)), len(large)):
+                found.unreadable[large[group.rows]] = group.error is not None
+        if messages.decoded is not None:
+            found.surplus[messages.decoded.surplus] = True
+            found.add_stamps(messages)
+        for number, rows in rows_by_channel(batch.channel):
+            known = decoded.setdefault(number % EXPIRED_IDS, ChannelStats())
+            known.add(found.stats(batch.log_time, rows))
+        return tables
+
+
+def _kind_of(channel: Channel) -> tuple[Hashable, Channel, Codec]:
+    codec = codec_for(channel)
+    original = encoding_of(channel.message_encoding, channel.metadata)
+    about = channel.has_publish_time, channel.is_indexed, codec.reason
+    kind = channel.topic, channel.schema, channel.message_encoding, original, *about
+    return kind, channel, codec
 
 
 def rows_by_channel(channel: NDArray[np.int32]) -> Iterator[tuple[int, NDArray[np.intp]]]:
@@ -112,7 +124,7 @@ def rows_by_channel(channel: NDArray[np.int32]) -> Iterator[tuple[int, NDArray[n
 
 
 class _Results:
-    """Results of decoding `messages` of one channel.
+    """Results of decoding so many messages.
 
     Attributes:
         unreadable: bool[n], messages that cannot be read.
@@ -125,14 +137,31 @@ class _Results:
         self.unreadable, self.surplus, self.stamped = np.zeros((3, messages), np.bool_)
         self.stamps = np.zeros(messages, np.int64)
 
-    def stats(self, log_time: NDArray[np.int64]) -> ChannelStats:
-        """The results as statistics; the sum of skews is exact."""
-        stamps = self.stamps[self.stamped]
+    def add_stamps(self, messages: Messages) -> None:
+        """Add header stamps, also of messages of which no more can be read."""
+        decoded, batch = messages.decoded, messages.placed.batch
+        assert decoded is not None
+        if isinstance(decoded.records, Records):
+            stamps = header_stamps(decoded.records)
+            if stamps is not None:
+                self.stamped[decoded.rows] = True
+                self.stamps[decoded.rows] = stamps
+        if any(one.path == STAMP and one.type == "time" for one in messages.codec.paths()):
+            left = np.flatnonzero(~self.stamped)
+            if len(left):
+                own, values = stamps_of(messages.codec, batch.take(left))
+                self.stamped[left[own]] = True
+                self.stamps[left[own]] = values
+
+    def stats(self, log_time: NDArray[np.int64], rows: NDArray[np.intp]) -> ChannelStats:
+        """The results of some messages as statistics; the sum of skews is exact."""
+        stamped = rows[self.stamped[rows]]
+        stamps = self.stamps[stamped]
         known = stamps[stamps != 0]
-        skew = (log_time[self.stamped] - stamps)[stamps != 0]
+        skew = (log_time[stamped] - stamps)[stamps != 0]
         found = ChannelStats(
-            unreadable=int(self.unreadable.sum()),
-            surplus=int(self.surplus.sum()),
+            unreadable=int(self.unreadable[rows].sum()),
+            surplus=int(self.surplus[rows].sum()),
             stamped=len(stamps),
             unset=len(stamps) - len(skew),
             skew_sum=(int((skew >> 32).sum()) << 32) + int((skew & 0xFFFF_FFFF).sum()),

@@ -194,7 +194,7 @@ def _differs(known: Tables, entry: RecordingEntry, found: ArraysOfTopic, *, off:
         if section.topic == topic:
             can_have = bool(file.arrays)
             found.has_arrays = found.has_arrays or can_have
-            is_other = can_have and bool(section.counts.arrays) is off
+            is_other = can_have and bool(section.arrays) is off
             differs = differs or is_other
     is_expired = any(one.id >= EXPIRED_IDS for one in entry.channels if one.topic == topic)
     return differs is not False and (off or not is_expired)

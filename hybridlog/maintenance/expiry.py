@@ -261,7 +261,7 @@ def write_rows(recording: Path, line: File, into: Path, *, version: int = 0) -> 
     The line of the log says that it is gone; the folder of its recording stays as it is. A damaged
     log, or one with what rows cannot keep, raises SegmentError.
     """
-    from hybridlog.columns.rows_writer import RowsWriter
+    from hybridlog.columns.rows_file import RowsWriter
 
     with SegmentReader(recording / line.name, line.number) as reader:
         summary = reader.summary()

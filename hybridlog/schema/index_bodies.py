@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from hybridlog.schema.column import Records, header_stamps
+from hybridlog.schema.column import Records
 from hybridlog.schema.document import bodies
 
 if TYPE_CHECKING:
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from hybridlog.schema.codec import Codec
+    from hybridlog.schema.codec import Codec, Decoded
     from hybridlog_storage.messages import Batch
 
 ARRAY_LIMIT: Final = 32
@@ -30,33 +30,29 @@ class BodyGroup(NamedTuple):
         rows: intp[k], rows of the input.
         body: uint8[k, width], BSON elements without the document's length and end.
         error: Reason why these payloads could not be read; the width is then 0.
-        stamps: int64[k], header stamps, ns; None if there are none, or if they are not at
-            hand.
     """
 
     rows: NDArray[np.intp]
     body: NDArray[np.uint8]
     error: str | None
-    stamps: NDArray[np.int64] | None = None
 
 
-def bodies_of(
-    codec: Codec, batch: Batch, surplus: NDArray[np.bool_] | None = None
-) -> Iterator[BodyGroup]:
-    """Make index bodies of messages of one channel, with or without payloads.
+def bodies_of(codec: Codec, batch: Batch) -> Iterator[BodyGroup]:
+    """Make index bodies of messages of one channel, with or without payloads."""
+    return bodies_in(codec.columns_of(batch) if codec.indexed else None, len(batch))
 
-    Each message is in exactly one group. `surplus`, bool[n], gets those with bytes left over.
+
+def bodies_in(decoded: Decoded | None, messages: int) -> Iterator[BodyGroup]:
+    """Make index bodies of so many decoded messages; None where these have no fields.
+
+    Each message is in exactly one group.
     """
-    if not codec.indexed:
-        if len(batch):
-            yield _without_fields(np.arange(len(batch)), None)
+    if decoded is None:
+        if messages:
+            yield _without_fields(np.arange(messages), None)
         return
-    decoded = codec.columns_of(batch)
-    if surplus is not None:
-        surplus[decoded.surplus] = True
-    records, stamps = decoded.records, None
+    records = decoded.records
     if isinstance(records, Records):
-        stamps = header_stamps(records)
         made = bodies(records, array_limit=ARRAY_LIMIT, max_bytes=MAX_BYTES)
     else:
         made = records.bodies(ARRAY_LIMIT, MAX_BYTES)
@@ -65,7 +61,7 @@ def bodies_of(
         if isinstance(body, str):
             yield _without_fields(rows, body)
         else:
-            yield BodyGroup(rows, body, None, None if stamps is None else stamps[own])
+            yield BodyGroup(rows, body, None)
     for bad in decoded.unreadable:
         yield _without_fields(bad.rows, bad.reason)
 

@@ -82,22 +82,21 @@ class LeftFields(Objects):
         return self._joined(self._parts)
 
     def summarised(self) -> pa.StructArray:
-        """The messages as an Arrow array in which arrays are summaries."""
-        return self._joined(self._records(None))
+        """The messages as an Arrow array; those arrays are summaries of which one is left."""
+        from hybridlog.columns.left_rows import summarised_in
+
+        return self._joined(self._records({one for p in self._parts for one in summarised_in(p)}))
 
     def _joined(self, parts: Sequence[pa.StructArray]) -> pa.StructArray:
         from hybridlog.columns.fields import joined
 
         return joined(parts).take(self._order)
 
-    def _records(self, summarised: Collection[str] | None) -> list[pa.StructArray]:
-        """The fields of each part; arrays at some paths, or all (None), are summaries."""
+    def _records(self, summarised: Collection[str]) -> list[pa.StructArray]:
+        """The fields of each part; arrays at some paths are summaries."""
         from hybridlog.columns.fields import records_of
 
-        def is_summarised(path: tuple[str, ...]) -> bool:
-            return summarised is None or ".".join(path) in summarised
-
-        return [records_of(part, is_summarised) for part in self._parts]
+        return [records_of(p, lambda path: ".".join(path) in summarised) for p in self._parts]
 
     def _narrowed(self, parts: Sequence[pa.Array[Any] | None], kind: Any) -> Any:
         """Values of each part, or None, as one array of a type."""

@@ -20,8 +20,7 @@ from hybridlog.columns.clouds import NEEDED, PointColumns, is_cloud
 from hybridlog.columns.column_file import FIRST
 from hybridlog.columns.fields import without
 from hybridlog.columns.layout import POINTS
-from hybridlog.columns.rows import Places, piece_of
-from hybridlog.columns.rows_file import RESTORE
+from hybridlog.columns.rows import piece_of
 from hybridlog.query.question import Counters, RecordedChannel
 from hybridlog.record.losses import lost_spans
 from hybridlog.schema.arrow_types import has_empty
@@ -31,6 +30,7 @@ from hybridlog.sql.columns import whole_message
 from hybridlog_storage.errors import ChangedError, StoreError
 from hybridlog_storage.lazy import lazy
 from hybridlog_storage.messages import EXPIRED_IDS
+from hybridlog_storage.segments.chunk import Placed
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -41,7 +41,6 @@ if TYPE_CHECKING:
     from hybridlog.schema.codec import Decoded
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
-    from hybridlog_storage.messages import Batch
     from hybridlog_storage.segments.chunk import StoredChunk
     from hybridlog_storage.segments.segment_reader import ChunkPlace
 
@@ -128,18 +127,12 @@ class TopicOfRecording:
             if made is not None:
                 table, covered = made
                 found += [_TableRows(self, table, part) for part in table.parts]
-        left = [chunk for chunk in chunks if chunk.segment not in covered]
-        for chunk in left:
-            if not chunk.place.is_expired:
-                span = chunk.first, chunk.last
-                there = [self.channels[i] for i in chunk.place.channels if i in self.channels]
-                for is_reduced in {one.is_reduced for one in there}:
-                    own = [one for one in there if one.is_reduced is is_reduced]
-                    found.append(_ChunkRows(self, chunk.segment, chunk.place, span, own))
-        gone = {(c.segment, c.number): c.messages for c in left if c.place.is_expired}
-        if gone:
-            fields = self.session.expired_fields(self.entry, self.topic, gone)
-            found += [_FieldRows(self, fields, part) for part in fields.parts]
+        for chunk in [one for one in chunks if one.segment not in covered]:
+            span = chunk.first, chunk.last
+            there = [self.channels[i] for i in chunk.place.channels if i in self.channels]
+            for is_reduced in {one.is_reduced for one in there}:
+                own = [one for one in there if one.is_reduced is is_reduced]
+                found.append(_ChunkRows(self, chunk.segment, chunk.place, span, own))
         return sorted(found, key=lambda one: (one.span is not None, (one.span or (0, 0))[0]))
 
     @lazy
@@ -248,13 +241,6 @@ class _TableRows:
         yield Rows(ours, records, self._part.rows)
 
 
-class _FieldRows(_TableRows):
-    """A row group of what is left of expired messages; it is never made again."""
-
-    def _damaged(self, error: StoreError) -> StoreError:
-        return StoreError(f"{error}{RESTORE}")
-
-
 class _ChunkRows:
     """The messages of a topic in a chunk; the attributes are those of `_TableRows`."""
 
@@ -297,16 +283,15 @@ class _ChunkRows:
         for channel in self._channels:
             rows = np.flatnonzero(chosen & (chunk.batch.channel == channel.channel_id))
             if len(rows):
-                batch, places = chunk.batch.take(rows), Places.of([chunk]).take(rows)
+                placed = Placed.of([chunk]).take(rows)
                 if channel.codec.indexed and not channel.is_reduced:
-                    counters.payload_bytes += batch.payload_bytes
-                yield self._rows(channel, batch, places, paths, own)
+                    counters.payload_bytes += placed.batch.payload_bytes
+                yield self._rows(channel, placed, paths, own)
 
     def _rows(
         self,
         channel: RecordedChannel,
-        batch: Batch,
-        places: Places,
+        placed: Placed,
         paths: Paths,
         own: Collection[str],
     ) -> Rows:
@@ -318,25 +303,22 @@ class _ChunkRows:
                 return decoded.records.summarised()
             records = decoded.arrow()
             if has_points:
-                points = without(PointColumns().points(records), decoded.rows, len(batch))
+                points = without(PointColumns().points(records), decoded.rows, len(placed.seq))
             return records
 
         wanted = None if paths is None else {*paths, "header.stamp"}
         if wanted is not None and has_points:
             wanted.update(NEEDED)
         piece = piece_of(
-            self._segment,
-            batch,
-            places,
-            channel.codec,
+            placed,
+            channel.codec.columns_of(placed.batch, wanted) if channel.codec.indexed else None,
             channel.state,
-            has_publish_time={channel.channel_id: channel.channel.has_publish_time},
+            has_publish_time=channel.channel.has_publish_time,
             columns=records_of,
-            fields=wanted,
         )
         columns = piece.own if points is None else {**piece.own, POINTS: points}
-        none = pa.nulls(len(batch), pa.struct([]))
-        return Rows(columns, none if piece.fields is None else piece.fields, len(batch))
+        none = pa.nulls(piece.rows, pa.struct([]))
+        return Rows(columns, none if piece.fields is None else piece.fields, piece.rows)
 
 
 RowSource: TypeAlias = _TableRows | _ChunkRows

@@ -41,7 +41,6 @@ from tests.payloads.logs import (
     cloud,
     points_of,
     ranges_of,
-    robot,
     scan,
     standard_channel,
     write_log,
@@ -212,22 +211,6 @@ def test_off_gives_the_columns_back(copy: Path) -> None:
     after = {name: one.replace_schema_metadata() for name, one in columns_of(copy).items()}
     assert before.keys() == after.keys()
     assert all(before[name].equals(after[name]) for name in before)
-
-
-def test_shared_files_cost_what_it_says(copy: Path, tmp_path: Path) -> None:
-    log = write_log(tmp_path / "other.mcap", [(f"{one[0]}2", *one[1:]) for one in robot(30)])
-    with hl.open(copy, mongo="none") as store:
-        store.record(log, name="other")
-        sizes = []
-        for off in (False, True) * 2:
-            found = store.index.arrays("scan", "scan2", "cloud", off=off)
-            for one, kind in zip(found, ("LaserScan", "LaserScan", "PointCloud2"), strict=True):
-                paths = files_of(store, kind)
-                assert one.bytes_after == sum(path.stat().st_size for path in paths)
-            sizes.append([(one.bytes_before, one.bytes_after) for one in found])
-    assert sizes[1] == sizes[3] == [one[::-1] for one in sizes[2]]
-    for before, with_, after in zip(*sizes[:3], strict=True):
-        assert with_[0] > with_[1] == after[0] <= before[0] < before[1]
 
 
 @pytest.mark.parametrize("off", [False, True])

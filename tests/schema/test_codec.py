@@ -22,7 +22,7 @@ from hybridlog.schema.codec import Codec
 from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.errors import DefinitionError, PayloadError
 from hybridlog_storage.messages import Channel, Schema
-from tests.indexed import groups_of, index_fields
+from tests.indexed import batch_of, groups_of, index_fields
 from tests.schema.test_document import assert_same_but_for_rounded_means, document_of
 
 
@@ -77,9 +77,8 @@ def test_objects_of_payloads_with_bytes_left_over(surplus: bytes) -> None:
         assert (found.s, found.n) == ("hi", 9)
     with pytest.raises(PayloadError, match="does not fit"):
         plain.decode(b"\x02\0\0\0\x07\x08\x01")
-    left = np.zeros(2, np.bool_)
-    groups_of(plain, b"\0\0\0\0\1\2", b"\0\0\0\0\1\2" + surplus, surplus=left)
-    assert left.tolist() == [False, True]
+    batch = batch_of(b"\0\0\0\0\1\2", b"\0\0\0\0\1\2" + surplus)
+    assert plain.columns_of(batch).surplus.tolist() == [1]
 
 
 def test_arrays_without_elements() -> None:

@@ -282,7 +282,7 @@ def test_skews_add_up_exactly(skews: list[int]) -> None:
     """Those of senders without a clock are beyond what floats hold one by one."""
     results = _Results(len(skews))
     results.stamps[:], results.stamped[:] = 7, True
-    found = results.stats(np.array(skews, np.int64) + 7)
+    found = results.stats(np.array(skews, np.int64) + 7, np.arange(len(skews)))
     assert (found.skew_sum, found.stamped, found.unset) == (sum(skews), len(skews), 0)
     assert (found.skew_min, found.skew_max) == (min(skews), max(skews))
 

@@ -10,11 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridlog_storage.messages import Batch, Channel
-from hybridlog_storage.mongo.index_documents import (
-    DocumentAssembler,
-    Placed,
-)
-from hybridlog_storage.segments.chunk import StoredChunk
+from hybridlog_storage.mongo.index_documents import DocumentAssembler
+from hybridlog_storage.segments.chunk import Placed, StoredChunk
 
 KEY = "fedcba9876543210"
 CHANNEL = Channel("/a topic/ä", "x", None)

@@ -41,7 +41,7 @@ def test_an_empty_message_that_is_missing_at_times(store: hl.Store, tmp_path: Pa
 
 def test_json_that_gets_fields_later(store: hl.Store, tmp_path: Path, limit: Limit) -> None:
     """A file has one type: what comes later goes to another one, and all is one table."""
-    limit(table_pending_bytes=1, table_left_bytes=0, table_arena_bytes=1)
+    limit(table_pending_bytes=1, table_left_bytes=0, group_bytes=1)
     values = [{"a": n} if n < 1000 else {"a": n, "b": str(n)} for n in range(2000)]
     record(store, tmp_path, values)
     assert len(list((store.directory.path / "tables").glob("any~*"))) == 2
@@ -52,7 +52,7 @@ def test_json_that_gets_fields_later(store: hl.Store, tmp_path: Path, limit: Lim
 def test_json_whose_types_change_has_files_and_no_answer(
     store: hl.Store, tmp_path: Path, limit: Limit
 ) -> None:
-    limit(table_pending_bytes=1, table_left_bytes=0, table_arena_bytes=1)
+    limit(table_pending_bytes=1, table_left_bytes=0, group_bytes=1)
     record(store, tmp_path, [{"a": n if n < 1000 else str(n)} for n in range(2000)])
     files = list((store.directory.path / "tables").glob("any~*/*.parquet"))
     assert sum(pq.read_metadata(path).num_rows for path in files) == 2000

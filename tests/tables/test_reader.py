@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 import hybridlog as hl
 from hybridlog.columns.column_file import ColumnFile, OpenFiles, TablePart
 from hybridlog.columns.fields import FieldShape, joined, records_of
-from hybridlog.columns.layout import Section, TopicCounts
+from hybridlog.columns.layout import Section
 from hybridlog.columns.parquet_file import ParquetFileWriter
 from hybridlog.columns.tables import Tables
 from hybridlog.columns.topic_table import TopicTable
@@ -61,11 +61,11 @@ def test_parts_are_merged(runs: list[list[tuple[int, int]]], size: int) -> None:
             writer = ParquetFileWriter(Path(folder) / f"{number}.parquet", table.schema)
             for begin in range(0, len(own), size):
                 writer.write(table.slice(begin, size))
-            writer.close([Section("r", "t", 0, {}, TopicCounts(len(own)))])
+            writer.close([Section("r", "t", 0, {}, len(own))])
             parts += ColumnFile(writer.path).parts(0, len(own))
         if not parts:
             return
-        table_of = TopicTable("t", parts, TopicCounts(len(seen)), OpenFiles(Cache()))
+        table_of = TopicTable(parts, OpenFiles(Cache()))
         for spans in (None, [(2, 4), (7, 8)]):
             want = [
                 k for k in sorted(seen) if spans is None or any(a <= k[0] < b for a, b in spans)
@@ -134,17 +134,6 @@ def test_a_segment_more_or_less_is_noticed(recorded: hl.Store, tables: Tables) -
     entry.channels[0].stats.messages += 1
     tables.look_again()
     assert tables.of(entry, entry.channels[0].topic) is None
-
-
-def test_memory_of_columns_is_bounded(recorded: hl.Store) -> None:
-    (entry,) = recorded.recordings()
-    cache = Cache(30_000)
-    tables = Tables(recorded.directory.path, cache)
-    table = tables.of(entry, "/large")
-    assert table is not None
-    for name in ("i8", "f64", "t", "nine", "covariance", "many"):
-        list(table.scan([name]))
-        assert 0 < cache._size <= 30_000
 
 
 def test_files_are_closed_when_they_are_forgotten(recorded: hl.Store) -> None:

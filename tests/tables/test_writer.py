@@ -8,7 +8,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pytest
 
@@ -18,7 +17,7 @@ from hybridlog.columns.layout import OWN_COLUMNS, TABLES, parts_folder
 from hybridlog.columns.table_writer import TableWriter
 from hybridlog.columns.tables import Tables
 from hybridlog.columns.topic_table import TableRows
-from hybridlog.maintenance import tables as making
+from hybridlog.index.indexing import ChunkIndexer
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.messages import Schema
 from hybridlog_storage.segments.segment_reader import SegmentReader
@@ -107,8 +106,8 @@ def test_tables_are_what_the_messages_say(
     pending: int,
 ) -> None:
     limit(
-        table_arena_bytes=arena,
-        table_collected_rows=rows,
+        group_bytes=arena,
+        group_rows=rows,
         table_pending_bytes=pending,
         table_left_bytes=pending // 4,
     )
@@ -161,19 +160,6 @@ def test_few_rows_a_segment_wait_for_more(store: hl.Store, tmp_path: Path, limit
     assert compare(store) == 12_000
 
 
-def test_a_topic_with_files_shares_one_for_its_last_rows(
-    store: hl.Store, tmp_path: Path, limit: Limit
-) -> None:
-    limit(long_table_rows=1000)
-    said = [(BASE + n, "/a" if n < 1100 else "/b", varied(n)) for n in range(3000)]
-    said += [(BASE + 3000 + n, "/a", varied(n)) for n in range(5)]
-    write_log(tmp_path / "log.mcap", said)
-    settings = SegmentSettings(chunk_size=4096, segment_size=1 << 17)
-    store.record(tmp_path / "log.mcap", name="log", settings=settings)
-    assert compare(store) == 3005
-    assert len(table_of(store).files) == 2
-
-
 @pytest.mark.parametrize("count", [40, 1200])
 def test_unreadable_messages_say_why(store: hl.Store, tmp_path: Path, count: int) -> None:
     said = [(BASE + n, "/a", varied(n)[:-1] if n % 3 == 1 else varied(n)) for n in range(count)]
@@ -216,23 +202,22 @@ def close(writer: TableWriter, entry: RecordingEntry) -> None:
 
 def waiting(writer: TableWriter) -> int:
     """Rows in memory."""
-    pieces = (piece.rows for topic in writer._topics.values() for piece in topic.pieces)
-    return sum(len(chunk.batch) for chunk in writer._held) + sum(pieces)
+    return sum(piece.rows for topic in writer._topics.values() for piece in topic.pieces)
 
 
 def test_memory_does_not_grow_with_the_recording(
     store: hl.Store, tmp_path: Path, limit: Limit
 ) -> None:
-    limit(table_pending_bytes=200_000, table_left_bytes=50_000, table_arena_bytes=20_000)
+    limit(table_pending_bytes=200_000, table_left_bytes=50_000)
     most = []
     for count in (2000, 8000):
         said = [(BASE + n, f"/{n % 3}", payload(n)) for n in range(count)]
         path = write_log(tmp_path / f"{count}.mcap", said)
         entry = store.record(path, name=str(count), settings=SMALL_CHUNKS).entry
         writer = TableWriter(store.directory.path, entry.id, entry.name, topics_of(entry))
-        held = []
+        held, indexer = [], ChunkIndexer(entry.id)
         for chunk, channels in chunks_of(store, entry):
-            writer.add(chunk, channels)
+            writer.add(indexer.messages_in([chunk], channels))
             held.append(waiting(writer))
         close(writer, entry)
         most.append(max(held))
@@ -240,35 +225,6 @@ def test_memory_does_not_grow_with_the_recording(
     assert most[0] < 1000
     assert most[1] <= most[0] + 50
     assert compare(store) == 10_000
-
-
-def test_chunks_that_come_late_are_put_in_their_place(
-    store: hl.Store, tmp_path: Path, limit: Limit
-) -> None:
-    limit(table_pending_bytes=100_000, table_left_bytes=20_000, table_arena_bytes=20_000)
-    said = [(BASE + n, "/a" if n % 9 else "/b", varied(n)) for n in range(4000)]
-    write_log(tmp_path / "log.mcap", said)
-    settings = SegmentSettings(chunk_size=4096, segment_size=1 << 17)
-    entry = store.record(tmp_path / "log.mcap", name="log", settings=settings).entry
-    assert entry.segments > 1
-    chunks = chunks_of(store, entry)
-    making.remove(store.directory, entry.id)
-    writer = TableWriter(store.directory.path, entry.id, entry.name)
-    late = chunks[3::5]
-    for chunk, channels in [c for c in chunks if not any(c is other for other in late)]:
-        writer.add(chunk, channels)
-    for chunk, channels in late:
-        writer.add(chunk, channels)
-    close(writer, entry)
-    assert compare(store) == 4000
-    table = table_of(store)
-    parts = table.parts  # they are merged when they are read
-    assert any(one.last > other.first for one, other in itertools.pairwise(parts))
-    bounds = [BASE + 100, BASE + 350, BASE + 2000]
-    spans = [(bounds[0], bounds[1]), (bounds[2], bounds[2] + 1)]
-    found = np.concatenate([block.t for block in table.scan(spans=spans)])
-    want = [t for t, topic, _ in said if topic == "/a" and any(a <= t < b for a, b in spans)]
-    assert found.tolist() == want
 
 
 def test_the_last_room_is_the_segments_alone(store: hl.Store, tmp_path: Path, limit: Limit) -> None:
@@ -293,7 +249,7 @@ def test_whatever_fails_the_recording_goes_on(
     error: Exception,
 ) -> None:
     if place == "add":
-        calls.fail(TableWriter, "_collect", error)
+        calls.fail(TableWriter, "_spill", error)
     elif place == "publish":
         calls.fail(TableFolders, "_change", error)
     else:
@@ -312,7 +268,7 @@ def test_whatever_fails_the_recording_goes_on(
 def test_too_many_topics_for_the_files_of_a_process(
     store: hl.Store, tmp_path: Path, limit: Limit
 ) -> None:
-    limit(table_pending_bytes=1, table_left_bytes=0, table_open_files=3, table_arena_bytes=1)
+    limit(table_pending_bytes=1, table_left_bytes=0, table_open_files=3, group_bytes=1)
     said = [(BASE + n, f"/{n % 10}", varied(n)) for n in range(200)]
     write_log(tmp_path / "log.mcap", said)
     entry = store.record(tmp_path / "log.mcap", name="log", settings=SMALL_CHUNKS).entry

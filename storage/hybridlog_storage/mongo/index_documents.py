@@ -9,19 +9,15 @@ from __future__ import annotations
 
 import struct
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Final, NamedTuple, Self
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from hybridlog_storage.disk.copying import joined
-
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from numpy.typing import NDArray
 
-    from hybridlog_storage.messages import Batch, Channel
-    from hybridlog_storage.segments.chunk import StoredChunk
+    from hybridlog_storage.messages import Channel
+    from hybridlog_storage.segments.chunk import Placed
 
 KEY_BYTES: Final = 24
 _HEAD_WIDTH: Final = 4 + 1 + 4 + 4 + 1 + KEY_BYTES
@@ -41,42 +37,6 @@ def between(begin: int | None = None, end: int | None = None) -> dict[str, objec
         return {}
     until = {} if end is None else {"$lt": key_bound(end)}
     return {"_id": {"$gte": key_bound(begin or 0), **until}}
-
-
-class Placed(NamedTuple):
-    """The messages of some chunks, and their positions.
-
-    Attributes:
-        batch: n messages, grouped by chunk; its offsets refer to its buffer.
-        seq: int64[n], arrival numbers.
-        number: intp[n], index of the chunk of each message.
-        segment: int32[n], segment of that chunk.
-        chunk: int64[n], number of the chunk in the segment.
-        offset: int64[n], position of the payload in the chunk's content.
-        length: int64[n], its bytes.
-    """
-
-    batch: Batch
-    seq: NDArray[np.int64]
-    number: NDArray[np.intp]
-    segment: NDArray[np.int32]
-    chunk: NDArray[np.int64]
-    offset: NDArray[np.int64]
-    length: NDArray[np.int64]
-
-    @classmethod
-    def of(cls, chunks: Sequence[StoredChunk]) -> Self:
-        """All messages of one or more chunks; the contents of several are copied together."""
-        batches = [chunk.batch for chunk in chunks]
-        number = np.arange(len(chunks)).repeat([len(batch) for batch in batches])
-        return cls(
-            joined(batches),
-            np.concatenate([chunk.seq for chunk in chunks]),
-            number,
-            np.array([chunk.segment for chunk in chunks], np.int32)[number],
-            np.array([chunk.number for chunk in chunks], np.int64)[number],
-            *map(np.concatenate, zip(*(batch.places for batch in batches), strict=True)),
-        )
 
 
 class DocumentAssembler:

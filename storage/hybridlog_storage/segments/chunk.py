@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
 
 from hybridlog_storage.checksum import crc32
+from hybridlog_storage.disk.copying import joined
 from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD
 from hybridlog_storage.segments.chunk_table import parts_of
 from hybridlog_storage.segments.segment_format import (
@@ -16,7 +19,8 @@ from hybridlog_storage.segments.segment_format import (
 )
 
 if TYPE_CHECKING:
-    import numpy as np
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from hybridlog_storage.messages import Batch, Buffer
@@ -96,3 +100,40 @@ class StoredChunk:
     trailer: int
     batch: Batch
     seq: NDArray[np.int64]
+
+
+class Placed(NamedTuple):
+    """The messages of some chunks, and their positions.
+
+    Attributes:
+        batch: n messages, grouped by chunk; its offsets refer to its buffer.
+        seq: int64[n], arrival numbers.
+        segment: int32[n], segment of the chunk of each message.
+        chunk: int64[n], number of the chunk in the segment.
+        offset: int64[n], position of the payload in the chunk's content.
+        length: int64[n], its bytes.
+    """
+
+    batch: Batch
+    seq: NDArray[np.int64]
+    segment: NDArray[np.int32]
+    chunk: NDArray[np.int64]
+    offset: NDArray[np.int64]
+    length: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, chunks: Sequence[StoredChunk]) -> Placed:
+        """All messages of one or more chunks; the contents of several are copied together."""
+        batches = [chunk.batch for chunk in chunks]
+        number = np.arange(len(chunks)).repeat([len(batch) for batch in batches])
+        return cls(
+            joined(batches),
+            np.concatenate([chunk.seq for chunk in chunks]),
+            np.array([chunk.segment for chunk in chunks], np.int32)[number],
+            np.array([chunk.number for chunk in chunks], np.int64)[number],
+            *map(np.concatenate, zip(*(batch.places for batch in batches), strict=True)),
+        )
+
+    def take(self, rows: NDArray[np.intp]) -> Placed:
+        """The selected messages."""
+        return Placed._make((self.batch.take(rows), *(column[rows] for column in self[1:])))
