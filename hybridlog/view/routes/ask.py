@@ -20,7 +20,7 @@ from hybridlog_storage.times import END
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from hybridlog.sql.plan import Reading
+    from hybridlog.sql.rows import Reading
     from hybridlog.view.context import RequestParams
     from hybridlog.view.question import PageQuestion
 
