@@ -246,8 +246,8 @@ class TopicOfRecording:
         offsets: NDArray[np.int64] | None = None,
     ) -> Iterator[Rows]:
         """The messages in a chunk, by segment and number; of those at some offsets."""
-        segment, place = key[0], self._places[key]
-        chunk = self.session.chunk(self.entry, segment, place, counters.add_chunk)
+        place = self._places[key]
+        chunk = self.session.chunk(self.entry, key[0], place, counters.add_chunk)
         chosen = np.ones(len(chunk.batch), np.bool_)
         if offsets is not None:
             chosen = np.isin(chunk.batch.places[0], offsets)
