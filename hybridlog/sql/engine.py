@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import threading
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 from difflib import get_close_matches
@@ -161,20 +161,6 @@ class SqlConnection:
         """Names of all views and tables of the store."""
         return list(self.content.names)
 
-    def check(self, text: str) -> None:
-        """Check that the answer of a query lacks nothing, by the views that it may read."""
-        content = self.content
-        named = (content.names.topic(name) for name in content.names.named(text))
-        topics = {topic for topic in named if topic is not None}
-        self.completeness(content, topics, content.having(topics)).check()
-
-    def completeness(
-        self, content: StoreContent, topics: Collection[str], recordings: Collection[str]
-    ) -> Completeness:
-        """Completeness of the answer of a query."""
-        asked = replace(self.scope, topics=tuple(topics), recordings=tuple(recordings))
-        return completeness_of(content.session, asked)
-
     def schema(self, view: str) -> pa.Schema:
         """Columns of a view or table of the store; none without such a view."""
         content = self.content
@@ -306,8 +292,13 @@ class SqlAnswer:
             unread = [views[other] for other in others if other not in found.topics]
             if unread:
                 lines.append(f"{topic} was asked, not the view {listed(unread, 5)}.")
-        lacks = self._connection.completeness(content, found.topics, found.recordings)
-        return [*lines, *lacks.sentences]
+        return [*lines, *self.completeness().sentences]
+
+    def completeness(self) -> Completeness:
+        """Completeness of the computed answer, by what was read for it."""
+        topics, recordings = tuple(self.reading.topics), tuple(self.reading.recordings)
+        asked = replace(self._connection.scope, topics=topics, recordings=recordings)
+        return completeness_of(self._connection.content.session, asked)
 
     def run(self) -> None:
         """Compute a statement that changes something, once."""

@@ -108,7 +108,7 @@ def completion(context: Context, params: RequestParams) -> dict[str, Any]:
 
 def sql_completion(context: Context, text: str, place: int) -> dict[str, Any]:
     """Candidates for completing SQL, worked out in the process for SQL."""
-    from hybridlog.sql.completion import candidates, word_before
+    from hybridlog.sql.names import candidates, word_before
 
     word = word_before(text[:place])
     with closing(context.store.sql_engine.connect(SQL_MEMORY, only_reads=True)) as connection:
