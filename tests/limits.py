@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 PLACES = {
-    "align_piece_bytes": "hybridlog.across.align._PIECE_BYTES",
+    "align_piece_bytes": "hybridlog.across.topic_reader._PIECE_BYTES",
     "printed_rows_at_once": "hybridlog.cli.render.ROWS_AT_ONCE",
     "column_file_open_files": "hybridlog.columns.column_file._OPEN_FILES",
     "shared_file_recordings": "hybridlog.columns.folders.MAX_SHARED_RECORDINGS",

@@ -1,6 +1,6 @@
-"""Aggregates of a topic's messages in bins of equal length: count, first, last, min, max, mean.
+"""Regular times as rows, and aggregates of a topic's messages from each to the next.
 
-The bins begin at regular times, which are rows of an alignment too.
+The aggregates are count, first, last, min, max, mean.
 """
 
 from __future__ import annotations
@@ -8,13 +8,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import chain
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import pyarrow as pa
 
-from hybridlog.across.topic_reader import TIME, Block, TopicReader, concatenated
+from hybridlog.across.match import Matched
+from hybridlog.across.topic_reader import TIME, Beside, Block, TopicReader, nanoseconds
 from hybridlog.frames.names import free_name, is_summary
 from hybridlog.query.predicate.types import FieldTypes
 from hybridlog.query.ranges import RangeResolver
@@ -40,61 +40,74 @@ MAX_TIMES = 100_000_000
 _GRID_ROWS = 65_536
 
 
-class Bins:
+class Bins(Beside):
     """A topic beside regular times: gives what its messages say until the next time."""
 
-    def __init__(self, reader: TopicReader, grid: RegularTimes, how: str) -> None:
-        self._reader = reader
+    def __init__(self, reader: TopicReader, how: str, grid: RegularTimes) -> None:
+        super().__init__(reader, how)
         self._grid = grid
-        self._how = how
-        self._none = self._reader.empty() if how != _COUNT else pa.table({})
-        self._blocks: Iterator[Block] = iter(())
 
-    def enter(self, recording: str, _end: int | None) -> None:
-        """Go on with the messages of another recording."""
-        self._recording, self._blocks = recording, self._reader.tables(recording)
-        if self._how == _COUNT:
-            self._blocks = ((times, pa.table({})) for times, _ in self._reader.times(recording))
+    def match(self, times: NDArray[np.int64]) -> Matched:
+        """The first or last message from each time to the next, with the number of all."""
+        edges = np.append(times, self._grid.end(self._recording, int(times[-1])))
+        places = np.searchsorted(placed(self._moments.time), edges)
+        counts = np.diff(places)
+        chosen = places[1:] - 1 if self._how == "last" else places[:-1]
+        chosen = np.where(counts > 0, chosen, -1)
+        return Matched(chosen, chosen, counts)
 
-    def decided(self, times: NDArray[np.int64]) -> int:
-        """Number of times that are decided: all of them."""
-        return len(times)
-
-    def row_bytes(self) -> int:
-        """Rows have a size of their own."""
-        return 0
+    def fitting(self, matched: Matched, begin: int) -> int:
+        """The number of rows from one on that are made together."""
+        is_of_one = self._how in {"first", "last"}
+        return super().fitting(matched, begin) if is_of_one else len(matched.before) - begin
 
     def add(
-        self, columns: dict[str, Any], times: NDArray[np.int64], _empty: Counter[tuple[str, str]]
+        self,
+        columns: dict[str, Any],
+        times: NDArray[np.int64],
+        matched: Matched,
+        empty: Counter[tuple[str, str]],
     ) -> None:
-        """Add the number of messages, and their fields, from each time to the next.
+        """Add the number of messages, and their fields, from each time, ns, to the next."""
+        columns[free_name(self._reader.prefix + _COUNT, columns)] = pa.array(matched.distance)
+        if self._how == _COUNT:
+            self._reader.counters.messages += int(matched.distance.sum())
+            return
+        if self._how in _OF_NUMBERS:
+            table = self._aggregates(times)
+        else:
+            (table,) = self._read(matched.before)
+        self._reader.add(columns, table, Counter(), len(times))
 
-        The times are ns, of the grid, and not before those of the last call.
-        """
-        made = _Rows(self._how, len(times))
-        made.add(self._none, np.empty(0, np.int64))
+    def _aggregates(self, times: NDArray[np.int64]) -> pa.Table:
+        """The aggregate of each column of numbers, from each time, ns, to the next."""
+        found: dict[str, _Column] = {}
+        others: set[str] = set()  # columns with values that are no numbers
+        for table in self._tables(times):
+            row = (placed(nanoseconds(table[TIME])) - times[:1]) // self._grid.step
+            for name, column in zip(table.column_names, table.columns, strict=True):
+                numeric = _values_of(column, self._how)
+                if numeric is not None:
+                    values, is_value = numeric
+                    own = found.setdefault(name, _Column(self._how, len(times)))
+                    own.add(column.type, values, row[is_value])
+                elif not pa.types.is_null(column.type):
+                    others.add(name)
+        for field in self._reader.question.fields or ():
+            some, numeric_ones = (
+                any(name == field or name.startswith(f"{field}.") for name in names)
+                for names in (others, found)
+            )
+            if some and not numeric_ones:
+                raise _no_number(field, self._reader.question.topics[0])
+        return pa.table({name: column.array() for name, column in found.items()})
+
+    def _tables(self, times: NDArray[np.int64]) -> Iterator[pa.Table]:
+        """No rows, then the messages from the first of some times, ns, to the end of the last."""
+        yield self._reader.empty
         if len(times):
             end = self._grid.end(self._recording, int(times[-1]))
-            for known, table in self._until(end):
-                row = (known - times[0]) // self._grid.step
-                begin = int(np.searchsorted(row, 0))
-                made.add(table.slice(begin), row[begin:])
-        for field in self._reader.question.fields or ():
-            if made.has_no_number(field):
-                raise _no_number(field, self._reader.question.topics[0])
-        name = free_name(self._reader.prefix + _COUNT, columns)
-        columns[name] = pa.array(made.messages)
-        self._reader.add(columns, made.table(), Counter(), len(times))
-
-    def _until(self, end: int) -> Iterator[Block]:
-        """The messages before a time that were not given yet."""
-        for whole, table in self._blocks:
-            times = placed(whole)
-            cut = int(np.searchsorted(times, end))
-            yield times[:cut], table.slice(0, cut)
-            if cut < len(times):
-                self._blocks = chain([(times[cut:], table.slice(cut))], self._blocks)
-                return
+            yield from self._reader.values(self._recording, (int(times[0]), end))
 
 
 def with_numbers(session: Session, question: Question, how: str) -> Question:
@@ -130,57 +143,6 @@ def _no_number(field: str, topic: str) -> UsageError:
     )
 
 
-class _Rows:
-    """The columns of some bins; `messages` counts those in each."""
-
-    def __init__(self, how: str, size: int) -> None:
-        self._how = how
-        self.messages = np.zeros(size, np.int64)
-        self._others: set[str] = set()  # columns with values that are no numbers
-        self._columns: dict[str, _Column] = {}
-        self._whole: list[pa.Table] = []  # the first or last messages of bins
-        self._place = np.full(size, -1, np.int64)  # row of that of each bin
-        self._given = 0
-
-    def add(self, table: pa.Table, row: NDArray[np.int64]) -> None:
-        """Add messages, not before those that were added; `row` is the bin of each, ascending."""
-        begins = run_starts(row)
-        bins, counts = row[begins], np.diff(np.append(begins, len(row)))
-        if self._how in _OF_NUMBERS:
-            for name, column in zip(table.column_names, table.columns, strict=True):
-                found = _values_of(column, self._how)
-                if found is not None:
-                    if name not in self._columns:
-                        self._columns[name] = _Column(self._how, len(self.messages))
-                    values, is_value = found
-                    self._columns[name].add(column.type, values, row[is_value])
-                elif not pa.types.is_null(column.type):
-                    self._others.add(name)
-        elif self._how != _COUNT:
-            chosen = begins if self._how == "first" else begins + counts - 1
-            is_new = (self.messages[bins] == 0) | (self._how == "last")
-            chosen = chosen[is_new]
-            self._place[bins[is_new]] = self._given + np.arange(len(chosen))
-            self._whole.append(table.take(pa.array(chosen)))
-            self._given += len(chosen)
-        self.messages[bins] += counts
-
-    def has_no_number(self, field: str) -> bool:
-        """True if a field has values, and none of them is a single number."""
-        others, numeric = (
-            any(name == field or name.startswith(f"{field}.") for name in names)
-            for names in (self._others, self._columns)
-        )
-        return others and not numeric
-
-    def table(self) -> pa.Table:
-        """The columns."""
-        if self._whole:
-            missing = self._place < 0
-            return concatenated(self._whole).take(pa.array(self._place, mask=missing))
-        return pa.table({name: column.array() for name, column in self._columns.items()})
-
-
 class _Column:
     """The aggregate of one column by bin."""
 
@@ -193,7 +155,7 @@ class _Column:
         self._kinds: set[pa.DataType] = set()
 
     def add(self, kind: pa.DataType, values: NDArray[Any], row: NDArray[np.int64]) -> None:
-        """Add values of an Arrow type in the bin of each."""
+        """Add values of an Arrow type in the bin of each, ascending."""
         begins = run_starts(row)
         bins = row[begins]
         if self._how != "mean":
@@ -242,6 +204,8 @@ class RegularTimes:
     The recordings and the range of the question count; the step is in ns, not zero.
     """
 
+    empty: Final = pa.table({TIME: numbers(np.empty(0, np.int64), "time")})
+
     def __init__(self, session: Session, question: Question, step: int) -> None:
         if step == 0:
             raise UsageError("A step of 0 gives no times: name a duration, such as 100ms.")
@@ -260,11 +224,7 @@ class RegularTimes:
         spans = self._spans[recording]
         return min(time + self.step, next(end for begin, end in spans if begin <= time < end))
 
-    def empty(self) -> pa.Table:
-        """No rows."""
-        return pa.table({TIME: numbers(np.empty(0, np.int64), "time")})
-
-    def tables(self, recording: str) -> Iterator[tuple[NDArray[np.int64], pa.Table]]:
+    def rows(self, recording: str) -> Iterator[Block]:
         """The times in a recording."""
         for begin, end in self._spans.get(recording, []):
             for first in range(begin, end, _GRID_ROWS * self.step):

@@ -13,7 +13,7 @@ nothing says in a definition that it wraps.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -30,8 +30,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-How = Literal["asof", "nearest", "interpolate"]
-HOWS: tuple[How, ...] = ("asof", "nearest", "interpolate")
+HOWS: Final = ("asof", "nearest", "interpolate")
 UNKNOWN = BEGIN
 """The time of a message that has none on a clock: it matches nothing."""
 
@@ -59,7 +58,7 @@ class Matched(NamedTuple):
 def match(
     times: NDArray[np.int64],
     rows: NDArray[np.int64],
-    how: How,
+    how: str,
     tolerance: int | None,
     apart: int | None = None,
 ) -> Matched:

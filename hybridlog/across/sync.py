@@ -8,14 +8,13 @@ from __future__ import annotations
 import os
 from array import array
 from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
-from functools import partial
-from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, overload
+from typing import TYPE_CHECKING, Any, TypeAlias, overload
 
 import numpy as np
 
-from hybridlog.across.match import UNKNOWN
-from hybridlog.across.topic_reader import TopicReader
+from hybridlog.across.topic_reader import SIDES, TopicReader
 from hybridlog.message import messages_in
 from hybridlog.query.answers.current import message_at
 from hybridlog.query.answers.lost import completeness_of
@@ -23,7 +22,6 @@ from hybridlog.query.answers.video import picture_of
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.planner import Planner
 from hybridlog.query.question import Counters
-from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import DurationLike, parse_duration
 from hybridlog.wording import counted
 from hybridlog_storage.errors import StoreError, TimeError, UsageError
@@ -37,7 +35,6 @@ if TYPE_CHECKING:
     from hybridlog.session import Session
 
 
-_SIDES: Final[tuple[Literal["left", "right"], ...]] = ("left", "right")
 _Times: TypeAlias = "NDArray[np.int64]"
 """int64[4, n] of messages: time on the clock, ns; log time, ns; place among the messages of that
 log time that the question finds; 1 if the topic has no other message of that log time."""
@@ -77,40 +74,38 @@ class Synced(Sequence[tuple["Message", ...]]):
         self._sessions: dict[int, Session] = {os.getpid(): session}  # by process
         self.topics = tuple(question.topics[0] for question in questions)
         limit = None if tolerance is None else parse_duration(tolerance)
-        snapshot = session.look()
-        shared = [set(session.chosen(question).tolist()) for question in questions]
+        chosen = [set(session.chosen(question).tolist()) for question in questions]
+        places = set.intersection(*chosen)
+        readers = [TopicReader(session, question, clock) for question in questions]
         ids: list[str] = []
         # By topic int64[4, n] of each recording, as of `_Times`.
         found = [[np.empty((4, 0), np.int64)] for _ in questions]
-        self._restarts: dict[str, None] = {}
-        known = np.zeros((2, len(questions)), np.int64)  # messages, those with a time
-        places = sorted(set.intersection(*shared))
-        in_range = set.union(*map(partial(_in_range, session), questions))
-        for place in sorted(in_range.intersection(places)):
-            recording = snapshot.summaries[place].id
-            readers = [
-                TopicReader(session, replace(q, recordings=(recording,), fields=()), clock)
-                for q in questions
-            ]
+        timed = np.zeros(len(questions), np.int64)  # messages with a time
+        for place in sorted(places):
+            recording = session.snapshot().summaries[place].id
+            read = [reader.moments(recording) for reader in readers]
+            timed += [len(one.time) for one in read]
+            if not all(len(one.time) for one in read):
+                continue
             epochs = readers[0].epochs(recording)
-            self._restarts |= dict.fromkeys(readers[0].remarks)
-            read = [_times_of(one, recording, self.counters) for one in readers]
             near = min((one for one in (limit, epochs.apart) if one is not None), default=None)
-            rows = approximate_sets([time[order] for _, time, order in read], near)
+            rows = approximate_sets([one.time for one in read], near)
             ids += [recording] * len(rows)
-            for n, (log_time, time, order) in enumerate(read):
-                place_of = order[rows[:, n]]
-                log = log_time[place_of]
-                first, behind = (np.searchsorted(log_time, log, side) for side in _SIDES)
+            for n, one in enumerate(read):
+                message = one.place[rows[:, n]]
+                log = one.log_time[message]
+                first, behind = (np.searchsorted(one.log_time, log, side) for side in SIDES)
                 is_whole = questions[n].is_unbounded and questions[n].predicate is None
+                own = one.time[rows[:, n]] - epochs.offsets(log)
                 is_alone = (behind - first == 1) & is_whole
-                own = time[place_of] - epochs.offsets(log)
-                found[n].append(np.stack([own, log, place_of - first, is_alone]))
-            known += [[len(log) for log, _, _ in read], [len(order) for _, _, order in read]]
+                found[n].append(np.stack([own, log, message - first, is_alone]))
+        for reader in readers:
+            self.counters.add(reader.counters)
+        self._restarts = readers[0].remarks
         self.recordings = tuple(ids)
         left_out = [
-            _left_out(session, question, counts, places, len(ids))
-            for question, counts in zip(questions, known.T.tolist(), strict=True)
+            _left_out(session, question, own - places, number, len(ids))
+            for question, own, number in zip(questions, chosen, timed.tolist(), strict=True)
         ]
         self.left_out = tuple(messages for messages, _ in left_out)
         self._why_left_out = [why for _, why in left_out if why]
@@ -172,15 +167,14 @@ class Synced(Sequence[tuple["Message", ...]]):
     ) -> Message:
         _, time, number, is_alone = map(int, times[:, row])
         question = replace(question, recordings=(recording,))
-        if is_alone:
-            plain = replace(question, bounds=None, during=None, predicate=None, clock="log")
-            found = message_at(session, plain, self.counters, time)
+        if is_alone:  # as those of most sets are, and ten times faster
+            found = message_at(session, replace(question, clock="log"), self.counters, time)
             if found is not None and found.log_time_ns == time:
                 return found
         span = Intervals.of([(recording, np.array([[*span_of(time, time), 1]], np.int64))])
-        counters = Counters()
-        runs = Planner(session, replace(question, during=span), counters).runs()
+        own, counters = replace(question, during=span), Counters()
         picture = picture_of(session)
+        runs = Planner(session, own, counters).runs()
         messages = [message for run in runs for message in messages_in(run, picture)]
         self.counters.add(counters)
         if number >= len(messages):
@@ -191,59 +185,31 @@ class Synced(Sequence[tuple["Message", ...]]):
         return messages[number]
 
 
-def _in_range(session: Session, question: Question) -> set[int]:
-    """Places of the recordings that a question's range touches."""
-    places = session.snapshot().by_id
-    try:
-        return {places[one.summary.id] for one in RangeResolver(session, question).resolve()}
-    except TimeError:
-        return set()
-
-
-def _times_of(
-    reader: TopicReader, recording: str, counters: Counters
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Log times of a recording's messages, times on the clock, and the order by these."""
-    read = [(np.empty(0, np.int64), np.empty(0, np.int64)), *reader.times(recording)]
-    counters.add(reader.counters)
-    log_time, time = (np.concatenate(parts) for parts in zip(*read, strict=True))
-    order = np.argsort(time, kind="stable")
-    return log_time, time, order[time[order] != UNKNOWN]
-
-
 def _left_out(
-    session: Session,
-    question: Question,
-    read: Sequence[int],
-    places: Collection[int],
-    sets: int,
+    session: Session, question: Question, apart: Collection[int], timed: int, sets: int
 ) -> tuple[int, str]:
     """The number of messages of a topic that are in no set, and a sentence about them.
 
-    `read` are the messages in the recordings with all topics, at `places`, and those of them
-    with a time on the clock.
+    Recordings at places `apart` lack another topic; in the others, so many messages are `timed`.
     """
     summaries = session.snapshot().summaries
 
-    def count(chosen: Collection[int]) -> int:
-        own = replace(question, recordings=tuple(summaries[place].id for place in chosen))
-        try:
-            return Planner(session, own).count() if chosen else 0
-        except TimeError:
-            return 0  # the range does not touch them
+    def count(question: Question) -> int:
+        with suppress(TimeError):  # the range does not touch the recordings
+            return Planner(session, question).count()
+        return 0
 
-    found, timed = read
-    if question.predicate is None:
-        found = count(places)  # with those that are unreadable
-    apart = count({*session.chosen(question).tolist()} - {*places})
-    left_out, topic = found + apart - sets, question.topics[0]
+    beside = tuple(summaries[place].id for place in apart)
+    total = count(question)
+    away = count(replace(question, recordings=beside)) if beside else 0
+    left_out = total - sets
     if not left_out:
         return 0, ""
     are = "is" if left_out == 1 else "are"
-    text = f"{left_out} of {counted(found + apart, 'message')} of {topic} {are} in no set"
-    why = [f"{apart} in recordings without another of the topics"] if apart else []
-    if found > timed:
-        why.append(f"{found - timed} without a time on the clock")
+    text = f"{left_out} of {counted(total, 'message')} of {question.topics[0]} {are} in no set"
+    why = [f"{away} in recordings without another of the topics"] if away else []
+    if total - away > timed:
+        why.append(f"{total - away - timed} without a time on the clock")
     return left_out, f"{': '.join([text, ', '.join(why)] if why else [text])}."
 
 

@@ -64,7 +64,7 @@ class _Prompt(InteractiveConsole):
         if state == 0:
             import readline
 
-            from hybridlog.sql.completion import candidates
+            from hybridlog.sql.names import candidates
 
             self._found = []
             with suppress(HybridlogError):
@@ -98,7 +98,7 @@ def _line_editing(prompt: _Prompt) -> Iterator[None]:
         yield
         return
     from hybridlog.index.consent import state_directory
-    from hybridlog.sql.completion import DELIMITERS
+    from hybridlog.sql.names import DELIMITERS
 
     path: Path | None = None
     with suppress(HybridlogError, OSError):

@@ -8,12 +8,13 @@ Durations are nanoseconds. Fields without a common exact type are JSON text.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from hybridlog.columns.fields import LIMIT
 from hybridlog.columns.layout import OWN_COLUMNS, column_names
@@ -50,8 +51,8 @@ OWN: Final = pa.schema(
 """Columns of every view in addition to the fields."""
 _RESERVED: Final = frozenset({*OWN_COLUMNS, *OWN.names})
 _types = pa.types
-Fields = Callable[["ViewColumn"], Any]
-"""Finds the values of a field that is no struct; None where the messages lack it."""
+Key = tuple[tuple[str, ...], bool]
+"""Of a column that is no struct: the path of its field, and whether it is a summary."""
 
 
 class UnfitValueError(Exception):
@@ -87,18 +88,44 @@ class ViewColumn:
         for column in self.inner:
             yield from column.leaves(path)
 
-    def values(self, fields: Fields, rows: int, missing: Callable[[tuple[str, ...]], Any]) -> Any:
-        """Its values, from those of the fields that are no structs, in their SQL types.
+    @property
+    def key(self) -> Key:
+        """Tells it from the others of a view."""
+        return self.source, self.is_summary
 
-        `missing` returns the mask of messages without the struct at a path, or None.
+    @property
+    def is_array(self) -> bool:
+        """True for an array that tables may hold as a summary."""
+        return not (self.is_summary or self.is_points) and _may_be_summary(self.kind)
+
+    def values(self, records: Any, summaries: Any, known: Collection[Key], rows: int) -> Any:
+        """Its values in their SQL types, from messages, and these with summaries of arrays.
+
+        They are null but for the `known` fields, and where the messages lack them.
         """
-        if not self.inner:
-            found = fields(self)
-            return pa.nulls(rows, self.type) if found is None else found
-        children = [column.values(fields, rows, missing) for column in self.inner]
-        return pa.StructArray.from_arrays(
-            children, fields=list(self.type), mask=missing(self.source)
-        )
+        here = _field(records, self.source[-1])
+        if self.inner:
+            beside = _field(summaries, self.source[-1])
+            children = [one.values(here, beside, known, rows) for one in self.inner]
+            missing = None if here is not None else pa.array(np.ones(rows, np.bool_))
+            if here is not None and here.null_count:
+                missing = here.is_null()
+            return pa.StructArray.from_arrays(children, fields=list(self.type), mask=missing)
+        if self.is_summary:
+            here = _field(summaries, self.source[-1])
+        if here is None or self.key not in known:
+            return pa.nulls(rows, self.type)
+        if self.is_summary and not is_summary(here.type):
+            here = summary(here)
+        return fitted(here, self.kind)
+
+
+def _field(records: Any, name: str) -> Any:
+    """A field of structs, null where these are; None without it."""
+    if records is None or not _types.is_struct(records.type):
+        return None
+    there = records.type.get_field_index(name) >= 0
+    return pc.struct_field(records, [name]) if there else None
 
 
 def view_columns(kind: Any) -> list[ViewColumn]:
@@ -270,9 +297,3 @@ def _fitted_struct(array: Any, kind: Any) -> Any:
         )
     }
     return structs(columns, len(array), missing_of(array))
-
-
-def summary_values(array: Any, kind: Any) -> Any:
-    """The summaries of an array, which a table may have instead of it."""
-    found = array if is_summary(array.type) else summary(array)
-    return fitted(found, kind)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from hybridlog.columns.layout import POINTS
 from hybridlog.columns.recordings_file import (
@@ -24,8 +25,7 @@ from hybridlog.query.ranges import RangeResolver
 from hybridlog.snapshot import UNFINISHED
 from hybridlog.sql.columns import OWN, ViewColumn, merged, sql_type, view_columns
 from hybridlog.sql.names import ViewNames
-from hybridlog.sql.pieces import TopicOfRecording
-from hybridlog.sql.plan import Plan, in_window
+from hybridlog.sql.rows import Plan, TopicOfRecording
 from hybridlog_storage.catalog import ChannelStats
 from hybridlog_storage.times import BEGIN, END
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
     from hybridlog.query.question import Question, Span
     from hybridlog.session import Session
-    from hybridlog.sql.plan import Reading
+    from hybridlog.sql.rows import Reading
     from hybridlog_storage.summary import RecordingSummary
 
 
@@ -145,12 +145,8 @@ class TopicView:
         """Type of the points of clouds of a topic whose tables have them; None without."""
         if self.topic not in self._content.session.directory.settings.arrays:
             return None
-        clouds = [self._of(one) for one in self._summaries]
-        of_tables = (one.table.points for one in clouds if one.table is not None)
-        kinds = [kind for kind in of_tables if kind is not None]
-        if not kinds:  # no table is there yet, or payloads have expired
-            of_messages = (one.first_points() for one in clouds[:_SAMPLED])
-            kinds = [kind for kind in of_messages if kind is not None]
+        clouds = (self._of(one).points() for one in self._summaries)
+        kinds = [kind for kind in clouds if kind is not None]
         return merged(kinds) if kinds else None
 
     def rows(
@@ -164,15 +160,18 @@ class TopicView:
         for number in np.flatnonzero(may_hold(bounds)).tolist():
             summary = self._summaries[number]
             recording, window = self._of(summary), self._content.window(summary.id)
-            if window not in plans:
-                holds = in_window(where, window)
-                plans[window] = Plan(self.schema, self._columns, columns, holds, reading)
             reading.add(recording)
             bounds = _bounds((summary.name, source.span) for source in recording.sources)
-            chosen = may_hold(bounds)
+            chosen, holds = may_hold(bounds), where
             if window is not None:
                 first, last = bounds["t"]
                 chosen &= (first < window[1]) & (last >= window[0])
+                inside = pc.field("t") >= window[0]
+                if window[1] < END:  # a range without an end holds the last time, too
+                    inside &= pc.field("t") < window[1]
+                holds = inside if where is None else inside & where
+            if window not in plans:
+                plans[window] = Plan(self.schema, self._columns, columns, holds, reading)
             for place in np.flatnonzero(chosen).tolist():
                 yield from plans[window].read(recording, recording.sources[place])
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import threading
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 from difflib import get_close_matches
@@ -21,7 +21,7 @@ from hybridlog.schema.states import without_fields
 from hybridlog.sql.content import StoreContent, store_schema, store_table
 from hybridlog.sql.duck import MEMORY, Worker, explained, open_duckdb, shortage_of
 from hybridlog.sql.names import TABLES
-from hybridlog.sql.plan import Reading
+from hybridlog.sql.rows import Reading
 from hybridlog.sql.usage import EVERYTHING, Usage, usage_of
 from hybridlog.wording import listed
 from hybridlog_storage.errors import ChangedError, HybridlogError, TopicError, UsageError
@@ -161,20 +161,6 @@ class SqlConnection:
         """Names of all views and tables of the store."""
         return list(self.content.names)
 
-    def check(self, text: str) -> None:
-        """Check that the answer of a query lacks nothing, by the views that it may read."""
-        content = self.content
-        named = (content.names.topic(name) for name in content.names.named(text))
-        topics = {topic for topic in named if topic is not None}
-        self.completeness(content, topics, content.having(topics)).check()
-
-    def completeness(
-        self, content: StoreContent, topics: Collection[str], recordings: Collection[str]
-    ) -> Completeness:
-        """Completeness of the answer of a query."""
-        asked = replace(self.scope, topics=tuple(topics), recordings=tuple(recordings))
-        return completeness_of(content.session, asked)
-
     def schema(self, view: str) -> pa.Schema:
         """Columns of a view or table of the store; none without such a view."""
         content = self.content
@@ -280,7 +266,7 @@ class SqlAnswer:
         self._timeout = timeout
         self.reading = Reading(usage)
         self._relation: Any = None
-        self._result: pa.Table | None = None
+        self._done: pa.Table | None = None  # of a statement that changes something
         self._prepare()
 
     def __repr__(self) -> str:
@@ -306,13 +292,17 @@ class SqlAnswer:
             unread = [views[other] for other in others if other not in found.topics]
             if unread:
                 lines.append(f"{topic} was asked, not the view {listed(unread, 5)}.")
-        lacks = self._connection.completeness(content, found.topics, found.recordings)
-        return [*lines, *lacks.sentences]
+        return [*lines, *self.completeness().sentences]
+
+    def completeness(self) -> Completeness:
+        """Completeness of the computed answer, by what was read for it."""
+        topics, recordings = tuple(self.reading.topics), tuple(self.reading.recordings)
+        asked = replace(self._connection.scope, topics=topics, recordings=recordings)
+        return completeness_of(self._connection.content.session, asked)
 
     def run(self) -> None:
-        """Compute a statement that changes something; the answer is its result."""
-        if self._relation is not None:
-            self._result = self._computed(self._table)
+        """Compute a statement that changes something, once."""
+        self._done = self.to_arrow() if self.columns else pa.table({})
 
     def check_names(self) -> None:
         """Check that no two columns have one name, for forms that go by names.
@@ -330,11 +320,9 @@ class SqlAnswer:
         Raises:
             ResourceError: it needs more memory or time than it may.
         """
-        if self._result is not None:
-            return self._result
-        if self._relation is None:
-            return pa.table({})
-        return self._computed(self._table)
+        if self._done is not None:
+            return self._done
+        return pa.Table.from_batches([*self._batches(_BATCH_ROWS, None)])
 
     def first(self, rows: int, size: int) -> tuple[pa.Table, bool]:
         """The first rows of a query, and whether there are more; the others are not computed.
@@ -364,21 +352,37 @@ class SqlAnswer:
         Raises:
             ResourceError: it needs more memory or time than it may.
         """
-        if self._result is not None or self._relation is None:
-            yield from self.to_arrow().to_batches()
+        if self._done is not None:
+            yield from self._done.to_batches()
             return
         yield from self._batches(_BATCH_ROWS, None)
 
     def _batches(self, size: int, limit: int | None) -> Iterator[pa.RecordBatch]:
         """The answer in batches of so many rows, up to a limit."""
-        with closing(self._worker()) as worker:
-            reader, batch = self._tried(lambda: worker.run(partial(self._stream, size, limit)))
+        connection = self._connection
+        with closing(Worker(connection.cursor, self._timeout, connection.stopped)) as worker:
+            reader, batch = self._begun(lambda: worker.run(partial(self._stream, size, limit)))
             if batch is None:
                 yield pa.RecordBatch.from_pylist([], schema=reader.schema)
             while batch is not None:
                 yield batch
                 with self._explained():
                     batch = worker.run(partial(next, reader, None))
+
+    def _begun(self, call: Callable[[], _T]) -> _T:
+        """The result of a call; repeated when a table was damaged or files were replaced."""
+        for tries in reversed(range(_MAX_TRIES)):
+            self.reading = self._connection.reading = Reading(self.reading.usage)
+            try:
+                with self._explained():
+                    return call()
+            except ChangedError:
+                if not tries:
+                    raise
+                self._connection.engine.forget()
+                self._connection.register(self._connection.content)
+                self._prepare()
+        raise AssertionError
 
     def to_pandas(self) -> pd.DataFrame:
         """The whole answer as a pandas frame.
@@ -410,18 +414,11 @@ class SqlAnswer:
         columns = [column.to_pylist(maps_as_pydicts="strict") for column in self.to_arrow().columns]
         return list(zip(*columns, strict=True))
 
-    def _worker(self) -> Worker:
-        return Worker(self._connection.cursor, self._timeout, self._connection.stopped)
-
     def _stream(self, size: int, limit: int | None) -> tuple[Any, pa.RecordBatch | None]:
         """A reader of the answer, and its first batch."""
         relation = self._relation if limit is None else self._relation.limit(limit)
         reader = relation.to_arrow_reader(size)
         return reader, next(reader, None)
-
-    def _table(self) -> pa.Table:
-        table: pa.Table = self._relation.to_arrow_table()
-        return table
 
     def _prepare(self) -> None:
         try:
@@ -437,24 +434,6 @@ class SqlAnswer:
             near = get_close_matches(found[1], self._connection.names())
             hint = f"did you mean {', '.join(near)}?" if near else "`show tables` lists all."
             raise TopicError(f"There is no view {found[1]!r}; {hint}") from error
-
-    def _computed(self, call: Callable[[], _T]) -> _T:
-        with closing(self._worker()) as worker:
-            return self._tried(lambda: worker.run(call))
-
-    def _tried(self, call: Callable[[], _T]) -> _T:
-        """The result of a call; repeated when a table was damaged or files were replaced."""
-        for _ in range(_MAX_TRIES):
-            self.reading = self._connection.reading = Reading(self.reading.usage)
-            try:
-                with self._explained():
-                    return call()
-            except ChangedError:
-                self._connection.engine.forget()
-                self._connection.register(self._connection.content)
-                self._prepare()
-        with self._explained():
-            return call()
 
     @contextmanager
     def _explained(self) -> Iterator[None]:

@@ -15,7 +15,7 @@ from duckdb._sources.to_arrow import to_arrow
 from numpy.typing import NDArray
 
 from hybridlog.sql.content import Bounds, TopicView
-from hybridlog.sql.plan import Reading
+from hybridlog.sql.rows import Reading
 
 _COMPARED: Final[Mapping[str, Callable[..., NDArray[np.bool_]]]] = {
     "=": lambda low, high, value: (low <= value) & (value <= high),

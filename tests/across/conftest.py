@@ -9,16 +9,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 import hybridlog as hl
-from hybridlog.across import topic_reader
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segments.segment_writer import SegmentSettings
-from tests.calls import Calls
 from tests.independent import write_mcap
 from tests.limits import Limit
 
@@ -142,17 +139,6 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Logs]:
 
 
 @pytest.fixture(params=[65_536, 3], ids=["whole", "in blocks"])
-def blocks(request: pytest.FixtureRequest, limit: Limit, calls: Calls) -> None:
-    """Topics are read in blocks of so many rows, also with messages of one time in two of them.
-
-    Rows that would be large are made a few at a time, too.
-    """
-    size = request.param
-    limit(align_piece_bytes=size * 400)
-
-    def tables(found: Iterator[Any], *_: Any) -> Iterator[Any]:
-        for times, table in found:
-            for begin in range(0, len(times), size):
-                yield times[begin : begin + size], table.slice(begin, size)
-
-    calls.change(topic_reader.TopicReader, "tables", tables)
+def blocks(request: pytest.FixtureRequest, limit: Limit) -> None:
+    """Rows are read in blocks of so many, and made a few at a time where messages are large."""
+    limit(align_piece_bytes=request.param * 400, frame_block_rows=request.param)

@@ -1,9 +1,8 @@
-"""Topics side by side against pandas, DuckDB and plain loops."""
+"""Topics side by side: columns, reasons, cost, refusals, commands."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +10,9 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 import hybridlog as hl
-from hybridlog.across.match import UNKNOWN, interpolated, match
+from hybridlog.across.match import interpolated
 from hybridlog_storage.errors import TimeError, TopicError, UsageError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
@@ -23,100 +20,8 @@ from tests import places
 from tests.cli.within import answer as run
 from tests.limits import Limit
 
-from .conftest import BASE, MS, Logs, Said
-
-TOLERANCE_MS = 7
-
-
-def naive(
-    time: int, rows: list[int], how: str, tolerance: int | None
-) -> tuple[int, int, int] | None:
-    """Row before, row after and distance, by looking at every message."""
-    before = [n for n, row in enumerate(rows) if row <= time]
-    after = [n for n, row in enumerate(rows) if row > time]
-    if how == "asof":
-        pair = [before[-1]] if before else []
-    elif how == "nearest":
-        near = sorted(
-            ([before[-1]] if before else []) + after[:1], key=lambda n: abs(rows[n] - time)
-        )
-        pair = near[:1]
-    else:
-        is_exact = bool(before) and rows[before[-1]] == time
-        pair = [before[-1]] if is_exact else before[-1:] + after[:1]
-        pair = pair if is_exact or (len(pair) == 2 and before) else []
-    if not pair or (tolerance is not None and any(abs(rows[n] - time) > tolerance for n in pair)):
-        return None
-    far = max(pair, key=lambda n: abs(rows[n] - time))
-    return pair[0], pair[-1], rows[far] - time
-
-
-@given(
-    st.lists(st.integers(0, 40), max_size=15),
-    st.lists(st.integers(0, 40), max_size=15).map(sorted),
-    st.sampled_from(["asof", "nearest", "interpolate"]),
-    st.none() | st.integers(0, 10),
-)
-def test_matches_are_those_of_a_loop(
-    times: list[int], rows: list[int], how: str, tolerance: int | None
-) -> None:
-    found = match(np.array([*times, UNKNOWN]), np.array(rows, np.int64), how, tolerance)  # type: ignore[arg-type]
-    assert found.before[-1] == -1
-    for time, before, after, distance in zip(times, *found, strict=False):
-        want = naive(time, rows, how, tolerance)
-        if want is None:
-            assert (before, after, distance) == (-1, -1, 0)
-            continue
-        # Of two that are equally far, either distance is right but for its sign.
-        assert (before, after, abs(distance)) == (want[0], want[1], abs(want[2]))
-
-
-def frame_of(said: list[Said], clock: Callable[[Said], int], prefix: str) -> pd.DataFrame:
-    frame = pd.DataFrame(
-        {
-            "time": pd.to_datetime([clock(one) for one in said], utc=True),
-            f"{prefix}x": [one.fields["x"] for one in said],
-            f"{prefix}number": [one.number for one in said],
-        }
-    )
-    return frame.sort_values("time", kind="stable")
-
-
-@pytest.mark.usefixtures("blocks")
-@pytest.mark.parametrize("clock", ["log", "publish", "header"])
-@pytest.mark.parametrize(("how", "direction"), [("asof", "backward"), ("nearest", "nearest")])
-def test_joins_are_those_of_pandas(logs: Logs, how: str, direction: str, clock: str) -> None:
-    found = logs.store.align(
-        "base",
-        ["left/pose", "right/pose"],
-        how=how,
-        tolerance=f"{TOLERANCE_MS}ms",
-        fields={name: ["x", "header.seq"] for name in ("base", "left/pose", "/right/pose")},
-        clock=clock,
-    ).to_pandas()
-    time: Callable[[Said], int] = (lambda m: m.time) if clock == "log" else (lambda m: m.stamp)
-    for label in logs.said:
-        mine = found[found["recording"] == label]
-        base = frame_of(logs.of(label, "/base"), time, "")
-        assert mine["base.header.seq"].tolist() == [m.number for m in logs.of(label, "/base")]
-        for topic in ("left/pose", "right/pose"):
-            others = frame_of(logs.of(label, f"/{topic}"), time, "their_")
-            if others.empty:
-                assert mine[f"{topic}.header.seq"].isna().all()
-                continue
-            want = pd.merge_asof(
-                base,
-                others.assign(their_time=others["time"]),
-                on="time",
-                direction=direction,  # type: ignore[arg-type]
-                tolerance=pd.Timedelta(TOLERANCE_MS, "ms"),
-            ).sort_values("number", kind="stable")
-            mine = mine.sort_values("base.header.seq", kind="stable")
-            assert mine[f"{topic}.header.seq"].astype("Float64").tolist() == (
-                want["their_number"].astype("Float64").tolist()
-            )
-            distance = (want["their_time"] - want["time"]).to_numpy()
-            np.testing.assert_array_equal(mine[f"{topic}.distance"].to_numpy(), distance)
+from .conftest import BASE, MS, Logs
+from .test_joins import naive
 
 
 def on_the_sphere(low: np.ndarray, high: np.ndarray, part: float) -> np.ndarray:
@@ -136,15 +41,8 @@ def on_the_sphere(low: np.ndarray, high: np.ndarray, part: float) -> np.ndarray:
     return product(low, share)
 
 
-@pytest.mark.usefixtures("blocks")
-@pytest.mark.parametrize("tolerance", [None, 20])
-def test_interpolation_is_that_of_a_loop(logs: Logs, tolerance: int | None) -> None:
-    found = logs.store.align(
-        "base",
-        "left/pose",
-        how="interpolate",
-        tolerance=None if tolerance is None else f"{tolerance}ms",
-    ).to_arrow()
+def test_interpolation_is_that_of_a_loop(logs: Logs) -> None:
+    found = logs.store.align("base", "left/pose", how="interpolate", tolerance="20ms").to_arrow()
     rows = found.to_pylist()
     name = "left/pose"
     assert found[f"{name}.y"].type == pa.float32()
@@ -157,8 +55,7 @@ def test_interpolation_is_that_of_a_loop(logs: Logs, tolerance: int | None) -> N
             row = {k.removeprefix(f"{name}."): v for k, v in rows[place].items()}
             place += 1
             assert (row["recording"], row["base.header.seq"]) == (label, base.number)
-            limit = None if tolerance is None else tolerance * MS
-            want = naive(base.time, times, "interpolate", limit)
+            want = naive(base.time, times, "interpolate", 20 * MS)
             if want is None:
                 nulls += 1
                 assert row["distance"] is row["x"] is row["state"] is row["header.stamp"] is None
@@ -192,29 +89,6 @@ def test_values_that_have_no_middle() -> None:
     found = interpolated(low, high, np.array([0.0, 0.5, 0.5, 0.5]), [])
     assert str(found["f"].to_pylist()) == "[inf, nan, None, None]"
     assert found["n"].to_pylist() == [2.0**63, 2.0, 2.0, 3.0]
-
-
-@pytest.mark.usefixtures("blocks")
-def test_regular_times(logs: Logs) -> None:
-    poses = logs.store.topic("left/pose").fields("x")
-    found = poses.resample("5ms", tolerance="4ms").to_pandas()
-    place = 0
-    for label in logs.said:
-        everything = [m.time for m in logs.said[label]]
-        others = logs.of(label, "/left/pose")
-        for time in range(min(everything), max(everything) + 1, 5 * MS):
-            row = found.iloc[place]
-            place += 1
-            assert found.index[place - 1].value == time
-            want = naive(time, [m.time for m in others], "asof", 4 * MS)
-            assert pd.isna(row["distance"]) == (want is None)
-            if want is not None:
-                np.testing.assert_equal(float(row["x"]), others[want[0]].fields["x"])
-    assert place == len(found)
-    near = poses.between("+50ms", "+80ms").in_recording("b").resample("10ms").to_pandas()
-    assert [t.value - logs.said["b"][0].time for t in near.index] == [50 * MS, 60 * MS, 70 * MS]
-    both = logs.store.topic("**/pose").in_recording("b").resample("1s", how="nearest").to_arrow()
-    assert {"left/pose.x", "right/pose.x", "right/pose.distance"} <= set(both.column_names)
 
 
 def test_columns_never_replace_each_other(logs: Logs) -> None:
@@ -323,30 +197,13 @@ def test_what_is_refused(logs: Logs) -> None:
         store.topic("base").resample("1ns")
 
 
-@pytest.mark.parametrize("how", ["asof", "nearest", "interpolate"])
-@pytest.mark.parametrize("tolerance", [None, 7 * MS])
-def test_empty_cells_are_explained(logs: Logs, how: str, tolerance: int | None) -> None:
-    topics = ["left/pose", "right/pose"]
-    near = None if tolerance is None else f"{tolerance}ns"
-    aligned = logs.store.align("base", topics, how=how, tolerance=near)
-    found = aligned.to_pandas()
-    assert aligned.rows == len(found)
-    for topic in topics:
-        reasons = dict(aligned.empty.get(f"/{topic}", {}))
-        assert sum(reasons.values()) == found[f"{topic}.distance"].isna().sum()
-        elsewhere = 0
-        for label in logs.said:
-            rows = [one.time for one in logs.of(label, f"/{topic}")]
-            times = [one.time for one in logs.of(label, "/base")]
-            empty = sum(naive(time, rows, how, tolerance) is None for time in times)
-            elsewhere += 0 if rows else empty
-        apart = [number for why, number in reasons.items() if "other recordings (b), " in why]
-        assert apart == ([elsewhere] if elsewhere else [])
-        others = {why for why in reasons if "other recordings" not in why}
-        assert all(why.startswith("no message") for why in others)
-        assert all(("7ms" in why) == (tolerance is not None) for why in others)
-    said = [line.partition(": ")[0] for line in aligned.remarks()]
-    assert said == [name for name, reasons in aligned.empty.items() for _ in reasons]
+def test_messages_of_other_recordings_are_named(logs: Logs) -> None:
+    aligned = logs.store.align("base", "right/pose", how="nearest")
+    found = aligned.to_arrow()
+    (why,) = aligned.empty["/right/pose"]
+    assert "other recordings (b), which --beside" in why
+    assert aligned.empty["/right/pose"][why] == found["right/pose.distance"].null_count == 130
+    assert aligned.remarks()[0] == f"/right/pose: 130 of 260 rows are empty: {why}."
 
 
 def test_cells_without_a_value_are_counted_by_column(tmp_path: Path) -> None:
@@ -369,41 +226,6 @@ def test_cells_without_a_value_are_counted_by_column(tmp_path: Path) -> None:
             "/b: 1 of 6 rows is empty: no message came before.",
             "b.x: 1 of 6 rows is empty: the message has no such value.",
         ]
-
-
-@pytest.mark.usefixtures("blocks")
-@pytest.mark.parametrize("clock", ["log", "header"])
-@pytest.mark.parametrize(("how", "direction"), [("asof", "backward"), ("nearest", "nearest")])
-@pytest.mark.parametrize("labels", [["c"], ["b", "c"]])
-def test_messages_of_another_recording(
-    logs: Logs, how: str, direction: str, clock: str, labels: list[str]
-) -> None:
-    base = logs.store.topic("base").in_recording("b").fields("header.seq")
-    other = logs.store.topic("left/pose").in_recording(*labels).fields("header.seq", "x")
-    found = logs.store.align(
-        base, [other], how=how, tolerance="7ms", clock=clock, across_recordings=True
-    ).to_pandas()
-    time: Callable[[Said], int] = (lambda m: m.time) if clock == "log" else (lambda m: m.stamp)
-    theirs = [one for label in labels for one in logs.of(label, "/left/pose")]
-    label_of = {id(one): label for label in labels for one in logs.of(label, "/left/pose")}
-    theirs.sort(key=lambda one: one.time)
-    others = frame_of(theirs, time, "their_")
-    want = pd.merge_asof(
-        frame_of(logs.of("b", "/base"), time, ""),
-        others.assign(their_time=others["time"]),
-        on="time",
-        direction=direction,  # type: ignore[arg-type]
-        tolerance=pd.Timedelta(7, "ms"),
-    ).sort_values("number", kind="stable")
-    found = found.sort_values("base.header.seq", kind="stable")
-    distance = (want["their_time"] - want["time"]).to_numpy()
-    np.testing.assert_array_equal(found["left/pose.distance"].to_numpy(), distance)
-    assert found["left/pose.distance"].notna().sum() > 20
-    numbers = {(label_of[id(one)], one.number): time(one) for one in theirs}
-    for row in found.dropna(subset=["left/pose.distance"]).itertuples(index=False):
-        label, number = row[2], int(row[3])
-        assert (label, number) in numbers
-    assert set(found["left/pose.recording"].dropna()) <= set(labels)
 
 
 def test_lost_messages_explain_empty_cells(tmp_path: Path) -> None:

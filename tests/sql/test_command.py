@@ -21,7 +21,7 @@ from click.testing import CliRunner, Result
 
 import hybridlog as hl
 from hybridlog.cli.app import app
-from hybridlog.sql import completion
+from hybridlog.sql.names import candidates as found
 from hybridlog_storage.errors import (
     HybridlogError,
     IncompleteError,
@@ -200,7 +200,7 @@ def test_completion(store: hl.Store) -> None:
 
     def candidates(line: str, text: str | None = None) -> list[str]:
         word = line.rpartition(" ")[2] if text is None else text
-        return completion.candidates(connection, line, word)
+        return found(connection, line, word)
 
     assert candidates("select * from sca") == ["scan"]
     assert candidates("select b") == ["base__scan", "between", "by"]

@@ -7,7 +7,7 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.schema.arrow_types import plain_values
-from hybridlog.sql.pieces import TopicOfRecording
+from hybridlog.sql.rows import TopicOfRecording
 from hybridlog_storage.errors import UsageError
 from tests.sql.conftest import LARGE, SCANS, files_read
 from tests.tables.logs import BASE, SECOND, decoded, same

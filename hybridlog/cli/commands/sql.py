@@ -47,15 +47,15 @@ def sql_command(given: _Given) -> None:
 
         def run(text: str) -> None:
             with limited_memory(connection.memory):
-                if given.strict:
-                    connection.check(text)
                 answer = connection.query(text, timeout=given.timeout)
                 if answer.columns:
                     from pyarrow import Table
 
                     if given.to_form != SCREEN:
                         answer.check_names()
-                    given.answer(Table.from_batches([one]) for one in answer.to_batches())
+                    tables = (Table.from_batches([one]) for one in answer.to_batches())
+                    completeness = answer.completeness if given.strict else None
+                    given.answer(tables, completeness=completeness)
             sys.stdout.flush()
             remarks(answer.sentences())
 

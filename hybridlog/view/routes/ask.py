@@ -20,7 +20,7 @@ from hybridlog_storage.times import END
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from hybridlog.sql.plan import Reading
+    from hybridlog.sql.rows import Reading
     from hybridlog.view.context import RequestParams
     from hybridlog.view.question import PageQuestion
 
@@ -108,7 +108,7 @@ def completion(context: Context, params: RequestParams) -> dict[str, Any]:
 
 def sql_completion(context: Context, text: str, place: int) -> dict[str, Any]:
     """Candidates for completing SQL, worked out in the process for SQL."""
-    from hybridlog.sql.completion import candidates, word_before
+    from hybridlog.sql.names import candidates, word_before
 
     word = word_before(text[:place])
     with closing(context.store.sql_engine.connect(SQL_MEMORY, only_reads=True)) as connection:
