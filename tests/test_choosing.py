@@ -161,9 +161,9 @@ def test_a_choice_without_a_meaning_is_refused(
         (("--tag", "robot=9"), "with the tag robot=9. The store has robot=, robot=7, robot=8."),
         (("--tag", "colour"), "with the tag colour. The tags of the store are: place, robot."),
         (("-r", "mon*", "--tag", "robot="), "named 'mon*', with the tag robot=. The tags"),
-        (("--has", "imy"), "did you mean /imu?"),
+        (("--has", "imy"), "Did you mean /imu?"),
         (("--type", "sensor_msgs/LaserScam"), "Did you mean sensor_msgs/LaserScan, "),
-        (("--type", "x"), f"The store has: {ODD}, hybridlog.Mark, {SCAN}, {IMU}"),
+        (("--type", "x"), f"There are {ODD}, hybridlog.Mark, {SCAN}, {IMU}"),
         (("--during", "2030-01-01", "end"), "lie between 2025-06-03T00:00:00Z and 2025-06-07"),
         (("--with", "/scan: n > 99"), "3 with /scan were asked."),
         (("-r", "x*"), "named 'x*'. There are: monday 1, monday 2, tuesday, run[1], run1."),
@@ -245,8 +245,9 @@ def test_queries_of_chosen_recordings(store: hl.Store) -> None:
     assert isinstance(found, Recordings)
     assert found.topics() == ["/left/scan", "/odd", "/scan"]
     assert found.all_topics().count() == 5
-    # A short name means one topic of all, and another one of the second recording.
-    assert found.topic("scan").topics == ("/scan",)
+    # A short name that is ambiguous among all is clear in the second recording.
+    with pytest.raises(TopicError, match="ambiguous"):
+        found.topic("scan")
     assert found[1:].topic("scan").topics == ("/left/scan",)
     assert found[0].name == "monday 1"
     assert store.topic("/scan").in_recording(tag="robot=8", where="imu: n = 5").count() == 2

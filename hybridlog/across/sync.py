@@ -177,7 +177,7 @@ class Synced(Sequence[tuple["Message", ...]]):
             found = message_at(session, plain, self.counters, time)
             if found is not None and found.log_time_ns == time:
                 return found
-        span = Intervals.of([(recording, np.array([[*span_of(time, time), 1]], np.int64))])
+        span = Intervals([(recording, np.array([[*span_of(time, time), 1]], np.int64))])
         counters = Counters()
         runs = Planner(session, replace(question, during=span), counters).runs()
         picture = picture_of(session)

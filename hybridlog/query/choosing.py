@@ -6,7 +6,6 @@ other conditions.
 
 from __future__ import annotations
 
-import difflib
 import time
 from collections.abc import Iterable, Sequence
 from fnmatch import fnmatchcase
@@ -23,8 +22,8 @@ from hybridlog.query.times import (
     parse_duration,
     parse_range,
 )
-from hybridlog.query.topics import matcher, resolve, split_topic
-from hybridlog.wording import listed
+from hybridlog.query.topics import fitting, split_topic
+from hybridlog.wording import listed, meant
 from hybridlog_storage.errors import TimeError, TopicError, UsageError
 
 if TYPE_CHECKING:
@@ -71,9 +70,9 @@ def choose(session: Session, choice: Choice) -> Chosen:
         for condition in choice.where:
             choosing.by_content(condition)
     except _NothingLeftError as nothing:
-        described = ", ".join(choosing.conditions)
+        described, hint = ", ".join(choosing.conditions), str(nothing)
         what = f"There is no recording {described}. " if described else ""
-        return Chosen([], f"{what}{nothing}")
+        return Chosen([], f"{what}{hint[:1].upper()}{hint[1:]}")
     return Chosen(choosing.summaries, "")
 
 
@@ -92,9 +91,7 @@ def topics_of_types(session: Session, types: Sequence[str], recordings: Sequence
     }
     chosen = [topic for topic, name in found.items() if any(_is_type(name, one) for one in types)]
     if not chosen:
-        known = sorted({*found.values()} - {""})
-        near = difflib.get_close_matches(types[0], [*known, *map(_last, known)], cutoff=0.6)
-        hint = f"did you mean {listed(near)}?" if near else f"there are {listed(known, 10)}"
+        hint = meant(types[0], {*found.values()} - {""})
         raise TopicError(f"there is no topic of type {listed(types)}; {hint}")
     return sorted(chosen)
 
@@ -168,50 +165,31 @@ class _Choosing:
 
     def _topics(self, pattern: str) -> tuple[list[str], str]:
         """The topics of the recordings that fit a pattern, and what to say if none does."""
-        fits = matcher([pattern])
         known = self._snapshot.topics_at(self._places)
-        found = [topic for topic in known if fits(topic)]
-        if found:
-            return found, ""
-        try:
-            return resolve([pattern], known), ""  # an unambiguous name in another case
-        except TopicError as error:
-            text = str(error)
-            end = "" if text.endswith("?") else "."
-            return [], f"{text[:1].upper()}{text[1:].rstrip('.')}{end}"
+        return fitting(pattern, known), meant(pattern, known)
 
     def by_type(self, name: str) -> None:
         names = self._session.type_names()
         schemas = {digest for digest, known in names.items() if _is_type(known, name)}
         found = self._snapshot.with_schemas(schemas).tolist()
-        known = sorted(set(names.values()))
-        near = difflib.get_close_matches(name, known, cutoff=0.6)
-        hint = f"Did you mean {listed(near)}?" if near else f"The store has: {listed(known)}."
-        self._keep(found, f"with messages of the type {name!r}", hint)
+        self._keep(found, f"with messages of the type {name!r}", meant(name, names.values()))
 
     def by_time(self, begin: TimeLike | None, end: TimeLike | None) -> None:
         for moment in (begin, end):
-            if is_relative(moment) and not _is_side(moment):
+            if is_relative(moment) and str(moment).strip() not in {"start", "end"}:
                 raise TimeError(
                     f"A time for choosing recordings is absolute, not {moment!r}: write a date "
                     "such as 2025-06-03, seconds since the epoch, `now`, `start` or `end`."
                 )
-        low, high = parse_range(
-            None if _is_side(begin) else begin,
-            None if _is_side(end) else end,
-            start=0,
-            end=TIME_LIMIT - 1,
-        )
+        low, high = parse_range(begin, end, start=0, end=TIME_LIMIT - 1)
         known = [one.span for one in self.summaries if one.span is not None]
         hint = "`hybridlog ls` shows the times of all."
         if known:
             first = format_time(min(span[0] for span in known))
             hint = f"The others lie between {first} and {format_time(max(s[1] for s in known))}."
         places = self._snapshot.during(self._places, low, high, time.time_ns())
-        sides = [] if _is_side(begin) else [f"from {format_time(low)} on"]
-        if not _is_side(end):
-            sides.append(f"before {format_time(high)}")
-        self._keep(places.tolist(), " ".join(["with messages", *sides]), hint)
+        condition = f"with messages from {begin or 'start'} to {end or 'end'}"
+        self._keep(places.tolist(), condition, hint)
 
     def by_age(self, age: DurationLike) -> None:
         latest = time.time_ns() - parse_duration(age)
@@ -237,29 +215,18 @@ class _Choosing:
             question = Question(tuple(topics), ids)
             if predicate:
                 checked = self._session.predicate(predicate, tuple(topics), ids)
+                if checked.is_across:
+                    raise UsageError(f"A condition for recordings is of one topic: {condition!r}.")
                 question = Question(tuple(topics), ids, predicate=checked)
             planner = Planner(self._session, question)
             found = {self._snapshot.by_id[one] for one in planner.recordings_with_any()}
-        hint = hint or f"{len(there)} with {listed(topics)} were asked."
+        hint = f"{len(there)} with {listed(topics)} were asked." if topics else hint
         self._keep(found, f"with a message for which {condition!r} holds", hint)
-
-
-def _is_side(moment: TimeLike | None) -> bool:
-    """True if a time leaves its side open."""
-    return moment is None or (isinstance(moment, str) and moment.strip() in {"start", "end"})
 
 
 def _is_type(name: str, pattern: str) -> bool:
     """True if a type is meant: `sensor_msgs/msg/Imu` by itself, `sensor_msgs/Imu` or `Imu`."""
-    spelled = {name, _short(name), _last(name)}
-    wanted = {pattern, _short(pattern)}
+    short = name.replace("/msg/", "/")  # as ROS 1 spells it
+    spelled = {name, short, short.replace(".", "/").rpartition("/")[2]}
+    wanted = {pattern, pattern.replace("/msg/", "/")}
     return any(fnmatchcase(one, want) or one == want for one in spelled for want in wanted)
-
-
-def _last(name: str) -> str:
-    return name.replace(".", "/").rpartition("/")[2]
-
-
-def _short(name: str) -> str:
-    """A ROS 2 type as ROS 1 spells it."""
-    return name.replace("/msg/", "/")

@@ -12,7 +12,6 @@ then has the cost of the answer.
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
@@ -24,7 +23,7 @@ from hybridlog.query.choice import Choice
 from hybridlog.query.planner import Planner
 from hybridlog.query.question import Clock, Counters, Question
 from hybridlog.query.times import parse_duration, parse_time
-from hybridlog.wording import listed
+from hybridlog.wording import listed, meant
 from hybridlog_storage.errors import (
     DefinitionError,
     HybridlogError,
@@ -46,7 +45,7 @@ if TYPE_CHECKING:
     from hybridlog.query.answers.statistics import FieldStatistics, TopicCheck
     from hybridlog.query.choice import During, Tags, Texts
     from hybridlog.query.intervals import Intervals
-    from hybridlog.query.predicate.tree import Near, Predicate
+    from hybridlog.query.predicate.tree import Predicate
     from hybridlog.query.question import RecordedChannel, Span
     from hybridlog.query.times import DurationLike, TimeLike
     from hybridlog.session import Asked, Session
@@ -193,18 +192,34 @@ class Query:
             TopicError: no such topic exists.
             TimeError: `within` is no duration.
         """
-        if isinstance(predicate, str) and ":" in predicate:
-            from hybridlog.query.predicate.parser import names_topics
-
-            if names_topics(predicate):
-                return self._near(predicate, within)
         checked = self.session.predicate(predicate, self.topics, self.question.recordings)
+        if checked.is_across:
+            return self._near(checked, within)
         if within is not None:
             raise UsageError(
                 "`within` is for conditions on other topics: where('/odom: twist.twist.linear.x > "
                 "0.5', within='0.1s'). A second predicate is a second where()."
             )
         return self._satisfying(checked)
+
+    def _near(
+        self, predicate: Predicate, within: DurationLike | tuple[DurationLike, DurationLike] | None
+    ) -> Query:
+        """Only messages near others, and those that satisfy the rest of a predicate."""
+        from hybridlog.query.near import Windows, split_own
+        from hybridlog.query.predicate.tree import And
+
+        if within is None:
+            raise UsageError(
+                "A condition on another topic needs a time within which its message is, such as "
+                "0.1s."
+            )
+        if not isinstance(within, tuple):  # the message that is exactly so far away belongs to it
+            within = within, f"{parse_duration(within) + 1}ns"
+        own, others = split_own(predicate.root)
+        query = self._satisfying(replace(predicate, root=And(tuple(own))))
+        near = Windows(of_now(query), predicate.text, *within).answer(others)
+        return Query(self.source, near.question, near.conditions)
 
     def _satisfying(self, predicate: Predicate) -> Query:
         known = self.question.predicate
@@ -314,11 +329,9 @@ class Query:
         chosen = choose(self.session, choice)
         if chosen.problem:
             raise TopicError(chosen.problem)
-        session, ids = self.session, [summary.id for summary in chosen.summaries]
-        topics, recordings = session.having(self.topics, ids)
-        there = {*session.topics_of(ids)}
-        others = tuple(topic for topic in self.question.namesakes if topic in there)
-        return self._with(topics=topics, recordings=recordings, namesakes=others)
+        ids = [summary.id for summary in chosen.summaries]
+        topics, recordings = self.session.having(self.topics, ids)
+        return self._with(topics=topics, recordings=recordings)
 
     def during(self, intervals: Intervals) -> Query:
         """Only messages whose log time is in one of some intervals of their recording.
@@ -733,45 +746,6 @@ class Query:
         found += remarks(now.session, self.question, is_empty=is_empty)
         return [*dict.fromkeys(found)]
 
-    def _near(
-        self, text: str, within: DurationLike | tuple[DurationLike, DurationLike] | None
-    ) -> Query:
-        """The query with the conditions on other topics as intervals."""
-        from hybridlog.query.near import everything, intervals_of, question_about, split_own
-        from hybridlog.query.predicate.parser import parse
-        from hybridlog.query.predicate.tree import And, Predicate
-        from hybridlog.query.predicate.types import check
-
-        if within is None:
-            raise UsageError(
-                "A condition on another topic needs a time within which its message is, such as "
-                "0.1s."
-            )
-        if not isinstance(within, tuple):  # the message that is exactly so far away belongs to it
-            within = within, f"{parse_duration(within) + 1}ns"
-        before, after = within
-        own, others = split_own(parse(text, across=True).root)
-        query = self
-        if own:
-            checked = Predicate(And(tuple(own)), text)
-            check(checked, field_types(self))
-            query = self._satisfying(checked)
-        query = now = of_now(query)
-        conditions: list[Query] = []
-
-        def windows(condition: Near) -> Intervals:
-            question = question_about(now.session, query.question, condition.topic, before, after)
-            events = Query(now.source, question)
-            if condition.predicate:
-                events = events.where(condition.predicate)
-            conditions.append(events)
-            return events.windows(before, after)
-
-        whole = everything(now.session, self.question)
-        for condition in others:
-            query = query.during(intervals_of(condition, windows, whole))
-        return Query(self.source, query.question, (*self.conditions, *conditions))
-
     def _intervals(self) -> IntervalQueries:
         from hybridlog.query.answers.interval_queries import IntervalQueries
 
@@ -846,9 +820,8 @@ def _is_field(path: str, known: Mapping[str, str]) -> bool:
 def _no_field(path: str, known: Mapping[str, str], topics: Sequence[str]) -> str:
     if re.search(r"\[[0-9:]", path):
         return f"{path!r} is a part of an array, and no column: take the array, or ask in SQL."
-    near = difflib.get_close_matches(path, known, n=5, cutoff=0.4) or sorted(known)[:10]
     return (
-        f"There is no field {path!r} on {', '.join(topics)}. Did you mean {', '.join(near)}? "
+        f"There is no field {path!r} on {', '.join(topics)}; {meant(path, known)} "
         "`hybridlog info -t TOPIC` lists them all."
     )
 

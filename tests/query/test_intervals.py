@@ -38,7 +38,7 @@ def listed(rows: np.ndarray[Any, Any]) -> Rows:
 
 
 def intervals(*rows: tuple[str, int, int]) -> Intervals:
-    return Intervals.of((name, np.array([[begin, end, 1]], np.int64)) for name, begin, end in rows)
+    return Intervals((name, np.array([[begin, end, 1]], np.int64)) for name, begin, end in rows)
 
 
 # --- the parts ------------------------------------------------------------------------

@@ -47,7 +47,7 @@ class IntervalQueries:
         self._check("A state")
         if state is not None:
             return self._certain(max_gap, state)
-        return Intervals.of(self.held(max_gap))
+        return Intervals(self.held(max_gap))
 
     def held(self, max_gap: DurationLike | None) -> Iterator[tuple[str, NDArray[np.int64]]]:
         """The intervals in which the predicate holds, some at a time; see `Query.held`."""
@@ -67,7 +67,7 @@ class IntervalQueries:
         )
         spans = RangeResolver(self._session, self._question).spans()
         by_recording = plain.times_in(summary for summary, _ in spans)
-        whole = Intervals.of(
+        whole = Intervals(
             (summary.id, np.array([[begin, end, 0]], np.int64)) for summary, (begin, end) in spans
         )
         # What was lost before the range may have changed the state at its beginning.
@@ -95,7 +95,7 @@ class IntervalQueries:
             raise UsageError(f"A tolerance is a number that is 0 or greater, not {tolerance}.")
         quiet = parse_duration(pause)
         paths = [field.replace("[*]", "").replace("[]", "") for field in fields]
-        return Intervals.of(
+        return Intervals(
             (part.recording.id, changing(self._steps_in(part, span, paths, tolerance), quiet))
             for part, span in self._spans()
         )
@@ -116,7 +116,7 @@ class IntervalQueries:
         # Windows that begin together are in the order of the recordings' keys.
         ordered = sorted(found, key=lambda item: known[item[0]].key)
         whole = {name: (0, END) if one.span is None else one.extent for name, one in known.items()}
-        return Intervals.of(ordered).widened(before, after).within(whole)
+        return Intervals(ordered).widened(before, after).within(whole)
 
     def _lasting(self) -> Iterator[tuple[str, NDArray[np.int64]]]:
         """Begin and end of marks, by recording."""

@@ -1,7 +1,7 @@
 """Checks MongoDB filters that a user wrote, before they are handed to MongoDB as they are.
 
-Only operators that compare values are allowed, and no code. Patterns have RE2's syntax, so no
-search takes forever. What is written wrongly otherwise MongoDB says itself.
+Only operators that compare values are allowed, on fields that exist, and no code. Patterns have
+RE2's syntax, so no search takes forever. What is written wrongly otherwise MongoDB says itself.
 """
 
 from __future__ import annotations
@@ -17,19 +17,17 @@ from bson.errors import BSONError
 from bson.regex import Regex
 
 from hybridlog.query.predicate.regex import RegexError, compile_regex
-from hybridlog.query.predicate.tokens import MAX_TEXT
 from hybridlog.query.predicate.tree import (
+    ALWAYS,
     And,
-    Compare,
+    Exists,
     Field,
-    Match,
     MongoFilter,
     Predicate,
     Reach,
-    Value,
     is_meta,
 )
-from hybridlog.query.predicate.types import STATS, FieldTypes, check, check_name
+from hybridlog.query.predicate.types import STATS, FieldTypes, check
 from hybridlog.schema.kinds import width_of
 from hybridlog_storage.errors import WhereError
 
@@ -71,8 +69,6 @@ _EXPRESSIONS = frozenset(
     }
 )
 _FLAGS = {"i": re.IGNORECASE, "m": re.MULTILINE, "s": re.DOTALL, "": re.UNICODE}
-_UNCHECKED = {"NoneType", "dict", "list", "Decimal128", "MinKey", "MaxKey"}
-"""Types of values that are compared with fields of any type."""
 _PLACE = re.compile(r"0|[1-9][0-9]{0,8}")
 
 Filter = dict[str, object]
@@ -110,8 +106,7 @@ def mongo_filter(
         types: Types of the fields by path; None where no definition fixes them.
 
     Raises:
-        WhereError: a part is not allowed, with its place; there is no such field; or a value
-            does not fit its type.
+        WhereError: a part is not allowed, with its place; or there is no such field.
     """
     if not isinstance(query, Mapping):
         raise WhereError(f"a filter is a mapping, not {type(query).__name__}")
@@ -119,8 +114,8 @@ def mongo_filter(
         content = bson.encode(query, codec_options=_CODEC)
         if len(content) > MAX_BYTES:
             raise _refused((), "it is too large")
-        text, found = str(query), bson.decode(content)
-        checker = _Checker(text)
+        found = bson.decode(content)
+        checker = _Checker()
         checker.query(found, ())
     except RecursionError:
         raise _refused((), "it is nested too deeply") from None
@@ -128,12 +123,10 @@ def mongo_filter(
         raise _refused((), "it has a text that is not valid Unicode") from None
     except (BSONError, OverflowError, TypeError, ValueError) as error:
         raise _refused((), str(error)) from None
-    for path in checker.paths:
-        if not _is_id(path):
-            check_name(text, _field(path), types)
-    check(Predicate(And(tuple(checker.compared)), text), types)
-    root = MongoFilter(content, tuple(checker.paths.items())) if found else And(())
-    return Predicate(root, text)
+    asked = (Exists(_field(path), present=True) for path in checker.paths if not _is_id(path))
+    check(Predicate(And(tuple(asked)), str(query)), types)
+    root = MongoFilter(content, tuple(checker.paths.items())) if found else ALWAYS
+    return Predicate(root, str(query))
 
 
 def misjudged(node: MongoFilter, types: FieldTypes | Mapping[str, str] | None) -> dict[str, Filter]:
@@ -182,10 +175,9 @@ def _is_summary(value: str) -> Filter:
     return {"$in": [value, [{name: f"{value}.{name}" for name in shape} for shape in shapes]]}
 
 
-def _field(path: str, position: int = 0) -> Field:
+def _field(path: str) -> Field:
     first, *rest = path.split(".")
-    parts = (int(part) if _PLACE.fullmatch(part) else part for part in rest)
-    return Field((first, *parts), position)
+    return Field((first, *(int(part) if _PLACE.fullmatch(part) else part for part in rest)))
 
 
 def _is_id(path: str) -> bool:
@@ -204,17 +196,10 @@ _CODEC: CodecOptions[Filter] = CodecOptions(type_registry=TypeRegistry(fallback_
 
 
 class _Checker:
-    """Checks a filter of plain values.
+    """Checks a filter of plain values; `paths` says how it asks for each path."""
 
-    Attributes:
-        paths: How the filter asks for each path.
-        compared: Fields and the values that they are compared with, as `==`, and patterns.
-    """
-
-    def __init__(self, text: str) -> None:
+    def __init__(self) -> None:
         self.paths: dict[str, Reach] = {}
-        self.compared: list[Compare | Match] = []
-        self._text = text
 
     def query(self, query: object, path: _Path, above: str = "") -> None:
         """Check a filter.
@@ -248,17 +233,10 @@ class _Checker:
         if self.paths.get(name, "exists") == "exists" or reach == "whole":
             self.paths[name] = reach
 
-    def _value(self, name: str) -> Field:
-        """A field that is compared, and its place in the text."""
-        return _field(name, max(0, self._text.find(repr(name), 0, MAX_TEXT)))
-
     def _compare(self, name: str, value: object, path: _Path) -> None:
         """Check a value that a field is compared with."""
         self._ask(name, "whole" if isinstance(value, dict | list) else "value")
         _literal(value, path)
-        if type(value).__name__ not in _UNCHECKED and not _is_id(name):
-            field = self._value(name)
-            self.compared.append(Compare(field, "==", cast("Value", value), field.position))
 
     def _operators(self, name: str, operators: Filter, path: _Path) -> None:
         for key, value in operators.items():
@@ -305,9 +283,6 @@ class _Checker:
             compile_regex(f"(?{options}){value}" if options else str(value))
         except RegexError as error:
             raise _refused(path, f"the pattern is refused: {error}") from None
-        if not _is_id(name):
-            field = self._value(name)
-            self.compared.append(Match(field, str(value), negated=False, position=field.position))
 
     def _expression(self, value: object, path: _Path) -> None:
         """Check an aggregation expression."""

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, Literal
 
-from hybridlog.query.predicate.tokens import error_at, is_filter
+from hybridlog.query.predicate.tokens import error_at
 from hybridlog.query.predicate.tree import (
     Compare,
     Condition,
@@ -22,7 +21,7 @@ from hybridlog.query.predicate.tree import (
     Value,
 )
 from hybridlog.schema.kinds import FLOATS, NUMBERS, TIMES
-from hybridlog.wording import listed
+from hybridlog.wording import listed, meant
 from hybridlog_storage.errors import WhereError
 
 Stat = Literal["n", "min", "max", "mean"]
@@ -155,11 +154,6 @@ def check(predicate: Predicate, types: FieldTypes | Mapping[str, str] | None) ->
         checker.check(condition)
 
 
-def check_name(text: str, target: Field, types: FieldTypes | Mapping[str, str] | None) -> None:
-    """Refuse an unknown field in a text, whatever it is compared with."""
-    _Checker(text, FieldTypes.of(types)).check_name(target)
-
-
 class _Checker:
     def __init__(self, text: str, types: FieldTypes) -> None:
         self._text = text
@@ -220,8 +214,7 @@ class _Checker:
     def _check_value(self, kind: Kind, path: str, value: Value, position: int) -> None:
         if kind == "other" or value is None:
             return
-        words = (name for name, known in _VALUES.items() if isinstance(value, known))
-        given = next(words, type(value).__name__)  # other types are in filters alone
+        given = next(name for name, known in _VALUES.items() if isinstance(value, known))
         if given == "number" and kind == "time":
             self._check_time(value, self._types.base(path), position)
             return
@@ -232,8 +225,6 @@ class _Checker:
             "time": '; write a time as t"2015-03-03T18:28:33Z", a duration as 5ms',
             "string": "; write it in quotes",
         }
-        if is_filter(self._text):
-            hints["time"] = "; write it in nanoseconds"
         raise error_at(
             self._text,
             position,
@@ -243,11 +234,7 @@ class _Checker:
     def _check_time(self, value: Value, kind: str, position: int) -> None:
         """Refuse a number without a unit that is seconds since 1970 rather than nanoseconds."""
         is_odd = kind != "duration" and _SECONDS <= value < _NANOSECONDS  # type: ignore[operator]
-        if is_odd and is_filter(self._text) and type(value) in {int, float}:
-            cure = f'multiply seconds since 1970 by 10**9, or write a predicate with t"{value}ns"'
-            raise error_at(self._text, position, f"a number is nanoseconds here; {cure}")
-        bare = _BARE.match(self._text, position)
-        if is_odd and bare:
+        if is_odd and (bare := _BARE.match(self._text, position)):
             raise error_at(
                 self._text,
                 position,
@@ -256,18 +243,9 @@ class _Checker:
             )
 
     def _unknown(self, target: Field, path: str) -> WhereError:
-        known = sorted(set(self._types.types) - ({} if path.startswith("_meta") else _META).keys())
-        lowered = {name.lower(): name for name in known}
-        near = [_COLUMNS[path]] if path in _COLUMNS else []
-        near += [name for name in known if name.rsplit(".", 1)[-1] == path.rsplit(".", 1)[-1]]
-        near += [
-            lowered[key]
-            for key in difflib.get_close_matches(path.lower(), lowered, n=_MAX_NAMES, cutoff=0.5)
-        ]
-        shown = list(dict.fromkeys(near or known))
-        names = listed(shown, _MAX_NAMES)
-        hint = f"; did you mean {names}?" if near else f"; there are {names}" if shown else ""
-        return self._fail(target, f"there is no field {path}{hint}")
+        known = self._types.types.keys() - ({} if path.startswith("_meta") else _META).keys()
+        hint = f"did you mean {_COLUMNS[path]}?" if path in _COLUMNS else meant(path, known)
+        return self._fail(target, f"there is no field {path}; {hint}")
 
     def _fail(self, target: Field, message: str) -> WhereError:
         return error_at(self._text, target.position, message)
