@@ -64,9 +64,8 @@ ALL = profile(history="keep_all", depth=0, reliability="reliable", durability="t
         ('[{"history": "keep_last", "depth": 6, "durability": "transient_local"}]', 6),
         (repr(TEN + ONE).replace("'", '"'), 11),
         (ONE.removeprefix("- ").replace("\n  ", "\n"), 1),
-        # What is very long or no YAML: one a publisher.
-        (TEN * 400, 400),
-        (TEN + "}{\n" + TEN, 2),
+        (TEN * 400, 4000),
+        (TEN + "}{\n" + TEN, 20),
     ],
 )
 def test_depths_of_ros_2_profiles(offered: str, depth: int) -> None:
