@@ -39,7 +39,7 @@ WHOLE = 32
 """Longer arrays are summaries in index documents."""
 
 _LOGICAL = {"$and", "$or", "$nor"}
-_LITERAL = {"$eq", "$ne", "$gt", "$gte", "$lt", "$lte", "$in", "$nin", "$all"}
+_OF_VALUES = {"$eq", "$ne", "$gt", "$gte", "$lt", "$lte", "$in", "$nin", "$all", "$not"}
 _PLAIN = {
     *("$exists", "$type", "$size", "$mod"),
     *("$bitsAllSet", "$bitsAllClear", "$bitsAnySet", "$bitsAnyClear"),
@@ -209,77 +209,63 @@ class _Checker:
             path: Its place, for messages.
             above: The path of the array whose elements it is about, and a dot.
         """
-        if isinstance(query, list):
-            for item in query:
-                self.query(item, path, above)
-        if not isinstance(query, dict):
-            return
-        for key, value in query.items():
-            place = (*path, key)
-            if key in _LOGICAL:
-                self.query(value, place, above)
-            elif key == "$expr" and not above:
-                self._expression(value, place)
-            elif key.startswith("$"):
-                raise _refused(place, "the operator is not allowed here")
-            elif isinstance(value, Regex) or _has_operators(value):
-                operators = {"$regex": value} if isinstance(value, Regex) else value
-                self._operators(above + key, cast("Filter", operators), place)
-            else:
-                self._compare(above + key, value, place)
+        for one in query if isinstance(query, list) else [query]:
+            for key, value in one.items() if isinstance(one, dict) else ():
+                place = (*path, key)
+                if key in _LOGICAL:
+                    self.query(value, place, above)
+                elif key == "$expr" and not above:
+                    self._expression(value, place)
+                elif key.startswith("$"):
+                    raise _refused(place, "the operator is not allowed here")
+                else:
+                    self._condition(above + key, value, place)
 
     def _ask(self, name: str, reach: Reach) -> None:
         """Note that the filter asks for a path, and how."""
         if self.paths.get(name, "exists") == "exists" or reach == "whole":
             self.paths[name] = reach
 
-    def _compare(self, name: str, value: object, path: _Path) -> None:
-        """Check a value that a field is compared with."""
-        self._ask(name, "whole" if isinstance(value, dict | list) else "value")
-        _literal(value, path)
+    def _condition(self, name: str, value: object, path: _Path) -> None:
+        """Check what a field is compared with: a value, a pattern, or operators."""
+        if isinstance(value, Regex):
+            self._pattern(name, value, "", path)
+        elif _has_operators(value):
+            self._operators(name, cast("Filter", value), path)
+        else:
+            self._ask(name, "whole" if isinstance(value, dict | list) else "value")
+            _literal(value, path)
 
     def _operators(self, name: str, operators: Filter, path: _Path) -> None:
         for key, value in operators.items():
             place = (*path, key)
-            if key == "$regex" or (key == "$not" and isinstance(value, Regex)):
+            self._ask(name, "exists" if key == "$exists" else "value")
+            if key == "$regex":
                 self._pattern(name, value, operators.get("$options", ""), place)
-            elif key == "$not" and isinstance(value, dict):
-                self._operators(name, value, place)
             elif key == "$elemMatch":
-                self._element(name, value, place)
-            elif key in _LITERAL:
-                self._ask(name, "value")
+                if _has_operators(value) and not {*cast("Filter", value)} & {*_LOGICAL, "$expr"}:
+                    self._condition(name, value, place)
+                else:
+                    self.query(value, place, f"{name}.")
+            elif key in _OF_VALUES:
                 is_list = key in {"$in", "$nin", "$all"} and isinstance(value, list)
                 for item in cast("list[object]", value) if is_list else [value]:
-                    if key == "$all" and isinstance(item, dict) and {*item} == {"$elemMatch"}:
-                        self._operators(name, item, place)
-                    else:
-                        self._compare(name, item, place)
+                    self._condition(name, item, place)
             elif key in _PLAIN:
-                self._ask(name, "exists" if key == "$exists" else "value")
                 _literal(value, place)
             elif key != "$options" or "$regex" not in operators:
                 raise _refused(place, "the operator is not allowed here")
 
-    def _element(self, name: str, value: object, path: _Path) -> None:
-        """Check the condition on an element of an array."""
-        self._ask(name, "value")
-        if _has_operators(value) and not {*cast("Filter", value)} & {*_LOGICAL, "$expr"}:
-            self._operators(name, cast("Filter", value), path)
-        else:
-            self.query(value, path, f"{name}.")
-
     def _pattern(self, name: str, value: object, options: object, path: _Path) -> None:
         self._ask(name, "value")
         if isinstance(value, Regex):
-            known = [*_FLAGS.values()]
-            if options or value.flags & ~sum(known):
+            if options or value.flags & ~sum(_FLAGS.values()):
                 raise _refused(path, "may have the options i, m and s only, and once")
             options = "".join(letter for letter, flag in _FLAGS.items() if value.flags & flag)
             value = value.pattern
+        if not {*str(options)} <= {*"ims"}:
+            raise _refused(path, "may have the options i, m and s only")
         try:
-            if not {*str(options)} <= {*"ims"}:
-                raise _refused(path, "may have the options i, m and s only")
             compile_regex(f"(?{options}){value}" if options else str(value))
         except RegexError as error:
             raise _refused(path, f"the pattern is refused: {error}") from None
