@@ -141,29 +141,23 @@ class LatchedFront:
 
     def split(
         self, batch: Batch, inside: NDArray[np.bool_], channels: Sequence[Channel]
-    ) -> tuple[Batch, NDArray[np.bool_]]:
+    ) -> NDArray[np.bool_]:
         """Take the messages to hold from the next ones of the log.
 
-        `inside` is true for those of the slice. Returns the batch and bool[n], true for messages to
-        write at once. Among them are messages from before the slice of publishers that keep all of
-        theirs.
+        `inside` is true for those of the slice. Returns bool[n], true for messages to write at
+        once.
         """
         for channel in channels[len(self._depths) :]:
-            self._depths.append(KEEP_ALL - 1 if is_video(channel) else depth_of(channel))
+            self._depths.append(KEEP_ALL if is_video(channel) else depth_of(channel))
             self._channels.append(channel)
             self._publishers.append(publisher_of(channel))
-        depth = np.array(self._depths, np.int64)[batch.channel]
-        before = batch.log_time < self._begin
-        always = before & (depth == KEEP_ALL)
-        hold = before & (depth > 0) & ~always
+        is_latched = np.array(self._depths, np.int64)[batch.channel] > 0
+        hold = is_latched & (batch.log_time < self._begin)
         if not self._original_times:
-            hold |= (batch.log_time == self._begin) & (depth > 0) & (depth < KEEP_ALL) & inside
+            hold |= is_latched & (batch.log_time == self._begin) & inside
         for row in np.flatnonzero(hold).tolist():
             hold[row] = self._hold(batch, row)
-        if always.any():
-            self.messages += int(always.sum())
-            batch = self._moved(batch)
-        return batch, (inside | always) & ~hold
+        return inside & ~hold
 
     def _hold(self, batch: Batch, row: int) -> bool:
         """Hold a message; False for one that is to be written at once."""
