@@ -336,21 +336,6 @@ def _key(fields: Sequence[str]) -> Callable[[Said], object]:
     return key
 
 
-def test_the_order_does_not_depend_on_indexes_of_the_user(store: hl.Store) -> None:
-    logs = [(second, "/state", {"s": 9 - second}) for second in range(10)]
-    model = recorded(store, {"a": logs})
-    database = store.shared.index.database_for("the test")
-    database.create_index("state", [("s", 1)])
-    query = store.topic("/state").where("s > 2")
-    for asked in (query, store.topic("/state").where({"s": {"$gt": 2}})):
-        assert [m.fields["s"] for m in asked] == [9, 8, 7, 6, 5, 4, 3]
-        assert [m.fields["s"] for m in asked.reverse()] == [3, 4, 5, 6, 7, 8, 9]
-    assert len(query.intervals()) == 1
-    assert len(query.changes("s", pause=0)) == 6
-    assert seconds(query.intervals()) == model.states(lambda m: m.value["s"] > 2, (0, 2**62), None)
-    database.drop_index("state", [("s", 1)])
-
-
 @pytest.fixture
 def plain(store: hl.Store) -> hl.Store:
     rows = [(second, "/state", {"s": second % 2, "x": 1.5}) for second in range(10)]
