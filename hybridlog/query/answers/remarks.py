@@ -13,7 +13,7 @@ from hybridlog.query.predicate.tree import Exists, is_meta
 from hybridlog.query.question import Question, field_types
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import format_time
-from hybridlog.wording import meant
+from hybridlog.wording import like, meant
 
 if TYPE_CHECKING:
     from hybridlog.query.question import RecordedChannel, Span
@@ -107,7 +107,9 @@ def _missing(topic: str, path: str, known: Collection[str]) -> Iterator[str]:
     """A sentence that no message of a topic has a field, if it is none of the known ones."""
     plain = path.replace("[]", "")
     if not any(_is_near(plain, name.replace("[]", "")) for name in known):
-        yield f"No message of {topic} has a field {path!r}; {meant(path, known)}"
+        near = like(path, known)
+        hint = f"; {meant(path, near)}" if near else "."
+        yield f"No message of {topic} has a field {path!r}{hint}"
 
 
 def _is_near(path: str, name: str) -> bool:
