@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,8 +22,6 @@ from hybridlog_storage.times import END, placed
 if TYPE_CHECKING:
     import pandas as pd
     from numpy.typing import NDArray
-
-    from hybridlog.query.query import Query
 
     Rows = NDArray[np.int64]
     """int64[n, 3]: begin, end, messages."""
@@ -242,7 +240,7 @@ class Intervals:
 
         return self._each(counted)
 
-    def containing(self, events: Query) -> Intervals:
+    def containing(self, events: Any) -> Intervals:
         """The intervals that contain the log time of at least one message of a question.
 
         The message must be of the interval's own recording. Overlapping intervals are

@@ -8,16 +8,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hybridlog.query.answers.interval_queries import IntervalQueries
 from hybridlog.query.answers.marks import mark_topics
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.predicate.tree import And, Condition, Near, Node, Not, Or, Predicate, nodes
 from hybridlog.query.predicate.types import check
+from hybridlog.query.question import Counters
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import TIME_LIMIT
 from hybridlog_storage.errors import WhereError
 
 if TYPE_CHECKING:
-    from hybridlog.query.query import Query
     from hybridlog.query.question import Question
     from hybridlog.query.times import DurationLike
     from hybridlog.session import Session
@@ -27,28 +28,37 @@ class Windows:
     """The log time around messages of other topics, in the recordings of a question.
 
     Args:
-        query: The question.
+        session: The open store.
+        question: The question.
         text: The predicate as written.
         before: Time before such a message, a duration.
         after: Time after it.
 
     Attributes:
-        query: The question, with what has been answered so far.
+        question: The question, with the times that have been found so far.
+        asked: The questions about other topics, and what their answers have cost.
     """
 
-    def __init__(self, query: Query, text: str, before: DurationLike, after: DurationLike) -> None:
-        self.query = query
+    def __init__(
+        self,
+        session: Session,
+        question: Question,
+        text: str,
+        before: DurationLike,
+        after: DurationLike,
+    ) -> None:
+        self.question = question
+        self.asked: list[tuple[Question, Counters]] = []
+        self._session = session
         self._text = text
         self._reach = before, after
         whole = np.array([[0, TIME_LIMIT - 1, 0]], np.int64)
-        self._whole = Intervals((one.id, whole) for one in query.summaries())
+        self._whole = Intervals((one.id, whole) for one in session.summaries_of(question))
 
-    def answer(self, nodes: list[Node]) -> Query:
-        """The question with the times at which some conditions hold, each asked in the last's."""
+    def answer(self, nodes: list[Node]) -> None:
+        """Find the times at which some conditions hold, each asked in those of the last one."""
         for node in nodes:
-            held = self._holding(node)  # which notes the questions that it asks
-            self.query = self.query.during(held)
-        return self.query
+            self.question = self.question.within(self._holding(node))
 
     def _holding(self, node: Node) -> Intervals:
         """The log time in which a condition holds."""
@@ -61,14 +71,14 @@ class Windows:
         return reduce(join, map(self._holding, node.items))
 
     def _around(self, node: Near) -> Intervals:
-        query, predicate = self.query, Predicate(node.item, self._text)
-        question = _question_about(query.session, query.question, node.topic, *self._reach)
+        session, predicate = self._session, Predicate(node.item, self._text)
+        question = _question_about(session, self.question, node.topic, *self._reach)
         if predicate:
-            check(predicate, query.session.field_types(question.topics, question.recordings))
+            check(predicate, session.field_types(question.topics, question.recordings))
             question = replace(question, predicate=predicate)
-        events = type(query)(query.source, question)
-        self.query = type(query)(query.source, query.question, (*query.conditions, events))
-        return events.windows(*self._reach)
+        self.asked.append((question, Counters()))
+        with self.asked[-1][1].timed():
+            return IntervalQueries(session, *self.asked[-1]).windows(*self._reach)
 
 
 def split_own(node: Node) -> tuple[list[Node], list[Node]]:

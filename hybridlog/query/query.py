@@ -69,10 +69,14 @@ class Query:
     """
 
     def __init__(
-        self, source: Asked, question: Question, conditions: tuple[Query, ...] = ()
+        self,
+        source: Asked,
+        question: Question,
+        counters: Counters | None = None,
+        conditions: tuple[Query, ...] = (),
     ) -> None:
         self.question = question
-        self.counters = Counters()
+        self.counters = Counters() if counters is None else counters
         self.conditions = conditions
         self.source = source
 
@@ -107,7 +111,7 @@ class Query:
 
     def __copy__(self) -> Query:
         """The same question with separate counters."""
-        return Query(self.source, self.question, self.conditions)
+        return Query(self.source, self.question, conditions=self.conditions)
 
     def __repr__(self) -> str:
         return f"<Query {'; '.join(self._described().values())}>"
@@ -218,8 +222,10 @@ class Query:
             within = within, f"{parse_duration(within) + 1}ns"
         own, others = split_own(predicate.root)
         query = self._satisfying(replace(predicate, root=And(tuple(own))))
-        near = Windows(of_now(query), predicate.text, *within).answer(others)
-        return Query(self.source, near.question, near.conditions)
+        near = Windows(self.session, query.question, predicate.text, *within)
+        near.answer(others)
+        asked = (Query(self.source, *one) for one in near.asked)
+        return Query(self.source, near.question, conditions=(*self.conditions, *asked))
 
     def _satisfying(self, predicate: Predicate) -> Query:
         known = self.question.predicate
@@ -346,9 +352,7 @@ class Query:
             TopicError: an interval is of a recording that is not in the store.
         """
         intervals = intervals.by_id(self.session.snapshot().ids_called())
-        if self.question.during is not None:
-            intervals = self.question.during.common(intervals)
-        return self._with(during=intervals.merged())
+        return Query(self.source, self.question.within(intervals), conditions=self.conditions)
 
     def windows(self, before: DurationLike = 0, after: DurationLike = 0) -> Intervals:
         """Time around each message: `t - before <= time < t + after`, within its recording.
@@ -436,7 +440,7 @@ class Query:
         start, end = snapshot.summaries[snapshot.by_id[found.recording]].extent
         latest = max(parse_time(moment, start=start, end=end), time)
         since = Query(self.source, replace(question, bounds=(time, latest + 1)))
-        return Query(self.source, question, (*self.conditions, since))
+        return Query(self.source, question, conditions=(*self.conditions, since))
 
     def batches(self) -> Iterator[tuple[Batch, Sequence[RecordedChannel]]]:
         """The messages in order, many at once; `batch.channel` indexes the channels.
@@ -752,7 +756,7 @@ class Query:
         return IntervalQueries(self.session, self.question, self.counters)
 
     def _with(self, **changes: Any) -> Query:
-        return Query(self.source, replace(self.question, **changes), self.conditions)
+        return Query(self.source, replace(self.question, **changes), conditions=self.conditions)
 
     def _as_they_came(self, what: str) -> None:
         """Refuse `in_frame` for answers that it would not change."""
@@ -767,9 +771,7 @@ class Query:
 
 def of_now(query: Query) -> Query:
     """The same question with the same counters, at the moment that begins now."""
-    found = Query(query.session, query.question, query.conditions)
-    found.counters = query.counters
-    return found
+    return Query(query.session, query.question, query.counters, query.conditions)
 
 
 def narrowed(query: Query, *topics: str) -> Query:
@@ -781,7 +783,7 @@ def narrowed(query: Query, *topics: str) -> Query:
     several = question.names_recording or len(session.chosen(question)) > 1
     names, chosen = session.having(topics, question.recordings)
     question = replace(question, topics=names, recordings=chosen, names_recording=several)
-    return Query(query.source, question, query.conditions)
+    return Query(query.source, question, conditions=query.conditions)
 
 
 def channels_of(query: Query) -> list[RecordedChannel]:

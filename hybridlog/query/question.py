@@ -79,6 +79,11 @@ class Question:
         """True if the time range, if any, refers to log time."""
         return self.bounds is None or self.clock == "log"
 
+    def within(self, intervals: Intervals) -> Question:
+        """The question about messages in some intervals alone."""
+        common = intervals if self.during is None else self.during.common(intervals)
+        return replace(self, during=common.merged())
+
 
 @dataclass(frozen=True)
 class RecordedChannel:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
-from itertools import count
+import math
+from itertools import count, pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 import hybridlog as hl
 from hybridlog_storage.messages import Channel, Schema
@@ -89,3 +92,29 @@ def test_summaries_where_definitions_differ(store: hl.Store) -> None:
     assert len(query.changes("a.min", "a.max", pause=0)) == 0
     assert [c.begin_ns - BASE for c in query.changes("a.n", pause=0)] == [2]
     assert [c.begin_ns - BASE for c in query.changes("a", pause=0)] == [1, 2]
+
+
+numbers = st.none() | st.sampled_from([0, 1, 1.0, -0.0, 0.5, math.nan, math.inf])
+words = st.none() | st.sampled_from(["", "1", "a"])
+lists = st.recursive(st.integers(0, 1), lambda inner: st.lists(inner, max_size=2), max_leaves=4)
+messages = st.lists(
+    st.fixed_dictionaries({}, optional={"a": numbers, "b": words, "c": lists}), min_size=1
+)
+
+
+@settings(
+    max_examples=25,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+@given(messages=messages)
+def test_as_a_plain_comparison(store: hl.Store, messages: list[Any]) -> None:
+    name = _record(store, messages)
+    for field in ("a", "b", "c"):
+        values = [message.get(field) for message in messages]
+        wanted = [
+            number
+            for number, (one, other) in enumerate(pairwise(values), 1)
+            if not (one == other or (one != one and other != other))
+        ]
+        assert _steps(store, name, field) == wanted

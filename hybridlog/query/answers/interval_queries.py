@@ -291,8 +291,11 @@ def _lists(
     column: pa.Array[Any], one: Places, other: Places, tolerance: float
 ) -> NDArray[np.bool_]:
     length = lengths_of(column)
-    start = np.cumsum(length) - length  # of the elements that `flatten` returns
-    elements = column.flatten()
+    if pa.types.is_fixed_size_list(column.type):
+        start = (column.offset + np.arange(len(column))) * column.type.list_size
+    else:
+        start = column.offsets.to_numpy()[:-1].astype(np.int64)
+    elements = column.values
     count = length[one]
     found: NDArray[np.bool_] = count != length[other]
     alike = np.flatnonzero(~found & (count > 0))
