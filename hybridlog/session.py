@@ -19,7 +19,7 @@ import numpy as np
 from hybridlog.entries import channels_of, read_again, summary_of, take_inventory
 from hybridlog.query.chunk_columns import PARTS, ChunkColumns, log_bounds
 from hybridlog.query.question import Question, RecordedChannel, field_types
-from hybridlog.query.topics import namesakes, resolve
+from hybridlog.query.topics import resolve
 from hybridlog.record.marks import MARKS
 from hybridlog.snapshot import UNFINISHED
 from hybridlog.wording import counted, listed
@@ -325,7 +325,7 @@ class Session:
             there = f"There are: {listed(known)}." if known else self.when_empty
             raise TopicError(f"Name a topic. {there}")
         found = self.having(self.resolve_in(names, recordings), recordings)
-        return Question(*found, namesakes=namesakes(names, known))
+        return Question(*found)
 
     def topics_of(self, recordings: Sequence[str] | None = None) -> list[str]:
         """Names of all topics of the recordings with some ids, or of all, sorted.

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import difflib
 import re
+from collections import defaultdict
 from collections.abc import Iterable
 
 from hybridlog_storage.errors import UsageError
 
 MAX_LISTED = 10
+_MAX_LIKE = 5
+_PARTS = re.compile(r"[./]")
 _UNITS = ("B", "kB", "MB", "GB", "TB")
 _SIZE = re.compile(r"\s*(\d{1,15}(?:\.\d{1,15})?)\s*([kKmMgGtT]?)(i?)[bB]?\s*")
 
@@ -19,6 +23,32 @@ def listed(names: Iterable[str], most: int = MAX_LISTED) -> str:
     if len(known) <= most + 1:
         return ", ".join(known) or "none"
     return f"{', '.join(known[:most])} and {len(known) - most} more"
+
+
+def like(wanted: str, known: Iterable[str]) -> list[str]:
+    """Names that are like one that does not exist, or a part of them is, the nearest first."""
+    by_word: dict[str, list[str]] = defaultdict(list)
+    for name in sorted({*known}):
+        whole = name.casefold().strip("/")
+        for word in {whole, *_PARTS.split(whole)}:
+            by_word[word].append(name)
+    whole = wanted.casefold().strip("/")
+    near: dict[str, None] = {}
+    for part in (whole, _PARTS.split(whole)[-1]):
+        for word in difflib.get_close_matches(part, by_word, _MAX_LIKE):
+            near.update(dict.fromkeys(by_word[word]))
+    return [*near]
+
+
+def meant(wanted: str, known: Iterable[str]) -> str:
+    """A hint where a name does not exist: names like it, else those that there are."""
+    names = sorted({*known})
+    near = like(wanted, names)
+    # Names come from files: control characters must not reach a terminal.
+    shown = [name[:100] if name.isprintable() else repr(name[:100]) for name in near or names]
+    if near:
+        return f"did you mean {listed(shown, _MAX_LIKE)}?"
+    return f"there {'is' if len(names) == 1 else 'are'} {listed(shown)}"
 
 
 def file_name(text: str) -> str:

@@ -137,23 +137,6 @@ def test_json_integers_are_exact_in_every_output(store: hl.Store) -> None:
     assert arrays["id.valid"].tolist() == [True, False, False]
 
 
-def test_missing_null_empty_nan_and_false_are_five_things(store: hl.Store) -> None:
-    query = store.topic("/opt").in_recording("json_optional_keys")
-    for table in (query.to_arrow(), parquet(query)):
-        assert table["err"].to_pylist() == [None, "x", None, None]
-        assert table["ok"].to_pylist() == [None, True, None, None]
-        assert table["list"].to_pylist() == [None, [1, 2], None, None]
-        assert table["temp"].to_pylist() == [1.5, 2.5, None, 3.0]
-        assert table["n"].to_pylist() == [None, 9007199254740993, 3, None]
-    frame = query.to_pandas()
-    assert frame["ok"].dtype == "boolean"
-    assert frame["err"].isna().tolist() == [True, False, True, True]
-    assert frame["list"].isna().tolist() == [True, False, True, True]
-    rows = csv_rows(query)
-    assert [row["ok"] for row in rows] == ["", "true", "", ""]
-    assert [row["list"] for row in rows] == ["", "[1, 2]", "", ""]
-
-
 def test_odd_values_stay_apart(tmp_path: Path) -> None:
     texts = [
         b'{"f": NaN, "s": "", "l": [], "b": false, "i": 0}',

@@ -280,9 +280,9 @@ def test_intervals_of_a_label_and_of_nobody(place: Path, mongo: str) -> None:
     with hl.open(place, mongo=mongo) as store:
         span = np.array([[110 * SECOND, 112 * SECOND, 1]])
         for name in ("one", store.entry("one").id):
-            assert store.topic("/n").during(Intervals.of([(name, span)])).count() == 2
+            assert store.topic("/n").during(Intervals([(name, span)])).count() == 2
         with pytest.raises(TopicError, match="'nobody'"):
-            store.topic("/n").during(Intervals.of([("nobody", span)]))
+            store.topic("/n").during(Intervals([("nobody", span)]))
 
 
 def test_a_removal_that_was_announced_is_finished(place: Path, mongo: str) -> None:

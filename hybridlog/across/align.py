@@ -93,7 +93,6 @@ class Aligned:
     def remarks(self) -> list[str]:
         """Sentences about the last answer, those of `Query.remarks` about each topic."""
         questions = [reader.question for reader in self._readers]
-        topics = tuple(topic for question in questions for topic in question.topics)
         rows = counted(self.rows, "row")
         lines = [
             f"{name}: {number} of {rows} {'is' if number == 1 else 'are'} empty: {reason}."
@@ -107,8 +106,7 @@ class Aligned:
             )
         found += dict.fromkeys(text for one in self._readers for text in one.remarks)
         for question in questions:
-            others = tuple(topic for topic in question.namesakes if topic not in topics)
-            found += remarks(self._session, replace(question, namesakes=others), is_empty=False)
+            found += remarks(self._session, question, is_empty=False)
         return [*dict.fromkeys([*found, *self.completeness().sentences])]
 
     def completeness(self) -> Completeness:

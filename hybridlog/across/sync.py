@@ -171,7 +171,7 @@ class Synced(Sequence[tuple["Message", ...]]):
             found = message_at(session, replace(question, clock="log"), self.counters, time)
             if found is not None and found.log_time_ns == time:
                 return found
-        span = Intervals.of([(recording, np.array([[*span_of(time, time), 1]], np.int64))])
+        span = Intervals([(recording, np.array([[*span_of(time, time), 1]], np.int64))])
         own, counters = replace(question, during=span), Counters()
         picture = picture_of(session)
         runs = Planner(session, own, counters).runs()

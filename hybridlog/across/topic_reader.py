@@ -150,7 +150,7 @@ class TopicReader:
         question = self._beside(recording)
         row = np.array([[*span, 1]], np.int64)
         ids = [one.id for one in self._session.summaries_of(question)]
-        yield from self._stream(replace(question, during=Intervals.of((i, row) for i in ids)))
+        yield from self._stream(replace(question, during=Intervals((i, row) for i in ids)))
 
     def moments(self, recording: str) -> Moments:
         """The times of all messages beside a recording; no payload is read for log times."""

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from hybridlog.formats.yaml_values import YamlError, parse_yaml, read_yaml
 from hybridlog.query.periods import GAP_PERIODS
-from hybridlog.query.predicate.parser import names_topics, parse
+from hybridlog.query.predicate.parser import parse
 from hybridlog.query.times import format_duration, parse_duration
 from hybridlog.record.marks import MARKS
 from hybridlog.wording import listed
@@ -214,7 +214,7 @@ def _flag(value: Any) -> Any:
 
 def _check_predicate(given: object, _: object) -> None:
     text = _KINDS["type"](given)
-    _checked(text, not names_topics(text), "is of two topics: leave the other topic out")
+    _checked(text, not parse(text).is_across, "is of two topics: leave the other topic out")
     _checked(text, parse(text).asks_fields, "is not about fields of the message")
 
 

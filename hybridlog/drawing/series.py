@@ -144,7 +144,7 @@ def over_time(query: Query, fields: Sequence[str], span: Span | None) -> tuple[Q
     if span is not None:
         begin, end = max(begin, span[0]), min(end, span[1])
         window = np.array([[begin, max(begin, end), 0]], np.int64)
-        narrowed = narrowed.during(Intervals.of([(recording, window)])) if recording else narrowed
+        narrowed = narrowed.during(Intervals([(recording, window)])) if recording else narrowed
     return narrowed, (begin, end)
 
 

@@ -261,7 +261,7 @@ class Trigger:
         fits, predicate = matcher([topic]), parse(condition) if condition else None
         if predicate is not None:
             names = {path.split(".", 1)[0] for path in predicate.fields()}
-            if names & {"_id", "_meta"} or predicate.filters:
+            if names & {"_id", "_meta"} or predicate.is_across:
                 raise WhereError(
                     f"A trigger asks for fields of the message alone, not for {condition}."
                 )

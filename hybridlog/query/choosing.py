@@ -6,11 +6,12 @@ other conditions.
 
 from __future__ import annotations
 
-import difflib
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from fnmatch import fnmatchcase
-from typing import TYPE_CHECKING, NamedTuple
+from itertools import chain
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -23,19 +24,22 @@ from hybridlog.query.times import (
     parse_duration,
     parse_range,
 )
-from hybridlog.query.topics import matcher, resolve, split_topic
-from hybridlog.wording import listed
+from hybridlog.query.topics import fitting, split_topic
+from hybridlog.wording import listed, meant
 from hybridlog_storage.errors import TimeError, TopicError, UsageError
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from hybridlog.query.choice import Choice
     from hybridlog.query.times import DurationLike, TimeLike
     from hybridlog.session import Session
     from hybridlog_storage.summary import RecordingSummary
 
 _GLOB = frozenset("*?[")
+
+
+_Step: TypeAlias = tuple[Iterable[int], str, str, Sequence[str]]
+"""Positions of the recordings that satisfy a condition; this in words; and, for a hint where there
+is none, the name that was wanted and those that there are."""
 
 
 class Chosen(NamedTuple):
@@ -45,35 +49,19 @@ class Chosen(NamedTuple):
     problem: str
 
 
-class _NothingLeftError(Exception):
-    """No recording satisfies the conditions so far; its text is the hint."""
-
-
 def choose(session: Session, choice: Choice) -> Chosen:
     """The recordings of a store that satisfy a choice."""
     choosing = _Choosing(session)
-    try:
-        if not choosing.left and not choice.is_everything:
-            raise _NothingLeftError(session.when_empty)
-        if choice.name:
-            choosing.by_name(choice.name)
-        choosing.look()
-        for key, value in choice.tag:
-            choosing.by_tag(key, value)
-        for topic in choice.has:
-            choosing.by_topic(topic)
-        for name in choice.type:
-            choosing.by_type(name)
-        if choice.during is not None:
-            choosing.by_time(*choice.during)
-        if choice.older_than is not None:
-            choosing.by_age(choice.older_than)
-        for condition in choice.where:
-            choosing.by_content(condition)
-    except _NothingLeftError as nothing:
-        described = ", ".join(choosing.conditions)
-        what = f"There is no recording {described}. " if described else ""
-        return Chosen([], f"{what}{nothing}")
+    if not choosing.left and not choice.is_everything:
+        return Chosen([], session.when_empty)
+    conditions: list[str] = []
+    for places, condition, wanted, known in choosing.steps(choice):
+        conditions.append(condition)
+        remaining = {*places}
+        choosing.left = [place for place in choosing.left if place in remaining]
+        if not choosing.left:
+            problem = f"There is no recording {', '.join(conditions)}"
+            return Chosen([], f"{problem}; {meant(wanted, known)}" if known else f"{problem}.")
     return Chosen(choosing.summaries, "")
 
 
@@ -92,9 +80,7 @@ def topics_of_types(session: Session, types: Sequence[str], recordings: Sequence
     }
     chosen = [topic for topic, name in found.items() if any(_is_type(name, one) for one in types)]
     if not chosen:
-        known = sorted({*found.values()} - {""})
-        near = difflib.get_close_matches(types[0], [*known, *map(_last, known)], cutoff=0.6)
-        hint = f"did you mean {listed(near)}?" if near else f"there are {listed(known, 10)}"
+        hint = meant(types[0], {*found.values()} - {""})
         raise TopicError(f"there is no topic of type {listed(types)}; {hint}")
     return sorted(chosen)
 
@@ -119,7 +105,6 @@ class _Choosing:
         self._session = session
         self._snapshot = session.snapshot()
         self.left: list[int] = [*range(len(self._snapshot))]
-        self.conditions: list[str] = []
 
     @property
     def summaries(self) -> list[RecordingSummary]:
@@ -127,139 +112,92 @@ class _Choosing:
         return [self._snapshot.summaries[place] for place in self.left]
 
     @property
-    def _places(self) -> NDArray[np.intp]:
-        """Positions of those that are left."""
-        return np.array(self.left, np.intp)
+    def _topics(self) -> list[str]:
+        """The topics of those that are left."""
+        return self._snapshot.topics_at(np.array(self.left, np.intp))
 
-    def look(self) -> None:
-        """See what those that go on have flushed."""
+    def steps(self, choice: Choice) -> Iterator[_Step]:
+        """Each condition, to be applied before the next one is asked for."""
+        if choice.name:
+            names = [one.name for one in self._snapshot.summaries]
+            words = f"named {' or '.join(map(repr, choice.name))}"
+            yield placed(self._session, choice.name), words, choice.name[0], names
+        # See what those that go on have flushed.
         ids = [summary.id for summary in self.summaries]
         self._snapshot = self._session.look(ids)
         self.left = sorted(self._snapshot.by_id[one] for one in ids)
-
-    def _keep(self, places: Iterable[int], condition: str, hint: str) -> None:
-        """Keep those at some positions; `hint` is what helps if none is left."""
-        self.conditions.append(condition)
-        remaining = {*places}
-        self.left = [place for place in self.left if place in remaining]
-        if not self.left:
-            raise _NothingLeftError(hint)
-
-    def by_name(self, names: Sequence[str]) -> None:
-        condition = f"named {' or '.join(map(repr, names))}"
-        there = listed(summary.name for summary in self._snapshot.summaries)
-        self._keep(placed(self._session, names), condition, f"There are: {there}.")
-
-    def by_tag(self, key: str, value: str | None) -> None:
         tags = self._snapshot.tags
-        values = tags.get(key, {})
-        chosen = values if value is None else [value]
-        places = [place for one in chosen for place in values.get(one, ())]
-        hint = f"The tags of the store are: {listed(sorted(tags))}."
-        if not tags:
-            hint = "No recording has a tag; `hybridlog tag RECORDING KEY=VALUE` sets one."
-        elif values and not places:
-            hint = f"The store has {listed(f'{key}={one}' for one in sorted(values))}."
-        self._keep(places, f"with the tag {key if value is None else f'{key}={value}'}", hint)
+        for key, value in choice.tag:
+            found = tags.get(key, {})
+            places = chain.from_iterable(
+                own for one, own in found.items() if value is None or one == value
+            )
+            words = key if value is None else f"{key}={value}"
+            known = [f"{name}={one}" for name, values in tags.items() for one in values]
+            yield places, f"with the tag {words}", words, known
+        for pattern in choice.has:
+            topics = fitting(pattern, self._topics)
+            having = self._snapshot.having(topics).tolist()
+            yield having, f"with the topic {pattern!r}", pattern, self._topics
+        for name in choice.type:
+            types = self._session.type_names()
+            schemas = {digest for digest, known in types.items() if _is_type(known, name)}
+            having = self._snapshot.with_schemas(schemas).tolist()
+            yield having, f"with messages of the type {name!r}", name, [*types.values()]
+        if choice.during is not None:
+            yield self._in_time(*choice.during)
+        if choice.older_than is not None:
+            yield self._of_age(choice.older_than)
+        for condition in choice.where:
+            yield self._of_content(condition)
 
-    def by_topic(self, pattern: str) -> None:
-        topics, hint = self._topics(pattern)
-        self._keep(self._snapshot.having(topics).tolist(), f"with the topic {pattern!r}", hint)
-
-    def _topics(self, pattern: str) -> tuple[list[str], str]:
-        """The topics of the recordings that fit a pattern, and what to say if none does."""
-        fits = matcher([pattern])
-        known = self._snapshot.topics_at(self._places)
-        found = [topic for topic in known if fits(topic)]
-        if found:
-            return found, ""
-        try:
-            return resolve([pattern], known), ""  # an unambiguous name in another case
-        except TopicError as error:
-            text = str(error)
-            end = "" if text.endswith("?") else "."
-            return [], f"{text[:1].upper()}{text[1:].rstrip('.')}{end}"
-
-    def by_type(self, name: str) -> None:
-        names = self._session.type_names()
-        schemas = {digest for digest, known in names.items() if _is_type(known, name)}
-        found = self._snapshot.with_schemas(schemas).tolist()
-        known = sorted(set(names.values()))
-        near = difflib.get_close_matches(name, known, cutoff=0.6)
-        hint = f"Did you mean {listed(near)}?" if near else f"The store has: {listed(known)}."
-        self._keep(found, f"with messages of the type {name!r}", hint)
-
-    def by_time(self, begin: TimeLike | None, end: TimeLike | None) -> None:
+    def _in_time(self, begin: TimeLike | None, end: TimeLike | None) -> _Step:
         for moment in (begin, end):
-            if is_relative(moment) and not _is_side(moment):
+            if is_relative(moment) and str(moment).strip() not in {"start", "end"}:
                 raise TimeError(
                     f"A time for choosing recordings is absolute, not {moment!r}: write a date "
                     "such as 2025-06-03, seconds since the epoch, `now`, `start` or `end`."
                 )
-        low, high = parse_range(
-            None if _is_side(begin) else begin,
-            None if _is_side(end) else end,
-            start=0,
-            end=TIME_LIMIT - 1,
-        )
-        known = [one.span for one in self.summaries if one.span is not None]
-        hint = "`hybridlog ls` shows the times of all."
-        if known:
-            first = format_time(min(span[0] for span in known))
-            hint = f"The others lie between {first} and {format_time(max(s[1] for s in known))}."
-        places = self._snapshot.during(self._places, low, high, time.time_ns())
-        sides = [] if _is_side(begin) else [f"from {format_time(low)} on"]
-        if not _is_side(end):
-            sides.append(f"before {format_time(high)}")
-        self._keep(places.tolist(), " ".join(["with messages", *sides]), hint)
+        low, high = parse_range(begin, end, start=0, end=TIME_LIMIT - 1)
+        places = self._snapshot.during(np.array(self.left, np.intp), low, high, time.time_ns())
+        return places.tolist(), f"with messages from {begin or 'start'} to {end or 'end'}", "", ()
 
-    def by_age(self, age: DurationLike) -> None:
+    def _of_age(self, age: DurationLike) -> _Step:
         latest = time.time_ns() - parse_duration(age)
         old = [
             place
             for place, one in zip(self.left, self.summaries, strict=True)
             if one.status != "open" and one.extent[0] < one.extent[1] <= latest + 1
         ]
-        condition = f"whose last message is from {format_time(latest)} or before"
-        self._keep(old, condition, "`hybridlog ls` shows the times of all.")
+        return old, f"whose last message is from {format_time(latest)} or before", "", ()
 
-    def by_content(self, condition: str) -> None:
+    def _of_content(self, condition: str) -> _Step:
         pattern, predicate = split_topic(condition)
         if not pattern:
             raise UsageError(
                 f"Write TOPIC: PREDICATE, such as 'scan: ranges.min < 0.5', not {condition!r}."
             )
-        topics, hint = self._topics(pattern)
-        there = np.intersect1d(self._snapshot.having(topics), self._places)
-        found: set[int] = set()
-        if len(there):
-            ids = tuple(self._snapshot.summaries[place].id for place in there.tolist())
-            question = Question(tuple(topics), ids)
+        known = self._topics
+        topics = tuple(fitting(pattern, known))
+        there = np.intersect1d(self._snapshot.having(topics), self.left).tolist()
+        found: list[int] = []
+        if there:
+            ids = tuple(self._snapshot.summaries[place].id for place in there)
+            question = Question(topics, ids)
             if predicate:
-                checked = self._session.predicate(predicate, tuple(topics), ids)
-                question = Question(tuple(topics), ids, predicate=checked)
-            planner = Planner(self._session, question)
-            found = {self._snapshot.by_id[one] for one in planner.recordings_with_any()}
-        hint = hint or f"{len(there)} with {listed(topics)} were asked."
-        self._keep(found, f"with a message for which {condition!r} holds", hint)
-
-
-def _is_side(moment: TimeLike | None) -> bool:
-    """True if a time leaves its side open."""
-    return moment is None or (isinstance(moment, str) and moment.strip() in {"start", "end"})
+                checked = self._session.predicate(predicate, topics, ids)
+                if checked.is_across:
+                    raise UsageError(f"A condition for recordings is of one topic: {condition!r}.")
+                question = replace(question, predicate=checked)
+            asked = Planner(self._session, question).recordings_with_any()
+            found = [self._snapshot.by_id[one] for one in asked]
+        words = f"with a message for which {condition!r} holds"
+        return found, words, pattern, () if there else known
 
 
 def _is_type(name: str, pattern: str) -> bool:
     """True if a type is meant: `sensor_msgs/msg/Imu` by itself, `sensor_msgs/Imu` or `Imu`."""
-    spelled = {name, _short(name), _last(name)}
-    wanted = {pattern, _short(pattern)}
+    short = name.replace("/msg/", "/")  # as ROS 1 spells it
+    spelled = {name, short, short.replace(".", "/").rpartition("/")[2]}
+    wanted = {pattern, pattern.replace("/msg/", "/")}
     return any(fnmatchcase(one, want) or one == want for one in spelled for want in wanted)
-
-
-def _last(name: str) -> str:
-    return name.replace(".", "/").rpartition("/")[2]
-
-
-def _short(name: str) -> str:
-    """A ROS 2 type as ROS 1 spells it."""
-    return name.replace("/msg/", "/")

@@ -181,10 +181,10 @@ class ChunkScan:
                 # Decoding each small chunk by itself costs more than copying it.
                 if ready and (size >= _MERGED_BYTES or not self._reads_ahead):
                     plan.counters.elapsed_s = time.monotonic() - started
-                    yield _in_order(ready, plan)
+                    yield in_order(ready, plan)
                     ready, size = [], 0
             if ready:
-                yield _in_order(ready, plan)
+                yield in_order(ready, plan)
         finally:
             plan.counters.elapsed_s = time.monotonic() - started
 
@@ -357,7 +357,7 @@ _Loaded = tuple[MessageRun, "StoredChunk", int, int]
 """Messages and their chunk, messages unreadable for the predicate, those of them that expired."""
 
 
-def _in_order(runs: list[MessageRun], plan: ScanPlan) -> MessageRun:
+def in_order(runs: list[MessageRun], plan: ScanPlan) -> MessageRun:
     """Merge runs, sorted by log time, recording and arrival."""
     keys = np.array([int(channel.recording.key, 16) for channel in plan.channels], np.uint64)
     times = np.concatenate([r.batch.log_time for r in runs])

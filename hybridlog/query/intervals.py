@@ -7,18 +7,13 @@ on access.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hybridlog.query.times import (
-    DurationLike,
-    format_duration,
-    format_time,
-    parse_duration,
-)
+from hybridlog.query.times import DurationLike, format_duration, format_time, parse_duration
 from hybridlog.schema.column import ranges
 from hybridlog_storage.errors import TopicError, UsageError
 from hybridlog_storage.ordering import run_starts
@@ -28,6 +23,9 @@ if TYPE_CHECKING:
     import pandas as pd
     from numpy.typing import NDArray
 
+    Rows = NDArray[np.int64]
+    """int64[n, 3]: begin, end, messages."""
+
 
 Span = tuple[int, int]
 """`[begin, end)` in nanoseconds."""
@@ -35,24 +33,7 @@ Span = tuple[int, int]
 MAX_PIECES = 10_000_000
 """Maximum number of intervals that `Intervals.cut` makes."""
 _ROWS_PER_BATCH = 10_000  # intervals whose columns become Python numbers together
-
-
-class Events(Protocol):
-    """Messages at some times: those of a query."""
-
-    @property
-    def recordings(self) -> tuple[str, ...]:
-        """Ids of their recordings."""
-
-    @property
-    def question(self) -> Any:
-        """The questions that they answer."""
-
-    def during(self, intervals: Intervals) -> Events:
-        """Only those in some intervals."""
-
-    def windows(self, before: DurationLike = 0, after: DurationLike = 0) -> Intervals:
-        """Time around each of them."""
+_NONE = np.empty((0, 3), np.int64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,73 +68,42 @@ class Intervals:
     """Intervals, ordered by their beginning. Immutable: each method returns new ones.
 
     Args:
-        recordings: Ids, in the order of intervals that begin at the same time.
-        recording: int32[n], index into `recordings`.
-        begin: int64[n], ns since the epoch.
-        end: int64[n], ns; never before `begin`.
-        messages: int64[n], number of messages of each interval.
+        parts: Id of a recording, and int64[n, 3]: begin, end (never before it), messages. A
+            recording may have several parts. Intervals that begin at the same time are in the
+            order of the recordings.
     """
 
-    __slots__ = ("_begin", "_end", "_messages", "_places", "_recording", "_recordings")
+    __slots__ = ("_columns", "_rows")
 
-    def __init__(
-        self,
-        recordings: tuple[str, ...],
-        recording: NDArray[np.int32],
-        begin: NDArray[np.int64],
-        end: NDArray[np.int64],
-        messages: NDArray[np.int64],
-    ) -> None:
-        order = np.lexsort((end, recording, begin))
-        self._recordings = recordings
-        self._places: dict[str, NDArray[np.intp]] | None = None
-        self._recording: NDArray[np.int32] = recording[order]
-        self._begin: NDArray[np.int64] = begin[order]
-        self._end: NDArray[np.int64] = end[order]
-        self._messages: NDArray[np.int64] = messages[order]
-
-    @classmethod
-    def of(cls, parts: Iterable[tuple[str, NDArray[np.int64]]]) -> Intervals:
-        """Intervals from parts of recordings.
-
-        Args:
-            parts: Id of a recording, and int64[n, 3]: begin, end, messages. A recording
-                may have several parts.
-        """
-        ids: dict[str, int] = {}
-        rows: list[NDArray[np.int64]] = [np.empty((0, 3), np.int64)]
-        codes: list[NDArray[np.int32]] = [np.empty(0, np.int32)]
-        for name, part in parts:
-            rows.append(part)
-            codes.append(np.full(len(part), ids.setdefault(name, len(ids)), np.int32))
-        begin, end, messages = np.ascontiguousarray(np.concatenate(rows).T)
-        return cls(tuple(ids), np.concatenate(codes), begin, end, messages)
+    def __init__(self, parts: Iterable[tuple[str, Rows]]) -> None:
+        found: dict[str, list[Rows]] = {}
+        for name, rows in parts:
+            found.setdefault(name, []).append(rows)
+        self._rows = {name: _ordered(np.concatenate(rows)) for name, rows in found.items()}
+        self._columns: tuple[NDArray[np.intp], Rows] | None = None
 
     @property
     def recordings(self) -> tuple[str, ...]:
         """Ids of the recordings that have intervals, or had some."""
-        return self._recordings
+        return tuple(self._rows)
 
     def __len__(self) -> int:
         """Number of intervals."""
-        return len(self._begin)
+        return sum(map(len, self._rows.values()))
 
     def __iter__(self) -> Iterator[Interval]:
         """The intervals, one by one."""
-        columns = (self._recording, self._begin, self._end, self._messages)
-        for start in range(0, len(self), _ROWS_PER_BATCH):
-            rows = (column[start : start + _ROWS_PER_BATCH].tolist() for column in columns)
-            for code, begin, end, count in zip(*rows, strict=True):
-                yield Interval(self._recordings[code], begin, end, count)
+        codes, rows = self._all()
+        names = self.recordings
+        for start in range(0, len(rows), _ROWS_PER_BATCH):
+            places = slice(start, start + _ROWS_PER_BATCH)
+            for code, row in zip(codes[places].tolist(), rows[places].tolist(), strict=True):
+                yield Interval(names[code], *row)
 
     def __getitem__(self, place: int) -> Interval:
         """The interval at an index; a negative index counts from the end."""
-        return Interval(
-            self._recordings[self._recording[place]],
-            int(self._begin[place]),
-            int(self._end[place]),
-            int(self._messages[place]),
-        )
+        codes, rows = self._all()
+        return Interval(self.recordings[codes[place]], *rows[place].tolist())
 
     def __repr__(self) -> str:
         return f"<Intervals {len(self)}, {format_duration(self.duration_ns)} in all>"
@@ -165,15 +115,13 @@ class Intervals:
     def __hash__(self) -> int:
         return hash(self._value())
 
-    def _value(self) -> tuple[object, ...]:
-        names = np.array(self._recordings, object)[self._recording] if len(self) else ()
-        columns = (self._begin, self._end, self._messages)
-        return tuple(names), *(column.tobytes() for column in columns)
+    def _value(self) -> frozenset[tuple[str, bytes]]:
+        return frozenset((name, rows.tobytes()) for name, rows in self._rows.items() if len(rows))
 
     @property
     def duration_ns(self) -> int:
         """Sum of the lengths, nanoseconds; time in which intervals overlap counts twice."""
-        return int((self._end - self._begin).sum())
+        return sum(int((rows[:, 1] - rows[:, 0]).sum()) for rows in self._rows.values())
 
     def at_least(self, length: DurationLike) -> Intervals:
         """The intervals of at least this length.
@@ -181,7 +129,8 @@ class Intervals:
         Raises:
             TimeError: it is no duration.
         """
-        return self._take(self._end - self._begin >= parse_duration(length))
+        least = parse_duration(length)
+        return self._each(lambda _, rows: rows[rows[:, 1] - rows[:, 0] >= least])
 
     def cut(self, length: DurationLike) -> Intervals:
         """Each interval cut into as many pieces of exactly this length as fit.
@@ -196,17 +145,20 @@ class Intervals:
         size = parse_duration(length)
         if size == 0:
             raise UsageError("Intervals cannot be cut into pieces of length 0.")
-        count = (self._end - self._begin) // size
-        if int(count.sum()) > MAX_PIECES:
+        pieces = sum(int(((r[:, 1] - r[:, 0]) // size).sum()) for r in self._rows.values())
+        if pieces > MAX_PIECES:
             raise UsageError(
-                f"The cut makes {int(count.sum())} intervals; use a greater length or a time range."
+                f"The cut makes {pieces} intervals; use a greater length or a time range."
             )
-        source = np.repeat(np.arange(len(self)), count)
-        number = np.arange(len(source)) - np.repeat(np.cumsum(count) - count, count)
-        begin = self._begin[source] + number * size
-        return Intervals(
-            self._recordings, self._recording[source], begin, begin + size, self._messages[source]
-        )
+
+        def cut(_: str, rows: Rows) -> Rows:
+            count = (rows[:, 1] - rows[:, 0]) // size
+            found = np.repeat(rows, count, axis=0)
+            found[:, 0] += size * ranges(np.zeros_like(count), count)
+            found[:, 1] = found[:, 0] + size
+            return found
+
+        return self._each(cut)
 
     def widened(self, before: DurationLike = 0, after: DurationLike = 0) -> Intervals:
         """Intervals that begin earlier and end later by these times; they may overlap.
@@ -214,61 +166,52 @@ class Intervals:
         Raises:
             TimeError: `before` or `after` is no duration.
         """
-        begin = np.maximum(self._begin, parse_duration(before)) - parse_duration(before)
-        later = parse_duration(after)
-        end = np.minimum(self._end, END - later) + later
-        return Intervals(self._recordings, self._recording, begin, end, self._messages)
+        earlier, later = parse_duration(before), parse_duration(after)
+
+        def widened(_: str, rows: Rows) -> Rows:
+            begin = np.maximum(rows[:, 0], earlier) - earlier
+            end = np.minimum(rows[:, 1], END - later) + later
+            return np.stack([begin, end, rows[:, 2]], axis=1)
+
+        return self._each(widened)
 
     def merged(self) -> Intervals:
         """Overlapping or touching intervals of a recording joined; empty ones dropped."""
-        return Intervals.of((name, joined(self._rows_of(name))) for name in self._recordings)
+        return self._each(lambda _, rows: joined(rows))
 
     def common(self, other: Intervals) -> Intervals:
         """The intersection: times of a recording that intervals of both cover.
 
         `messages` is 0, since no messages belong to the new intervals.
         """
-        if len(other.recordings) < len(self._recordings):
+        if len(other.recordings) < len(self.recordings):
             return other.common(self)
-        parts = []
-        for name in self._recordings:
-            mine, theirs = self.of_recording(name), other.of_recording(name)
-            # Each pair that overlaps: the others that end after this one begins, and so on.
-            low = np.searchsorted(theirs[:, 1], mine[:, 0], "right")
-            high = np.searchsorted(theirs[:, 0], mine[:, 1], "left")
-            count = np.maximum(high - low, 0)
-            one, pair = np.repeat(np.arange(len(mine)), count), ranges(low, count)
-            begin = np.maximum(mine[one, 0], theirs[pair, 0])
-            end = np.minimum(mine[one, 1], theirs[pair, 1])
-            parts.append((name, np.stack([begin, end, np.zeros_like(begin)], axis=1)))
-        return Intervals.of(parts)
+        return self._each(
+            lambda name, _: _common(self.of_recording(name), other.of_recording(name))
+        )
 
     def union(self, other: Intervals) -> Intervals:
         """Times of a recording that intervals of either cover, joined.
 
         `messages` is 0, since no messages belong to the new intervals.
         """
-        parts = []
-        for one in (self, other):
-            for name in one.recordings:
-                rows = one.of_recording(name)
-                parts.append((name, np.insert(rows, 2, 0, axis=1)))
-        return Intervals.of(parts).merged()
+        covered = (
+            (name, one.of_recording(name)) for one in (self, other) for name in one.recordings
+        )
+        return Intervals((name, np.insert(rows, 2, 0, axis=1)) for name, rows in covered).merged()
 
     def without(self, other: Intervals) -> Intervals:
         """Times of a recording that these intervals cover and the other ones do not.
 
         `messages` is 0, since no messages belong to the new intervals.
         """
-        parts = []
-        for name in self._recordings:
-            taken = other.of_recording(name)
+
+        def left(name: str, _: Rows) -> Rows:
             # What is between the others, from the first time to the last.
-            begin = np.concatenate([[0], taken[:, 1]])
-            end = np.concatenate([taken[:, 0], [END]])
-            rows = np.stack([begin, end, np.zeros_like(begin)], axis=1)
-            parts.append((name, rows[end > begin]))
-        return self.common(Intervals.of(parts))
+            edges = np.concatenate([[0], other.of_recording(name).ravel(), [END]])
+            return _common(self.of_recording(name), edges.reshape(-1, 2))
+
+        return self._each(left)
 
     def until_next(self, times: Mapping[str, NDArray[np.int64]]) -> Intervals:
         """Each extended to the first of some times of its recording after it, or without end.
@@ -276,13 +219,13 @@ class Intervals:
         Args:
             times: int64[n], log times, ns, ascending, by id of the recording.
         """
-        parts = []
-        for name in self._recordings:
-            rows = self._rows_of(name)
-            known = np.append(times.get(name, np.empty(0, np.int64)), END)
-            rows[:, 1] = known[np.searchsorted(known[:-1], rows[:, 1])]
-            parts.append((name, rows))
-        return Intervals.of(parts).merged()
+
+        def extended(name: str, rows: Rows) -> Rows:
+            known = np.append(times.get(name, _NONE[:, 0]), END)
+            end = known[np.searchsorted(known[:-1], rows[:, 1])]
+            return np.stack([rows[:, 0], end, rows[:, 2]], axis=1)
+
+        return self._each(extended).merged()
 
     def counted(self, times: Mapping[str, NDArray[np.int64]]) -> Intervals:
         """The same with the number of some times in each as `messages`.
@@ -290,15 +233,14 @@ class Intervals:
         Args:
             times: int64[n], log times, ns, ascending, by id of the recording.
         """
-        parts = []
-        for name in self._recordings:
-            rows = self._rows_of(name)
-            places = np.searchsorted(times.get(name, np.empty(0, np.int64)), rows[:, :2])
-            rows[:, 2] = places[:, 1] - places[:, 0]
-            parts.append((name, rows))
-        return Intervals.of(parts)
 
-    def containing(self, events: Events) -> Intervals:
+        def counted(name: str, rows: Rows) -> Rows:
+            places = np.searchsorted(times.get(name, _NONE[:, 0]), rows[:, :2])
+            return np.stack([rows[:, 0], rows[:, 1], places[:, 1] - places[:, 0]], axis=1)
+
+        return self._each(counted)
+
+    def containing(self, events: Any) -> Intervals:
         """The intervals that contain the log time of at least one message of a question.
 
         The message must be of the interval's own recording. Overlapping intervals are
@@ -312,16 +254,16 @@ class Intervals:
         """
         if not events.question.returns_all:
             raise UsageError("limit and every cannot be combined with a test for any message.")
-        known = set(events.recordings)
-        own = Intervals.of((n, self._rows_of(n)) for n in self._recordings if n in known)
-        found = np.zeros(len(self), np.bool_)
-        if len(own):
-            moments = events.during(own).windows(after="1ns")
-            for name in own.recordings:
-                rows, (begin, end) = self._rows(name), moments.of_recording(name).T
-                first = np.searchsorted(end, self._begin[rows], side="right")
-                found[rows] = first < np.searchsorted(begin, self._end[rows])
-        return self._take(found)
+        known = {*events.recordings}
+        own = Intervals(part for part in self._rows.items() if part[0] in known and len(part[1]))
+        moments = events.during(own).windows(after="1ns") if len(own) else own
+
+        def holding(name: str, rows: Rows) -> Rows:
+            begin, end = moments.of_recording(name).T
+            first = np.searchsorted(end, rows[:, 0], side="right")
+            return rows[first < np.searchsorted(begin, rows[:, 1])]
+
+        return self._each(holding)
 
     def within(self, spans: Mapping[str, Span]) -> Intervals:
         """Each interval cut to its recording; the number of intervals is unchanged.
@@ -329,11 +271,11 @@ class Intervals:
         Args:
             spans: `[begin, end)`, ns, by id of the recording.
         """
-        bounds = np.array([spans[name] for name in self._recordings], np.int64).reshape(-1, 2)
-        low, high = bounds[self._recording].T
-        begin: NDArray[np.int64] = np.clip(self._begin, low, high)
-        end: NDArray[np.int64] = np.clip(self._end, low, high)
-        return Intervals(self._recordings, self._recording, begin, end, self._messages)
+
+        def within(name: str, rows: Rows) -> Rows:
+            return np.column_stack([np.clip(rows[:, :2], *spans[name]), rows[:, 2]])
+
+        return self._each(within)
 
     def by_id(self, ids: Mapping[str, str]) -> Intervals:
         """The same intervals, with other names of recordings replaced by ids.
@@ -344,15 +286,14 @@ class Intervals:
         Raises:
             TopicError: a recording is not in `ids`.
         """
-        unknown = [name for name in self._recordings if name not in ids]
+        unknown = [name for name in self._rows if name not in ids]
         if unknown:
             raise TopicError(f"Recording {unknown[0]!r} of an interval is not in the store.")
-        names = tuple(ids[name] for name in self._recordings)
-        return Intervals(names, self._recording, self._begin, self._end, self._messages)
+        return Intervals((ids[name], rows) for name, rows in self._rows.items())
 
     def of_recording(self, recording: str) -> NDArray[np.int64]:
         """Covered time of one recording: int64[n, 2], begin and end, disjoint, in order."""
-        return joined(self._rows_of(recording))[:, :2]
+        return joined(self._rows.get(recording, _NONE))[:, :2]
 
     def to_pandas(self) -> pd.DataFrame:
         """A frame: `recording`, `begin`, `end` (UTC, ns), `duration`, `messages`."""
@@ -361,39 +302,44 @@ class Intervals:
         from hybridlog.frames.frame import frame_of_table
         from hybridlog.schema.arrow_columns import numbers
 
-        names = pa.array(self._recordings, pa.string())
+        codes, rows = self._all()
+        begin, end, messages = np.ascontiguousarray(rows.T)
         columns = {
-            "recording": names.take(pa.array(self._recording)),
-            "begin": numbers(self._begin, "time"),
-            "end": numbers(self._end, "time"),
-            "duration": numbers(self._end - self._begin, "duration"),
-            "messages": numbers(self._messages),
+            "recording": pa.array(self.recordings, pa.string()).take(pa.array(codes)),
+            "begin": numbers(begin, "time"),
+            "end": numbers(end, "time"),
+            "duration": numbers(end - begin, "duration"),
+            "messages": numbers(messages),
         }
         return frame_of_table(pa.table(columns))
 
-    def _rows(self, recording: str) -> NDArray[np.intp]:
-        """Places of the intervals of a recording, in order."""
-        if self._places is None:
-            order = np.argsort(self._recording, kind="stable")
-            edges = np.searchsorted(self._recording[order], np.arange(len(self._recordings) + 1))
-            self._places = {
-                name: order[begin:end]
-                for name, begin, end in zip(self._recordings, edges, edges[1:], strict=False)
-            }
-        return self._places.get(recording, np.empty(0, np.intp))
+    def _each(self, change: Callable[[str, Rows], Rows]) -> Intervals:
+        """The intervals of each recording changed."""
+        return Intervals((name, change(name, rows)) for name, rows in self._rows.items())
 
-    def _rows_of(self, recording: str) -> NDArray[np.int64]:
-        rows = self._rows(recording)
-        return np.stack([self._begin[rows], self._end[rows], self._messages[rows]], axis=1)
+    def _all(self) -> tuple[NDArray[np.intp], Rows]:
+        """All intervals in order, and the place of the recording of each in `recordings`."""
+        if self._columns is None:
+            rows = np.concatenate([_NONE, *self._rows.values()])
+            codes = np.repeat(np.arange(len(self._rows)), [*map(len, self._rows.values())])
+            order = np.lexsort((rows[:, 1], codes, rows[:, 0]))
+            self._columns = codes[order], rows[order]
+        return self._columns
 
-    def _take(self, rows: NDArray[np.bool_]) -> Intervals:
-        return Intervals(
-            self._recordings,
-            self._recording[rows],
-            self._begin[rows],
-            self._end[rows],
-            self._messages[rows],
-        )
+
+def _ordered(rows: Rows) -> Rows:
+    return rows[np.lexsort((rows[:, 1], rows[:, 0]))]
+
+
+def _common(mine: NDArray[np.int64], theirs: NDArray[np.int64]) -> Rows:
+    """What intervals (int64[n, 2], disjoint, in order) have in common."""
+    # Each pair that overlaps: the others that end after this one begins, and so on.
+    low = np.searchsorted(theirs[:, 1], mine[:, 0], "right")
+    count = np.maximum(np.searchsorted(theirs[:, 0], mine[:, 1], "left") - low, 0)
+    one, pair = np.repeat(np.arange(len(mine)), count), ranges(low, count)
+    begin = np.maximum(mine[one, 0], theirs[pair, 0])
+    end = np.minimum(mine[one, 1], theirs[pair, 1])
+    return np.stack([begin, end, np.zeros_like(begin)], axis=1)
 
 
 def joined(rows: NDArray[np.int64]) -> NDArray[np.int64]:

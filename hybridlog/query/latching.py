@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from hybridlog.arrays import is_video_type
-from hybridlog.formats.yaml_values import YamlError, parse_yaml
 from hybridlog_storage.errors import DefinitionError, PayloadError
 from hybridlog_storage.messages import Batch
 
@@ -28,8 +27,8 @@ if TYPE_CHECKING:
 KEEP_ALL: Final = 1 << 62
 """Depth of a publisher that keeps all of its messages."""
 
-_TRANSIENT_LOCAL = re.compile(r"durability\W+(?:1|\w*transient_local)\b", re.IGNORECASE)
-_MAX_TEXT = 32 << 10  # characters; profiles of more than a hundred publishers are counted only
+_POLICY = re.compile(r"\b(history|depth|durability)\W+(\w{1,60})")
+"""A policy in a profile, whether it is written as YAML or JSON; a profile has each once."""
 
 MAX_HELD: Final = 256 << 20
 """Payload bytes that are held; the last message of each publisher is held in any case."""
@@ -77,38 +76,26 @@ def publisher_of(channel: Channel) -> Hashable:
 
 @lru_cache(maxsize=256)
 def _offered_depth(text: str) -> int:
-    """The sum of the depths of the transient-local profiles in a YAML list."""
-    if "durability" not in text:
-        return 0
-    if len(text) > _MAX_TEXT:
-        return len(_TRANSIENT_LOCAL.findall(text))
-    try:
-        profiles = parse_yaml(text)
-        if isinstance(profiles, str):  # the list itself was quoted
-            profiles = parse_yaml(profiles)
-    except YamlError:
-        return len(_TRANSIENT_LOCAL.findall(text))
-    listed = profiles if isinstance(profiles, list) else [profiles]
-    depths = [_depth(one) for one in listed if isinstance(one, Mapping)]
-    return min(sum(depths), KEEP_ALL)
+    """The sum of the depths of the transient-local profiles in a list of them."""
+    found, profile = 0, dict[str, str]()
+    for name, value in (*_POLICY.findall(text.lower()), ("", "")):
+        if name in profile or not name:
+            found, profile = found + _depth(profile), {}
+        profile[name] = value
+    return min(found, KEEP_ALL)
 
 
-def _depth(profile: Mapping[object, object]) -> int:
+def _depth(profile: Mapping[str, str]) -> int:
     """The depth of one profile, 0 for one that is not transient local.
 
     Policies are numbers of rmw or names: `1`, `transient_local`.
     """
-    if not _is(profile.get("durability"), 1, "transient_local"):
+    durability, history, depth = map(profile.get, ("durability", "history", "depth"), ("",) * 3)
+    if durability != "1" and not durability.endswith("transient_local"):
         return 0
-    if _is(profile.get("history"), 2, "keep_all"):
+    if history == "2" or history.endswith("keep_all"):
         return KEEP_ALL
-    depth = profile.get("depth")
-    return depth if isinstance(depth, int) and depth > 0 else 1
-
-
-def _is(policy: object, number: int, name: str) -> bool:
-    text = str(policy).lower()
-    return text == str(number) or text.endswith(name)
+    return int(depth) if depth.isdecimal() and depth != "0" else 1
 
 
 class _Held(NamedTuple):
@@ -154,29 +141,23 @@ class LatchedFront:
 
     def split(
         self, batch: Batch, inside: NDArray[np.bool_], channels: Sequence[Channel]
-    ) -> tuple[Batch, NDArray[np.bool_]]:
+    ) -> NDArray[np.bool_]:
         """Take the messages to hold from the next ones of the log.
 
-        `inside` is true for those of the slice. Returns the batch and bool[n], true for messages to
-        write at once. Among them are messages from before the slice of publishers that keep all of
-        theirs.
+        `inside` is true for those of the slice. Returns bool[n], true for messages to write at
+        once.
         """
         for channel in channels[len(self._depths) :]:
-            self._depths.append(KEEP_ALL - 1 if is_video(channel) else depth_of(channel))
+            self._depths.append(KEEP_ALL if is_video(channel) else depth_of(channel))
             self._channels.append(channel)
             self._publishers.append(publisher_of(channel))
-        depth = np.array(self._depths, np.int64)[batch.channel]
-        before = batch.log_time < self._begin
-        always = before & (depth == KEEP_ALL)
-        hold = before & (depth > 0) & ~always
+        is_latched = np.array(self._depths, np.int64)[batch.channel] > 0
+        hold = is_latched & (batch.log_time < self._begin)
         if not self._original_times:
-            hold |= (batch.log_time == self._begin) & (depth > 0) & (depth < KEEP_ALL) & inside
+            hold |= is_latched & (batch.log_time == self._begin) & inside
         for row in np.flatnonzero(hold).tolist():
             hold[row] = self._hold(batch, row)
-        if always.any():
-            self.messages += int(always.sum())
-            batch = self._moved(batch)
-        return batch, (inside | always) & ~hold
+        return inside & ~hold
 
     def _hold(self, batch: Batch, row: int) -> bool:
         """Hold a message; False for one that is to be written at once."""

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 GAP_PERIODS: Final = 5
 """A time without messages is a gap if it is longer than so many usual periods."""
-_SAMPLED: Final = 1_000_000  # steps that are kept at least, of more a random share
+_SAMPLED: Final = 1_000_000  # steps that are kept, and those added with the last of them
 
 
 def usual_period(steps: NDArray[np.int64]) -> float:
@@ -24,13 +24,11 @@ def usual_period(steps: NDArray[np.int64]) -> float:
 
 
 class Steps:
-    """Times from one message to the next; of very many a random share, in bounded memory."""
+    """Times from one message to the next: the first million of them, in bounded memory."""
 
     def __init__(self) -> None:
-        self._sampled: list[NDArray[np.int64]] = []
-        self._size = 0
-        self._share = 1.0
-        self._random = np.random.default_rng(0)
+        self._steps: list[NDArray[np.int64]] = []
+        self._left = _SAMPLED
         self.restart()
 
     def restart(self) -> None:
@@ -39,23 +37,14 @@ class Steps:
 
     def add(self, times: NDArray[np.int64]) -> None:
         """Add times of the next messages, ns."""
-        steps = np.diff(np.concatenate([self._last, times]))
-        self._last = times[-1:] if len(times) else self._last
-        self._keep(steps, self._share)
-        while self._size > 2 * _SAMPLED:
-            steps, self._sampled, self._size = np.concatenate(self._sampled), [], 0
-            self._keep(steps, 0.5)
-            self._share /= 2
-
-    def _keep(self, steps: NDArray[np.int64], share: float) -> None:
-        if share < 1.0:
-            steps = steps[self._random.random(len(steps)) < share]
-        self._sampled.append(steps)
-        self._size += len(steps)
+        if self._left > 0:
+            self._steps.append(np.diff(np.concatenate([self._last, times])))
+            self._left -= len(self._steps[-1])
+            self._last = times[-1:] if len(times) else self._last
 
     def usual_period(self) -> float:
         """As the function of this name."""
-        return usual_period(np.concatenate(self._sampled)) if self._sampled else 0.0
+        return usual_period(np.concatenate([np.empty(0, np.int64), *self._steps]))
 
 
 def mean_rate(messages: int, first: int, last: int) -> float | None:

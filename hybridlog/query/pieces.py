@@ -92,5 +92,5 @@ def _of_intervals(query: Query, rows: Iterable[tuple[str, int, int, str]]) -> It
             one = one.between(begin, end)  # with latched messages from before
         else:
             span = np.array([[begin, end, 0]], np.int64)
-            one = one.during(Intervals.of([(recording, span)]))
+            one = one.during(Intervals([(recording, span)]))
         yield Piece(name, one)

@@ -12,7 +12,6 @@ then has the cost of the answer.
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
@@ -24,7 +23,7 @@ from hybridlog.query.choice import Choice
 from hybridlog.query.planner import Planner
 from hybridlog.query.question import Clock, Counters, Question
 from hybridlog.query.times import parse_duration, parse_time
-from hybridlog.wording import listed
+from hybridlog.wording import listed, meant
 from hybridlog_storage.errors import (
     DefinitionError,
     HybridlogError,
@@ -46,7 +45,7 @@ if TYPE_CHECKING:
     from hybridlog.query.answers.statistics import FieldStatistics, TopicCheck
     from hybridlog.query.choice import During, Tags, Texts
     from hybridlog.query.intervals import Intervals
-    from hybridlog.query.predicate.tree import Near, Predicate
+    from hybridlog.query.predicate.tree import Predicate
     from hybridlog.query.question import RecordedChannel, Span
     from hybridlog.query.times import DurationLike, TimeLike
     from hybridlog.session import Asked, Session
@@ -70,10 +69,14 @@ class Query:
     """
 
     def __init__(
-        self, source: Asked, question: Question, conditions: tuple[Query, ...] = ()
+        self,
+        source: Asked,
+        question: Question,
+        counters: Counters | None = None,
+        conditions: tuple[Query, ...] = (),
     ) -> None:
         self.question = question
-        self.counters = Counters()
+        self.counters = Counters() if counters is None else counters
         self.conditions = conditions
         self.source = source
 
@@ -108,7 +111,7 @@ class Query:
 
     def __copy__(self) -> Query:
         """The same question with separate counters."""
-        return Query(self.source, self.question, self.conditions)
+        return Query(self.source, self.question, conditions=self.conditions)
 
     def __repr__(self) -> str:
         return f"<Query {'; '.join(self._described().values())}>"
@@ -193,18 +196,36 @@ class Query:
             TopicError: no such topic exists.
             TimeError: `within` is no duration.
         """
-        if isinstance(predicate, str) and ":" in predicate:
-            from hybridlog.query.predicate.parser import names_topics
-
-            if names_topics(predicate):
-                return self._near(predicate, within)
         checked = self.session.predicate(predicate, self.topics, self.question.recordings)
+        if checked.is_across:
+            return self._near(checked, within)
         if within is not None:
             raise UsageError(
                 "`within` is for conditions on other topics: where('/odom: twist.twist.linear.x > "
                 "0.5', within='0.1s'). A second predicate is a second where()."
             )
         return self._satisfying(checked)
+
+    def _near(
+        self, predicate: Predicate, within: DurationLike | tuple[DurationLike, DurationLike] | None
+    ) -> Query:
+        """Only messages near others, and those that satisfy the rest of a predicate."""
+        from hybridlog.query.near import Windows, split_own
+        from hybridlog.query.predicate.tree import And
+
+        if within is None:
+            raise UsageError(
+                "A condition on another topic needs a time within which its message is, such as "
+                "0.1s."
+            )
+        if not isinstance(within, tuple):  # the message that is exactly so far away belongs to it
+            within = within, f"{parse_duration(within) + 1}ns"
+        own, others = split_own(predicate.root)
+        query = self._satisfying(replace(predicate, root=And(tuple(own))))
+        near = Windows(self.session, query.question, predicate.text, *within)
+        near.answer(others)
+        asked = (Query(self.source, *one) for one in near.asked)
+        return Query(self.source, near.question, conditions=(*self.conditions, *asked))
 
     def _satisfying(self, predicate: Predicate) -> Query:
         known = self.question.predicate
@@ -314,11 +335,9 @@ class Query:
         chosen = choose(self.session, choice)
         if chosen.problem:
             raise TopicError(chosen.problem)
-        session, ids = self.session, [summary.id for summary in chosen.summaries]
-        topics, recordings = session.having(self.topics, ids)
-        there = {*session.topics_of(ids)}
-        others = tuple(topic for topic in self.question.namesakes if topic in there)
-        return self._with(topics=topics, recordings=recordings, namesakes=others)
+        ids = [summary.id for summary in chosen.summaries]
+        topics, recordings = self.session.having(self.topics, ids)
+        return self._with(topics=topics, recordings=recordings)
 
     def during(self, intervals: Intervals) -> Query:
         """Only messages whose log time is in one of some intervals of their recording.
@@ -333,9 +352,7 @@ class Query:
             TopicError: an interval is of a recording that is not in the store.
         """
         intervals = intervals.by_id(self.session.snapshot().ids_called())
-        if self.question.during is not None:
-            intervals = self.question.during.common(intervals)
-        return self._with(during=intervals.merged())
+        return Query(self.source, self.question.within(intervals), conditions=self.conditions)
 
     def windows(self, before: DurationLike = 0, after: DurationLike = 0) -> Intervals:
         """Time around each message: `t - before <= time < t + after`, within its recording.
@@ -423,7 +440,7 @@ class Query:
         start, end = snapshot.summaries[snapshot.by_id[found.recording]].extent
         latest = max(parse_time(moment, start=start, end=end), time)
         since = Query(self.source, replace(question, bounds=(time, latest + 1)))
-        return Query(self.source, question, (*self.conditions, since))
+        return Query(self.source, question, conditions=(*self.conditions, since))
 
     def batches(self) -> Iterator[tuple[Batch, Sequence[RecordedChannel]]]:
         """The messages in order, many at once; `batch.channel` indexes the channels.
@@ -733,52 +750,13 @@ class Query:
         found += remarks(now.session, self.question, is_empty=is_empty)
         return [*dict.fromkeys(found)]
 
-    def _near(
-        self, text: str, within: DurationLike | tuple[DurationLike, DurationLike] | None
-    ) -> Query:
-        """The query with the conditions on other topics as intervals."""
-        from hybridlog.query.near import everything, intervals_of, question_about, split_own
-        from hybridlog.query.predicate.parser import parse
-        from hybridlog.query.predicate.tree import And, Predicate
-        from hybridlog.query.predicate.types import check
-
-        if within is None:
-            raise UsageError(
-                "A condition on another topic needs a time within which its message is, such as "
-                "0.1s."
-            )
-        if not isinstance(within, tuple):  # the message that is exactly so far away belongs to it
-            within = within, f"{parse_duration(within) + 1}ns"
-        before, after = within
-        own, others = split_own(parse(text, across=True).root)
-        query = self
-        if own:
-            checked = Predicate(And(tuple(own)), text)
-            check(checked, field_types(self))
-            query = self._satisfying(checked)
-        query = now = of_now(query)
-        conditions: list[Query] = []
-
-        def windows(condition: Near) -> Intervals:
-            question = question_about(now.session, query.question, condition.topic, before, after)
-            events = Query(now.source, question)
-            if condition.predicate:
-                events = events.where(condition.predicate)
-            conditions.append(events)
-            return events.windows(before, after)
-
-        whole = everything(now.session, self.question)
-        for condition in others:
-            query = query.during(intervals_of(condition, windows, whole))
-        return Query(self.source, query.question, (*self.conditions, *conditions))
-
     def _intervals(self) -> IntervalQueries:
         from hybridlog.query.answers.interval_queries import IntervalQueries
 
         return IntervalQueries(self.session, self.question, self.counters)
 
     def _with(self, **changes: Any) -> Query:
-        return Query(self.source, replace(self.question, **changes), self.conditions)
+        return Query(self.source, replace(self.question, **changes), conditions=self.conditions)
 
     def _as_they_came(self, what: str) -> None:
         """Refuse `in_frame` for answers that it would not change."""
@@ -793,9 +771,7 @@ class Query:
 
 def of_now(query: Query) -> Query:
     """The same question with the same counters, at the moment that begins now."""
-    found = Query(query.session, query.question, query.conditions)
-    found.counters = query.counters
-    return found
+    return Query(query.session, query.question, query.counters, query.conditions)
 
 
 def narrowed(query: Query, *topics: str) -> Query:
@@ -807,7 +783,7 @@ def narrowed(query: Query, *topics: str) -> Query:
     several = question.names_recording or len(session.chosen(question)) > 1
     names, chosen = session.having(topics, question.recordings)
     question = replace(question, topics=names, recordings=chosen, names_recording=several)
-    return Query(query.source, question, query.conditions)
+    return Query(query.source, question, conditions=query.conditions)
 
 
 def channels_of(query: Query) -> list[RecordedChannel]:
@@ -846,9 +822,8 @@ def _is_field(path: str, known: Mapping[str, str]) -> bool:
 def _no_field(path: str, known: Mapping[str, str], topics: Sequence[str]) -> str:
     if re.search(r"\[[0-9:]", path):
         return f"{path!r} is a part of an array, and no column: take the array, or ask in SQL."
-    near = difflib.get_close_matches(path, known, n=5, cutoff=0.4) or sorted(known)[:10]
     return (
-        f"There is no field {path!r} on {', '.join(topics)}. Did you mean {', '.join(near)}? "
+        f"There is no field {path!r} on {', '.join(topics)}; {meant(path, known)} "
         "`hybridlog info -t TOPIC` lists them all."
     )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -47,7 +47,6 @@ class Question:
         during: Intervals of log time that messages must lie in; None for all times.
         frame: Frame of points and poses in the answer; None for that of each message.
         tf_topics: Topics whose transforms lead to that frame; empty for those of each tree.
-        namesakes: Further topics that end with a short name that chose one of `topics`.
     """
 
     topics: tuple[str, ...]
@@ -64,7 +63,6 @@ class Question:
     during: Intervals | None = None
     frame: str | None = None
     tf_topics: tuple[str, ...] = ()
-    namesakes: tuple[str, ...] = field(default=(), compare=False)
 
     @property
     def returns_all(self) -> bool:
@@ -80,6 +78,11 @@ class Question:
     def is_by_log_time(self) -> bool:
         """True if the time range, if any, refers to log time."""
         return self.bounds is None or self.clock == "log"
+
+    def within(self, intervals: Intervals) -> Question:
+        """The question about messages in some intervals alone."""
+        common = intervals if self.during is None else self.during.common(intervals)
+        return replace(self, during=common.merged())
 
 
 @dataclass(frozen=True)

@@ -107,7 +107,7 @@ def parse_time(text: TimeLike, *, start: int | None, end: int | None) -> int:
     if isinstance(text, str):
         return _checked(_parse_text(text, start, end), text)
     if isinstance(text, bool):
-        raise TimeError(f"{text} is not a time: {ACCEPTED}")
+        raise _no_time(text)
     if isinstance(text, Integral):
         return _checked(int(text), text)
     if isinstance(text, Real):
@@ -171,18 +171,15 @@ def parse_duration(text: DurationLike) -> int:
     `5s`, `1m30s`, `2h`, `500ms`, `250us`, `100ns`, `1d`, `2y` (730 days): units are in descending
     order, each number may have a fraction; one without unit is seconds, less than ten million.
     """
+    ns: int | None = None
     if isinstance(text, str):
         ns = _duration(text.strip()) if len(text) <= _LONGEST_TEXT else None
-        if ns is None:
-            raise TimeError(f"{_shown(text)} is not a duration: {DURATIONS}")
     elif isinstance(text, timedelta):
         ns = _timedelta(text)
-    elif isinstance(text, bool) or not isinstance(text, Real) or not math.isfinite(text):
-        raise TimeError(f"{text!r} is not a duration: {DURATIONS}")
-    elif isinstance(text, Integral):
-        ns = int(text) * _SECOND
-    else:
-        ns = round(Fraction(repr(float(text))) * _SECOND)
+    elif isinstance(text, Real) and not isinstance(text, bool) and math.isfinite(text):
+        ns = round(Fraction(str(text)) * _SECOND)
+    if ns is None:
+        raise TimeError(f"{_shown(text)} is not a duration: {DURATIONS}")
     if not 0 <= ns < TIME_LIMIT:
         raise TimeError(f"{_shown(text)} is out of range for a duration: {DURATIONS}")
     is_bare = _NUMBER.fullmatch(text.strip()) if isinstance(text, str) else isinstance(text, Real)
@@ -238,21 +235,24 @@ def format_duration(ns: int) -> str:
 def _parse_text(text: str, start: int | None, end: int | None) -> int:
     word = text.strip()
     if not word or len(word) > _LONGEST_TEXT:
-        raise TimeError(f"{_shown(text)} is not a time: {ACCEPTED}")
-    if word[0] in "+-":
-        return _relative(word, start, end)
-    named = {"start": start, "end": end}
-    if word.lower() in named:
-        return _base(named[word.lower()], word)
+        raise _no_time(text)
     if word.lower() == "now":
         return time.time_ns()
     absolute = _absolute(word)
     if absolute is not None:
         return absolute
-    offset = _duration(word)
+    sign = word[0] if word[0] in "+-" else ""
+    named = {"start": (start, 0), "end": (end, 0)}
+    offset = _duration(word.removeprefix(sign).strip())
+    base, offset = named.get(word.lower(), (end if sign == "-" else start, offset))
     if offset is None:
-        raise TimeError(f"{_shown(text)} is not a time: {ACCEPTED}")
-    return _base(start, word) + offset
+        raise _no_time(text)
+    if base is None:
+        raise TimeError(
+            f"{_shown(word)} is relative to a recording, and none has messages: "
+            "write a date or a number since the epoch"
+        )
+    return base - offset if sign == "-" else base + offset
 
 
 def _absolute(word: str) -> int | None:
@@ -272,24 +272,6 @@ def _absolute(word: str) -> int | None:
     if iso := _ISO.fullmatch(word):
         return _from_iso(iso, word)
     return None
-
-
-def _relative(word: str, start: int | None, end: int | None) -> int:
-    offset = _duration(word[1:].strip())
-    if offset is None:
-        raise TimeError(f"{_shown(word)} is not a time: {ACCEPTED}")
-    if word[0] == "+":
-        return _base(start, word) + offset
-    return _base(end, word) - offset
-
-
-def _base(base: int | None, word: str) -> int:
-    if base is None:
-        raise TimeError(
-            f"{_shown(word)} is relative to a recording, and none has messages: "
-            "write a date or a number since the epoch"
-        )
-    return base
 
 
 def _exact(ns: Fraction, word: str) -> int:
@@ -325,7 +307,7 @@ def _duration(word: str) -> int | None:
 
 def _from_float(number: float) -> int:
     if not math.isfinite(number) or not -TIME_LIMIT <= number < TIME_LIMIT:
-        raise TimeError(f"{number!r} is not a time: {ACCEPTED}")
+        raise _no_time(number)
     # The shortest decimal of this float is the text that the user typed.
     exact = Fraction(repr(number))
     return round(exact if abs(exact) >= _NANOSECONDS_FROM else exact * _SECOND)
@@ -338,7 +320,7 @@ def _timedelta(delta: timedelta) -> int:
 
 def _from_date(moment: date) -> int:
     if not isinstance(moment.year, int):  # pandas.NaT is a datetime whose year is nan
-        raise TimeError(f"{moment} is not a time: {ACCEPTED}")
+        raise _no_time(moment)
     if not isinstance(moment, datetime):
         moment = datetime(moment.year, moment.month, moment.day)
     if moment.utcoffset() is None:
@@ -350,7 +332,7 @@ def _from_datetime64(moment: object) -> int:
     import numpy as np
 
     if not isinstance(moment, np.datetime64) or np.isnat(moment):
-        raise TimeError(f"{_shown(moment)} is not a time: {ACCEPTED}")
+        raise _no_time(moment)
     ns = moment.astype("datetime64[ns]")
     is_finer = np.datetime_data(moment.dtype)[0] in {"ps", "fs", "as"}
     if not is_finer and ns.astype(moment.dtype) != moment:
@@ -370,6 +352,10 @@ def _checked(ns: int, source: object) -> int:
 def _spelled(source: object, default: str, ns: int) -> str:
     name = default if source is None else _shown(source)
     return f"{name} ({format_time(ns)}, {ns} ns)"
+
+
+def _no_time(source: object) -> TimeError:
+    return TimeError(f"{_shown(source)} is not a time: {ACCEPTED}")
 
 
 def _shown(source: object) -> str:

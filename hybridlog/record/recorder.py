@@ -235,7 +235,7 @@ class _Copy:
             times = placed(batch.log_time)
             inside = (times >= begin) & (times < end)
             if self.front is not None:
-                batch, inside = self.front.split(batch, inside, channels)
+                inside = self.front.split(batch, inside, channels)
             batch = _where(batch, inside)
         return batch
 

@@ -8,7 +8,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
-from difflib import get_close_matches
 from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
@@ -16,14 +15,13 @@ import pyarrow as pa
 
 from hybridlog.query.answers.lost import completeness_of
 from hybridlog.query.question import Question
-from hybridlog.query.topics import namesakes
 from hybridlog.schema.states import without_fields
 from hybridlog.sql.content import StoreContent, store_schema, store_table
 from hybridlog.sql.duck import MEMORY, Worker, explained, open_duckdb, shortage_of
 from hybridlog.sql.names import TABLES
 from hybridlog.sql.rows import Reading
 from hybridlog.sql.usage import EVERYTHING, Usage, usage_of
-from hybridlog.wording import listed
+from hybridlog.wording import meant
 from hybridlog_storage.errors import ChangedError, HybridlogError, TopicError, UsageError
 
 if TYPE_CHECKING:
@@ -285,13 +283,6 @@ class SqlAnswer:
             lines.append(f"{topic} has no columns of fields: {reason}.")
         for (topic, state), count in found.absent.items():
             lines.append(f"{topic}: {without_fields(count, state)}.")
-        content = self._connection.content
-        views = content.names.views
-        for topic in sorted(found.topics):
-            others = namesakes([topic.strip("/")], views)
-            unread = [views[other] for other in others if other not in found.topics]
-            if unread:
-                lines.append(f"{topic} was asked, not the view {listed(unread, 5)}.")
         return [*lines, *self.completeness().sentences]
 
     def completeness(self) -> Completeness:
@@ -431,8 +422,7 @@ class SqlAnswer:
                 raise UsageError(f"{error}\n{cure}") from error
             if found is None:
                 raise
-            near = get_close_matches(found[1], self._connection.names())
-            hint = f"did you mean {', '.join(near)}?" if near else "`show tables` lists all."
+            hint = meant(found[1], self._connection.names())
             raise TopicError(f"There is no view {found[1]!r}; {hint}") from error
 
     @contextmanager

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from hybridlog.query.predicate.parser import names_topics, parse
+from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.tokens import MAX_TEXT
 from hybridlog.query.predicate.tree import Near
 from hybridlog.query.times import format_time
@@ -75,15 +75,13 @@ class PageQuestion:
 
         The predicate must have no conditions on other topics.
         """
-        if len(self.topics) != 1 or not self.where or names_topics(self.where):
+        where = f"{self.topics[0]}: ({self.where})" if len(self.topics) == 1 and self.where else ""
+        if not where or _topic_of(where) != self.topics[0]:
             raise UsageError(
-                "Messages around matches need a predicate on one topic: without other topics."
+                "Messages around matches need a predicate on one topic, without other topics, "
+                "whose name can stand in a predicate."
             )
         self.query()  # the predicate is one by itself, without the brackets
-        (topic,) = self.topics
-        where = f"{topic}: ({self.where})"
-        if _topic_of(where) != topic:
-            raise UsageError(f"The name {topic!r} cannot stand in a predicate.")
         return PageQuestion(self.store, self.recording, (), where, distance, self.span)
 
     def command(self) -> str:
@@ -132,7 +130,7 @@ class PageQuestion:
 def _topic_of(where: str) -> str | None:
     """The topic of a predicate that is one condition on another topic."""
     try:
-        condition = parse(where, across=True).root
+        condition = parse(where).root
     except WhereError:
         return None
     return condition.topic if isinstance(condition, Near) else None

@@ -75,7 +75,7 @@ def test_bins_end_with_their_range(logs: Logs) -> None:
     rows = [[begin, end, 1] for begin, end in spans]
 
     asked = logs.store.topic("left/pose").where("x > -3")
-    asked = asked.during(Intervals.of([(entry.id, np.array(rows, np.int64))]))
+    asked = asked.during(Intervals([(entry.id, np.array(rows, np.int64))]))
     for how in ("count", "max"):
         found = asked.fields("x").resample("10ms", how=how).to_arrow().to_pylist()
         messages = [m for m in logs.of("b", "/left/pose") if float(str(m.fields["x"])) > -3]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from hybridlog.query.predicate.parser import names_topics, parse
+from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.tree import And, Near, Node, Not, Or
 from hybridlog_storage.errors import TimeError, TopicError, UsageError, WhereError
 from tests.cli.within import answer as run
@@ -18,8 +18,13 @@ from .conftest import MS, Logs, Said
 
 pytestmark = pytest.mark.mongo
 
-ODOM = Near("/odom", "v > 0.5")
-A = Near("/a", "b == 1")
+
+def near(topic: str, text: str) -> Near:
+    return Near(topic, parse(text).root if text else And(()))
+
+
+ODOM = near("/odom", "v > 0.5")
+A = near("/a", "b == 1")
 X = parse("x < 1").root
 
 
@@ -27,13 +32,13 @@ X = parse("x < 1").root
     ("text", "want"),
     [
         ("/odom: v > 0.5", ODOM),
-        ("  odom:   v > 0.5 ", Near("odom", "v > 0.5")),
-        ("/odom:", Near("/odom", "")),
-        ("/odom: v > 1 and w < 2", Near("/odom", "v > 1 and w < 2")),
+        ("  odom:   v > 0.5 ", near("odom", "v > 0.5")),
+        ("/odom:", near("/odom", "")),
+        ("/odom: v > 1 and w < 2", near("/odom", "v > 1 and w < 2")),
         ("x < 1 and /odom: v > 0.5", And((X, ODOM))),
-        ("x between 1 and 2 and /odom:", And((parse("x between 1 and 2").root, Near("/odom", "")))),
-        ("/odom: v > 0.5 and /a: b == ': c /d: e'", And((ODOM, Near("/a", "b == ': c /d: e'")))),
-        ("/odom: v > 0.5 or /a: b == 1 && /c:", Or((ODOM, And((A, Near("/c", "")))))),
+        ("x between 1 and 2 and /odom:", And((parse("x between 1 and 2").root, near("/odom", "")))),
+        ("/odom: v > 0.5 and /a: b == ': c /d: e'", And((ODOM, near("/a", "b == ': c /d: e'")))),
+        ("/odom: v > 0.5 or /a: b == 1 && /c:", Or((ODOM, And((A, near("/c", "")))))),
         ("/odom: v > 0.5 && !/a: b == 1", And((ODOM, Not(A)))),
         ("not (/odom: v > 0.5 || /a: b == 1) and x < 1", And((Not(Or((ODOM, A))), X))),
         (
@@ -42,26 +47,32 @@ X = parse("x < 1").root
         ),
         (
             "/odom: (v > 1 or v < 0) and /a: b == 1",
-            And((Near("/odom", "(v > 1 or v < 0)"), A)),
+            And((near("/odom", "v > 1 or v < 0"), A)),
         ),
-        ("/odom: not v > 1 or /a: b == 1", Or((Near("/odom", "not v > 1"), A))),
+        (
+            "/odom: v > 1 or v < 0 and w < 2 and /a: b == 1",
+            Or((near("/odom", "v > 1"), And((near("/odom", "v < 0 and w < 2"), A)))),
+        ),
+        (
+            "/odom: v > 0.5 and (w < 2 or /a: b == 1)",
+            And((ODOM, Or((near("/odom", "w < 2"), A)))),
+        ),
+        ("/odom: not v > 1 or /a: b == 1", Or((near("/odom", "not v > 1"), A))),
         (
             "re:/tf(_static)?: x < 1 and /camera/*/image_[rb]aw: y > 0",
-            And((Near("re:/tf(_static)?", "x < 1"), Near("/camera/*/image_[rb]aw", "y > 0"))),
+            And((near("re:/tf(_static)?", "x < 1"), near("/camera/*/image_[rb]aw", "y > 0"))),
         ),
         (
             '/odom: t >= t"2025-06-03 08:00" and a == 1',
-            Near("/odom", 't >= t"2025-06-03 08:00" and a == 1'),
+            near("/odom", 't >= t"2025-06-03 08:00" and a == 1'),
         ),
         ("((/odom: v > 0.5))", ODOM),
-        ("/odom: name != 'x' and v !~ 'y'", Near("/odom", "name != 'x' and v !~ 'y'")),
+        ("/odom: name != 'x' and v !~ 'y'", near("/odom", "name != 'x' and v !~ 'y'")),
     ],
 )
 def test_conditions_on_topics(text: str, want: Node) -> None:
-    assert names_topics(text)
-    assert parse(text, across=True).root == want
-    with pytest.raises(WhereError, match="cannot stand here"):
-        parse(text)
+    assert parse(text).is_across
+    assert parse(text).root == want
 
 
 @pytest.mark.parametrize(
@@ -76,18 +87,17 @@ def test_conditions_on_topics(text: str, want: Node) -> None:
     ],
 )
 def test_predicates_without_topics(text: str) -> None:
-    assert not names_topics(text)
+    assert not parse(text).is_across
 
 
 @pytest.mark.parametrize(
     ("text", "said"),
     [
         ("x > 1 or y > 2 and /odom: v > 1", "joined by `and`"),
-        ("/odom: v > 1 or v < 0 and /a: b == 1", "brackets around"),
-        ("x > 1 and /odom: v > 1 or v < 0", "brackets around"),
         ("x > 1 /odom: v > 1", "expected 'and'"),
         ("x > (1 /odom: v > 1)", "expected a value"),
-        ("/odom: (v > 1 and /a: b == 1)", "expected '\\)'"),
+        ("/odom: (v > 1 and /a: b == 1)", "cannot stand behind this one"),
+        ("/odom: not /a: b == 1", "cannot stand behind this one"),
         ("and /odom: v > 1", "expected an operator"),
         ("(/odom: v > 1", "expected '\\)'"),
         ("/odom: v > 1) and x > 1", "or the end here"),
@@ -95,7 +105,7 @@ def test_predicates_without_topics(text: str) -> None:
         ("not " * 60 + "/odom: v > 1", "deeper than 50"),
         ("(" * 60 + "/odom: v > 1" + ")" * 60, "deeper than 50"),
         ("/a: b == 1 or " * 3000 + "/a:", "at most 10000"),
-        ("a:b > 1", "a space follows"),
+        ("a:b > 1", "a space follows the name"),
     ],
 )
 def test_conditions_that_are_refused(logs: Logs, text: str, said: str) -> None:

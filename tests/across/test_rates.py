@@ -62,7 +62,7 @@ def test_gaps(
     assert query.counters.chunks_read == 0
 
 
-def test_of_very_many_steps_a_share_tells_the_usual_one(calls: Calls, limit: Limit) -> None:
+def test_of_very_many_steps_the_first_tell_the_usual_one(calls: Calls, limit: Limit) -> None:
     sizes: list[int] = []
     calls(periods, "usual_period", lambda steps: sizes.append(len(steps)))
     limit(sampled_periods=20)

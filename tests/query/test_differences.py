@@ -77,7 +77,7 @@ def test_equal_questions_ask_the_same(store: hl.Store) -> None:
     assert seconds == asked.between(0, 5 * SECOND)
     assert len({nanoseconds, seconds, asked.between(0, 5)}) == 2
     windows = asked.where("n == 1").windows("1s", "1s")
-    again = Intervals.of([(windows[0].recording, np.array([[SECOND, 3 * SECOND, 1]]))])
+    again = Intervals([(windows[0].recording, np.array([[SECOND, 3 * SECOND, 1]]))])
     assert asked.during(again) == asked.during(windows)
     question = asked.where("n ~ 'x' and n > 1").during(windows).every(2).question
     assert pickle.loads(pickle.dumps(question)) == question

@@ -297,7 +297,7 @@ def _windows(world: World, windows: list[tuple[str, int, int]]) -> Intervals:
     for name, begin, length in windows:
         first = BASE + begin * SECOND // 4
         rows.setdefault(world.ids[name], []).append([first, first + length * SECOND // 4, 1])
-    return Intervals.of((name, np.array(spans, np.int64)) for name, spans in rows.items())
+    return Intervals((name, np.array(spans, np.int64)) for name, spans in rows.items())
 
 
 def asked(world: World, question: dict[str, Any]) -> Query:
@@ -390,7 +390,7 @@ def check(world: World, question: dict[str, Any]) -> None:
                     for n, s in enumerate(world.sent)
                 ]
                 for recording in query.recordings:
-                    rows = Intervals.of([(recording, np.array(spans, np.int64))])
+                    rows = Intervals([(recording, np.array(spans, np.int64))])
                     times = [s.log_time for s in want if s.recording == recording]
                     found = [(one.begin_ns, one.end_ns) for one in rows.containing(query)]
                     assert found == [

@@ -19,8 +19,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import hybridlog as hl
+from hybridlog.query.answers.interval_queries import rows_differ
 from hybridlog.query.intervals import Interval, Intervals, changing, holding
-from hybridlog.query.rows_differ import rows_differ
 from hybridlog_storage.errors import TimeError, UsageError, WhereError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
@@ -38,7 +38,7 @@ def listed(rows: np.ndarray[Any, Any]) -> Rows:
 
 
 def intervals(*rows: tuple[str, int, int]) -> Intervals:
-    return Intervals.of((name, np.array([[begin, end, 1]], np.int64)) for name, begin, end in rows)
+    return Intervals((name, np.array([[begin, end, 1]], np.int64)) for name, begin, end in rows)
 
 
 # --- the parts ------------------------------------------------------------------------
@@ -334,21 +334,6 @@ def _key(fields: Sequence[str]) -> Callable[[Said], object]:
         return found
 
     return key
-
-
-def test_the_order_does_not_depend_on_indexes_of_the_user(store: hl.Store) -> None:
-    logs = [(second, "/state", {"s": 9 - second}) for second in range(10)]
-    model = recorded(store, {"a": logs})
-    database = store.shared.index.database_for("the test")
-    database.create_index("state", [("s", 1)])
-    query = store.topic("/state").where("s > 2")
-    for asked in (query, store.topic("/state").where({"s": {"$gt": 2}})):
-        assert [m.fields["s"] for m in asked] == [9, 8, 7, 6, 5, 4, 3]
-        assert [m.fields["s"] for m in asked.reverse()] == [3, 4, 5, 6, 7, 8, 9]
-    assert len(query.intervals()) == 1
-    assert len(query.changes("s", pause=0)) == 6
-    assert seconds(query.intervals()) == model.states(lambda m: m.value["s"] > 2, (0, 2**62), None)
-    database.drop_index("state", [("s", 1)])
 
 
 @pytest.fixture

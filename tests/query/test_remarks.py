@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 import hybridlog as hl
-from hybridlog.query.topics import namesakes
 from hybridlog_storage.errors import TimeError, UsageError
 from hybridlog_storage.messages import Channel, Schema
 
@@ -38,7 +36,6 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
     numbers = Channel("/n", "ros1", NUMBER)
     early, near = Channel("/early", "ros1", STAMPED), Channel("/near", "ros1", STAMPED)
     text, opaque = Channel("/j", "json", None), Channel("/opaque", "cbor", None)
-    scans = [Channel(f"{name}/scan", "ros1", NUMBER) for name in ("", "/rear", "/front/base")]
     path = tmp_path_factory.mktemp("remarks") / "store"
     with hl.open(path, create=True) as opened:
         with opened.start("monday") as monday:
@@ -50,8 +47,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
                 fields = {"n": n, "list": [{"deep": 1}], "long": [1.5] * 40}
                 monday.write(text, json.dumps(fields).encode(), log_time=at)
                 monday.write(opaque, b"abc", log_time=at)
-            for scan in scans:
-                monday.write(scan, number(0), log_time=BEGIN + 20 * SECOND)
+            monday.write(Channel("/late", "ros1", NUMBER), number(0), log_time=BEGIN + 20 * SECOND)
         with opened.start("tuesday") as tuesday:
             tuesday.write(numbers, number(7), log_time=BEGIN + 86_400 * SECOND)
         yield opened
@@ -159,40 +155,6 @@ def test_why_an_answer_is_empty(store: hl.Store) -> None:
     )
     with pytest.raises(TimeError, match=r"Z\.$"):
         store.topic("/n").between(day + SECOND, day + 2 * SECOND).count()
-
-
-def test_a_short_name_that_several_topics_end_with(store: hl.Store) -> None:
-    query = store.topic("scan")
-    assert query.topics == ("/scan",)
-    assert query.count() == 1
-    told = ["/scan was asked, not /front/base/scan, /rear/scan; '**/scan' takes all."]
-    assert query.remarks() == store.recordings().topic("scan").remarks() == told
-    for name in ("/scan", "*scan"):
-        assert store.topic(name).remarks(is_empty=False) == []
-    every = store.topic("**/scan")
-    assert every.count() == 3
-    assert every.remarks() == []
-    near = store.topic("/n").where("scan: n >= 0", within="1s")
-    assert told[0] in near.remarks(is_empty=False)
-    assert namesakes(["SCAN"], ["/Scan", "/a/scan", "/a/scanner"]) == ("/a/scan",)
-    assert namesakes(["scan"], ["/a/scan", "/b/scan"]) == ()
-
-
-def test_a_short_name_that_topics_of_other_recordings_end_with(tmp_path: Path) -> None:
-    with hl.open(tmp_path / "store", mongo="none", create=True) as store:
-        for label, topic in (("one", "/scan"), ("two", "/base/scan")):
-            with store.start(label) as recording:
-                recording.write(Channel(topic, "ros1", NUMBER), number(0), log_time=BEGIN)
-        query = store.topic("scan")
-        assert query.count() == 1
-        assert query.remarks() == ["/scan was asked, not /base/scan; '**/scan' takes all."]
-        assert (
-            store.recordings(["o*", "t*"]).topic("scan").remarks(is_empty=False) == query.remarks()
-        )
-        assert query.in_recording("one").remarks(is_empty=False) == []
-        answer = store.sql("select count(*) from scan")
-        assert answer.to_arrow().to_pylist() == [{"count_star()": 1}]
-        assert answer.sentences() == ["/scan was asked, not the view base__scan."]
 
 
 def test_messages_that_changes_and_statistics_leave_out(store: hl.Store) -> None:

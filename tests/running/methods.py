@@ -277,7 +277,7 @@ def _right_clocks(known: Known) -> Any:
 
 def _during(store: hl.Store) -> Intervals:
     recording = store.summaries()[0].id
-    return Intervals.of([(recording, np.array([[FIRST_S, LAST_S, 0]], np.int64))])
+    return Intervals([(recording, np.array([[FIRST_S, LAST_S, 0]], np.int64))])
 
 
 def _thrice(query: Any) -> Any:

@@ -212,14 +212,15 @@ def _follow(query: Query, choices: _Choices) -> None:
 
 
 def _query(store: Store, choices: _Choices) -> Query:
-    from hybridlog.query.predicate.parser import names_topics
+    from hybridlog.query.predicate.parser import parse
+    from hybridlog.query.predicate.tokens import is_filter
 
     query = choices.bounded(query_of(store, choices.named(store), choices.choice))
     query = query.clock(choices.clock)
     near: str | tuple[str, str] | None = choices.within
     if (choices.before, choices.after) != (None, None):
         near = choices.before or "0s", choices.after or "0s"
-    across = [*map(names_topics, choices.where)]
+    across = [not is_filter(one) and parse(one).is_across for one in choices.where]
     if near is not None and not any(across):
         raise UsageError(
             "--within, --before and --after are about messages of other topics: add --where "

@@ -111,28 +111,21 @@ class Completeness:
         Raises:
             IncompleteError: some are.
         """
-        if self.has_losses:
-            raise IncompleteError(
-                f"{self._losses()} in this range; `hybridlog info --losses` says where. Without "
-                "--strict the rest is given."
-            )
-        if self.late:
-            raise IncompleteError(" ".join(self.late))
-        if self.untransformed:
-            raise IncompleteError(
-                f"{counted(self.untransformed, 'message')} without a transform. Without --strict "
-                "the rest is given."
-            )
-        if self.untested:
-            raise IncompleteError(
-                f"{counted(self.untested, 'message')} could not be tested: their arrays were "
-                "deleted, or not copied yet. Without --strict the rest is given."
-            )
-        if payloads and self.reduced:
-            raise IncompleteError(
-                f"Of {self.reduced} messages in this range only the fields are stored. Without "
-                "--strict the rest is given."
-            )
+        problems = {
+            f"{self._losses()} in this range; `hybridlog info --losses` says where.": (
+                self.has_losses
+            ),
+            " ".join(self.late): self.late,
+            f"{counted(self.untransformed, 'message')} without a transform.": self.untransformed,
+            f"{counted(self.untested, 'message')} could not be tested: their arrays were deleted, "
+            "or not copied yet.": self.untested,
+            f"Of {self.reduced} messages in this range only the fields are stored.": (
+                payloads and self.reduced
+            ),
+        }
+        for problem, is_there in problems.items():
+            if is_there:
+                raise IncompleteError(f"{problem} Without --strict the rest is given.")
 
 
 def not_written(name: str, messages: int | None, interval_ns: int) -> str:

@@ -17,19 +17,27 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hybridlog.message import messages_in
+from hybridlog.query import latching
 from hybridlog.query.answers.video import picture_of
-from hybridlog.query.chunk_scan import ChunkScan, MessageRun, RecordingScan, ScanPlan, with_payloads
-from hybridlog.query.latching import depth_of, is_key_frame, is_video, publisher_of
+from hybridlog.query.chunk_scan import (
+    ChunkScan,
+    MessageRun,
+    RecordingScan,
+    ScanPlan,
+    in_order,
+    with_payloads,
+)
+from hybridlog.query.latching import KEEP_ALL, depth_of, is_key_frame, is_video, publisher_of
 from hybridlog.query.planner import Planner
 from hybridlog.query.question import Counters, Question
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import TimeLike, parse_time
-from hybridlog_storage.errors import SegmentError
-from hybridlog_storage.times import END, earlier, span_of
+from hybridlog_storage.disk.copying import interleave
+from hybridlog_storage.errors import ResourceError, SegmentError
+from hybridlog_storage.times import BEGIN, END, earlier, span_of
 
 if TYPE_CHECKING:
     from hybridlog.message import Message
-    from hybridlog.query.chunk_columns import Chunk
     from hybridlog.query.question import RecordedChannel, Span
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
@@ -116,11 +124,6 @@ def _last_of(
 
 
 _FIRST_LOOK = 1 << 30  # ns, about a second
-_Key = tuple[int, int]
-"""Log time, ns, and arrival number of a message."""
-
-_FIRST: _Key = (-1, -1)
-"""Before any message."""
 
 
 def in_force(
@@ -141,18 +144,21 @@ def in_force(
     """
     for summary, begin in _beginnings(session, question):
         recording = session.entry_of(summary)
-        channels = _latching(session, question, recording)
-        for batch, own in _LatchedScan(session, recording, begin, counters).read(channels):
-            frames = np.array([is_video(c.channel) for c in own])[batch.channel].sum()
-            counters.frames += int(frames)
-            counters.latched += len(batch) - int(frames)
-            if not original_times:
-                has_publish_time = np.array([c.channel.has_publish_time for c in own])
-                batch.publish_time = np.where(
-                    has_publish_time[batch.channel], batch.publish_time, batch.log_time
-                )
-                batch.log_time = np.full(len(batch), begin, np.int64)
-            yield batch, own
+        own = _latching(session, question, recording, begin)
+        run = _last_messages(session, recording, own, begin, counters)
+        if run is None:
+            continue
+        batch = run.batch
+        is_frame = np.array([is_video(one.channel) for one in own])[batch.channel]
+        counters.frames += int(is_frame.sum())
+        counters.latched += int((~is_frame).sum())
+        if not original_times:
+            has_publish_time = np.array([one.channel.has_publish_time for one in own])
+            batch.publish_time = np.where(
+                has_publish_time[batch.channel], batch.publish_time, batch.log_time
+            )
+            batch.log_time = np.full(len(batch), begin, np.int64)
+        yield batch, own
 
 
 def _beginnings(session: Session, question: Question) -> Iterator[tuple[RecordingSummary, int]]:
@@ -164,115 +170,75 @@ def _beginnings(session: Session, question: Question) -> Iterator[tuple[Recordin
         yield from RangeResolver(session, question).beginnings()
         return
     for summary, _, _ in RangeResolver(session, question).resolve():
-        if _latching(session, question, session.entry_of(summary)):
+        if _latching(session, question, session.entry_of(summary), END):
             first = replace(question, recordings=(summary.id,), limit=1, every=1, reverse=False)
             for run in Planner(session, first).runs():
                 yield summary, int(run.batch.log_time[0])
 
 
 def _latching(
-    session: Session, question: Question, recording: RecordingEntry
+    session: Session, question: Question, recording: RecordingEntry, begin: int
 ) -> list[RecordedChannel]:
-    """The latching channels of a question in a recording, and those of video."""
+    """The latching channels of a question with messages before a time, and those of video."""
     return [
         channel
         for channel in session.channels_of(recording, {*question.topics})
-        if depth_of(channel.channel) or is_video(channel.channel)
+        if (depth_of(channel.channel) or is_video(channel.channel))
+        and channel.stats.first is not None
+        and channel.stats.first < begin
     ]
 
 
-class _LatchedScan:
-    """Reads the last messages of each publisher before a log time, in order.
+def _last_messages(
+    session: Session,
+    recording: RecordingEntry,
+    channels: list[RecordedChannel],
+    begin: int,
+    counters: Counters,
+) -> MessageRun | None:
+    """The last messages of each publisher before a log time, in order; None without any."""
+    publishers: dict[Hashable, dict[int, int]] = defaultdict(dict)
+    for index, channel in enumerate(channels):
+        publishers[publisher_of(channel.channel)][channel.channel_id] = index
+    found: list[MessageRun] = []
+    for indexes in publishers.values():
+        chunks = session.chunks(recording, [*indexes], (BEGIN, begin), "log")
+        scan = RecordingScan(recording, indexes, (BEGIN, begin), chunks)
+        plan = ScanPlan(channels, [scan], reverse=True, counters=counters)
+        found += _of_publisher([channels[index] for index in indexes.values()], plan, session)
+        if sum(run.batch.payload_bytes for run in found) > latching.MAX_HELD:
+            raise ResourceError(
+                f"What is in force at the beginning has more than {latching.MAX_HELD >> 20} MiB: "
+                "leave latched messages and frames out (--no-latched)."
+            )
+    found = [one for run in found if len((one := with_payloads(run, counters)).batch)]
+    return in_order(found, ScanPlan(channels, [])) if found else None
 
-    The first pass goes back from that time, one publisher after the other, and finds the
-    first message in force. The second one reads from there on, so memory is bounded by the
-    chunks that overlap in time, whatever the depth.
-    """
 
-    def __init__(
-        self, session: Session, recording: RecordingEntry, begin: int, counters: Counters
-    ) -> None:
-        self._session = session
-        self._recording = recording
-        self._begin = begin
-        self._counters = counters
-
-    def read(
-        self, channels: Sequence[RecordedChannel]
-    ) -> Iterator[tuple[Batch, Sequence[RecordedChannel]]]:
-        """The messages in force on some latching channels."""
-        publishers: dict[Hashable, list[RecordedChannel]] = defaultdict(list)
-        for channel in channels:
-            first = channel.stats.first
-            if first is not None and first < self._begin:
-                publishers[publisher_of(channel.channel)].append(channel)
-        own: list[RecordedChannel] = []
-        cuts: list[_Key] = []
-        scans: list[RecordingScan] = []
-        for group in publishers.values():
-            cut = self._cut(group)
-            if cut is None:
-                continue
-            scans.append(self._scan(group, cut[0], len(own)))
-            own += group
-            cuts += [cut] * len(group)
-        if not own:
-            return
-        times, numbers = np.array(cuts, np.int64).T
-        plan = ScanPlan(own, [_merged_scan(scans)], counters=self._counters)
-        for run in ChunkScan(plan, self._session).runs():
-            of, time = run.batch.channel, run.batch.log_time
-            at = times[of]
-            keep = (time > at) | ((time == at) & (run.seq >= numbers[of]))
-            if keep.any():
-                found = with_payloads(run.take(keep), self._counters)
-                if len(found.batch):
-                    yield found.batch, own
-
-    def _cut(self, group: Sequence[RecordedChannel]) -> _Key | None:
-        """The first message in force, of publishers that displace one another or of video."""
-        is_of_video = is_video(group[0].channel)
-        left = max(depth_of(channel.channel) for channel in group)
-        if not is_of_video and left >= sum(channel.stats.messages for channel in group):
-            return _FIRST
-        plan = ScanPlan([*group], [self._scan(group, 0, 0)], reverse=True, counters=self._counters)
-        for run in ChunkScan(plan, self._session, ahead=False).runs():
-            row = None if left > len(run.batch) else left - 1
-            if is_of_video:
-                row = next(filter(partial(_is_key, run), range(len(run.batch))), None)
-            if row is not None:
-                return int(run.batch.log_time[row]), int(run.seq[row])
-            left -= len(run.batch)
-        return None if is_of_video else _FIRST
-
-    def _scan(self, group: Sequence[RecordedChannel], begin: int, first: int) -> RecordingScan:
-        """The scan of some channels from a log time on; their indexes begin with `first`."""
-        indexes = {channel.channel_id: first + row for row, channel in enumerate(group)}
-        bounds = max(begin, 0), self._begin
-        chunks = self._session.chunks(self._recording, [*indexes], bounds, "log")
-        return RecordingScan(self._recording, indexes, bounds, chunks)
+def _of_publisher(
+    channels: Sequence[RecordedChannel], plan: ScanPlan, session: Session
+) -> list[MessageRun]:
+    """The last messages of publishers that displace one another, or of video from a key frame."""
+    is_of_video = is_video(channels[0].channel)
+    left = KEEP_ALL if is_of_video else max(depth_of(one.channel) for one in channels)
+    found: list[MessageRun] = []
+    size = 0
+    for run in ChunkScan(plan, session, ahead=False).runs():
+        rows = range(len(run.batch))
+        key = next(filter(partial(_is_key, run), rows), None) if is_of_video else None
+        chosen = np.array(rows if key is None else rows[: key + 1])[:left]
+        batch = interleave([run.batch.take(chosen)], np.arange(len(chosen)))  # not its chunk
+        found.append(MessageRun(batch, run.seq[chosen], run.channels))
+        left -= len(chosen)
+        size += batch.payload_bytes
+        if key is not None or left == 0 or size > latching.MAX_HELD:
+            return found
+    return [] if is_of_video else found
 
 
 def _is_key(run: MessageRun, row: int) -> bool:
     channel = run.channels[int(run.batch.channel[row])].channel
     return is_key_frame(channel, run.batch.payload(row))
-
-
-def _merged_scan(scans: Sequence[RecordingScan]) -> RecordingScan:
-    """One scan of everything, which reads each chunk once."""
-    chunks: dict[tuple[int, int], Chunk] = {}
-    for chunk in (chunk for scan in scans for chunk in scan.chunks):
-        key = chunk.segment, chunk.number
-        known = chunks.setdefault(key, chunk)
-        first, last = min(known.first, chunk.first), max(known.last, chunk.last)
-        chunks[key] = known._replace(first=first, last=last)
-    bounds = [scan.bounds for scan in scans if scan.bounds is not None]
-    return RecordingScan(
-        scans[0].recording,
-        {channel: index for scan in scans for channel, index in scan.channels.items()},
-        (min(begin for begin, _ in bounds), bounds[0][1]),
-        [*chunks.values()],
-    )
 
 
 def next_time(session: Session, recording: RecordingEntry, topic: str, moment: int) -> int | None:

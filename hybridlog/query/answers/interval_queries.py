@@ -10,6 +10,8 @@ from operator import itemgetter
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 
 from hybridlog.query.answers.lost import lost_times
 from hybridlog.query.answers.marks import mark_topics, marks
@@ -18,17 +20,20 @@ from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import DurationLike, parse_duration
 from hybridlog.record.losses import extent_of
+from hybridlog.schema.arrow_types import is_list, lengths_of
+from hybridlog.schema.column import ranges
 from hybridlog.wording import listed
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.times import END, earlier, placed
 
 if TYPE_CHECKING:
-    import pyarrow as pa
     from numpy.typing import NDArray
 
     from hybridlog.query.question import Counters, Part, Question, Span
     from hybridlog.session import Session
     from hybridlog_storage.summary import RecordingSummary
+
+    Places = NDArray[np.intp]
 
 _Rows = TypeVar("_Rows", bound="tuple[Any, ...]")
 _NONE = np.empty(0, np.int64)
@@ -47,7 +52,7 @@ class IntervalQueries:
         self._check("A state")
         if state is not None:
             return self._certain(max_gap, state)
-        return Intervals.of(self.held(max_gap))
+        return Intervals(self.held(max_gap))
 
     def held(self, max_gap: DurationLike | None) -> Iterator[tuple[str, NDArray[np.int64]]]:
         """The intervals in which the predicate holds, some at a time; see `Query.held`."""
@@ -67,7 +72,7 @@ class IntervalQueries:
         )
         spans = RangeResolver(self._session, self._question).spans()
         by_recording = plain.times_in(summary for summary, _ in spans)
-        whole = Intervals.of(
+        whole = Intervals(
             (summary.id, np.array([[begin, end, 0]], np.int64)) for summary, (begin, end) in spans
         )
         # What was lost before the range may have changed the state at its beginning.
@@ -95,7 +100,7 @@ class IntervalQueries:
             raise UsageError(f"A tolerance is a number that is 0 or greater, not {tolerance}.")
         quiet = parse_duration(pause)
         paths = [field.replace("[*]", "").replace("[]", "") for field in fields]
-        return Intervals.of(
+        return Intervals(
             (part.recording.id, changing(self._steps_in(part, span, paths, tolerance), quiet))
             for part, span in self._spans()
         )
@@ -116,7 +121,7 @@ class IntervalQueries:
         # Windows that begin together are in the order of the recordings' keys.
         ordered = sorted(found, key=lambda item: known[item[0]].key)
         whole = {name: (0, END) if one.span is None else one.extent for name, one in known.items()}
-        return Intervals.of(ordered).widened(before, after).within(whole)
+        return Intervals(ordered).widened(before, after).within(whole)
 
     def _lasting(self) -> Iterator[tuple[str, NDArray[np.int64]]]:
         """Begin and end of marks, by recording."""
@@ -137,11 +142,11 @@ class IntervalQueries:
 
     def _spans(self) -> Iterator[tuple[Part, Span]]:
         """The one part of each recording, without a time range, with each span of the question."""
-        ranges = RangeResolver(self._session, self._question).spans()
+        resolved = RangeResolver(self._session, self._question).spans()
         # All stored messages of the topic may be lost: then nothing is known of its state.
         found = [
             (part, [span for _, span in spans])
-            for summary, spans in groupby(ranges, key=itemgetter(0))
+            for summary, spans in groupby(resolved, key=itemgetter(0))
             for part in self._planner.parts_in(summary, None, None)
         ]
         # MongoDB is asked once for all.
@@ -223,9 +228,84 @@ def _steps(
 ) -> tuple[NDArray[np.bool_], pa.StructArray]:
     """Find the rows that differ from the row before them; also returns the last row."""
     from hybridlog.columns.fields import joined
-    from hybridlog.query.rows_differ import rows_differ
 
     whole = rows if carried is None else joined([carried, rows])
     numbers = np.arange(len(whole))
     differs = rows_differ(whole, numbers, np.maximum(numbers - 1, 0), tolerance)
     return differs[len(whole) - len(rows) :], whole[-1:]
+
+
+def rows_differ(
+    column: pa.Array[Any], one: Places, other: Places, tolerance: float = 0.0
+) -> NDArray[np.bool_]:
+    """True where rows of a column, possibly nested, differ from other rows of it.
+
+    NaN equals NaN, -0 equals 0, and null equals only null; numbers are equal if they differ by at
+    most the tolerance. Lists of different lengths differ.
+    """
+    kind = column.type
+    if isinstance(kind, pa.BaseExtensionType):  # JSON text
+        return rows_differ(column.storage, one, other)
+    if pa.types.is_null(kind):
+        return np.zeros(len(one), np.bool_)
+    valid: NDArray[np.bool_] = np.asarray(column.is_valid(), np.bool_)
+    differs: NDArray[np.bool_] = valid[one] != valid[other]
+    there = valid[one] & valid[other]
+    if pa.types.is_struct(kind):
+        for inner in column.flatten():
+            differs |= there & rows_differ(inner, one, other, tolerance)
+        return differs
+    if is_list(kind):
+        rows = np.flatnonzero(there)
+        differs[rows] = _lists(column, one[rows], other[rows], tolerance)
+        return differs
+    differs |= there & _values(column, one, other, tolerance)
+    return differs
+
+
+def _values(
+    column: pa.Array[Any], one: Places, other: Places, tolerance: float
+) -> NDArray[np.bool_]:
+    kind = column.type
+    if not (pa.types.is_primitive(kind) and not pa.types.is_decimal(kind)):
+        codes = pc.fill_null(column.dictionary_encode().indices, -1)
+        values = codes.to_numpy(zero_copy_only=False)
+    else:
+        if pa.types.is_temporal(kind):
+            column = column.view(pa.int64())
+        values = pc.fill_null(column, False if pa.types.is_boolean(kind) else 0).to_numpy(
+            zero_copy_only=False
+        )
+    left, right = values[one], values[other]
+    same = left == right
+    if left.dtype.kind == "f":
+        same |= np.isnan(left) & np.isnan(right)
+    if tolerance and left.dtype.kind in "iuf" and pa.types.is_primitive(kind):
+        with np.errstate(invalid="ignore"):  # inf - inf is NaN, which is not near
+            same |= np.abs(left.astype(np.float64) - right.astype(np.float64)) <= tolerance
+    differs: NDArray[np.bool_] = ~same
+    return differs
+
+
+def _lists(
+    column: pa.Array[Any], one: Places, other: Places, tolerance: float
+) -> NDArray[np.bool_]:
+    length = lengths_of(column)
+    if pa.types.is_fixed_size_list(column.type):
+        start = (column.offset + np.arange(len(column))) * column.type.list_size
+    else:
+        start = column.offsets.to_numpy()[:-1].astype(np.int64)
+    elements = column.values
+    count = length[one]
+    found: NDArray[np.bool_] = count != length[other]
+    alike = np.flatnonzero(~found & (count > 0))
+    if len(alike):
+        count = count[alike]
+        differs = rows_differ(
+            elements,
+            ranges(start[one[alike]], count),
+            ranges(start[other[alike]], count),
+            tolerance,
+        )
+        found[alike] = np.logical_or.reduceat(differs, np.cumsum(count) - count)
+    return found

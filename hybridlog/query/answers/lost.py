@@ -153,7 +153,7 @@ def lost_times(session: Session, question: Question) -> Intervals:
             continue
         low, end = span_of(*(_span_of(entry, row) or (BEGIN, END)))
         parts.append((entry.id, np.array([[low, end, 0]], np.int64)))
-    return Intervals.of(parts)
+    return Intervals(parts)
 
 
 def _losses_in(

@@ -1,8 +1,7 @@
-"""Remarks on a question: names, fields and stamps, and likely causes of an empty answer."""
+"""Remarks on a question: fields and stamps, and likely causes of an empty answer."""
 
 from __future__ import annotations
 
-import difflib
 from collections import defaultdict
 from collections.abc import Collection, Iterator
 from dataclasses import replace
@@ -14,14 +13,13 @@ from hybridlog.query.predicate.tree import Exists, is_meta
 from hybridlog.query.question import Question, field_types
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import format_time
-from hybridlog.wording import listed
+from hybridlog.wording import like, meant
 
 if TYPE_CHECKING:
     from hybridlog.query.question import RecordedChannel, Span
     from hybridlog.session import Session
 
 _MAX_RECORDINGS = 100  # recordings looked at
-_MAX_NAMES = 5  # names in a remark
 _APART_NS = 86_400 * 10**9  # header stamps and log times this far apart have other epochs
 
 
@@ -33,23 +31,12 @@ def remarks(session: Session, question: Question, *, is_empty: bool) -> Iterator
         question: The question.
         is_empty: The answer has no messages or intervals.
     """
-    yield from about_names(question)
     if question.clock == "header" and question.bounds is not None:
         yield from _about_stamps(session, question)
     yield from _missing_fields(session, question, is_empty=is_empty)
     yield from _missing_columns(session, question)
     if is_empty and question.limit != 0:
         yield from _causes(session, question)
-
-
-def about_names(question: Question) -> Iterator[str]:
-    """Further topics that end with a short name, in the recordings that were chosen."""
-    others = [topic for topic in question.namesakes if topic not in question.topics]
-    for topic in question.topics:
-        tail = "/" + topic.strip("/")
-        found = [other for other in others if other.casefold().endswith(tail.casefold())]
-        if found:
-            yield f"{topic} was asked, not {listed(found, _MAX_NAMES)}; '**{tail}' takes all."
 
 
 def _about_stamps(session: Session, question: Question) -> Iterator[str]:
@@ -120,8 +107,8 @@ def _missing(topic: str, path: str, known: Collection[str]) -> Iterator[str]:
     """A sentence that no message of a topic has a field, if it is none of the known ones."""
     plain = path.replace("[]", "")
     if not any(_is_near(plain, name.replace("[]", "")) for name in known):
-        near = difflib.get_close_matches(path, known, n=_MAX_NAMES, cutoff=0.5)
-        hint = f"; did you mean {', '.join(near)}?" if near else "."
+        near = like(path, known)
+        hint = f"; {meant(path, near)}" if near else "."
         yield f"No message of {topic} has a field {path!r}{hint}"
 
 

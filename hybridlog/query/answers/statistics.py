@@ -259,7 +259,7 @@ def gaps(
             places = np.flatnonzero(np.diff(edges) > limit)
             none = np.zeros(len(places), np.int64)
             found.append((summary.id, np.stack([edges[places], edges[places + 1], none], axis=1)))
-    return Intervals.of(found)
+    return Intervals(found)
 
 
 def check(

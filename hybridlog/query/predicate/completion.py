@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
 
 from hybridlog.frames.names import is_summary
 from hybridlog.query.predicate.tokens import Token, tokenize
@@ -26,76 +25,46 @@ Fields = Callable[[str | None], Mapping[str, str] | None]
 """Types of the fields by path: of a topic, or of the message itself. None if unknown."""
 
 
-@dataclass(frozen=True, slots=True)
-class Candidate:
-    """A text that may stand at a place.
-
-    Attributes:
-        text: As it is written.
-        kind: Field, topic or word.
-        type: Type of a field, empty for others.
-    """
+class Candidate(NamedTuple):
+    """A text that may stand at a place, with its kind, and with its type if it is a field."""
 
     text: str
     kind: Kind
     type: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Completion:
-    """The candidates for the word that ends at a place.
-
-    Attributes:
-        begin: Index of the first character of the word.
-        candidates: Those that begin with the word, then those that contain it.
-    """
-
-    begin: int
-    candidates: tuple[Candidate, ...]
-
-
 def complete(
-    text: str, place: int, topics: Collection[str], fields: Fields, *, most: int = 50
-) -> Completion:
-    """Candidates for completing a predicate at a place.
+    text: str, topics: Collection[str], fields: Fields, *, most: int = 50
+) -> tuple[int, list[Candidate]]:
+    """Where the last word of a text begins, and what it may become.
 
     Args:
-        text: The predicate.
-        place: Index of the character that is typed next.
+        text: The beginning of a predicate.
         topics: Other topics that may be asked.
         fields: Gives the fields of a topic, by its name as written.
         most: Greatest number of candidates.
     """
-    before = text[:place]
-    found = _WORD.search(before)
-    begin = place if found is None else found.start()
+    begin = len(text) - len(_WORD.findall(text)[0])
     try:
-        known = tokenize(before[:begin])[:-1]
+        known = tokenize(text[:begin])[:-1]
     except WhereError:  # in a string, for example
-        return Completion(place, ())
-    offered = [*_offered(known, topics, fields)]
-    folded = before[begin:].casefold()
-    fitting = [one for one in offered if folded in one.text.casefold()]
+        return len(text), []
+    folded = text[begin:].casefold()
+    fitting = [one for one in _offered(known, topics, fields) if folded in one.text.casefold()]
     fitting.sort(key=lambda one: not one.text.casefold().startswith(folded))
-    return Completion(begin, tuple(fitting[:most]))
+    return begin, fitting[:most]
 
 
 def _offered(known: list[Token], topics: Collection[str], fields: Fields) -> Iterator[Candidate]:
-    last = known[-1] if known else None
-    word = _word(last) if last is not None else "("
+    word = known[-1].keyword if known else "("
     if word in _COMPARISONS:
         yield from (Candidate(word, "word") for word in _VALUES)
-    elif word in _BEGINS or (last is not None and last.kind == "topic"):
+    elif word in _BEGINS or known[-1].kind == "topic":
         yield from _fields_of(fields(_topic_at(known)))
         yield Candidate("not", "word")
         yield from (Candidate(f"{topic}: ", "topic") for topic in sorted(topics))
     else:
         yield from (Candidate(word, "word") for word in _BEHIND)
-
-
-def _word(token: Token) -> str:
-    """An operator, or a word that may be a keyword; empty for others."""
-    return token.text if token.kind == "operator" else token.keyword
 
 
 def _fields_of(types: Mapping[str, str] | None) -> Iterator[Candidate]:
@@ -122,13 +91,12 @@ def _quoted(part: str) -> str:
 
 def _topic_at(known: list[Token]) -> str | None:
     """The topic that a predicate behind some tokens is about; None for the message itself."""
-    outer: list[str | None] = []
-    topic: str | None = None
+    topics: list[str | None] = [None]
     for token in known:
         if token.kind == "topic":
-            topic = token.text.removesuffix(":")
-        elif _word(token) == "(":
-            outer.append(topic)
-        elif _word(token) == ")" and outer:
-            topic = outer.pop()
-    return topic
+            topics[-1] = token.text
+        elif token.keyword == "(":
+            topics.append(topics[-1])
+        elif token.keyword == ")" and len(topics) > 1:
+            topics.pop()
+    return topics[-1]

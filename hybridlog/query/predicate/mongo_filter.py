@@ -1,7 +1,7 @@
 """Checks MongoDB filters that a user wrote, before they are handed to MongoDB as they are.
 
-Only operators that compare values are allowed, and no code. Patterns have RE2's syntax, so no
-search takes forever. What is written wrongly otherwise MongoDB says itself.
+Only operators that compare values are allowed, on fields that exist, and no code. Patterns have
+RE2's syntax, so no search takes forever. What is written wrongly otherwise MongoDB says itself.
 """
 
 from __future__ import annotations
@@ -17,19 +17,17 @@ from bson.errors import BSONError
 from bson.regex import Regex
 
 from hybridlog.query.predicate.regex import RegexError, compile_regex
-from hybridlog.query.predicate.tokens import MAX_TEXT
 from hybridlog.query.predicate.tree import (
+    ALWAYS,
     And,
-    Compare,
+    Exists,
     Field,
-    Match,
     MongoFilter,
     Predicate,
     Reach,
-    Value,
     is_meta,
 )
-from hybridlog.query.predicate.types import STATS, FieldTypes, check, check_name
+from hybridlog.query.predicate.types import STATS, FieldTypes, check
 from hybridlog.schema.kinds import width_of
 from hybridlog_storage.errors import WhereError
 
@@ -41,7 +39,7 @@ WHOLE = 32
 """Longer arrays are summaries in index documents."""
 
 _LOGICAL = {"$and", "$or", "$nor"}
-_LITERAL = {"$eq", "$ne", "$gt", "$gte", "$lt", "$lte", "$in", "$nin", "$all"}
+_OF_VALUES = {"$eq", "$ne", "$gt", "$gte", "$lt", "$lte", "$in", "$nin", "$all", "$not"}
 _PLAIN = {
     *("$exists", "$type", "$size", "$mod"),
     *("$bitsAllSet", "$bitsAllClear", "$bitsAnySet", "$bitsAnyClear"),
@@ -71,8 +69,6 @@ _EXPRESSIONS = frozenset(
     }
 )
 _FLAGS = {"i": re.IGNORECASE, "m": re.MULTILINE, "s": re.DOTALL, "": re.UNICODE}
-_UNCHECKED = {"NoneType", "dict", "list", "Decimal128", "MinKey", "MaxKey"}
-"""Types of values that are compared with fields of any type."""
 _PLACE = re.compile(r"0|[1-9][0-9]{0,8}")
 
 Filter = dict[str, object]
@@ -110,8 +106,7 @@ def mongo_filter(
         types: Types of the fields by path; None where no definition fixes them.
 
     Raises:
-        WhereError: a part is not allowed, with its place; there is no such field; or a value
-            does not fit its type.
+        WhereError: a part is not allowed, with its place; or there is no such field.
     """
     if not isinstance(query, Mapping):
         raise WhereError(f"a filter is a mapping, not {type(query).__name__}")
@@ -119,8 +114,8 @@ def mongo_filter(
         content = bson.encode(query, codec_options=_CODEC)
         if len(content) > MAX_BYTES:
             raise _refused((), "it is too large")
-        text, found = str(query), bson.decode(content)
-        checker = _Checker(text)
+        found = bson.decode(content)
+        checker = _Checker()
         checker.query(found, ())
     except RecursionError:
         raise _refused((), "it is nested too deeply") from None
@@ -128,12 +123,10 @@ def mongo_filter(
         raise _refused((), "it has a text that is not valid Unicode") from None
     except (BSONError, OverflowError, TypeError, ValueError) as error:
         raise _refused((), str(error)) from None
-    for path in checker.paths:
-        if not _is_id(path):
-            check_name(text, _field(path), types)
-    check(Predicate(And(tuple(checker.compared)), text), types)
-    root = MongoFilter(content, tuple(checker.paths.items())) if found else And(())
-    return Predicate(root, text)
+    asked = (Exists(_field(path), present=True) for path in checker.paths if not _is_id(path))
+    check(Predicate(And(tuple(asked)), str(query)), types)
+    root = MongoFilter(content, tuple(checker.paths.items())) if found else ALWAYS
+    return Predicate(root, str(query))
 
 
 def misjudged(node: MongoFilter, types: FieldTypes | Mapping[str, str] | None) -> dict[str, Filter]:
@@ -182,10 +175,9 @@ def _is_summary(value: str) -> Filter:
     return {"$in": [value, [{name: f"{value}.{name}" for name in shape} for shape in shapes]]}
 
 
-def _field(path: str, position: int = 0) -> Field:
+def _field(path: str) -> Field:
     first, *rest = path.split(".")
-    parts = (int(part) if _PLACE.fullmatch(part) else part for part in rest)
-    return Field((first, *parts), position)
+    return Field((first, *(int(part) if _PLACE.fullmatch(part) else part for part in rest)))
 
 
 def _is_id(path: str) -> bool:
@@ -204,17 +196,10 @@ _CODEC: CodecOptions[Filter] = CodecOptions(type_registry=TypeRegistry(fallback_
 
 
 class _Checker:
-    """Checks a filter of plain values.
+    """Checks a filter of plain values; `paths` says how it asks for each path."""
 
-    Attributes:
-        paths: How the filter asks for each path.
-        compared: Fields and the values that they are compared with, as `==`, and patterns.
-    """
-
-    def __init__(self, text: str) -> None:
+    def __init__(self) -> None:
         self.paths: dict[str, Reach] = {}
-        self.compared: list[Compare | Match] = []
-        self._text = text
 
     def query(self, query: object, path: _Path, above: str = "") -> None:
         """Check a filter.
@@ -224,90 +209,66 @@ class _Checker:
             path: Its place, for messages.
             above: The path of the array whose elements it is about, and a dot.
         """
-        if isinstance(query, list):
-            for item in query:
-                self.query(item, path, above)
-        if not isinstance(query, dict):
-            return
-        for key, value in query.items():
-            place = (*path, key)
-            if key in _LOGICAL:
-                self.query(value, place, above)
-            elif key == "$expr" and not above:
-                self._expression(value, place)
-            elif key.startswith("$"):
-                raise _refused(place, "the operator is not allowed here")
-            elif isinstance(value, Regex) or _has_operators(value):
-                operators = {"$regex": value} if isinstance(value, Regex) else value
-                self._operators(above + key, cast("Filter", operators), place)
-            else:
-                self._compare(above + key, value, place)
+        for one in query if isinstance(query, list) else [query]:
+            for key, value in one.items() if isinstance(one, dict) else ():
+                place = (*path, key)
+                if key in _LOGICAL:
+                    self.query(value, place, above)
+                elif key == "$expr" and not above:
+                    self._expression(value, place)
+                elif key.startswith("$"):
+                    raise _refused(place, "the operator is not allowed here")
+                else:
+                    self._condition(above + key, value, place)
 
     def _ask(self, name: str, reach: Reach) -> None:
         """Note that the filter asks for a path, and how."""
         if self.paths.get(name, "exists") == "exists" or reach == "whole":
             self.paths[name] = reach
 
-    def _value(self, name: str) -> Field:
-        """A field that is compared, and its place in the text."""
-        return _field(name, max(0, self._text.find(repr(name), 0, MAX_TEXT)))
-
-    def _compare(self, name: str, value: object, path: _Path) -> None:
-        """Check a value that a field is compared with."""
-        self._ask(name, "whole" if isinstance(value, dict | list) else "value")
-        _literal(value, path)
-        if type(value).__name__ not in _UNCHECKED and not _is_id(name):
-            field = self._value(name)
-            self.compared.append(Compare(field, "==", cast("Value", value), field.position))
+    def _condition(self, name: str, value: object, path: _Path) -> None:
+        """Check what a field is compared with: a value, a pattern, or operators."""
+        if isinstance(value, Regex):
+            self._pattern(name, value, "", path)
+        elif _has_operators(value):
+            self._operators(name, cast("Filter", value), path)
+        else:
+            self._ask(name, "whole" if isinstance(value, dict | list) else "value")
+            _literal(value, path)
 
     def _operators(self, name: str, operators: Filter, path: _Path) -> None:
         for key, value in operators.items():
             place = (*path, key)
-            if key == "$regex" or (key == "$not" and isinstance(value, Regex)):
+            self._ask(name, "exists" if key == "$exists" else "value")
+            if key == "$regex":
                 self._pattern(name, value, operators.get("$options", ""), place)
-            elif key == "$not" and isinstance(value, dict):
-                self._operators(name, value, place)
             elif key == "$elemMatch":
-                self._element(name, value, place)
-            elif key in _LITERAL:
-                self._ask(name, "value")
+                if _has_operators(value) and not {*cast("Filter", value)} & {*_LOGICAL, "$expr"}:
+                    self._condition(name, value, place)
+                else:
+                    self.query(value, place, f"{name}.")
+            elif key in _OF_VALUES:
                 is_list = key in {"$in", "$nin", "$all"} and isinstance(value, list)
                 for item in cast("list[object]", value) if is_list else [value]:
-                    if key == "$all" and isinstance(item, dict) and {*item} == {"$elemMatch"}:
-                        self._operators(name, item, place)
-                    else:
-                        self._compare(name, item, place)
+                    self._condition(name, item, place)
             elif key in _PLAIN:
-                self._ask(name, "exists" if key == "$exists" else "value")
                 _literal(value, place)
             elif key != "$options" or "$regex" not in operators:
                 raise _refused(place, "the operator is not allowed here")
 
-    def _element(self, name: str, value: object, path: _Path) -> None:
-        """Check the condition on an element of an array."""
-        self._ask(name, "value")
-        if _has_operators(value) and not {*cast("Filter", value)} & {*_LOGICAL, "$expr"}:
-            self._operators(name, cast("Filter", value), path)
-        else:
-            self.query(value, path, f"{name}.")
-
     def _pattern(self, name: str, value: object, options: object, path: _Path) -> None:
         self._ask(name, "value")
         if isinstance(value, Regex):
-            known = [*_FLAGS.values()]
-            if options or value.flags & ~sum(known):
+            if options or value.flags & ~sum(_FLAGS.values()):
                 raise _refused(path, "may have the options i, m and s only, and once")
             options = "".join(letter for letter, flag in _FLAGS.items() if value.flags & flag)
             value = value.pattern
+        if not {*str(options)} <= {*"ims"}:
+            raise _refused(path, "may have the options i, m and s only")
         try:
-            if not {*str(options)} <= {*"ims"}:
-                raise _refused(path, "may have the options i, m and s only")
             compile_regex(f"(?{options}){value}" if options else str(value))
         except RegexError as error:
             raise _refused(path, f"the pattern is refused: {error}") from None
-        if not _is_id(name):
-            field = self._value(name)
-            self.compared.append(Match(field, str(value), negated=False, position=field.position))
 
     def _expression(self, value: object, path: _Path) -> None:
         """Check an aggregation expression."""

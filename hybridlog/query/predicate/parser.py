@@ -31,8 +31,8 @@ The pattern of `~` is found anywhere in the string unless anchored; its backslas
 escaping of their own. It has RE2's syntax and takes linear time.
 
 `TOPIC: expression` holds for a message if another one, of that topic and near in time,
-satisfies the expression. That reaches to the next topic, or to the end of the brackets; what
-joins it to the next topic is the last `and` or `or` before that. A space follows the colon.
+satisfies the expression. A space follows the colon. Conditions behind a topic are about it, up to
+the next topic or the end of the brackets. Those that `and` joins are about one message of it.
 
 `x.min`, `x.max`, `x.mean` and `x.n` of an array are its least and greatest finite element,
 their mean, and the number of elements. Where the types of the fields are unknown, a
@@ -43,18 +43,16 @@ holds for any finite element.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import lru_cache
+from itertools import groupby
+from operator import itemgetter
+from typing import TypeAlias
 
 from hybridlog.query.predicate.regex import RegexError, compile_regex
-from hybridlog.query.predicate.tokens import (
-    Token,
-    error_at,
-    is_filter,
-    regex_text,
-    tokenize,
-    unescape,
-)
+from hybridlog.query.predicate.tokens import Token, error_at, is_filter, tokenize, unescape
 from hybridlog.query.predicate.tree import (
+    ALWAYS,
     And,
     Compare,
     Exists,
@@ -68,7 +66,6 @@ from hybridlog.query.predicate.tree import (
     Order,
     Predicate,
     Value,
-    nodes,
 )
 from hybridlog_storage.errors import WhereError
 
@@ -94,147 +91,110 @@ _VALUE_WORDS: dict[str, Value] = {
     "infinity": math.inf,
     "nan": math.nan,
 }
-
-
+_ENDS = frozenset({"", ")", "and", "&&", "or", "||"})
+"""Keywords behind a topic of which any message will do."""
 _ONLY_INDEXED = frozenset({"inserted_at", "error", "ref"})
 """Fields of `_meta` that index documents have and messages do not."""
 
-
-def names_topics(text: str) -> bool:
-    """True if a predicate has conditions on other topics; a MongoDB filter has none."""
-    if ":" not in text or is_filter(text):
-        return False
-    return any(isinstance(node, Near) for node in nodes(parse(text, across=True).root))
+_OWN, _MIXED = 0, -1
+_About: TypeAlias = tuple[int, Node]
+"""A condition, and the number of the topic it is about: `_OWN`, or `_MIXED` of several."""
 
 
-def parse(text: str, *, across: bool = False) -> Predicate:
-    """Parse a predicate.
-
-    Args:
-        text: The predicate.
-        across: It may have conditions on other topics.
-    """
+def parse(text: str) -> Predicate:
+    """Parse a predicate."""
     if not isinstance(text, str):
         raise WhereError(f"a predicate is text, not {type(text).__name__}")
     if is_filter(text):
         raise WhereError("MongoDB filters are not possible here: write a predicate, such as x > 1")
-    return _parsed(text, across)
+    return _parsed(text)
 
 
 @lru_cache(maxsize=128)  # for a small topic, parsing takes as long as the answer
-def _parsed(text: str, across: bool) -> Predicate:  # noqa: FBT001
-    found = _Parser(text, across=across).parse()
-    for condition in found.conditions():
-        name = condition.field.path.split(".")
-        if name[0] == "_meta" and not _ONLY_INDEXED.isdisjoint(name[1:2]):
-            path = condition.field.path
-            raise error_at(
-                text,
-                condition.field.position,
-                f'only MongoDB has {path}; ask with a filter: {{"{path}": {{"$exists": true}}}}',
-            )
-    return found
+def _parsed(text: str) -> Predicate:
+    return _Parser(text).parse()
 
 
 class _Parser:
-    def __init__(self, text: str, *, across: bool) -> None:
+    def __init__(self, text: str) -> None:
         self._text = text
         self._tokens = tokenize(text)
         self._at = 0
         self._depth = 0
-        self._takes_topics = across
-        self._is_of_topic = False  # what is parsed is about another topic
-        self._has_or = False  # what was parsed last is joined by `or`, without brackets
-        self._groups = self._find_groups()
+        self._topics = [""]  # as written, in their order; the message itself is the first
+        self._topic = _OWN
 
     def parse(self) -> Predicate:
         if self._peek().kind == "end":
             raise WhereError("the predicate is empty; write for example: ranges.min < 0.5")
-        root = self._or()
+        root = self._whole(*self._or())
         if self._peek().kind != "end":
             raise self._fail(self._peek(), "expected 'and', 'or' or the end here")
         return Predicate(root, self._text)
 
-    def _or(self) -> Node:
-        items = [self._and()]
-        while not self._is_at_topic() and self._take("or", "||"):
-            items.append(self._and())
-        self._has_or = len(items) > 1
-        return items[0] if len(items) == 1 else Or(tuple(items))
+    def _or(self) -> _About:
+        return self._joined(Or, ("or", "||"), self._and)
 
-    def _and(self) -> Node:
-        items = [self._factor()]
-        while not self._is_at_topic() and self._take("and", "&&"):
-            items.append(self._factor())
-        return items[0] if len(items) == 1 else And(tuple(items))
+    def _and(self) -> _About:
+        return self._joined(And, ("and", "&&"), self._factor)
 
-    def _factor(self) -> Node:
-        token = self._peek()
+    def _joined(
+        self, join: type[And | Or], words: tuple[str, str], item: Callable[[], _About]
+    ) -> _About:
+        """One item or several; neighbours about one topic are about one message of it."""
+        found = [item()]
+        while self._take(*words):
+            found.append(item())
+        alike = [(topic, [one for _, one in own]) for topic, own in groupby(found, itemgetter(0))]
+        joined = [(topic, own[0] if len(own) == 1 else join(tuple(own))) for topic, own in alike]
+        if len(joined) == 1:
+            return joined[0]
+        return _MIXED, join(tuple(self._whole(*one) for one in joined))
+
+    def _whole(self, topic: int, node: Node) -> Node:
+        """A condition as one on the message itself."""
+        return Near(self._topics[topic], node) if topic > _OWN else node
+
+    def _factor(self) -> _About:
+        token, topic = self._peek(), self._topic
         self._depth += 1
         if self._depth > MAX_DEPTH:
             raise self._fail(token, f"nested deeper than {MAX_DEPTH}")
-        node: Node
-        if self._take("not", "!"):
-            node = Not(self._factor())
+        if token.kind == "topic":
+            found = self._near(token)
+        elif self._take("not", "!"):
+            about, node = self._factor()
+            found = (
+                (about, Not(node)) if about == topic else (_MIXED, Not(self._whole(about, node)))
+            )
         elif self._take("("):
-            node = self._or()
+            found = self._or()
             if not self._take(")"):
                 raise self._fail(self._peek(), "expected ')' here")
-            self._has_or = False
+            self._topic = topic
         else:
-            node = self._near() if token.kind == "topic" else self._condition()
+            found = topic, self._condition()
         self._depth -= 1
-        return node
-
-    def _find_groups(self) -> set[int]:
-        """Places of opening brackets with a topic inside."""
-        found: set[int] = set()
-        opened: list[int] = []
-        for place, token in enumerate(self._tokens):
-            if token.kind == "topic":
-                found.update(opened)
-            elif token.kind == "operator" and token.text == "(":
-                opened.append(place)
-            elif token.kind == "operator" and token.text == ")" and opened:
-                opened.pop()
         return found
 
-    def _is_at_topic(self) -> bool:
-        """True where a topic ends what is about another one: behind the next `and` or `or`."""
-        place = self._at + 1
-        if not self._is_of_topic or self._peek().kind == "end":
-            return False
-        while (self._tokens[place].keyword or self._tokens[place].text) in {"not", "!"}:
-            place += 1
-        return self._tokens[place].kind == "topic" or place in self._groups
-
-    def _near(self) -> Near:
-        topic, first = self._tokens[self._at : self._at + 2]
-        if self._is_of_topic or not self._takes_topics:
-            raise self._fail(topic, "a condition on another topic cannot stand here")
-        before = self._tokens[self._at - 1] if self._at else topic
+    def _near(self, token: Token) -> _About:
         self._at += 1
-        name = topic.text.removesuffix(":")
-        is_any = first.kind == "end" or first.text == ")" or first.keyword in {"and", "or"}
-        if is_any or first.text in {"&&", "||"}:
-            return Near(name, "")
-        self._is_of_topic = True
-        self._or()
-        self._is_of_topic = False
-        beside = {(token.keyword or token.text) for token in (before, self._peek())}
-        if self._has_or and not beside.isdisjoint({"and", "&&"}):
-            raise self._fail(
-                topic,
-                "`or` stands beside `and`: put brackets around what belongs together, such as "
-                "/odom: (a > 1 or b > 1) and /imu: c > 1",
-            )
-        return Near(name, self._text[first.position : self._tokens[self._at - 1].end])
+        self._topics.append(token.text)
+        self._topic = topic = len(self._topics) - 1
+        behind = self._peek()
+        if behind.kind in {"operator", "path", "end"} and behind.keyword in _ENDS:
+            return topic, ALWAYS
+        about, node = self._factor()
+        if about != topic:
+            raise self._fail(token, "a condition on another topic cannot stand behind this one")
+        return topic, node
 
     def _condition(self) -> Node:
         token = self._peek()
         if token.kind == "path" and token.keyword not in _VALUE_WORDS:
             return self._of_field(self._field())
-        if not self._is_value(token):
+        is_signed = token.keyword in {*_VALUE_WORDS, "+", "-"}
+        if not is_signed and token.kind not in {"number", "time", "string"}:
             raise self._fail(token, "expected a condition here, such as: x < 5")
         # `0 < x`, `0 < x < 5`
         value = self._value()
@@ -265,6 +225,9 @@ class _Parser:
             return self._member(field, token, negated=token.keyword == "not")
         if self._take("between"):
             return self._between(field)
+        if token.keyword == "[":
+            problem = "write an element as x[3], a slice as x[3:8]; both count from 0"
+            raise self._fail(token, problem)
         raise self._fail(
             token,
             "expected an operator here: ==, !=, <, <=, >, >=, in, not in, ~, !~, between, "
@@ -288,7 +251,7 @@ class _Parser:
         return And((low, high))
 
     def _member(self, field: Field, token: Token, *, negated: bool) -> Node:
-        closing = {"[": "]", "(": ")"}.get(self._peek().text if self._is_operator() else "")
+        closing = {"[": "]", "(": ")"}.get(self._peek().keyword)
         if closing is None:
             raise self._fail(self._peek(), "expected a list here: [1, 2]")
         self._at += 1
@@ -308,7 +271,8 @@ class _Parser:
         if token.kind != "string":
             raise self._fail(token, 'expected a pattern in quotes here: ~ "^base_"')
         self._at += 1
-        pattern = regex_text(token)
+        # Backslashes stay: "\d+" means digits.
+        pattern = token.text.replace('\\"', '"').replace("\\'", "'")
         try:
             compile_regex(pattern)
         except RegexError as error:
@@ -320,13 +284,17 @@ class _Parser:
         if token.kind != "path":
             raise self._fail(token, "expected the name of a field here")
         self._at += 1
+        if token.path[0] == "_meta" and not _ONLY_INDEXED.isdisjoint(token.path[1:2]):
+            path = Field(token.path).path
+            problem = (
+                f'only MongoDB has {path}; ask with a filter: {{"{path}": {{"$exists": true}}}}'
+            )
+            raise self._fail(token, problem)
         return Field(token.path, token.position)
 
     def _value(self) -> Value:
-        sign = 0
-        if self._is_operator() and self._peek().text in {"-", "+"}:
-            sign = -1 if self._peek().text == "-" else 1
-            self._at += 1
+        sign = {"-": -1, "+": 1}.get(self._peek().keyword, 0)
+        self._at += bool(sign)
         token = self._peek()
         self._at += 1
         if token.kind in {"number", "time"}:
@@ -347,29 +315,18 @@ class _Parser:
         raise self._fail(token, "expected a value here")
 
     def _order(self) -> Order | None:
-        if self._is_operator() and self._peek().text in _ORDERS:
-            self._at += 1
-            return _ORDERS[self._tokens[self._at - 1].text]
-        return None
-
-    def _is_value(self, token: Token) -> bool:
-        return token.kind in {"number", "time", "string"} or (
-            token.keyword in _VALUE_WORDS or (token.kind == "operator" and token.text in {"+", "-"})
-        )
-
-    def _is_operator(self) -> bool:
-        return self._peek().kind == "operator"
+        order = _ORDERS.get(self._peek().keyword)
+        self._at += order is not None
+        return order
 
     def _peek(self) -> Token:
         return self._tokens[self._at]
 
     def _take(self, *words: str) -> bool:
         """Consume the next token if it is one of these words or operators."""
-        token = self._peek()
-        if (token.text if token.kind == "operator" else token.keyword or None) in words:
-            self._at += 1
-            return True
-        return False
+        is_one = self._peek().keyword in words
+        self._at += is_one
+        return is_one
 
     def _fail(self, token: Token, message: str) -> WhereError:
         return error_at(self._text, token.position, message)

@@ -1,4 +1,4 @@
-"""The tokens of a predicate: field paths, numbers, strings, times, operators.
+"""The tokens of a predicate: topics, field paths, numbers, times, strings, operators.
 
 Text that forms no token raises `WhereError` with a caret under the place. The length of
 the text is limited before it is processed.
@@ -7,8 +7,7 @@ the text is limited before it is processed.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple, cast
 
 from hybridlog.query.predicate.tree import Parts, Slice
 from hybridlog.query.times import parse_duration, parse_time
@@ -16,64 +15,55 @@ from hybridlog_storage.errors import TimeError, WhereError
 
 MAX_TEXT = 10_000
 """Maximum length of a predicate, characters."""
-MAX_TOKENS = 2_000
 _WINDOW = 100
 
-_PART = r"[^\W\d]\w*|`[^`]*`"
-_FIRST = re.compile(_PART)
-_DIGITS = "0123456789"
-_NEXT = re.compile(
-    rf"""\.(?P<name>{_PART}|[0-9]+)
-    |\[\s*(?:(?P<begin>[0-9]*)\s*(?P<colon>:)\s*(?P<end>[0-9]*)|(?P<index>[0-9]+|\*)?)\s*\]""",
-    re.VERBOSE,
+_NAME = r"(?:[^\W\d]\w*|`[^`.$\0][^`.\0]*`)"
+_SLICE = r"(?P<begin>[0-9]*)\s*(?P<colon>:)\s*(?P<end>[0-9]*)"
+_PART = re.compile(
+    rf"""\.?(?P<name>{_NAME})|\.(?P<digits>[0-9]+)"""
+    rf"""|\[\s*(?:{_SLICE}|(?P<index>[0-9]+)|\*?)\s*\]"""
 )
-_NUMBER_WORD = re.compile(r"\.?[0-9](?:[eE][+-](?=[0-9])|[0-9A-Za-z_.µμ])*")
-_HEX = re.compile(r"0[xX][0-9a-fA-F]+")
-_INTEGER = re.compile(r"[0-9]+")
-_FLOAT = re.compile(r"(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
-_TOPIC = re.compile(
-    r"""(?<![^\s(!])(?:re:\S*[^\s:]"""
-    r"""|(?!\S*\[[^\s\]]*:|[0-9]+:)[^\s()"'`:!&|][^\s()"'`:]*):(?=\s|$)"""
+_STRING = r"""(?:"(?:\\.|[^"\\])*"|'(?:\\.|[^'\\])*')"""
+_TOKEN = re.compile(
+    rf"""(?P<space>\s+)
+    |(?P<topic>(?<![^\s(!])(?:re:\S*[^\s:]
+        |(?!\S*\[[^\s\]]*:|[0-9]+:)[^\s()"'`:!&|][^\s()"'`:]*):(?=\s|$))
+    |(?P<time>[tT]{_STRING})
+    |(?P<string>{_STRING})
+    |(?P<number>\.?[0-9](?:[eE][+-](?=[0-9])|[0-9A-Za-z_.µμ])*)
+    |(?P<path>[iI][nN](?=\[)|{_NAME}
+        (?:\.(?:{_NAME}|[0-9]+)|\[\s*(?:[0-9]*\s*:\s*[0-9]*|[0-9]+|\*?)\s*\])*)
+    |(?P<operator>==|!=|<=|>=|&&|\|\||!~|=~|[<>=~!()\[\],+-])""",
+    re.VERBOSE | re.DOTALL,
 )
-"""The name of another topic with its colon."""
-_OPERATOR = re.compile(r"==|!=|<=|>=|&&|\|\||!~|=~|[<>=~!()\[\],+-]")
 _HINTS = {
     "&": "; write and",
     "|": "; write or",
-    ":": "; behind the name of another topic a space follows: /odom: x > 1",
+    ":": "; a slice is x[3:8], and a space follows the name of another topic: /odom: x > 1",
+    ".": "; the field's name does not end",
+    "'": "; the string is not closed",
+    '"': "; the string is not closed",
+    "`": "; a name must not be empty, hold '.' or NUL, or begin with '$'",
 }
-_STRING = re.compile(
-    r"""(?P<quote>["'])(?P<body>(?:\\.|(?!(?P=quote))[^\\])*)(?P=quote)""", re.DOTALL
-)
+_INTEGER = re.compile(r"0[xX][0-9a-fA-F]+|[0-9]+")
+_FLOAT = re.compile(r"(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 _ESCAPE = re.compile(r"\\(?:u([0-9a-fA-F]{4})|(.))", re.DOTALL)
-_ESCAPES = {
-    '"': '"',
-    "'": "'",
-    "\\": "\\",
-    "/": "/",
-    "n": "\n",
-    "t": "\t",
-    "r": "\r",
-    "b": "\b",
-    "f": "\f",
-    "0": "\0",
-}
+_ESCAPES = dict(zip("\"'\\/ntrbf0", "\"'\\/\n\t\r\b\f\0", strict=True))
 
 Kind = Literal["path", "number", "time", "string", "operator", "topic", "end"]
 
 
-@dataclass(frozen=True, slots=True)
-class Token:
+class Token(NamedTuple):
     """One token.
 
     Attributes:
         kind: Its kind; `time` is a number of nanoseconds, a time or a duration.
-        text: The text as written; for a string, without its quotes.
+        text: The text as written; of a string without its quotes, of a topic without its colon.
         position: Index of its first character.
         number: Value of a `number` or `time`.
         path: Parts of a `path`: names, ints for array elements, slices. `[]` and `[*]`,
             any element, add no part.
-        keyword: A path of one plain name, in lower case; empty for all others.
+        keyword: A path in lower case, which may be a keyword, or an operator; empty for others.
     """
 
     kind: Kind
@@ -82,11 +72,6 @@ class Token:
     number: int | float = 0
     path: Parts = ()
     keyword: str = ""
-
-    @property
-    def end(self) -> int:
-        """Index behind its last character."""
-        return self.position + len(self.text) + 2 * (self.kind == "string")
 
 
 def is_filter(text: str) -> bool:
@@ -114,18 +99,20 @@ def tokenize(text: str) -> list[Token]:
         raise WhereError(
             f"the predicate has {len(text)} characters, at most {MAX_TEXT} are allowed"
         )
+    try:
+        text.encode()
+    except UnicodeEncodeError as error:
+        raise error_at(text, error.start, "the predicate is not valid Unicode") from None
     tokens: list[Token] = []
     at = 0
-    while True:
-        while at < len(text) and text[at].isspace():
-            at += 1
-        if at >= len(text):
-            tokens.append(Token("end", "", len(text.rstrip())))
-            return tokens
-        token, at = _next(text, at)
-        tokens.append(token)
-        if len(tokens) > MAX_TOKENS:
-            raise error_at(text, token.position, f"the predicate has more than {MAX_TOKENS} words")
+    while at < len(text):
+        match = _TOKEN.match(text, at)
+        if match is None:
+            raise error_at(text, at, f"{text[at]!r} has no meaning here{_HINTS.get(text[at], '')}")
+        if match.lastgroup != "space":
+            tokens.append(_token(text, cast(Kind, match.lastgroup), match[0], at))
+        at = match.end()
+    return [*tokens, Token("end", "", len(text.rstrip()))]
 
 
 def unescape(text: str, token: Token) -> str:
@@ -147,129 +134,64 @@ def unescape(text: str, token: Token) -> str:
         raise error_at(text, token.position, "the string has half a surrogate pair") from None
 
 
-def regex_text(token: Token) -> str:
-    r"""The pattern of a string token, with its backslashes: `"\d+"` means digits."""
-    return token.text.replace('\\"', '"').replace("\\'", "'")
+def _token(text: str, kind: Kind, word: str, at: int) -> Token:
+    if kind == "path":
+        return Token(kind, word, at, path=_parts(text, at, word), keyword=word.lower())
+    if kind == "number":
+        return _number(text, word, at)
+    if kind == "time":
+        try:
+            return Token(kind, word, at, parse_time(word[2:-1], start=None, end=None))
+        except TimeError as error:
+            raise error_at(text, at, str(error)) from None
+    if kind == "operator":
+        return Token(kind, word, at, keyword=word)
+    return Token(kind, word[1:-1] if kind == "string" else word[:-1], at)
 
 
-def _next(text: str, at: int) -> tuple[Token, int]:
-    char = text[at]
-    if topic := _TOPIC.match(text, at):
-        return Token("topic", topic[0], at), topic.end()
-    if char in "\"'":
-        return _string(text, at)
-    if char in "tT" and text[at + 1 : at + 2] in {'"', "'"}:
-        return _time(text, at)
-    if word := _NUMBER_WORD.match(text, at):
-        return _number(text, word)
-    if first := _FIRST.match(text, at):
-        return _path(text, first)
-    if operator := _OPERATOR.match(text, at):
-        return Token("operator", operator[0], at), operator.end()
-    hint = _HINTS.get(char, "")
-    raise error_at(text, at, f"{char!r} has no meaning here{hint}")
-
-
-def _string(text: str, at: int) -> tuple[Token, int]:
-    match = _STRING.match(text, at)
-    if match is None:
-        raise error_at(text, at, "the string is not closed")
-    if any(0xD800 <= ord(char) <= 0xDFFF for char in match["body"]):
-        raise error_at(text, at, "the string is not valid Unicode")
-    return Token("string", match["body"], at), match.end()
-
-
-def _time(text: str, at: int) -> tuple[Token, int]:
-    inner, end = _string(text, at + 1)
-    try:
-        ns = parse_time(inner.text, start=None, end=None)
-    except TimeError as error:
-        raise error_at(text, at, str(error)) from None
-    return Token("time", text[at:end], at, number=ns), end
-
-
-def _number(text: str, word: re.Match[str]) -> tuple[Token, int]:
-    written, at = word[0], word.start()
-    kind: Kind = "number"
-    value: int | float
-    if len(written) > 400:
+def _number(text: str, word: str, at: int) -> Token:
+    if len(word) > 400:
         raise error_at(text, at, "the number has more than 400 characters")
-    if _HEX.fullmatch(written) or _INTEGER.fullmatch(written):
-        value = int(written, 16 if written[:2] in {"0x", "0X"} else 10)
-    elif _FLOAT.fullmatch(written):
-        value = float(written)
-        if value == float("inf"):
+    if _INTEGER.fullmatch(word):
+        return Token("number", word, at, int(word, 16 if word[:2] in {"0x", "0X"} else 10))
+    if _FLOAT.fullmatch(word):
+        if float(word) == float("inf"):
             problem = "the number is too large for a double; write inf if that is meant"
             raise error_at(text, at, problem)
-    else:
-        kind = "time"
-        try:
-            value = parse_duration(written)
-        except TimeError:
-            raise error_at(
-                text, at, f"{written!r} is neither a number nor a duration such as 500ms"
-            ) from None
-    return Token(kind, written, at, number=value), word.end()
+        return Token("number", word, at, float(word))
+    try:
+        return Token("time", word, at, parse_duration(word))
+    except TimeError:
+        problem = f"{word!r} is neither a number nor a duration such as 500ms"
+        raise error_at(text, at, problem) from None
 
 
-def _path(text: str, first: re.Match[str]) -> tuple[Token, int]:
-    at = first.start()
-    parts: list[str | int | Slice] = [_name(text, at, first[0])]
-    end = first.end()
-    # `in[1, 2]` is the operator and a list, not an element of a field.
-    is_in = first[0].lower() == "in"
+def _parts(text: str, begin: int, word: str) -> Parts:
+    """The parts of a path."""
+    parts: list[str | int | Slice] = []
     of_any = False
-    while (match := _NEXT.match(text, end)) and not (is_in and text[end] == "["):
-        name, is_slice = match["name"], match["colon"] is not None
-        is_element = name is None or name[0] in _DIGITS
-        if is_element and of_any:
+    for match in _PART.finditer(word):
+        name, digits, at = match["name"], match["digits"] or match["index"], begin + match.start()
+        if name is None and of_any:
             raise error_at(
                 text,
-                end,
+                at,
                 "any element can be asked only of named fields: write x[0][1], x[0][1:3] or x[*].y",
             )
-        of_any = is_slice or (name is None and match["index"] in {None, "*"})
+        of_any = name is None and digits is None
+        if any(len(match[number] or "") > 9 for number in ("digits", "index", "begin", "end")):
+            raise error_at(text, at, "the index is too large")
         if name is not None:
-            parts.append(_index(text, end, name) if is_element else _part(text, end + 1, name))
-        elif is_slice:
-            parts.append(_slice(text, end, match["begin"], match["end"]))
-        elif not of_any:
-            parts.append(_index(text, end, match["index"]))
-        end = match.end()
-    if text[end : end + 1] == "[" and not is_in:
-        raise error_at(text, end, "write an element as x[3], a slice as x[3:8]; both count from 0")
-    if text[end : end + 1] == ".":
-        raise error_at(text, end, "the field's name does not end")
-    plain = end == first.end() and not first[0].startswith("`")
-    keyword = first[0].lower() if plain else ""
-    return Token("path", text[at:end], at, path=tuple(parts), keyword=keyword), end
-
-
-def _name(text: str, at: int, name: str) -> str:
-    """A part of a path, without its backquotes."""
-    plain = name.strip("`")
-    if not plain or "." in plain or "\0" in plain or plain.startswith("$"):
-        raise error_at(text, at, "a name must not be empty, hold '.' or NUL, or begin with '$'")
-    if any(0xD800 <= ord(char) <= 0xDFFF for char in plain):
-        raise error_at(text, at, "the name is not valid Unicode")
-    return plain
-
-
-def _part(text: str, at: int, name: str) -> str | int:
-    """A name after another; MongoDB treats a number as an index in an array."""
-    plain = _name(text, at, name)
-    is_place = plain.isascii() and plain.isdecimal() and str(int(plain[:10])) == plain
-    return int(plain) if is_place else plain
-
-
-def _index(text: str, at: int, digits: str) -> int:
-    if len(digits) > 9:
-        raise error_at(text, at, "the index is too large")
-    return int(digits)
-
-
-def _slice(text: str, at: int, begin: str, end: str) -> Slice:
-    found = Slice(_index(text, at, begin or "0"), _index(text, at, end) if end else None)
-    if found.end is not None and found.end <= found.begin:
-        raise error_at(text, at, "the slice is empty: its end is the element after the last one")
-    return found
+            plain = name.strip("`")
+            # MongoDB treats a number as an index in an array.
+            is_place = parts and plain.isascii() and plain.isdecimal() and len(plain) < 10
+            parts.append(int(plain) if is_place and str(int(plain)) == plain else plain)
+        elif digits is not None:
+            parts.append(int(digits))
+        elif match["colon"]:
+            found = Slice(int(match["begin"] or 0), int(match["end"]) if match["end"] else None)
+            if found.end is not None and found.end <= found.begin:
+                problem = "the slice is empty: its end is the element after the last one"
+                raise error_at(text, at, problem)
+            parts.append(found)
+    return tuple(parts)

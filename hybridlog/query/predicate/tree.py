@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, TypeAlias
+from typing import Final, Literal, NamedTuple, TypeAlias
 
 from hybridlog_storage.lazy import lazy
 
@@ -137,11 +137,11 @@ class Near(_Node):
 
     Attributes:
         topic: As written.
-        predicate: What it satisfies, as written; empty for any message.
+        item: What that message satisfies.
     """
 
     topic: str
-    predicate: str
+    item: Node
 
 
 Reach: TypeAlias = Literal["exists", "value", "whole"]
@@ -172,6 +172,8 @@ class MongoFilter(_Node):
         return not all(is_meta(path) or path.split(".")[0] == "_id" for path, _ in self.paths)
 
 
+ALWAYS: Final = And(())
+"""What every message satisfies."""
 Condition: TypeAlias = Compare | Member | Exists | Match
 Node: TypeAlias = Condition | And | Or | Not | Near | MongoFilter
 
@@ -190,7 +192,7 @@ class Predicate:
 
     def __bool__(self) -> bool:
         """True if it has any condition."""
-        return self.root != And(())
+        return self.root != ALWAYS
 
     def __and__(self, other: Predicate) -> Predicate:
         """Both predicates hold."""
@@ -220,6 +222,11 @@ class Predicate:
         )
 
     @lazy
+    def is_across(self) -> bool:
+        """True if it has conditions on other topics."""
+        return any(isinstance(node, Near) for node in nodes(self.root))
+
+    @lazy
     def filters(self) -> tuple[MongoFilter, ...]:
         """The MongoDB filters in it."""
         return tuple(node for node in nodes(self.root) if isinstance(node, MongoFilter))
@@ -236,7 +243,7 @@ def root_of(node: Predicate | Node) -> Node:
 
 
 def nodes(node: Node) -> Iterator[Node]:
-    """All nodes of a tree, parents before children, from left to right."""
+    """All nodes of a tree but those of other topics, parents first, from left to right."""
     yield node
     match node:
         case And(items) | Or(items):

@@ -2,28 +2,24 @@
 
 from __future__ import annotations
 
-import difflib
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
-from hybridlog.query.predicate.tokens import error_at, is_filter
+from hybridlog.query.predicate.tokens import error_at
 from hybridlog.query.predicate.tree import (
     Compare,
-    Condition,
     Exists,
     Field,
     Match,
     Member,
     Parts,
     Predicate,
-    Value,
 )
 from hybridlog.schema.kinds import FLOATS, NUMBERS, TIMES
-from hybridlog.wording import listed
-from hybridlog_storage.errors import WhereError
+from hybridlog.wording import listed, meant
 
 Stat = Literal["n", "min", "max", "mean"]
 Kind = Literal["number", "string", "bool", "time", "datetime", "other"]
@@ -44,7 +40,12 @@ _KINDS: dict[str, Kind] = {
     **dict.fromkeys(TIMES, "time"),
     **dict.fromkeys({*NUMBERS, "number", "integer"}, "number"),
 }
-_VALUES: dict[str, Any] = {"bool": bool, "string": str, "number": int | float}
+_VALUES: dict[Kind, Any] = {"bool": bool, "string": str, "number": int | float}
+_CURES: dict[Kind, str] = {
+    "bool": "; write true or false",
+    "time": '; write a time as t"2015-03-03T18:28:33Z", a duration as 5ms',
+    "string": "; write it in quotes",
+}
 _COLUMNS = {
     "log_time": "_meta.t",
     "t": "_meta.t",
@@ -104,8 +105,7 @@ class FieldTypes:
         stat = STATS.get(str(parts[-1])) if len(parts) > 1 and parts[0] != "_meta" else None
         if stat is None or not self.known:
             return stat
-        names = [part for part in parts if isinstance(part, str)]
-        path, parent = ".".join(names), ".".join(names[:-1])
+        path, parent = Field(parts).names, Field(parts[:-1]).names
         if path in self.types or path in self.inner or parent not in self.arrays:
             return None
         numeric = _KINDS.get(self.base(parent)) in {"number", "bool", "time"}
@@ -122,8 +122,7 @@ class FieldTypes:
     def are_singles(self, parts: Parts) -> bool:
         """True if a field, the elements of an array, or its ends are of float32."""
         is_end = self.statistic(parts) in {"min", "max"}
-        names = [part for part in (parts[:-1] if is_end else parts) if isinstance(part, str)]
-        return self.base(".".join(names)) == "float32"
+        return self.base(Field(parts[:-1] if is_end else parts).names) == "float32"
 
     def are_floats(self, path: str) -> bool:
         """True if a field, or the elements of an array, are floating-point numbers."""
@@ -150,124 +149,61 @@ def _listed(types: tuple[tuple[str, str], ...] | None) -> FieldTypes:
 
 def check(predicate: Predicate, types: FieldTypes | Mapping[str, str] | None) -> None:
     """Refuse a predicate with unknown fields, or with comparisons of different kinds."""
-    checker = _Checker(predicate.text, FieldTypes.of(types))
+    known = FieldTypes.of(types)
     for condition in predicate.conditions():
-        checker.check(condition)
-
-
-def check_name(text: str, target: Field, types: FieldTypes | Mapping[str, str] | None) -> None:
-    """Refuse an unknown field in a text, whatever it is compared with."""
-    _Checker(text, FieldTypes.of(types)).check_name(target)
-
-
-class _Checker:
-    def __init__(self, text: str, types: FieldTypes) -> None:
-        self._text = text
-        self._types = types
-
-    def check(self, node: Condition) -> None:
-        kind = self.check_name(node.field)
-        if not isinstance(node, Exists):
-            self._check_leaf(node.field)
-        match node:
-            case Compare(value=value, position=position):
-                self._check_value(kind, node.field.names, value, position)
-            case Member(values=values, position=position):
-                for value in values:
-                    self._check_value(kind, node.field.names, value, position)
-            case Match(position=position) if kind not in {"string", "other"}:
-                raise error_at(self._text, position, f"the field is a {kind}, not a string")
-            case _:
-                pass
-
-    def check_name(self, target: Field) -> Kind:
-        """Refuse a field that does not exist; the kind of one that does."""
-        self._check_elements(target)
-        types = self._types
-        path = target.names
-        if target.parts[0] == "_id":
-            raise self._fail(target, "_id is no field; use _meta.t, _meta.rec and _meta.seq")
-        if target.parts[0] != "_meta" and not types.known:
-            return "other"
-        if path in types.types:
-            return types.kind(path)
-        if types.statistic(target.parts) is not None:
-            return "number"
-        if path in types.inner or path in types.arrays:
-            return "other"
-        raise self._unknown(target, path)
-
-    def _check_elements(self, target: Field) -> None:
-        """Refuse an element that an array of fixed length does not have."""
-        for place, part in enumerate(target.parts):
-            before = ".".join(name for name in target.parts[:place] if isinstance(name, str))
-            size = _FIXED.search(self._types.types.get(before, ""))
-            if isinstance(part, int) and size and part >= int(size[1]):
-                raise self._fail(target, f"{before} has {size[1]} elements, numbered from 0")
-
-    def _check_leaf(self, target: Field) -> None:
-        """Refuse a comparison with a message, which has fields and no value of its own."""
-        path = target.names
-        if path not in self._types.inner:
-            return
-        below = [name for name in self._types.types if name.startswith(f"{path}.")]
-        leaves = [name for name in below if name not in self._types.inner]
-        names = listed(leaves, _MAX_NAMES)
-        raise self._fail(
-            target, f"{path} is a message, not a value; ask for one of its fields: {names}"
-        )
-
-    def _check_value(self, kind: Kind, path: str, value: Value, position: int) -> None:
-        if kind == "other" or value is None:
-            return
-        words = (name for name, known in _VALUES.items() if isinstance(value, known))
-        given = next(words, type(value).__name__)  # other types are in filters alone
-        if given == "number" and kind == "time":
-            self._check_time(value, self._types.base(path), position)
-            return
-        if given == kind:
-            return
-        hints = {
-            "bool": "; write true or false",
-            "time": '; write a time as t"2015-03-03T18:28:33Z", a duration as 5ms',
-            "string": "; write it in quotes",
-        }
-        if is_filter(self._text):
-            hints["time"] = "; write it in nanoseconds"
-        raise error_at(
-            self._text,
-            position,
-            f"the field is a {kind}, the value is a {given}{hints.get(kind, '')}",
-        )
-
-    def _check_time(self, value: Value, kind: str, position: int) -> None:
-        """Refuse a number without a unit that is seconds since 1970 rather than nanoseconds."""
-        is_odd = kind != "duration" and _SECONDS <= value < _NANOSECONDS  # type: ignore[operator]
-        if is_odd and is_filter(self._text) and type(value) in {int, float}:
-            cure = f'multiply seconds since 1970 by 10**9, or write a predicate with t"{value}ns"'
-            raise error_at(self._text, position, f"a number is nanoseconds here; {cure}")
-        bare = _BARE.match(self._text, position)
-        if is_odd and bare:
-            raise error_at(
-                self._text,
-                position,
-                f'a number is nanoseconds here; write t"{bare[0]}" for seconds since 1970, or '
-                f't"{bare[0]}ns"',
+        target = condition.field
+        for problem in _problems_of(target, known):
+            raise error_at(predicate.text, target.position, problem)
+        if isinstance(condition, Exists):
+            continue
+        if target.names in known.inner:
+            below = (name for name in known.types if name.startswith(f"{target.names}."))
+            names = listed((name for name in below if name not in known.inner), _MAX_NAMES)
+            problem = (
+                f"{target.names} is a message, not a value; ask for one of its fields: {names}"
             )
+            raise error_at(predicate.text, target.position, problem)
+        for problem in _problems(condition, known, predicate.text):
+            raise error_at(predicate.text, condition.position, problem)
 
-    def _unknown(self, target: Field, path: str) -> WhereError:
-        known = sorted(set(self._types.types) - ({} if path.startswith("_meta") else _META).keys())
-        lowered = {name.lower(): name for name in known}
-        near = [_COLUMNS[path]] if path in _COLUMNS else []
-        near += [name for name in known if name.rsplit(".", 1)[-1] == path.rsplit(".", 1)[-1]]
-        near += [
-            lowered[key]
-            for key in difflib.get_close_matches(path.lower(), lowered, n=_MAX_NAMES, cutoff=0.5)
-        ]
-        shown = list(dict.fromkeys(near or known))
-        names = listed(shown, _MAX_NAMES)
-        hint = f"; did you mean {names}?" if near else f"; there are {names}" if shown else ""
-        return self._fail(target, f"there is no field {path}{hint}")
 
-    def _fail(self, target: Field, message: str) -> WhereError:
-        return error_at(self._text, target.position, message)
+def _problems_of(target: Field, types: FieldTypes) -> Iterator[str]:
+    """Reasons to refuse a field."""
+    parts, path = target.parts, target.names
+    for place, part in enumerate(parts):
+        before = Field(parts[:place]).names
+        size = _FIXED.search(types.types.get(before, ""))
+        if isinstance(part, int) and size and part >= int(size[1]):
+            yield f"{before} has {size[1]} elements, numbered from 0"
+    if parts[0] == "_id":
+        yield "_id is no field; use _meta.t, _meta.rec and _meta.seq"
+    is_there = path in types.types.keys() | types.inner | types.arrays
+    if is_there or types.statistic(parts) or not (types.known or parts[0] == "_meta"):
+        return
+    known = types.types.keys() - ({} if path.startswith("_meta") else _META).keys()
+    hint = f"did you mean {_COLUMNS[path]}?" if path in _COLUMNS else meant(path, known)
+    yield f"there is no field {path}; {hint}"
+
+
+def _problems(node: Compare | Member | Match, types: FieldTypes, text: str) -> Iterator[str]:
+    """Reasons to refuse what a field is compared with."""
+    path = node.field.names
+    is_statistic = types.known and path not in types.types and types.statistic(node.field.parts)
+    kind = "number" if is_statistic else types.kind(path)
+    if isinstance(node, Match):
+        if kind not in {"string", "other"}:
+            yield f"the field is a {kind}, not a string"
+        return
+    is_moment = kind == "time" and types.base(path) != "duration"
+    for value in (node.value,) if isinstance(node, Compare) else node.values:
+        if kind == "other" or value is None:
+            continue
+        given = next(name for name, known in _VALUES.items() if isinstance(value, known))
+        if given != kind and (kind, given) != ("time", "number"):
+            yield f"the field is a {kind}, the value is a {given}{_CURES.get(kind, '')}"
+        bare = _BARE.match(text, node.position)
+        if is_moment and bare and _SECONDS <= cast(float, value) < _NANOSECONDS:
+            yield (
+                f'a number is nanoseconds here; write t"{bare[0]}" for seconds since 1970, or '
+                f't"{bare[0]}ns"'
+            )

@@ -63,8 +63,8 @@ class PlayedLog:
         self.begin = int(times[:, 0].min())
         self.end = int(times[:, 1].max()) - 1
         whole = replace(query.question, bounds=None, during=None, clock="log")
-        self._whole = Query(query.session, whole, query.conditions)
-        params = Intervals.of((id_, times[row : row + 1]) for row, id_ in enumerate(spans))
+        self._whole = Query(query.session, whole, conditions=query.conditions)
+        params = Intervals((id_, times[row : row + 1]) for row, id_ in enumerate(spans))
         during = query.question.during
         self._during = params if during is None else during.common(params)
         self._begin, self._end = times[:, 0], times[:, 1]

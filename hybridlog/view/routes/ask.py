@@ -101,9 +101,8 @@ def completion(context: Context, params: RequestParams) -> dict[str, Any]:
             return None
         return known_fields(context.query(recording, name))
 
-    found = complete(text, place, topics - {own}, fields, most=_MAX_CANDIDATES)
-    offered = [[one.text, one.kind, one.type] for one in found.candidates]
-    return {"begin": found.begin, "candidates": offered}
+    begin, candidates = complete(text[:place], topics - {own}, fields, most=_MAX_CANDIDATES)
+    return {"begin": begin, "candidates": candidates}
 
 
 def sql_completion(context: Context, text: str, place: int) -> dict[str, Any]:

@@ -18,12 +18,11 @@ ODOM = {"pose.x": "float64", "speed": "float64"}
 
 def offered(text: str) -> list[str]:
     """Candidates at the mark `|`, put into the text."""
-    place = text.index("|")
-    text = text.replace("|", "")
-    found = complete(
-        text, place, ["/odom", "/imu"], lambda topic: ODOM if topic == "/odom" else SCAN
+    text = text[: text.index("|")]
+    begin, found = complete(
+        text, ["/odom", "/imu"], lambda topic: ODOM if topic == "/odom" else SCAN
     )
-    return [text[: found.begin] + one.text for one in found.candidates]
+    return [text[:begin] + one.text for one in found]
 
 
 @pytest.mark.parametrize(
@@ -57,9 +56,9 @@ def test_what_fits_is_offered(text: str, want: list[str]) -> None:
 
 def test_candidates_are_few_and_say_what_they_are() -> None:
     fields = {f"f{n}": "int32" for n in range(1000)} | {"a": "float64[]"}
-    assert len(complete("f", 1, [], lambda _: fields).candidates) == 50
-    first, *_, count = complete("a", 1, [], lambda _: fields, most=5).candidates
-    assert (first.text, first.kind, first.type) == ("a", "field", "float64[]")
+    assert len(complete("f", [], lambda _: fields)[1]) == 50
+    first, *_, count = complete("a", [], lambda _: fields, most=5)[1]
+    assert first == ("a", "field", "float64[]")
     assert (count.text, count.kind) == ("a.mean", "field")
-    assert complete("x" * 20_000, 20_000, [], lambda _: fields).candidates == ()
-    assert [one.kind for one in complete("im", 2, ["/imu"], lambda _: None).candidates] == ["topic"]
+    assert complete("x" * 20_000, [], lambda _: fields)[1] == []
+    assert [one.kind for one in complete("im", ["/imu"], lambda _: None)[1]] == ["topic"]

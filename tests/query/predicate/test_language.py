@@ -143,12 +143,11 @@ def test_nan() -> None:
         ("x between 5 and 3", "empty", 10),
         ("x not 5", "expected 'in'", 6),
         ("x[*][0] == 1", "only of named", 4),
-        ("x[][*] == 1", "only of named", 3),
         ("x[].0 == 1", "only of named", 3),
         ("x[0:2][0] == 1", "only of named", 6),
         ("x[2:2] == 1", "slice is empty", 1),
         ("x[-1] == 1", r"write an element as x\[3\]", 1),
-        ("x[-5:] == 1", "both count from 0", 1),
+        ("x[-5:] == 1", "a slice is x", 4),
         ("x[0][a] == 1", "a slice as", 4),
         ("x[3:2] == 1", "slice is empty", 1),
         ("x[0:99999999999] == 1", "index", 1),
@@ -180,8 +179,6 @@ def test_limits() -> None:
         checked("(" * 60 + "x < 1" + ")" * 60)
     with pytest.raises(WhereError, match="deeper than 50"):
         checked("not " * 60 + "x < 1")
-    with pytest.raises(WhereError, match="words"):
-        checked("x in [" + "1," * 1500 + "1]")
     with pytest.raises(WhereError, match="is empty"):
         checked("  ")
     with pytest.raises(WhereError, match="not int"):
@@ -219,7 +216,7 @@ def test_limits() -> None:
         ("1760000000.5 < t", 't"1760000000.5" for seconds'),
         ("_meta.t between 1760000000000 and 1770000000000", "nanoseconds here"),
         ("x > 1 & x < 2", "write and"),
-        ("o:x > 1", "a space follows"),
+        ("o:x > 1", "a space follows the name"),
     ],
 )
 def test_types(where: str, message: str) -> None:
