@@ -17,9 +17,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.query.chunk_scan import MessageRun
-    from hybridlog.query.question import RecordedChannel
     from hybridlog.schema.codec import Decoded
-    from hybridlog_storage.messages import Batch
 
 
 PictureOf: TypeAlias = "Callable[[Message], NDArray[Any]]"
@@ -44,8 +42,8 @@ class Message:
     """
 
     __slots__ = (
-        "_codec",
-        "_documents",
+        "_channel",
+        "_of",
         "_picture_of",
         "_row",
         "_view",
@@ -60,32 +58,21 @@ class Message:
     )
 
     def __init__(
-        self,
-        channel: RecordedChannel,
-        *,
-        log_time: int,
-        publish_time: int,
-        sequence: int,
-        seq: int,
-        view: memoryview,
-        documents: Documents,
-        row: int,
-        picture_of: PictureOf | None,
+        self, of: Messages, row: int, numbers: Sequence[int], picture_of: PictureOf | None
     ) -> None:
-        described = channel.channel
+        index, log_time, publish_time, sequence, seq, start, size = numbers
+        self._of, self._row, self._picture_of = of, row, picture_of
+        self._channel = of.channels[index]
+        self._view = of.view[start : start + size]
+        described = self._channel.channel
         self.topic = described.topic
         self.type = described.schema.name if described.schema is not None else ""
         self.log_time_ns = log_time
         self.publish_time_ns = publish_time if described.has_publish_time else None
         self.sequence = sequence
         self.seq = seq
-        self.recording = channel.recording.id
-        self._view = view
-        self._codec = channel.codec
-        self.state = channel.state
-        self._documents = documents
-        self._row = row
-        self._picture_of = picture_of
+        self.recording = self._channel.recording.id
+        self.state = self._channel.state
 
     def __repr__(self) -> str:
         return f"<Message {self.topic} {format_time(self.log_time_ns)} {len(self._view)} B>"
@@ -141,7 +128,7 @@ class Message:
     @property
     def fields(self) -> dict[str, object]:
         """Its fields as in the index: long arrays are summaries."""
-        return self._documents.fields(self._row)
+        return self._of.fields(self._row)
 
     @property
     def header_stamp_ns(self) -> int | None:
@@ -158,8 +145,8 @@ class Message:
             DefinitionError: no usable definition exists.
         """
         if self.is_reduced:
-            self._documents.refuse(self._row)
-        return self._codec.decode(self._view)
+            self._of.refuse(self._row)
+        return self._channel.codec.decode(self._view)
 
     def content(self) -> pa.StructScalar | Mapping[str, Any]:
         """Its fields with exact values, arrays whole and without a copy where possible.
@@ -171,7 +158,7 @@ class Message:
             PayloadError: the payload does not fit its definition.
             DefinitionError: no usable definition exists.
         """
-        decoded = self._documents.decoded(self._row)
+        decoded = self._of.decoded(self._row)
         has_columns = isinstance(decoded.records, Records)
         values: Any = decoded.arrow() if has_columns else decoded.plain()
         return cast("pa.StructScalar | Mapping[str, Any]", values[0])
@@ -192,32 +179,30 @@ class Message:
         return to_numpy(self.type, self.decode())
 
 
-class Documents:
-    """The index documents of some messages, created together on first access.
+class Messages:
+    """The messages of a run; their index documents are created together on first access."""
 
-    Channels are by index, as in `batch.channel`.
-    """
-
-    def __init__(
-        self,
-        channels: Sequence[RecordedChannel] | Mapping[int, RecordedChannel],
-        batch: Batch,
-    ) -> None:
-        self._channels = channels
-        self._batch = batch
+    def __init__(self, run: MessageRun) -> None:
+        self.channels = run.channels
+        self.view = memoryview(run.batch.buffer)
+        self._batch = run.batch
         self._bodies: dict[int, bytes] = {}
 
     def fields(self, row: int) -> dict[str, object]:
         """The fields of one message, as in its index document."""
-        from hybridlog.schema.index_bodies import document_of
+        from hybridlog.schema.index_bodies import bodies_of, document_of
 
         if row not in self._bodies:
-            self._make(int(self._batch.channel[row]))
+            index = int(self._batch.channel[row])
+            rows = np.flatnonzero(self._batch.channel == index)
+            for group in bodies_of(self.channels[index].codec, self._batch.take(rows)):
+                for own, body in zip(rows[group.rows].tolist(), group.body, strict=True):
+                    self._bodies[own] = body.tobytes()
         return document_of(self._bodies[row])
 
     def decoded(self, row: int) -> Decoded:
         """The columns of one message."""
-        codec = self._channels[int(self._batch.channel[row])].codec
+        codec = self.channels[int(self._batch.channel[row])].codec
         decoded = codec.columns_of(self._batch.take(slice(row, row + 1)))
         if decoded.unreadable:
             raise PayloadError(f"the payload cannot be read: {decoded.unreadable[0].reason}")
@@ -228,25 +213,15 @@ class Documents:
         from hybridlog.columns.left_rows import digest_in, with_rows
         from hybridlog.schema.left import missing_payload
 
-        state = self._channels[int(self._batch.channel[row])].state
         left = with_rows(self._batch.take(slice(row, row + 1))).left
         assert left is not None
+        state = self.channels[int(self._batch.channel[row])].state
         raise missing_payload(state, *digest_in(left, 0))
-
-    def _make(self, index: int) -> None:
-        from hybridlog.schema.index_bodies import bodies_of
-
-        rows = np.flatnonzero(self._batch.channel == index)
-        for group in bodies_of(self._channels[index].codec, self._batch.take(rows)):
-            for row, body in zip(rows[group.rows].tolist(), group.body, strict=True):
-                self._bodies[row] = body.tobytes()
 
 
 def messages_in(run: MessageRun, picture_of: PictureOf | None = None) -> Iterator[Message]:
     """The messages of a run, in its order; with pictures of frames of video if asked for."""
-    batch, channels = run.batch, run.channels
-    documents = Documents(channels, batch)
-    view = memoryview(batch.buffer)
+    of, batch = Messages(run), run.batch
     # Columns are converted to lists at once: access to single numbers of arrays is slow.
     columns = (
         batch.channel,
@@ -258,15 +233,4 @@ def messages_in(run: MessageRun, picture_of: PictureOf | None = None) -> Iterato
         batch.length,
     )
     rows = zip(*(column.tolist() for column in columns), strict=True)
-    for row, (index, log_time, publish_time, sequence, seq, start, size) in enumerate(rows):
-        yield Message(
-            channels[index],
-            log_time=log_time,
-            publish_time=publish_time,
-            sequence=sequence,
-            seq=seq,
-            view=view[start : start + size],
-            documents=documents,
-            row=row,
-            picture_of=picture_of,
-        )
+    return (Message(of, row, numbers, picture_of) for row, numbers in enumerate(rows))

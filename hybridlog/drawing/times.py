@@ -22,9 +22,9 @@ from hybridlog_storage.times import BEGIN, END, placed
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.query.planner import MatchTimes
     from hybridlog.query.query import Query
     from hybridlog.query.question import Span
+    from hybridlog.query.rows import RowBatch
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
 
@@ -205,7 +205,7 @@ class Matches:
 _SIDES: Final = ("left", "right")
 
 
-def _bounded(found: Iterable[MatchTimes]) -> Iterator[MatchTimes]:
+def _bounded(found: Iterable[RowBatch]) -> Iterator[RowBatch]:
     count = 0
     for one in found:
         count += len(one.seq)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from hybridlog.frames.columns import chunked, flat, in_order, with_summaries
+from hybridlog.frames.columns import chunked, in_order, leaves_of
 from hybridlog.frames.names import (
     FIELD,
     TAG,
@@ -21,7 +21,7 @@ from hybridlog.frames.names import (
     tag_columns,
 )
 from hybridlog.index.indexing import rows_by_channel
-from hybridlog.schema.arrow_columns import TIME, numbers, structs
+from hybridlog.schema.arrow_columns import TIME, numbers
 from hybridlog.schema.arrow_types import common_schema, common_type, converted
 from hybridlog.schema.codec import stamp_array
 from hybridlog.schema.column import STAMP
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from hybridlog.query.chunk_scan import MessageRun
     from hybridlog.query.planner import Planner
     from hybridlog.query.question import Part, Question, RecordedChannel
-    from hybridlog.query.rows import Values
+    from hybridlog.query.rows import RowBatch
     from hybridlog.schema.codec import Decoded
     from hybridlog_storage.catalog import RecordingEntry
 
@@ -63,9 +63,10 @@ def _groups(planner: Planner, parts: Sequence[Part] | None) -> Iterator[Iterable
     decoder = Decoder(planner)
     yield decoder.empty()
     if parts and decoder.fits_tables and planner.question.returns_all:
-        found = planner.values_of_tables(parts, decoder.fields)
-        if found is not None:
-            for part, values in zip(parts, found, strict=True):
+        found = [planner.tabled(part, decoder.fields) for part in parts]
+        if all(one is not None and one.rest is None for one in found):
+            for part in parts:
+                values = planner.values(part, decoder.fields)
                 yield from ([block] for block in decoder.of_table(part, values))
             return
     for run in planner.runs():
@@ -123,7 +124,6 @@ class Decoder:
     """Makes blocks from the messages of a query.
 
     Attributes:
-        channels: The channels of the messages that are read now; at first examples of all.
         own: Names of the built-in columns.
         fields: The requested fields, without the names of built-in columns; None for all.
         fits_tables: False if tables of topics lack a column.
@@ -131,7 +131,7 @@ class Decoder:
 
     def __init__(self, planner: Planner) -> None:
         _check(planner.examples)
-        self.channels: Sequence[RecordedChannel] = ()
+        self._examples = planner.examples
         self._counters = planner.counters
         self._chosen = planner.question.fields
         self.own = _own(planner)
@@ -140,30 +140,21 @@ class Decoder:
         self.fits_tables = self.fields != [] and names <= {"log_time", "topic", "recording"}
         self._tags = tag_columns(planner.question.tags)
         self._ranks = {key: rank << _SEQ_BITS for key, rank in planner.ranks.items()}
-        self._fields: list[frozenset[str] | None] = []
-        self.read(planner.examples)
-
-    def read(self, channels: Sequence[RecordedChannel]) -> None:
-        """Continue with messages of these channels."""
-        if channels is not self.channels:
-            self.channels = channels
-            self._fields = [_to_decode(self._chosen, channel, self.own) for channel in channels]
 
     def empty(self) -> Iterator[Block]:
         """A block without rows for each example: columns exist even without messages."""
         none = np.empty(0, np.int64)
         batch = Batch(b"", none, none, np.empty(0, np.int32), none, none, none.astype(np.uint32))
-        for number in range(len(self.channels)):
-            yield self.block(number, batch, none, self.decoded(number, batch))
+        for channel in self._examples:
+            yield self.block(channel, batch, none, self.decoded(channel, batch))
 
     def blocks(self, run: MessageRun) -> Iterator[Block]:
         """The messages of a run, by channel."""
-        self.read(run.channels)
         for number, rows in rows_by_channel(run.batch.channel):
-            batch = run.batch.take(rows)
-            yield self.block(number, batch, run.seq[rows], self.decoded(number, batch))
+            channel, batch = run.channels[number], run.batch.take(rows)
+            yield self.block(channel, batch, run.seq[rows], self.decoded(channel, batch))
 
-    def of_table(self, part: Part, values: Iterator[Values]) -> Iterator[Block]:
+    def of_table(self, part: Part, values: Iterator[RowBatch]) -> Iterator[Block]:
         """The messages of a part from its table, in order."""
         names = {"topic": part.topic, "recording": part.recording.name}
         # Tables have lists where a definition fixes the length.
@@ -176,9 +167,10 @@ class Decoder:
             order = found.seq + self._ranks[part.recording.key]
             yield Block(part.topic, found.log_time, order, own, found.records.cast(kind), 0)
 
-    def decoded(self, number: int, batch: Batch) -> Decoded:
+    def decoded(self, channel: RecordedChannel, batch: Batch) -> Decoded:
         """The fields of messages of one channel; those that cannot be read are counted."""
-        found = self.channels[number].codec.columns_of(batch, self._fields[number])
+        fields = _to_decode(self._chosen, channel, self.own)
+        found = channel.codec.columns_of(batch, fields)
         self._counters.unreadable += len(batch) - len(found.rows)
         if isinstance(found.records, LeftFields):
             requested = {path.replace("[]", "") for path in self._chosen or ()}
@@ -186,17 +178,17 @@ class Decoder:
             self._counters.lacking += int(found.records.lacking(summarised).sum())
         return found
 
-    def block(self, number: int, batch: Batch, seq: NDArray[np.int64], decoded: Decoded) -> Block:
+    def block(
+        self, channel: RecordedChannel, batch: Batch, seq: NDArray[np.int64], decoded: Decoded
+    ) -> Block:
         """The readable messages of one channel."""
-        channel = self.channels[number]
         records, good = decoded.arrow(), decoded.rows
         stamps = None
         if "stamp" in self.own:
             stamps = stamp_array(records)
-            records = _without_stamp(records, self._chosen)
         if len(good) < len(batch):
             batch, seq = batch.take(good), seq[good]
-        own = self.own_columns(number, batch, seq, stamps)
+        own = self.own_columns(channel, batch, seq, stamps)
         order = seq + self._ranks.get(channel.recording.key, 0)  # examples have no messages
         topic = channel.channel.topic
         values = decoded.records
@@ -211,13 +203,12 @@ class Decoder:
 
     def own_columns(
         self,
-        number: int,
+        channel: RecordedChannel,
         batch: Batch,
         seq: NDArray[np.int64],
         stamps: pa.Array[Any] | None = None,
     ) -> dict[str, pa.Array[Any]]:
         """Built-in columns of messages of one channel, without the log time."""
-        channel = self.channels[number]
         own = {name: _own_column(name, channel, batch, seq, stamps) for name in self.own}
         return own | _tags_of(channel.recording, self._tags, len(batch))
 
@@ -287,20 +278,6 @@ def _to_decode(
         if summary is not None and is_summary(path, known):
             wanted.add(summary[0])
     return frozenset(wanted | {STAMP} if "stamp" in own else wanted)
-
-
-def _without_stamp(records: pa.StructArray, fields: Sequence[str] | None) -> pa.StructArray:
-    """The messages without a stamp that was decoded only for the column of that name."""
-    if fields is None or any(path in {"header", STAMP} for path in fields):
-        return records
-    children = dict(zip([f.name for f in records.type], records.flatten(), strict=True))
-    header = children.get("header")
-    if header is None or not pa.types.is_struct(header.type):
-        return records
-    inner = dict(zip([f.name for f in header.type], header.flatten(), strict=True))
-    inner.pop("stamp", None)
-    children["header"] = structs(inner, len(records))
-    return structs(children, len(records))
 
 
 def _check(channels: Sequence[RecordedChannel]) -> None:
@@ -387,8 +364,7 @@ def _flat(blocks: Sequence[Block], fields: Sequence[str] | None) -> list[dict[st
         topics.setdefault(block.topic, []).append(block.records)
     kinds = {topic: common_type(records) for topic, records in topics.items()}
     return [
-        with_summaries(flat(converted(one.records, kinds[one.topic])), fields, one.summaries)
-        for one in blocks
+        leaves_of(converted(one.records, kinds[one.topic]), fields, one.summaries) for one in blocks
     ]
 
 

@@ -6,7 +6,7 @@ Long arrays are shortened.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, Final
 
 import pyarrow as pa
@@ -35,32 +35,35 @@ def cells(table: pa.Table, *, exact: bool = False, most: int = MAX_CELL) -> list
 
 def _cell(value: pa.Scalar, *, exact: bool, most: int = MAX_CELL) -> str:
     """A value in few characters."""
+    kind, inner = value.type, functools.partial(_cell, exact=exact)
     if not value.is_valid:
-        return ""
-    for applies, shown in _forms(exact=exact):
-        if applies(value.type):
-            return shown(value)
+        text = ""
+    elif types.is_floating(kind):
+        text = _exact(value) if exact else f"{value.as_py():.6g}"
+    elif types.is_timestamp(kind):
+        text = _time(value)
+    elif types.is_time(kind):
+        text = time_of_day(value)
+    elif types.is_duration(kind):
+        text = format_duration(value.value)
+    elif is_bytes(kind):
+        text = f"{len(value.as_py())} bytes"
+    elif types.is_map(kind):
+        text = _pairs((inner(item["key"]), inner(item["value"])) for item in value.values)
+    elif types.is_struct(kind):
+        text = _pairs((name, inner(item)) for name, item in value.items())
+    elif is_list(kind):
+        text = _list(value.values, inner)
+    else:
+        text = _cut(_plain(value), most)
+    return text
+
+
+def _plain(value: pa.Scalar) -> str:
     try:
-        return _cut(str(value.as_py()), most)
+        return str(value.as_py())
     except OverflowError:  # DuckDB has infinite dates
         return f"{value.value} days"
-
-
-@functools.cache
-def _forms(
-    *, exact: bool
-) -> list[tuple[Callable[[pa.DataType], bool], Callable[[pa.Scalar], str]]]:
-    """Tests of a column's type, and how its values are shown."""
-    return [
-        (types.is_floating, _exact if exact else lambda value: f"{value.as_py():.6g}"),
-        (types.is_timestamp, _time),
-        (types.is_time, time_of_day),
-        (types.is_duration, lambda value: format_duration(value.value)),
-        (types.is_map, functools.partial(_map, exact=exact)),
-        (is_list, functools.partial(_list, exact=exact)),
-        (types.is_struct, functools.partial(_struct, exact=exact)),
-        (is_bytes, lambda value: f"{len(value.as_py())} bytes"),
-    ]
 
 
 def _exact(value: pa.Scalar) -> str:
@@ -76,27 +79,14 @@ def _time(value: pa.Scalar) -> str:
         return f"{ns} ns"
 
 
-def _struct(value: pa.Scalar, *, exact: bool) -> str:
-    inside = (f"{name}: {_cell(item, exact=exact)}" for name, item in value.items())
-    return _cut("{" + ", ".join(inside) + "}", MAX_LINE)
+def _pairs(pairs: Iterable[tuple[str, str]]) -> str:
+    return _cut("{" + ", ".join(f"{name}: {value}" for name, value in pairs) + "}", MAX_LINE)
 
 
-def _map(value: pa.Scalar, *, exact: bool) -> str:
-    inside = (
-        f"{_cell(item['key'], exact=exact)}: {_cell(item['value'], exact=exact)}"
-        for item in value.values
-    )
-    return _cut("{" + ", ".join(inside) + "}", MAX_LINE)
-
-
-def _list(value: pa.Scalar, *, exact: bool) -> str:
-    inner = value.values
-    if inner is None or not len(inner):
-        return "[]"
-    if len(inner) <= _MAX_ITEMS:
-        return _cut("[" + ", ".join(_cell(item, exact=exact) for item in inner) + "]", MAX_LINE)
-    first = ", ".join(_cell(inner[i], exact=exact) for i in range(2))
-    return _cut(f"[{first}, … {len(inner)} in all]", MAX_LINE)
+def _list(values: Any, shown: Callable[[pa.Scalar], str]) -> str:
+    is_short = len(values) <= _MAX_ITEMS
+    first = ", ".join(shown(item) for item in values[: _MAX_ITEMS if is_short else 2])
+    return _cut(f"[{first}]" if is_short else f"[{first}, … {len(values)} in all]", MAX_LINE)
 
 
 def _cut(text: str, most: int) -> str:

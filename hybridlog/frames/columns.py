@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from hybridlog.frames.names import summary_of
+from hybridlog.frames.names import is_part, summary_of
 from hybridlog.schema.arrow_columns import OFFSET_LIMIT, structs
 from hybridlog.schema.arrow_types import (
     has_empty,
@@ -67,34 +67,34 @@ def _with_fields(array: pa.Array[Any]) -> pa.Array[Any]:
     return structs({f.name: _with_fields(child) for f, child in children}, len(array), missing)
 
 
-def with_summaries(
-    leaves: dict[str, pa.Array[Any]],
+def leaves_of(
+    records: pa.StructArray,
     requested: Collection[str] | None,
     known: Mapping[str, pa.Array[Any]] = MappingProxyType({}),
 ) -> dict[str, pa.Array[Any]]:
-    """The leaves, by dotted path, with the requested summaries (`ranges.min`).
+    """The requested leaves of messages, by dotted path, and summaries (`ranges.min`).
 
-    None requests all fields. An array of which only summaries are requested is left out; `known`
-    are those of arrays that are not there.
+    None requests all fields. Fields that were decoded only for others are left out; `known` are
+    summaries of arrays that are not there.
     """
-    wanted = [path.replace("[]", "") for path in requested or ()]
-    found = {}
+    leaves = flat(records)
+    if requested is None:
+        return leaves
+    wanted = [path.replace("[]", "") for path in requested]
+    made: dict[str, pa.Array[Any]] = {}
     for path in wanted:
         summary = summary_of(path)
-        if summary is not None and path not in leaves:
-            array = leaves.get(summary[0])
-            made = None if array is None else known.get(path, summary_array(array, summary[1]))
-            if made is not None:
-                found[path] = made
-    if not found:
-        return leaves
-    arrays = {path.rpartition(".")[0] for path in found}
-    not_requested = {a for a in arrays if not any(_covers(path, a) for path in wanted)}
-    return {path: a for path, a in leaves.items() if path not in not_requested} | found
-
-
-def _covers(path: str, field: str) -> bool:
-    return path == field or field.startswith(f"{path}.")
+        array = None if summary is None or path in leaves else leaves.get(summary[0])
+        if summary is not None and array is not None:
+            found = known.get(path, summary_array(array, summary[1]))
+            made |= {} if found is None else {path: found}
+    asked = [one for one in wanted if one not in made]
+    return {
+        path: array
+        for path, array in leaves.items()
+        # A path that is there twice has an underscore.
+        if any(is_part(path, one) or is_part(path.rstrip("_"), one) for one in asked)
+    } | made
 
 
 def summary_array(array: pa.Array[Any], what: str) -> pa.Array[Any] | None:

@@ -9,8 +9,8 @@ import pyarrow as pa
 
 from hybridlog.formats.answer import Line
 from hybridlog.formats.jsonl import json_line, json_rows
-from hybridlog.frames.answer import Block, Decoder, text_column
-from hybridlog.frames.columns import flat, summary_array, with_summaries
+from hybridlog.frames.answer import Decoder, text_column
+from hybridlog.frames.columns import leaves_of, summary_array
 from hybridlog.frames.names import arranged, free_name, summary_of
 from hybridlog.index.indexing import rows_by_channel
 from hybridlog.schema.arrow_columns import below, structs, values_array
@@ -31,7 +31,6 @@ def lines(planner: Planner) -> Iterator[list[Line]]:
     """
     decoder = Decoder(planner)
     for run in planner.runs():
-        decoder.read(run.channels)
         yield _lines_of(run, decoder, planner)
 
 
@@ -40,34 +39,27 @@ def _lines_of(run: MessageRun, decoder: Decoder, planner: Planner) -> list[Line]
     found: list[Line | None] = [None] * len(run.batch)
     fields = planner.question.fields
     for number, rows in rows_by_channel(run.batch.channel):
-        batch, seq = run.batch.take(rows), run.seq[rows]
-        decoded = decoder.decoded(number, batch)
+        channel, batch, seq = run.channels[number], run.batch.take(rows), run.seq[rows]
+        decoded = decoder.decoded(channel, batch)
         good = decoded.rows
         if decoded.is_typed or "stamp" in decoder.own:
-            block = decoder.block(number, batch, seq, decoded)
+            block = decoder.block(channel, batch, seq, decoded)
             own = block.own
         else:
-            block, own = None, decoder.own_columns(number, batch.take(good), seq[good])
-        topic = text_column(decoder.channels[number].channel.topic, len(good))
+            block, own = None, decoder.own_columns(channel, batch.take(good), seq[good])
+        topic = text_column(channel.channel.topic, len(good))
         firsts = {"log_time_ns": pa.array(batch.log_time[good]), "topic": topic}
         firsts |= {name: array for name, array in own.items() if name not in firsts}
         if block is not None and decoded.is_typed:
-            made = _of_columns(firsts, block, fields)
+            leaves = leaves_of(block.records, fields, block.summaries)
+            for path in arranged([*leaves], fields):
+                firsts[free_name(path, firsts)] = leaves[path]
+            made = json_rows(structs(firsts, len(good)))
         else:
             made = _of_objects(firsts, decoded.plain(), fields)
         for row, line in zip(rows[good].tolist(), made, strict=True):
             found[row] = line
     return [line for line in found if line is not None]
-
-
-def _of_columns(
-    columns: dict[str, pa.Array[Any]], block: Block, fields: Sequence[str] | None
-) -> Iterator[Line]:
-    """Lines of messages that all have every field; they begin with built-in columns."""
-    leaves = with_summaries(flat(block.records), fields, block.summaries)
-    for path in arranged([*leaves], fields):
-        columns[free_name(path, columns)] = leaves[path]
-    yield from json_rows(structs(columns, len(block.log_time)))
 
 
 def _of_objects(

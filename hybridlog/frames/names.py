@@ -76,15 +76,15 @@ def arranged(
         plain = name.rstrip("_")
         same = {name, plain} if is_own(plain) or plain in tags else {name}
         exact = (number for number, path in enumerate(requested) if path in same)
-        near = (number for number, path in enumerate(requested) if _is_part(name, path))
+        near = (number for number, path in enumerate(requested) if is_part(name, path))
         return next(exact, next(near, -1))
 
     return sorted(names, key=place)
 
 
-def _is_part(name: str, path: str) -> bool:
-    """True if one of two paths is a part of the other."""
-    return name.startswith(f"{path}.") or path.startswith(f"{name}.")
+def is_part(name: str, path: str) -> bool:
+    """True if one of two paths is a part of the other, or they are equal."""
+    return f"{name}.".startswith(f"{path}.") or path.startswith(f"{name}.")
 
 
 def summary_of(path: str) -> tuple[str, str] | None:

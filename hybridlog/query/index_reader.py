@@ -4,22 +4,23 @@ from __future__ import annotations
 
 import struct
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import product
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hybridlog.index.access import again_if_lost
 from hybridlog.query.predicate.mongo_filter import misjudged
 from hybridlog.query.predicate.tree import And, Field, Member, MongoFilter, Predicate
+from hybridlog.query.question import field_types
 from hybridlog.record.marks import MARKS
 from hybridlog.schema.column import STAMP
-from hybridlog_storage.errors import IndexChangedError, StoreError, TopicError, WhereError
+from hybridlog_storage.errors import StoreError, TopicError, WhereError
 from hybridlog_storage.mongo.collection_names import collection_of
 from hybridlog_storage.mongo.index_documents import KEY_BYTES, between
-from hybridlog_storage.mongo.index_state import Indexed, IndexState
+from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.stopping import check_wanted
 from hybridlog_storage.times import END
 
@@ -39,23 +40,8 @@ _READABLE: Filter = {"_meta.error": {"$exists": False}}
 _WITHOUT_FIELDS: Filter = {"_meta.error": {"$exists": True}}
 _TOO_LARGE: Filter = {"_meta.error": {"$regex": "take more than [0-9]+ MiB$"}}
 """Documents whose message has fields, but too large ones for a document."""
-_T = TypeVar("_T")
 Query = tuple[str, Filter]
 """A collection and a filter."""
-
-
-class Found(NamedTuple):
-    """The answer of MongoDB about parts of a question.
-
-    Attributes:
-        parts: The parts, with the arrival numbers of what the filters find in their place.
-        documents: Number of documents of those parts of which the index may lack some.
-        untested: Messages that the filters cannot test, since their documents have no fields.
-    """
-
-    parts: list[Part]
-    documents: dict[Part, int]
-    untested: int
 
 
 class IndexReader:
@@ -65,21 +51,15 @@ class IndexReader:
         self._session = session
         self._counters = counters
 
-    def found(self, parts: Sequence[Part]) -> Found:
-        """The parts with predicates that columns and messages decide."""
-        return self._ask(parts, self._found)
+    @again_if_lost
+    def found(self, parts: Sequence[Part]) -> tuple[list[Part], dict[Part, int]]:
+        """The parts with arrival numbers in place of filters, and `documents`.
 
-    def documents(self, parts: Sequence[Part]) -> dict[Part, int]:
-        """Number of documents of those parts of which the index may lack some."""
-        return self._ask(parts, _documents)
-
-    def _found(
-        self, database: Database, parts: Sequence[Part], indexed: Mapping[str, Indexed]
-    ) -> Found:
-        predicate = _predicate(parts[0])
+        Messages that the filters cannot test, since their documents have no fields, are counted.
+        """
+        database, predicate = self._database(parts), _predicate(parts[0])
         asks_fields = any(node.asks_fields for node in predicate.filters)
         own: list[Filter] = [node.to_filter() for node in predicate.filters]
-        documents = _documents(database, parts, indexed)
         _check_arrays(database, parts, predicate.filters)
         everything: Filter = {"$and": [*own, _READABLE] if asks_fields else own}
         numbers = self._numbers(database, parts, everything)
@@ -87,14 +67,19 @@ class IndexReader:
             replace(part, predicate=_decided(predicate, numbers[part.recording.key]))
             for part in parts
         ]
-        untested = 0
         if asks_fields:
             lacking = [part for part in parts if part.lacks_fields]
             # What is read for the rest of the predicate is counted there.
             is_read = _predicate(decided[0]).asks_fields
             unknown = _TOO_LARGE if is_read else _WITHOUT_FIELDS
-            untested = sum(_counts(database, lacking, unknown).values())
-        return Found(decided, documents, untested)
+            self._counters.unreadable += sum(_counts(database, lacking, unknown).values())
+        # Counted last: what another process has removed meanwhile is told as lacking.
+        return decided, _documents(database, parts)
+
+    @again_if_lost
+    def documents(self, parts: Sequence[Part]) -> dict[Part, int]:
+        """Number of documents of those parts of which the index may lack some."""
+        return _documents(self._database(parts), parts)
 
     def _numbers(
         self, database: Database, parts: Sequence[Part], own: Filter
@@ -116,13 +101,8 @@ class IndexReader:
             for part in parts
         }
 
-    @again_if_lost
-    def _ask(
-        self,
-        parts: Sequence[Part],
-        ask: Callable[[Database, Sequence[Part], Mapping[str, Indexed]], _T],
-    ) -> _T:
-        """An answer during which no other process has removed documents."""
+    def _database(self, parts: Sequence[Part]) -> Database:
+        """The database; refuses parts without documents."""
         for part in parts:
             if not part.is_indexed:
                 why = "it was recorded with --no-index"
@@ -132,25 +112,15 @@ class IndexReader:
                     f"{part.topic} has no index documents: {why}. Write a predicate, such as "
                     "'x > 1', instead of a MongoDB filter."
                 )
-        database = self._session.shared.index.database_for(
+        database: Database = self._session.shared.index.database_for(
             "A MongoDB filter (a predicate needs none)", brings=False
         )
-        state, keys = IndexState(database), {part.recording.key for part in parts}
-        indexed = state.of(keys)
-        found = ask(database, parts, indexed)
-        if {key: one.made for key, one in state.of(keys).items()} != {
-            key: one.made for key, one in indexed.items()
-        }:
-            raise IndexChangedError(
-                "The index was changed by another process while it was asked. Ask again."
-            )
-        return found
+        return database
 
 
-def _documents(
-    database: Database, parts: Sequence[Part], indexed: Mapping[str, Indexed]
-) -> dict[Part, int]:
+def _documents(database: Database, parts: Sequence[Part]) -> dict[Part, int]:
     """Number of documents of the parts whose recordings are not in the index as a whole."""
+    indexed = IndexState(database).of({part.recording.key for part in parts})
     doubtful = []
     for part in parts:
         one = indexed.get(part.recording.key)
@@ -177,7 +147,8 @@ def _check_arrays(
     for part in parts:
         by_topic[part.topic].append(part)
     for (topic, own), node in product(by_topic.items(), filters):
-        for reason, test in misjudged(node, _types_of(own)).items():
+        channels = (c for part in own for c in part.channels if c.codec.indexed)
+        for reason, test in misjudged(node, field_types(tuple(channels))).items():
             if any(
                 database.find(collection, query, {"_id": 1}, limit=1)
                 for collection, query in _queries(own, test)
@@ -225,13 +196,3 @@ def _decided(predicate: Predicate, numbers: NDArray[np.int64]) -> Predicate:
     rest = tuple(item for item in items if not isinstance(item, MongoFilter))
     found = Member(_SEQ, tuple(numbers.tolist()), negated=False)
     return Predicate(And((found, *rest)), predicate.text)
-
-
-def _types_of(parts: Sequence[Part]) -> Mapping[str, str] | None:
-    """Types of the fields of a topic; None where a definition does not fix them."""
-    types: dict[str, str] = {}
-    for part in parts:
-        if part.field_types is None:
-            return None
-        types |= part.field_types
-    return types

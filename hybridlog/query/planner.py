@@ -6,20 +6,21 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hybridlog.query.chunk_scan import ChunkScan, MessageRun
 from hybridlog.query.question import Counters, Part
 from hybridlog.query.ranges import RangeResolver
-from hybridlog.query.rows import TABLE_ERRORS, Rows
+from hybridlog.query.rows import RowBatch, Rows
 from hybridlog.schema.column import STAMP
 from hybridlog.schema.states import GONE
 from hybridlog.snapshot import UNFINISHED
-from hybridlog_storage.errors import ChangedError, TopicError, UsageError
+from hybridlog_storage.errors import TopicError, UsageError
 from hybridlog_storage.lazy import lazy
 from hybridlog_storage.times import END
 
@@ -29,31 +30,24 @@ if TYPE_CHECKING:
     from hybridlog.query.chunk_scan import ScanPlan
     from hybridlog.query.index_reader import IndexReader
     from hybridlog.query.question import Question, RecordedChannel, Span
-    from hybridlog.query.rows import MatchColumns, Values
     from hybridlog.schema.states import State
     from hybridlog.session import Session
-    from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.summary import RecordingSummary
 
 _GROUP_GROWTH = 64  # so many times more recordings are planned after each group
 _MAX_GROUP = 4096  # recordings planned at once, if they do not overlap
-_RENEWALS = 50  # of a question, while a ring lets files go
 _READ_AHEAD_FROM = 50  # messages; nothing is read ahead for fewer
-_T = TypeVar("_T")
-_Rows = TypeVar("_Rows", "MatchColumns", "Values")
 
 
-class Planner:
+class Planner(Rows):
     """Answers one question; `counters` count what that costs."""
 
     def __init__(
         self, session: Session, question: Question, counters: Counters | None = None
     ) -> None:
-        self.session = session
+        super().__init__(session, Counters() if counters is None else counters)
         self.question = question
-        self.counters = Counters() if counters is None else counters
         self._ranges = RangeResolver(session, question)
-        self._rows = Rows(session, self.counters)
 
     @lazy
     def _index(self) -> IndexReader:
@@ -67,7 +61,7 @@ class Planner:
 
         Recordings are oldest first. MongoDB is asked once for all.
         """
-        return self._rows.fitting(self.decided(self.split()))
+        return self.fitting(self.decided(self.split()))
 
     def split(self) -> list[Part]:
         """The same, of which nothing was asked yet."""
@@ -129,52 +123,26 @@ class Planner:
         alike: dict[str, list[Part]] = defaultdict(list)
         for part in self.parts():
             alike[part.topic if every > 1 else ""].append(part)
-        total = sum(-(-self._again(self._count, parts) // every) for parts in alike.values())
+        total = sum(-(-self.count_of(parts) // every) for parts in alike.values())
         return total if limit is None else min(total, limit)
 
     def recordings_with_any(self) -> set[str]:
         """Ids of the recordings that have a message in the answer."""
-        return {part.recording.id for part in self.parts() if self._rows.count([part])}
+        return {part.recording.id for part in self.parts() if self.count_of([part])}
 
     def decided(self, parts: Sequence[Part]) -> list[Part]:
         """The parts with predicates for columns and messages: MongoDB is asked once for all."""
         wanted = [part for part in parts if part.needs_index]
         if not wanted:
             return [*parts]
-        found = self._index.found(wanted)
-        self.counters.unreadable += found.untested
-        self.counters.not_indexed += self._lacking(found.documents)
-        decidable = dict(zip(wanted, found.parts, strict=True))
+        found, documents = self._index.found(wanted)
+        self.counters.not_indexed += self._lacking(documents)
+        decidable = dict(zip(wanted, found, strict=True))
         return [decidable.get(part, part) for part in parts]
 
-    def outcomes(self, part: Part) -> Iterator[MatchColumns]:
-        """For each message of a part, whether it matches, in order."""
-        return self._lasting(part, self._rows.outcomes)
-
-    def times(self, part: Part) -> NDArray[np.int64]:
-        """Log times of the matching messages of a part, ns, ascending."""
-        found = [one.log_time[one.holds] for one in self.outcomes(part)]
-        return np.concatenate([np.empty(0, np.int64), *found])
-
-    def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
-        """Fields of the matching messages of a part, in order."""
-        return self._lasting(part, lambda own: self._rows.values(own, fields))
-
-    def columns(
-        self, part: Part, fields: Collection[str] | None, *, partial: bool = False
-    ) -> Iterator[Values]:
-        """The same by dotted path; also summaries of arrays. See `Rows.columns`."""
-        return self._lasting(part, lambda own: self._rows.columns(own, fields, partial=partial))
-
-    def values_of_tables(
-        self, parts: Sequence[Part], fields: Collection[str] | None
-    ) -> list[Iterator[Values]] | None:
-        """The same of each part, if tables have the fields of all their messages."""
-        for part in parts:
-            found = self._rows.tabled(part, fields)
-            if found is None or found.rest is not None:
-                return None
-        return [self.values(part, fields) for part in parts]
+    def _lasting(self, part: Part, ask: Callable[[Part], Iterator[RowBatch]]) -> Iterator[RowBatch]:
+        (part,) = self.decided([part])
+        return super()._lasting(part, ask)
 
     def runs(self) -> Iterator[MessageRun]:
         """The messages of the answer, in order."""
@@ -193,6 +161,11 @@ class Planner:
         ahead = limit is None or limit > _READ_AHEAD_FROM
         for group in self.groups():
             yield from ChunkScan(self.plan(group), self.session, ahead=ahead).runs()
+
+    def plan(self, parts: Sequence[Part]) -> ScanPlan:
+        """The plan for reading the matching messages of some parts, in the answer's order."""
+        parts = self.fitting(self.decided(parts))
+        return self.again(partial(self.chunk_plan, reverse=self.question.reverse), parts)
 
     def groups(self) -> Iterator[list[Part]]:
         """The parts in groups, those that overlap in time together, in the answer's order.
@@ -218,38 +191,6 @@ class Planner:
             yield [part for row in rows for part in self.parts_in(*found[row])]
             begin, most = end, min(most * _GROUP_GROWTH, _MAX_GROUP)
 
-    def _again(self, ask: Callable[[Sequence[Part]], _T], parts: Sequence[Part]) -> _T:
-        """Ask about parts; again about those of recordings whose files were replaced."""
-        for _ in range(_RENEWALS):
-            unreadable = self.counters.unreadable
-            try:
-                return ask(parts)
-            except ChangedError:
-                self.counters.unreadable = unreadable
-                parts = self._renewed(parts)
-        return ask(parts)
-
-    def _renewed(self, parts: Sequence[Part]) -> list[Part]:
-        """The same parts, of recordings whose files were replaced as they are now."""
-        snapshot = self.session.snapshot()
-        found: list[Part] = []
-        for part in parts:
-            summary = snapshot.summaries[snapshot.by_id[part.recording.id]]
-            if self.session.entry_of(summary) is part.recording:
-                found.append(part)
-                continue
-            again = self.parts_in(summary, part.bounds, part.windows)
-            found += [one for one in again if one.topic == part.topic]
-        return found
-
-    def plan(self, parts: Sequence[Part]) -> ScanPlan:
-        """The plan for reading the matching messages of some parts."""
-        return self._again(self._plan, parts)
-
-    def _plan(self, parts: Sequence[Part]) -> ScanPlan:
-        parts = self._rows.fitting(self.decided(parts))
-        return self._rows.plan(parts, reverse=self.question.reverse)
-
     def count_expired(self) -> Counter[State]:
         """Number of messages, in the range, whose payloads are gone, by state."""
         found: Counter[State] = Counter()
@@ -258,7 +199,7 @@ class Planner:
                 gone = tuple(one for one in part.channels if one.state is state)
                 if gone:
                     own = replace(part, channels=gone, predicate=None)
-                    found[state] += self._rows.count([own])
+                    found[state] += self.count_of([own])
         return found
 
     def not_indexed(self) -> tuple[tuple[str, int], ...]:
@@ -271,35 +212,8 @@ class Planner:
         found: Counter[str] = Counter()
         for part, number in documents.items():
             whole = replace(part, predicate=None)
-            found[part.recording.name] += max(self._rows.count([whole]) - number, 0)
+            found[part.recording.name] += max(self.count_of([whole]) - number, 0)
         return tuple((name, number) for name, number in found.items() if number)
-
-    def _count(self, parts: Sequence[Part]) -> int:
-        return self._rows.count(self.decided(parts))
-
-    def _lasting(self, part: Part, ask: Callable[[Part], Iterator[_Rows]]) -> Iterator[_Rows]:
-        """Rows of a part, to the end if files are replaced or a table is damaged meanwhile."""
-        (part,) = self.decided([part])
-        last: tuple[int, int] | None = None
-        renewals, unreadable = 0, self.counters.unreadable
-        while True:
-            self.counters.unreadable = unreadable
-            try:
-                for item in ask(part):
-                    rest = item if last is None else _after(item, last)
-                    if rest is not None and len(rest.log_time):
-                        last = int(rest.log_time[-1]), int(rest.seq[-1])
-                    if rest is not None:
-                        yield rest
-                return
-            except ChangedError:
-                renewals += 1
-                if renewals > _RENEWALS:
-                    raise
-                (part,) = self.decided(self._renewed([part]))
-            except TABLE_ERRORS:
-                if not self._rows.leave_table(part):
-                    raise
 
     def _check_clock(self, channel: RecordedChannel) -> None:
         if self.question.bounds is None:
@@ -313,18 +227,9 @@ class Planner:
             )
 
 
-class MatchTimes(NamedTuple):
-    """Some messages of one topic of one recording, in order of log time (ns) and arrival number."""
-
-    recording: RecordingEntry
-    topic: str
-    log_time: NDArray[np.int64]
-    seq: NDArray[np.int64]
-
-
 def match_times(
     session: Session, question: Question, counters: Counters | None = None
-) -> Iterator[MatchTimes]:
+) -> Iterator[RowBatch]:
     """The times of an answer, some at a time; recordings and topics one after the other."""
     if not question.returns_all:
         raise UsageError("Times are those of all messages: leave out limit and every.")
@@ -332,18 +237,7 @@ def match_times(
     for part in planner.parts():
         for found in planner.outcomes(part):
             holds = found.holds
-            yield MatchTimes(part.recording, part.topic, found.log_time[holds], found.seq[holds])
-
-
-def _after(item: _Rows, key: tuple[int, int]) -> _Rows | None:
-    """The rows behind a log time and arrival number; None without any."""
-    time, seq = key
-    is_before = (item.log_time < time) | ((item.log_time == time) & (item.seq <= seq))
-    begin = int(np.count_nonzero(is_before))
-    if begin == len(item.log_time):
-        return None
-    columns: dict[str, Any] = {n: column[begin:] for n, column in item._asdict().items()}
-    return item._replace(**columns)
+            yield RowBatch(found.log_time[holds], found.seq[holds], holds[holds])
 
 
 def _decimated(runs: Iterator[MessageRun], question: Question) -> Iterator[MessageRun]:

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
     from hybridlog.query.question import Question, RecordedChannel, Span
     from hybridlog.session import Session
-    from hybridlog_storage.catalog import ChannelStats
     from hybridlog_storage.summary import RecordingSummary
 
 _MAX_NAMES = 5  # recordings in a message
@@ -141,9 +140,13 @@ class RangeResolver:
 
         Where its statistics do not have them, the messages are read.
         """
-        recording, is_publish = channel.recording, self._question.clock == "publish"
+        recording, stats = channel.recording, channel.stats
+        is_publish = self._question.clock == "publish"
         if recording.is_decoded if not is_publish else not recording.flushed:
-            yield from _known_ends(channel.stats, is_publish=is_publish)
+            known = stats.first_stamp, stats.last_stamp
+            if is_publish:
+                known = stats.first_publish, stats.last_publish
+            yield from (time for time in known if time is not None)
             return
         number = channel.channel_id
         for chunk in self._session.chunks(recording, [number], None, "log"):
@@ -192,13 +195,3 @@ class RangeResolver:
         inside = (one for one in known if not self._is_outside(shared, one))
         names = [one.name for one in inside if one.id not in self._question.recordings]
         return f" Other recordings span that time: {listed(names, _MAX_NAMES)}." if names else ""
-
-
-def _known_ends(stats: ChannelStats, *, is_publish: bool) -> list[int]:
-    """First and last publish time, or header stamp; empty if they are unknown."""
-    ends = (
-        (stats.first_publish, stats.last_publish)
-        if is_publish
-        else (stats.first_stamp, stats.last_stamp)
-    )
-    return [time for time in ends if time is not None]

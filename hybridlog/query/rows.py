@@ -7,22 +7,21 @@ times without a predicate come from chunk tables and message indexes.
 
 from __future__ import annotations
 
-import re
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from hybridlog.query.chunk_scan import ChunkKey, ChunkScan, RecordingScan, ScanPlan
 from hybridlog.query.predicate.tree import is_meta
 from hybridlog.record.losses import lost_spans
-from hybridlog.schema.kinds import SINGLE, element_of, width_of
 from hybridlog.snapshot import UNFINISHED
-from hybridlog_storage.errors import HybridlogError, ResourceError, SegmentError, StoreError
-from hybridlog_storage.times import BEGIN, END, inside, placed
+from hybridlog_storage.errors import ChangedError, SegmentError, StoreError
+from hybridlog_storage.times import inside, placed
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -35,47 +34,44 @@ if TYPE_CHECKING:
     from hybridlog.schema.left import LeftFields
     from hybridlog.session import Session
 
-_MARK = re.compile(r"[.\[]")
-_WHOLE = 32  # elements; longer arrays are summaries in tables
-_IN_FULL = SINGLE - {"uint8", "byte", "char"}  # elements of arrays in tables with arrays
+_RENEWALS = 50  # of a question, while a ring lets files go
+_T = TypeVar("_T")
 
 
-class UndecidedError(HybridlogError):
-    """The columns of a table cannot decide a predicate."""
-
-
-TABLE_ERRORS = (ResourceError, StoreError, UndecidedError)
-"""Failures of a table after which chunks answer."""
-
-
-class MatchColumns(NamedTuple):
-    """Result of a predicate for each message, in order of log time and arrival.
+class RowBatch(NamedTuple):
+    """Some messages of a topic of a recording, in order of log time and arrival.
 
     Attributes:
         log_time: int64[n], ns.
         seq: int64[n], arrival numbers; 0 where only times are read.
         holds: bool[n], true where the message matches.
+        records: n rows, their fields; None where only times are asked for.
     """
 
     log_time: NDArray[np.int64]
     seq: NDArray[np.int64]
     holds: NDArray[np.bool_]
+    records: Any = None
+
+    def after(self, last: tuple[int, int]) -> RowBatch:
+        """Those behind a log time and an arrival number."""
+        time, seq = last
+        is_before = (self.log_time < time) | ((self.log_time == time) & (self.seq <= seq))
+        begin = int(np.count_nonzero(is_before))
+        records = None if self.records is None else self.records[begin:]
+        return RowBatch(self.log_time[begin:], self.seq[begin:], self.holds[begin:], records)
 
 
-class Values(NamedTuple):
-    """Fields of matching messages, nested as these are, in order of log time (ns) and arrival."""
-
-    log_time: NDArray[np.int64]
-    seq: NDArray[np.int64]
-    records: pa.StructArray
+class _UndecidedError(StoreError):
+    """The columns of a table cannot decide a predicate."""
 
 
 class Tabled(NamedTuple):
-    """A part of a question that has a table.
+    """The table of a part of a question.
 
     Attributes:
-        part: The part in the segments that the table covers.
-        rest: The part in other segments, whose messages are all later; None if there is none.
+        part: The part as asked.
+        rest: It in the segments that the table does not cover, which are all later; or None.
         segments: Numbers of the segments that it covers; None for all.
     """
 
@@ -86,11 +82,11 @@ class Tabled(NamedTuple):
 
 
 class Rows:
-    """Rows for the parts of one question."""
+    """Rows for the parts of one question; `counters` count what they cost."""
 
     def __init__(self, session: Session, counters: Counters) -> None:
         self.session = session
-        self._counters = counters
+        self.counters = counters
         self._tabled: dict[Part, Tabled | None] = {}
         self._counts: dict[Part, tuple[int, int]] = {}  # matching ones, and unreadable ones
 
@@ -106,38 +102,34 @@ class Rows:
         found = self._tabled[part]
         return found if found is not None and _holds(found, fields) else None
 
-    def leave_table(self, part: Part) -> bool:
-        """Read a part from chunks from now on; False if it is read from them already."""
-        had = self._tabled.get(part) is not None
-        self._tabled[part] = None
-        return had
-
     def _find(self, part: Part) -> Tabled | None:
+        asked = () if part.predicate is None else part.predicate.fields()
         asks_fields = part.predicate is not None and part.predicate.asks_fields
-        if not part.is_by_log_time or (asks_fields and not part.has_fields):
+        # A table does not say which messages have a publish time, and may be older than the
+        # package that reads the messages. Lost rows must not answer.
+        if (
+            not part.is_by_log_time
+            or (asks_fields and not part.has_fields)
+            or (
+                "_meta.pub" in asked
+                and len({c.channel.has_publish_time for c in part.channels}) > 1
+            )
+            or any(True for _ in lost_spans(part.recording))
+        ):
             return None
-        asks_publish = part.predicate is not None and "_meta.pub" in part.predicate.fields()
-        if asks_publish and len({c.channel.has_publish_time for c in part.channels}) > 1:
-            return None  # the table does not say which messages have one
-        if any(True for _ in lost_spans(part.recording)):
-            return None  # lost rows must not answer
         if part.recording.status in UNFINISHED:
             found = self._of_sealed(part)
         else:
             table = self.session.table(part.recording, part.topic)
             found = None if table is None else Tabled(table, part)
-        if found is None:
-            return None
-        if found.table.unreadable and part.predicate is None:
+        if found is None or (found.table.unreadable and part.predicate is None):
             return None  # fields of such messages are not in the table
-        # A table may be older than the package that reads the messages.
         is_older = not found.table.has_fields and any(c.codec.indexed for c in part.channels)
         return None if is_older else found
 
     def _of_sealed(self, part: Part) -> Tabled | None:
         """A part of a running recording; None if no segment has a table, or times overlap."""
-        ids = [channel.channel_id for channel in part.channels]
-        held = self.session.parts(part.recording, ids, (BEGIN, END))
+        held = self._held(replace(part, bounds=None, windows=None))
         messages: Counter[int] = Counter()
         for segment, number in held[["segment", "messages"]].tolist():
             messages[segment] += number
@@ -149,161 +141,200 @@ class Rows:
         early, late = held["last"][is_sealed], held["first"][~is_sealed]
         if not len(early) or (len(late) and early.max() >= late.min()):
             return None
-        rest = _within(part, messages.keys() - segments)
-        return Tabled(table, _within(part, segments), rest, segments)
+        spans = [span for span in part.recording.spans if span[0] not in segments]
+        rest = replace(part, recording=replace(part.recording, spans=spans))
+        return Tabled(table, part, rest, segments)
 
     # Answers.
 
-    def count(self, parts: Sequence[Part]) -> int:
+    def count_of(self, parts: Sequence[Part]) -> int:
         """Number of matching messages in all parts."""
-        total = 0
-        in_chunks: list[Part] = []
-        self._count_by_file([part for part in parts if part.predicate is not None])
-        for part in parts:
-            number: int = 0
-            left: Part | None = part
-            with suppress(*TABLE_ERRORS):
-                number, left = self._count_of(part)
-            total += number
-            if left is not None:
-                in_chunks.append(left)
-        return total + (self.count_in_chunks(in_chunks) if in_chunks else 0)
+        return self.again(self._count, parts)
 
     def fitting(self, parts: Sequence[Part]) -> list[Part]:
         """The parts without those of which a file of tables tells that nothing matches."""
-        asked = [part for part in parts if part.predicate is not None and not part.needs_index]
-        self._count_by_file(asked)
+        self._count_by_file([part for part in parts if not part.needs_index])
         return [part for part in parts if self._counts.get(part) != (0, 0)]
 
-    def outcomes(self, part: Part) -> Iterator[MatchColumns]:
+    def outcomes(self, part: Part) -> Iterator[RowBatch]:
         """For each message of the part's topic and time, whether it matches."""
-        found = self.tabled(part)
-        left: Part | None = part
-        if found is not None:
-            for rows, holds in self._answers(found):
-                yield MatchColumns(rows.t, rows.seq, holds)
-            left = found.rest
-        if left is None:
-            return
-        if left.predicate is None and left.is_by_log_time:
-            with suppress(SegmentError):
-                time = self._times(left, self._held(left))
-                left = None
-        if left is None:
-            yield MatchColumns(time, np.zeros_like(time), np.ones(len(time), np.bool_))
-        else:
-            yield from self._outcomes_in_chunks(left)
+        return self._lasting(part, self._outcomes)
 
-    def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
-        """Fields of the matching messages."""
-        for found, _ in self._values(part, self.tabled(part, fields), fields):
-            yield found
+    def times(self, part: Part) -> NDArray[np.int64]:
+        """Log times of the matching messages of a part, ns, ascending."""
+        found = [one.log_time[one.holds] for one in self.outcomes(part)]
+        return np.concatenate([np.empty(0, np.int64), *found])
+
+    def values(self, part: Part, fields: Collection[str] | None) -> Iterator[RowBatch]:
+        """The matching messages with some fields, nested as these are."""
+        return self._lasting(part, lambda own: self._values(own, fields, flattens=False))
 
     def columns(
         self, part: Part, fields: Collection[str] | None, *, partial: bool = False
-    ) -> Iterator[Values]:
+    ) -> Iterator[RowBatch]:
         """The same by dotted path, as tables have them; also summaries of arrays.
 
-        With `partial`, also of messages that have lost arrays with their payloads: null there.
+        With `partial`, also messages that have lost arrays with their payloads: null there.
         """
-        from hybridlog.frames.columns import flat, with_summaries
-        from hybridlog.schema.arrow_columns import structs
+        return self._lasting(part, lambda own: self._values(own, fields, partial=partial))
 
-        summaries = summaries_in(fields, part.field_types)
-        found = self.tabled(part, None if fields is None else {*fields} - summaries)
-        if found is not None and not all(map(found.table.has, summaries)):
-            found = None
-        for (times, seq, records), left in self._values(
-            part, found, fields, summaries, partial=partial
-        ):
-            made = {} if left is None else left.statistics(summaries)
-            leaves = with_summaries(flat(records), fields, made)
-            yield Values(times, seq, structs(leaves, len(times)))
+    # Files that go, and tables that cannot tell.
+
+    def again(self, ask: Callable[[Sequence[Part]], _T], parts: Sequence[Part]) -> _T:
+        """Ask about parts; again about those whose files were replaced, or whose table failed."""
+        before = self.counters.copy()
+        for _ in range(_RENEWALS):
+            try:
+                return ask(parts)
+            except ChangedError:
+                self._forget(before)
+                parts = [*map(self._renewed, parts)]
+        return ask(parts)
+
+    def _lasting(self, part: Part, ask: Callable[[Part], Iterator[RowBatch]]) -> Iterator[RowBatch]:
+        """Rows of a part, to the end if files are replaced or a table fails meanwhile."""
+        last: tuple[int, int] | None = None
+        before = self.counters.copy()
+        for turn in range(_RENEWALS + 1):
+            try:
+                for found in ask(part):
+                    rest = found if last is None else found.after(last)
+                    if len(rest.log_time):
+                        last = int(rest.log_time[-1]), int(rest.seq[-1])
+                        yield rest
+                return
+            except ChangedError:
+                if turn == _RENEWALS:
+                    raise
+                self._forget(before)
+                part = self._renewed(part)
+
+    def _forget(self, before: Counters) -> None:
+        """What the counters said of messages that are read again."""
+        self.counters.unreadable = before.unreadable
+        self.counters.without_arrays = before.without_arrays
+
+    def _renewed(self, part: Part) -> Part:
+        """The same part of its recording as that is now."""
+        recording = self.session.entry(part.recording.id)
+        if recording is part.recording:
+            return part
+        channels = self.session.channels_of(recording, [part.topic])
+        return replace(part, recording=recording, channels=tuple(channels))
+
+    # Rows of tables, then those of chunks.
+
+    def _count(self, parts: Sequence[Part]) -> int:
+        self._count_by_file(parts)
+        total = 0
+        left: list[Part] = []
+        for part in parts:
+            found = self.tabled(part)
+            if part.predicate is None and part.is_unbounded:
+                total += part.messages
+            elif part.predicate is None and part.is_by_log_time:
+                total += self._count_by_time(part)
+            elif found is None:
+                left.append(part)
+            elif part in self._counts:
+                matched, unreadable = self._counts[part]
+                total += matched
+                self.counters.unreadable += unreadable
+            else:
+                total += sum(int(holds.sum()) for _, holds in self._answers(found))
+                left += [] if found.rest is None else [found.rest]
+        return total + (self.count_in_chunks(left) if left else 0)
+
+    def _outcomes(self, part: Part) -> Iterator[RowBatch]:
+        found = self.tabled(part)
+        if found is not None:
+            for rows, holds in self._answers(found):
+                yield RowBatch(rows.t, rows.seq, holds)
+            if found.rest is None:
+                return
+            part = found.rest
+        if part.predicate is None and part.is_by_log_time:
+            with suppress(SegmentError):
+                time = self._times(part, self._held(part))
+                yield RowBatch(time, np.zeros_like(time), np.ones(len(time), np.bool_))
+                return
+        for channel, run in self._by_channel(part):
+            holds = self._decided(part, channel, run)
+            yield RowBatch(run.batch.log_time, run.seq, holds)
 
     def _values(
         self,
         part: Part,
-        found: Tabled | None,
         fields: Collection[str] | None,
-        summaries: Collection[str] = (),
         *,
         partial: bool = False,
-    ) -> Iterator[tuple[Values, LeftFields | None]]:
-        """Fields of the matching messages, of a table or decoded, and what is left of them."""
+        flattens: bool = True,
+    ) -> Iterator[RowBatch]:
         from hybridlog.schema.arrow_types import converted
 
+        summaries = summaries_in(fields, part.field_types) if flattens else set()
+        wanted = None if fields is None else {*fields} - summaries
+        found = self.tabled(part, wanted)
         rest: Part | None = part
-        if found is not None:
+        if found is not None and all(map(found.table.has, summaries)):
+            rest = found.rest
             kind = None if fields is None else found.table.fields(fields)
             for rows, holds in self._answers(found, fields):
                 chosen = rows if holds.all() else rows.take(np.flatnonzero(holds))
-                if len(chosen):
-                    # Without the columns that only the predicate needs.
-                    records = chosen.records
-                    records = records if kind is None else converted(records, kind, drops=True)
-                    yield Values(chosen.t, chosen.seq, records), None
-            rest = found.rest
+                # Without the columns that only the predicate needs.
+                records = chosen.records
+                records = records if kind is None else converted(records, kind, drops=True)
+                records = _flattened(records, fields) if flattens else records
+                yield RowBatch(chosen.t, chosen.seq, holds[holds], records)
         arrays = {path.rpartition(".")[0] for path in summaries}
-        wanted = None if fields is None else {*fields} - {*summaries} | arrays
-        for channel, run in self._by_channel(self.plan([rest])) if rest is not None else ():
-            decoded = channel.codec.columns_of(run.batch, wanted)
-            self._counters.unreadable += len(run.batch) - len(decoded.rows)
+        wanted = None if wanted is None else wanted | arrays
+        for channel, run in self._by_channel(rest) if rest is not None else ():
+            own = run.take(self._decided(part, channel, run))
+            decoded = channel.codec.columns_of(own.batch, wanted)
+            self.counters.unreadable += len(own.batch) - len(decoded.rows)
             left: LeftFields | None = None
             if channel.is_reduced:
                 from hybridlog.schema.left import LeftFields, without_lacking
 
                 whole, lacking = without_lacking(decoded, arrays.difference(fields or ()))
                 if partial:
-                    self._counters.lacking += lacking
+                    self.counters.lacking += lacking
                 else:
                     decoded = whole
-                    self._counters.leave_out(lacking, channel.state)
+                    self.counters.leave_out(lacking, channel.state)
                 left = decoded.records if isinstance(decoded.records, LeftFields) else None
+            records = decoded.arrow()
+            if flattens:
+                made = {} if left is None else left.statistics(summaries)
+                records = _flattened(records, fields, made)
             good = decoded.rows
-            yield Values(run.batch.log_time[good], run.seq[good], decoded.arrow()), left
+            holds = np.ones(len(good), np.bool_)
+            yield RowBatch(own.batch.log_time[good], own.seq[good], holds, records)
 
     # Tables.
-
-    def _count_of(self, part: Part) -> tuple[int, Part | None]:
-        """Number of matching messages without reading chunks, and what is left to read."""
-        if part.predicate is None:
-            if part.is_unbounded:
-                return part.messages, None
-            return (self._count_by_time(part), None) if part.is_by_log_time else (0, part)
-        found = self.tabled(part)
-        if found is None:
-            return 0, part
-        if found.part not in self._counts:
-            counts = [
-                (int(h.sum()), int(r.is_unreadable().sum())) for r, h in self._in_table(found)
-            ]
-            self._counts[found.part] = sum(m for m, _ in counts), sum(n for _, n in counts)
-        matched, unreadable = self._counts[found.part]
-        self._counters.unreadable += unreadable
-        return matched, found.rest
 
     def _answers(
         self, found: Tabled, fields: Collection[str] | None = (), own: Collection[str] = ()
     ) -> Iterator[tuple[TableRows, NDArray[np.bool_]]]:
         """Rows of a table with the outcome for each; those that are unreadable are counted."""
         for rows, holds in self._in_table(found, fields, own):
-            self._counters.unreadable += int(rows.is_unreadable().sum())
+            self.counters.unreadable += int(rows.is_unreadable().sum())
             yield rows, holds
 
     def _count_by_file(self, parts: Sequence[Part]) -> None:
         """Count whole parts that lie in one file: the predicate is evaluated once for all rows."""
         by_file: dict[tuple[int, bool], list[Tabled]] = defaultdict(list)
         for part in parts:
-            assert part.predicate is not None
-            is_whole = part not in self._counts and part.is_unbounded
-            if not is_whole or any(map(is_meta, part.predicate.fields())):
+            if part.predicate is None or part in self._counts or not part.is_unbounded:
+                continue
+            if any(map(is_meta, part.predicate.fields())):
                 continue  # known of the part, not of a row
             found = self.tabled(part)
             if found is not None and found.segments is None and len(found.table.files) == 1:
                 by_file[found.table.files[0].number, found.table.has_arrays].append(found)
         for group in by_file.values():
             if len(group) > 1:
-                with suppress(UndecidedError, StoreError):  # then part by part
+                with suppress(StoreError):  # then part by part
                     self._count_in_file(group)
 
     def _count_in_file(self, group: Sequence[Tabled]) -> None:
@@ -311,19 +342,18 @@ class Rows:
         types = first.part.field_types
         file = first.table.files[0]
         whole = self.session.tables.whole(file, arrays=first.table.has_arrays)
-        matched, unreadable, before = [np.zeros(1, np.int64)], [np.zeros(1, np.int64)], [0]
-        alike = [(one.part, one.table) for one in group if one.part.field_types == types]
+        sums, before = [np.zeros((2, 1), np.int64)], [0]
         for rows, holds in self._in_table(first, whole=whole):
             before.append(before[-1] + len(rows))
-            for found, mask in ((matched, holds), (unreadable, rows.is_unreadable())):
-                found.append(found[-1][-1] + np.cumsum(mask))
-        sums, bad = np.concatenate(matched), np.concatenate(unreadable)
-        for part, table in alike:
-            places = [(before[one.group] + one.begin, one.rows) for one in table.parts]
-            self._counts[part] = (
-                sum(int(sums[begin + rows] - sums[begin]) for begin, rows in places),
-                sum(int(bad[begin + rows] - bad[begin]) for begin, rows in places),
-            )
+            both = np.stack([holds, rows.is_unreadable()])
+            sums.append(sums[-1][:, -1:] + np.cumsum(both, axis=1))
+        total = np.concatenate(sums, axis=1)
+        for one in group:
+            if one.part.field_types == types:
+                begin = np.array([before[p.group] + p.begin for p in one.table.parts])
+                end = begin + [p.rows for p in one.table.parts]
+                matched, unreadable = (total[:, end] - total[:, begin]).sum(axis=1).tolist()
+                self._counts[one.part] = matched, unreadable
 
     def _in_table(
         self,
@@ -335,7 +365,7 @@ class Rows:
         """Rows of the part's time in its table, with the outcome for each.
 
         `own` are columns of the table itself; `whole` are all rows of its file, in place of its
-        table. An `UndecidedError` says that the columns cannot decide.
+        table. Of a table that is damaged or cannot tell, a `ChangedError` says that it is left.
         """
         part, table = found.part, whole or found.table
         spans = None if part.is_unbounded else [(a, b) for a, b in part.log_windows.tolist()]
@@ -345,22 +375,23 @@ class Rows:
         if part.predicate is not None and part.predicate.asks_fields and table.unreadable:
             columns.add("state")
         try:
-            paths = _wanted(table, part, fields)
+            paths = None if fields is None else {*_paths(table, part), *map(_plain, fields)}
             size = table.size(paths, own)
-            self._counters.bytes_read += int(size * min(part.share * 1.2, 1.0))
+            self.counters.bytes_read += int(size * min(part.share * 1.2, 1.0))
             for rows in table.scan(paths, own=columns, spans=spans):
                 yield rows, _decided(part, rows) & ~rows.is_unreadable()
-        except StoreError:
-            if whole is None:
+        except StoreError as error:
+            if whole is not None:
+                raise
+            self._tabled[part] = None
+            if not isinstance(error, _UndecidedError):
                 self.session.reject_table(part.recording, part.topic)
-            raise
+            raise ChangedError(f"The table of {part.topic} is left. Ask again.") from error
 
     # Chunks.
 
-    def plan(
-        self, parts: Sequence[Part], *, filtered: bool = True, reverse: bool = False
-    ) -> ScanPlan:
-        """The plan for reading messages of some parts from chunks; if `filtered`, matching ones.
+    def chunk_plan(self, parts: Sequence[Part], *, reverse: bool = False) -> ScanPlan:
+        """The plan for reading the matching messages of some parts from chunks.
 
         Where a table decides, it says where they are; else filters decide on what is read.
         """
@@ -370,12 +401,14 @@ class Rows:
         of_recording: dict[str, tuple[Part, dict[int, int]]] = {}
         for part in parts:
             _, indexes = of_recording.setdefault(part.recording.id, (part, {}))
-            decide = filter_of(part) if filtered else None
-            found = None if decide is None else self._placed(part, offsets)
-            covered = frozenset[int]() if found is None else found.segments
+            decide = filter_of(part)
+            found = None if decide is None else self.tabled(part)
+            for key, own in self._offsets(found).items() if found is not None else ():
+                offsets[key].append(own)
             for channel in part.channels:
                 indexes[channel.channel_id] = len(channels)
-                if decide is not None and covered is not None:  # None: the table has all
+                if decide is not None and (found is None or found.segments is not None):
+                    covered = () if found is None or found.segments is None else found.segments
                     filters[len(channels)] = decide, covered
                 channels.append(channel)
         return ScanPlan(
@@ -384,33 +417,18 @@ class Rows:
             parts[0].clock if parts else "log",
             filters=filters,
             offsets={key: np.concatenate(own) for key, own in offsets.items()},
-            is_chosen=filtered and any(part.predicate is not None for part in parts),
+            is_chosen=any(part.predicate is not None for part in parts),
             reverse=reverse,
-            counters=self._counters,
+            counters=self.counters,
         )
 
-    def _placed(
-        self, part: Part, offsets: dict[ChunkKey, list[NDArray[np.int64]]]
-    ) -> Tabled | None:
-        """The part with its table, which has added the places of its matching messages."""
-        found = self.tabled(part)
-        if found is None:
-            return None
-        unreadable = self._counters.unreadable
-        try:
-            places = [
-                places_of(rows.own["ref"])[holds]
-                for rows, holds in self._answers(found, own=("ref",))
-            ]
-        except TABLE_ERRORS:
-            self._counters.unreadable = unreadable
-            self.leave_table(part)
-            return None
-        if places:
-            by_chunk = offsets_by_chunk(part.recording.id, np.concatenate(places))
-            for key, own in by_chunk.items():
-                offsets[key].append(own)
-        return found
+    def _offsets(self, found: Tabled) -> dict[ChunkKey, NDArray[np.int64]]:
+        """Payload offsets of the matching messages that a table has, by chunk."""
+        places = [
+            places_of(rows.own["ref"])[holds] for rows, holds in self._answers(found, own=("ref",))
+        ]
+        none = np.empty((0, 3), np.int64)
+        return offsets_by_chunk(found.part.recording.id, np.concatenate([none, *places]))
 
     def _scan(self, part: Part, indexes: dict[int, int]) -> RecordingScan:
         """The chunks of a recording that may hold wanted messages."""
@@ -426,32 +444,26 @@ class Rows:
 
     def count_in_chunks(self, parts: Sequence[Part]) -> int:
         """Read the messages of some parts and count those that match."""
-        scan = ChunkScan(self.plan(parts), self.session)
+        scan = ChunkScan(self.chunk_plan(parts), self.session)
         return sum(len(run.batch) for _, run, _ in scan.loaded())
 
-    def _outcomes_in_chunks(self, part: Part) -> Iterator[MatchColumns]:
-        """Read the messages in order and decide on each."""
-        from hybridlog.index.indexing import rows_by_channel
-
-        plan, decide = self.plan([part], filtered=False), filter_of(part)
-        for run in ChunkScan(plan, self.session).runs():
-            holds = np.ones(len(run.batch), np.bool_)
-            for index, rows in rows_by_channel(run.batch.channel) if decide is not None else ():
-                assert decide is not None
-                found = decide.matches(plan.channels[index], run.batch.take(rows), run.seq[rows])
-                holds[rows] = found.holds
-                self._counters.unreadable += found.unreadable
-                self._counters.without_arrays += found.expired
-            yield MatchColumns(run.batch.log_time, run.seq, holds)
-
-    def _by_channel(self, plan: ScanPlan) -> Iterator[tuple[RecordedChannel, MessageRun]]:
-        """The messages of a plan with fields in order, those of one channel at a time."""
+    def _by_channel(self, part: Part) -> Iterator[tuple[RecordedChannel, MessageRun]]:
+        """The messages of a part in order, whether they match or not, of one channel at a time."""
+        plan = self.chunk_plan([replace(part, predicate=None)])
         for run in ChunkScan(plan, self.session).runs():
             changes = np.flatnonzero(np.diff(run.batch.channel)) + 1
             for own in map(run.take, np.split(np.arange(len(run.batch)), changes)):
-                channel = plan.channels[int(own.batch.channel[0])]
-                if len(own.batch):
-                    yield channel, own
+                yield plan.channels[int(own.batch.channel[0])], own
+
+    def _decided(self, part: Part, channel: RecordedChannel, run: MessageRun) -> NDArray[np.bool_]:
+        """Whether messages of one channel match; those that cannot be tested are counted."""
+        decide = filter_of(part)
+        if decide is None:
+            return np.ones(len(run.batch), np.bool_)
+        found = decide.matches(channel, run.batch, run.seq)
+        self.counters.unreadable += found.unreadable
+        self.counters.without_arrays += found.expired
+        return found.holds
 
     # Times alone.
 
@@ -471,7 +483,7 @@ class Rows:
             reader = self.session.segment(part.recording.id, segment)
             read_before = reader.bytes_read
             found.append(self.session.times(part.recording, segment, chunk)[channel])
-            self._counters.bytes_read += reader.bytes_read - read_before
+            self.counters.bytes_read += reader.bytes_read - read_before
         time = np.sort(np.concatenate(found))
         return time[inside(time, part.log_windows)]
 
@@ -479,12 +491,6 @@ class Rows:
         """Messages of a part in chunks, as of `Session.parts`."""
         ids = [channel.channel_id for channel in part.channels]
         return self.session.parts(part.recording, ids, part.log_span)
-
-
-def _within(part: Part, segments: Collection[int]) -> Part:
-    """A part in some segments of its recording; statistics are those of all."""
-    spans = [span for span in part.recording.spans if span[0] in segments]
-    return replace(part, recording=replace(part.recording, spans=spans))
 
 
 def summaries_in(fields: Collection[str] | None, types: Mapping[str, str] | None) -> set[str]:
@@ -531,30 +537,49 @@ def _decided(part: Part, rows: TableRows) -> NDArray[np.bool_]:
     times = rows.t, rows.seq, rows.own.get("pub")
     found = mask_of(predicate, part.field_types, rows.records, part.channels[0], *times)
     if found is None:
-        raise UndecidedError(f"The table of {part.topic} cannot tell.")
+        raise _UndecidedError
     return found
 
 
+def _flattened(
+    records: pa.StructArray,
+    fields: Collection[str] | None,
+    summaries: Mapping[str, pa.Array[Any]] = MappingProxyType({}),
+) -> pa.StructArray:
+    """Fields by dotted path, with the summaries of arrays that are asked for."""
+    from hybridlog.frames.columns import leaves_of
+    from hybridlog.schema.arrow_columns import structs
+
+    return structs(leaves_of(records, fields, summaries), len(records))
+
+
+def _plain(path: str) -> str:
+    return path.replace("[]", "")
+
+
 def _holds(found: Tabled, fields: Collection[str] | None) -> bool:
-    """True if a table holds some fields, or all, in full: no array that may be a summary."""
+    """True if a table holds some fields, or all, in full: no array that is a summary there."""
     types = found.part.field_types
-    if types is None:
-        return fields is not None and not fields
-    above = {path[: mark.start()] for path in types for mark in _MARK.finditer(path)}
-    below = [*types]
-    if fields is not None:
-        begins = tuple(f"{field}{mark}" for field in fields for mark in ".[")
-        below = [path for path in types if path in fields or path.startswith(begins)]
-        if not all(field in above or field in types for field in fields):
-            return False
-    for name in below:
-        kind, width, element = types[name], width_of(types[name]), element_of(types[name])
-        is_short = width is not None and width <= _WHOLE and element in SINGLE
-        has_fields = name in above
-        is_full = found.table.has_arrays and (element in _IN_FULL or (has_fields and element))
-        if not (kind in SINGLE or is_short or is_full) and not (has_fields and element is None):
-            return False
-    return True
+    if not fields and fields is not None:
+        return True
+    if types is None or summaries_in(fields, types):
+        return False
+    held = found.table.fields(fields)
+    return all(_is_full(held, channel.arrow_type(fields)) for channel in found.part.channels)
+
+
+def _is_full(held: Any, kind: Any) -> bool:
+    """True if a type has all fields and arrays of another one."""
+    from pyarrow.types import is_struct
+
+    from hybridlog.schema.arrow_types import is_list
+
+    if is_struct(kind):
+        own = {field.name: field.type for field in held} if is_struct(held) else {}
+        return all(field.name in own and _is_full(own[field.name], field.type) for field in kind)
+    if is_list(kind):
+        return is_list(held) and _is_full(held.value_type, kind.value_type)
+    return not is_struct(held)
 
 
 def _paths(table: TopicTable, part: Part) -> set[str]:
@@ -572,10 +597,3 @@ def _paths(table: TopicTable, part: Part) -> set[str]:
             path = path.rpartition(".")[0]
         found.add(path)
     return found
-
-
-def _wanted(table: TopicTable, part: Part, fields: Collection[str] | None) -> set[str] | None:
-    """Columns to read: those of the predicate and the requested ones; None for all."""
-    if fields is None:
-        return None
-    return {*_paths(table, part), *(path.replace("[]", "") for path in fields)}

@@ -143,10 +143,6 @@ class CatalogError(StoreError):
     """A segment is not the one that the catalog knows. Its files are read again."""
 
 
-class IndexChangedError(StoreError):
-    """Another process changed the index during the question. Ask again."""
-
-
 class DatabaseError(HybridlogError):
     """MongoDB does not answer, refuses, or has ended."""
 

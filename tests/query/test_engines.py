@@ -208,8 +208,7 @@ def only(way: str) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         if way == "chunks":
             patch.setattr(Rows, "tabled", lambda *_: None)
-            patch.setattr(Rows, "count", Rows.count_in_chunks)
-            patch.setattr(Rows, "outcomes", Rows._outcomes_in_chunks)
+            patch.setattr(Rows, "count_of", Rows.count_in_chunks)
         yield
 
 

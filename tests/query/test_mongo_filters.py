@@ -7,7 +7,6 @@ import math
 import pickle
 import re
 from collections.abc import Iterator
-from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -26,13 +25,10 @@ from hybridlog_storage.errors import (
     DatabaseError,
     HybridlogError,
     IncompleteError,
-    IndexChangedError,
     UsageError,
     WhereError,
 )
 from hybridlog_storage.messages import Channel, Schema
-from hybridlog_storage.mongo.index_state import Indexed, IndexState
-from tests.calls import Calls
 from tests.cli.within import answer
 
 pytestmark = pytest.mark.mongo("embedded")
@@ -383,15 +379,3 @@ def test_messages_without_fields_are_told(tmp_path: Path) -> None:
         both = topic.where({"x": {"$ne": 1}}).where("x < 5")
         assert (both.count(), both.counters.unreadable) == (1, 1)
         assert topic.where({"_meta.error": {"$exists": True}}).count() == 1
-
-
-def test_an_index_that_others_change_meanwhile_is_told(store: hl.Store, calls: Calls) -> None:
-    made = iter("ab")
-
-    def told(found: dict[str, Indexed], *_: object) -> object:
-        now = next(made)
-        return {key: replace(one, made=now) for key, one in found.items()}
-
-    calls.change(IndexState, "of", told)
-    with pytest.raises(IndexChangedError, match="Ask again"):
-        store.topic("/t").where({"x": 3}).count()

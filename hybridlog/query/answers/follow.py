@@ -19,7 +19,6 @@ from hybridlog.query.chunk_columns import ChunkColumns
 from hybridlog.query.chunk_scan import ChunkScan, RecordingScan
 from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
-from hybridlog.query.rows import Rows
 from hybridlog.query.topics import later
 from hybridlog.record.marks import MARKS_SEGMENT
 from hybridlog.record.marks_log import without
@@ -58,7 +57,7 @@ class Arrivals(Planner):
     ) -> None:
         super().__init__(session, question, counters)
         self._ranges = RangeResolver(session, replace(question, bounds=None))
-        self._rows = self._arrived = _Arrived(session, counters)
+        self._chunks: dict[str, list[Chunk]] = {}  # that have just come, by recording
         self._takes = takes
         self._bounds: dict[str, Span] = {}
         recordings = question.recordings or ()
@@ -68,7 +67,7 @@ class Arrivals(Planner):
 
     def look(self, session: Session) -> tuple[Iterator[MessageRun], bool]:
         """The messages that have come since the last look, and whether more will."""
-        self.session = self._arrived.session = session
+        self.session = session
         places = session.chosen(self.question)
         snapshot = session.snapshot()
         new = [t for t in snapshot.topics_at(places) if t not in self.question.topics]
@@ -82,9 +81,18 @@ class Arrivals(Planner):
                 # The beginning that a time may be relative to is known now.
                 self._bounds[one.id] = RangeResolver(session, self.question).bounds_in(one)
             bounds = self._bounds.get(one.id)
-            self._arrived.chunks[one.id] = chunks = [*self._arrivals(entry, bounds)]
+            self._chunks[one.id] = chunks = [*self._arrivals(entry, bounds)]
             parts += self.parts_in(one, bounds, None) if chunks else ()
         return ChunkScan(self.plan(parts), session).runs(), any(map(self._goes_on, summaries))
+
+    def tabled(self, part: Part, fields: Collection[str] | None = ()) -> None:
+        """No tables: they have older messages, too."""
+
+    def _scan(self, part: Part, indexes: dict[int, int]) -> RecordingScan:
+        """Reads only the chunks that have just come."""
+        new = self._chunks[part.recording.id]
+        chunks = [chunk for chunk in new if not indexes.keys().isdisjoint(chunk.place.channels)]
+        return RecordingScan(part.recording, indexes, part.bounds, chunks)
 
     def _goes_on(self, one: RecordingSummary) -> bool:
         """True if more messages of the question may come."""
@@ -176,22 +184,6 @@ class Following(Arrivals, Iterator["Message"]):
                 safe_point()
             if goes_on:
                 pause(max(_EVERY_S - (time.monotonic() - started), 0))
-
-
-class _Arrived(Rows):
-    """Reads only the chunks that have just come, in `chunks` by recording."""
-
-    def __init__(self, session: Session, counters: Counters) -> None:
-        super().__init__(session, counters)
-        self.chunks: dict[str, list[Chunk]] = {}
-
-    def tabled(self, part: Part, fields: Collection[str] | None = ()) -> None:
-        """No tables: they have older messages, too."""
-
-    def _scan(self, part: Part, indexes: dict[int, int]) -> RecordingScan:
-        new = self.chunks[part.recording.id]
-        chunks = [chunk for chunk in new if not indexes.keys().isdisjoint(chunk.place.channels)]
-        return RecordingScan(part.recording, indexes, part.bounds, chunks)
 
 
 def _sealed(entry: RecordingEntry) -> set[int]:

@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import groupby
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
@@ -30,12 +30,12 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.query.question import Counters, Part, Question, Span
+    from hybridlog.query.rows import RowBatch
     from hybridlog.session import Session
     from hybridlog_storage.summary import RecordingSummary
 
     Places = NDArray[np.intp]
 
-_Rows = TypeVar("_Rows", bound="tuple[Any, ...]")
 _NONE = np.empty(0, np.int64)
 
 
@@ -166,12 +166,9 @@ class IntervalQueries:
         return clipped(holding(time, holds, end, gap, before=len(begun[0])), span)
 
     def _last_before(
-        self, part: Part, span: Span, ask: Callable[[Part], Iterator[_Rows]]
-    ) -> _Rows | None:
-        """The last rows before a span, if there are any; unreadable messages do not count.
-
-        Rows begin with the column of log times.
-        """
+        self, part: Part, span: Span, ask: Callable[[Part], Iterator[RowBatch]]
+    ) -> RowBatch | None:
+        """The last rows before a span, if there are any; unreadable messages do not count."""
         counters = self._planner.counters
         unreadable = counters.unreadable, counters.without_arrays
         recorded = part.recording.span
@@ -180,7 +177,7 @@ class IntervalQueries:
         for begin in earlier(span[0], recorded[0]):
             last = None
             for found in ask(_bounded(part, (begin, span[0]))):
-                last = found if len(found[0]) else last
+                last = found
             counters.unreadable, counters.without_arrays = unreadable
             if last is not None:
                 return last
@@ -194,10 +191,9 @@ class IntervalQueries:
         before = self._last_before(part, span, ask)
         carried = None if before is None else before.records[-1:]
         found = [_NONE]
-        for times, _, rows in ask(_bounded(part, span)):
-            if len(rows):
-                differs, carried = _steps(carried, rows, tolerance)
-                found.append(times[differs])
+        for rows in ask(_bounded(part, span)):
+            differs, carried = _steps(carried, rows.records, tolerance)
+            found.append(rows.log_time[differs])
         return np.concatenate(found)
 
     def _check(self, subject: str) -> None:

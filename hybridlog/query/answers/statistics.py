@@ -130,9 +130,9 @@ def statistics(session: Session, question: Question, counters: Counters) -> list
         fields = _numbers(part.field_types) if question.fields is None else question.fields
         if fields == []:
             continue
-        for times, _, records in planner.columns(part, fields, partial=True):
-            counters.messages += len(times)
-            _add(found[part.topic], question, records)
+        for rows in planner.columns(part, fields, partial=True):
+            counters.messages += len(rows.log_time)
+            _add(found[part.topic], question, rows.records)
     if question.fields is not None and not any(found.values()):
         raise UsageError(f"{', '.join(question.fields)}: no field with numbers.")
     return [
@@ -153,14 +153,14 @@ def _columns_of(channel: RecordedChannel, question: Question) -> pa.StructArray:
     """The columns of a channel, without rows."""
     import pyarrow as pa
 
-    from hybridlog.frames.columns import flat, with_summaries
+    from hybridlog.frames.columns import leaves_of
     from hybridlog.schema.arrow_columns import structs
 
     types = field_types((channel,))
     fields = _numbers(types) if question.fields is None else question.fields
     arrays = {path.rpartition(".")[0] for path in summaries_in(fields, types)}
     empty = pa.array([], channel.arrow_type(None if fields is None else {*fields, *arrays}))
-    return structs(with_summaries(flat(empty), fields), 0)
+    return structs(leaves_of(empty, fields), 0)
 
 
 def _add(running: dict[str, _Running], question: Question, records: pa.StructArray) -> None:
