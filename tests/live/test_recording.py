@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
@@ -20,7 +19,6 @@ import pytest
 from mcap.reader import make_reader
 
 import hybridlog as hl
-from benchmarks.simulator.write import write_bag
 from hybridlog.live import LiveRecording
 from hybridlog.live import recording as live
 from hybridlog_storage.disk.files import System
@@ -32,7 +30,6 @@ from hybridlog_storage.segments.segment_file import SegmentFile
 from hybridlog_storage.segments.segment_writer import RecordingWriter, SegmentSettings
 from tests import places
 from tests.calls import Calls
-from tests.limits import Limit
 from tests.live.sources.heard import must_return
 from tests.live.speaker import TEXT, text
 from tests.test_faults import kill_mongod
@@ -204,21 +201,6 @@ def test_a_full_disk(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
         (entry,) = again.recordings()
         assert entry.status == "recovered"
         assert sum(row["count"] for row in entry.end["losses"]) == taken - 1
-
-
-def test_no_mistake_of_ours_is_silent(store: hl.Store, calls: Calls) -> None:
-    recording = store.start("talk", budget_bytes=1 << 20)
-    calls.fail(RecordingWriter, "append", ZeroDivisionError)
-    own = channel("/talk")
-
-    def until_refused() -> None:
-        while True:
-            recording.write(own, text(b"x" * 100_000))
-
-    with pytest.raises(ZeroDivisionError):
-        until_refused()
-    with pytest.raises(ZeroDivisionError):
-        recording.close()
 
 
 def test_chunks_are_flushed_within_the_interval(store: hl.Store, calls: Calls) -> None:
@@ -398,27 +380,6 @@ def test_what_a_mongod_had_lost_when_it_died_is_indexed_again_and_counted_once(
     assert not store.verify().findings
 
 
-def test_documents_of_many_chunks_are_sent_together(
-    store: hl.Store, calls: Calls, limit: Limit
-) -> None:
-    """Each topic has a chunk a flush, and one insert for all of an interval."""
-    inserted = calls(Database, "insert_raw")
-    limit(index_interval=lambda _: 1e6)
-    topics = [channel(f"/topic{number}") for number in range(3)]
-    with store.start("talk", flush_interval_s=0.05) as recording:
-        totals = recording.capture.writer.totals
-        for number in range(5):
-            for own in topics:
-                recording.write(own, text(bytes([number]) * 2000), log_time=number)
-            wait_for(lambda n=number: totals.chunks == 3 * (n + 1))
-        assert recording.lag == 15
-        assert not inserted
-    names = [collection for _, collection, *_ in inserted if collection.startswith("topic")]
-    assert sorted(names) == [collection_of(own.topic) for own in topics]
-    assert [m.raw[4] for m in store.topic("/topic1")] == list(range(5))
-    assert store.verify().findings == []
-
-
 @pytest.mark.mongo("embedded")
 def test_a_mongod_that_stands_still_costs_nothing(store: hl.Store) -> None:
     speech = channel("/speech")
@@ -441,52 +402,3 @@ def test_a_mongod_that_stands_still_costs_nothing(store: hl.Store) -> None:
             os.kill(pid, signal.SIGCONT)
         wait_for(lambda: recording.lag == 0)
     assert store.topic("/speech").count() == 99
-
-
-SPEAKS = """
-import json, sys, threading, time
-from pathlib import Path
-from rosbags.rosbag1 import Reader
-import hybridlog as hl
-from hybridlog_storage.messages import Channel, Schema
-from hybridlog_storage.segments.segment_writer import SegmentSettings
-
-small = SegmentSettings(chunk_size=64 << 10, segment_size=1 << 20)  # tables are made meanwhile
-with Reader(Path(sys.argv[1])) as reader:
-    said = [(c, when, bytes(payload)) for c, when, payload in reader.messages()]
-channels = {
-    c.id: Channel(c.topic, "ros1", Schema(c.msgtype, "ros1msg", c.msgdef.data.encode()))
-    for c, _, _ in said
-}
-
-def speak():
-    for connection, when, payload in said:
-        recording.write(channels[connection.id], payload, log_time=when)
-
-with hl.open(sys.argv[2], create=True) as store, store.start("live", settings=small) as recording:
-    recording.expect(*channels.values())
-    before = set(sys.modules)
-    speaker = threading.Thread(target=speak)
-    speaker.start()
-    speaker.join()
-    while recording.stored[0] < len(said) or recording.lag:
-        time.sleep(0.01)
-    print(json.dumps([len(said), sorted(set(sys.modules) - before)]))
-"""
-
-
-def test_nothing_is_loaded_while_messages_come(tmp_path: Path) -> None:
-    """What is imported then keeps the interpreter from all who bring messages."""
-    log = tmp_path / "robot.bag"
-    write_bag(log, duration_s=3)
-    done = subprocess.run(
-        [sys.executable, "-c", SPEAKS, str(log), str(tmp_path / "store")],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=60,
-    )
-    assert done.returncode == 0, done.stderr
-    messages, loaded = json.loads(done.stdout)
-    assert messages > 500
-    assert loaded == []

@@ -267,13 +267,6 @@ def check_command(client: TestClient, params: dict[str, Any]) -> None:
     assert printed_by(told["python"]).split()[0] == str(told["count"])
 
 
-def test_a_name_that_no_predicate_has_is_refused(
-    odd: hl.Store, asking: Callable[[hl.Store], TestClient]
-) -> None:
-    asked = {"recording": "x [1]", "topic": "/a b", "where": "n > 1", "around": "1s"}
-    assert "'/a b' cannot stand" in asking(odd).get("ask", params=asked).json()["error"]
-
-
 def test_losses_are_told(odd: hl.Store, asking: Callable[[hl.Store], TestClient]) -> None:
     client = asking(odd)
     asked = {"recording": DAMAGED, "topic": "/large", "where": "_meta.seq >= 0"}
@@ -285,14 +278,6 @@ def test_losses_are_told(odd: hl.Store, asking: Callable[[hl.Store], TestClient]
     assert client.get("ask", params=asked).json()["lost"] == want
     answer = client.get("sql", params={**asked, "text": "select count(*) from large"}).json()
     assert any(f"{lost.messages} messages lost in" in line for line in answer["remarks"])
-
-
-def test_observed_fields_are_offered(
-    odd: hl.Store, asking: Callable[[hl.Store], TestClient]
-) -> None:
-    asked = {"recording": "x [1]", "topic": "/a b", "text": "na", "place": 2}
-    answer = asking(odd).get("complete", params=asked).json()
-    assert answer["candidates"][0] == ["`odd.name`", "field", "integer"]
 
 
 def test_a_file_is_made_while_it_is_sent(
