@@ -30,19 +30,19 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).parents[1]
 PAGE = "benchmarks.md"
 README = "readme.md"
-UNTIL: Mapping[Scale, float] = {"full": 49.0, "quick": 15.0, "tiny": 0.0}
+UNTIL: Mapping[Scale, float] = {"full": 49.0, "tiny": 0.0}
 """Minutes until which the repetition of a search is begun."""
 _EPILOG = """\
 parts:
-  tasks    commands, SQL, many recordings, the page and a bucket
+  tasks    commands, SQL, many recordings and the page
   queries  the paper's questions to every system
   reading  slices, messages at a time and whole tables from every system
   live     recording a running robot
   logs     the log of a robot, played faster until something is lost
   record   streams of messages: the largest load of which nothing is lost
 
-It takes less than an hour and 20 GB of disk; --quick takes 20 minutes. --docs writes
-docs/benchmarks.md, its samples and the table of README.md.
+It takes less than an hour and 20 GB of disk. --docs writes docs/benchmarks.md, its samples
+and the table of README.md.
 
 exit codes: 0 done; 1 something failed, or answers differ; 2 wrong usage; 130 Ctrl-C.
 """
@@ -127,14 +127,8 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
-    scale = parser.add_mutually_exclusive_group()
-    scale.add_argument(
-        "--quick", dest="scale", action="store_const", const="quick", help="in 20 minutes"
-    )
-    scale.add_argument(
-        "--tiny", dest="scale", action="store_const", const="tiny", help="only see that it works"
-    )
     parser.set_defaults(scale="full")
+    add("--tiny", dest="scale", action="store_const", const="tiny", help="only see that it works")
     add("--only", action="append", choices=PARTS, help="only this part; repeatable")
     add("-b", "--backends", metavar="NAME,…", help="only these systems")
     add("-o", "--out", type=Path, default=Path("benchmark-results"), metavar="DIR")

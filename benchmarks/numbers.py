@@ -1,56 +1,20 @@
-"""Numbers and names for people: three digits, sizes, spreads, backends."""
+"""Numbers and names for people: three digits, sizes, backends."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from math import floor, isfinite, log10
-from statistics import median
-from typing import NamedTuple
 
+from benchmarks.backends.registry import BACKENDS
 from hybridlog.cli.output import printable
 
 OURS = "hybridlog"
 FLOORS = frozenset({"nothing", "mcap", "bagfile"})
 """Backends that are no databases: a file, or nothing at all."""
 
-TITLES = {
-    OURS: "hybridlog",
-    "mongo": "MongoDB",
-    "mongo_indexed": "MongoDB",
-    "postgres": "PostgreSQL",
-    "postgres_indexed": "PostgreSQL",
-    "sqlite": "SQLite",
-    "sqlite_indexed": "SQLite",
-    "bagfile": "ROS bag",
-    "mcap": "plain MCAP",
-    "nothing": "harness alone",
-}
-"""Backends in the order of every table and legend."""
-
-
-class Spread(NamedTuple):
-    """A measure of several repetitions."""
-
-    median: float
-    low: float
-    high: float
-
-    @classmethod
-    def of(cls, values: Iterable[float | None]) -> Spread | None:
-        """None when there is no value."""
-        known = [value for value in values if value is not None]
-        return cls(median(known), min(known), max(known)) if known else None
-
 
 def title(backend: str) -> str:
     """A backend's name for people."""
-    return TITLES.get(backend, printable(backend))
-
-
-def ordered(backends: Iterable[str]) -> list[str]:
-    """Backends in the order of every table: ours, the paper's, the rest."""
-    places = {name: place for place, name in enumerate(TITLES)}
-    return sorted(set(backends), key=lambda name: (places.get(name, len(places)), name))
+    return BACKENDS[backend].title if backend in BACKENDS else printable(backend)
 
 
 def number(value: float) -> str:

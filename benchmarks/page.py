@@ -3,32 +3,33 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from statistics import median
 from typing import Any, NamedTuple
 
+from benchmarks.backends.registry import BACKENDS
 from benchmarks.live.cases import CASES
 from benchmarks.loads.robot import RATE
-from benchmarks.numbers import FLOORS, OURS, Spread, number, ordered, percent, size, title
+from benchmarks.numbers import FLOORS, OURS, number, percent, size, title
 from benchmarks.samples import Journal, Sample
 from benchmarks.studies import record
 from benchmarks.studies.search import Found, searches
 from hybridlog.cli.output import printable
 
-Cell = str | None
-Values = dict[str, Spread]
-"""Figures by backend."""
+Values = dict[str, float]
+"""Medians by backend."""
 MADE = "<!-- made by `python -m benchmarks`; change benchmarks/page.py -->"
 BEGIN, END = "<!-- measured -->", "<!-- /measured -->"
 _MB = 1e6
-LARGEST = record.SIZES[-1]
+_MIDDLE, LARGEST = record.SIZES[1:]
 
 
 class Row(NamedTuple):
-    """A row of the README's table.
+    """What was measured of several systems.
 
     Attributes:
-        what: What was measured.
-        short: The same, to say where a bag is ahead.
+        what: It.
+        short: The same, to say where another one is ahead; empty to leave it out of the README.
         values: By backend.
         best: `max` or `min`, whichever is better.
         unit: After a figure.
@@ -42,13 +43,29 @@ class Row(NamedTuple):
     unit: str = ""
     above: frozenset[str] = frozenset()
 
+    def shown(self, name: str) -> str:
+        """The figure of a backend; empty without one."""
+        if name not in self.values:
+            return ""
+        value = self.values[name]
+        text = percent(value) if self.unit == " %" else number(value)
+        return f"{'≥ ' if name in self.above else ''}{text}{self.unit}"
+
+    def first(self, names: Iterable[str]) -> str | None:
+        """Which of some backends is ahead; None if there is none."""
+        there = [name for name in names if name in self.values]
+        return self.best(there, key=self.values.__getitem__) if there else None
+
+    def is_behind(self, names: Iterable[str]) -> bool:
+        """Whether we are behind one of some backends, as far as the figures tell."""
+        first = self.first([*names, OURS])
+        if OURS not in self.values or first is None:
+            return False
+        return first != OURS and self.shown(first) != self.shown(OURS)
+
 
 class Results:
-    """The samples of a journal by study.
-
-    Args:
-        journal: Of runs of one scale.
-    """
+    """The samples of a journal by study."""
 
     def __init__(self, journal: Journal) -> None:
         self.header = journal.header
@@ -58,47 +75,28 @@ class Results:
         self.missing = sorted(
             {(s.backend, s.reason) for s in self._samples if s.status == "missing"}
         )
-        self.streams = {
-            bytes_: searches(
-                [s for s in self.of("record", failed=True) if s.case["size"] == bytes_],
-                "rate",
-                record.HARNESS,
-            )
-            for bytes_ in record.SIZES
-        }
-        self.speeds = searches(self.of("logs", failed=True), "speed", record.HARNESS)
 
-    def of(self, study: str, *, failed: bool = False) -> list[Sample]:
-        """Samples of a study that succeeded, or failed as well."""
+    def of(self, study: str, *, failed: bool = False, **case: Any) -> list[Sample]:
+        """Samples of a case of a study that succeeded, or failed as well."""
         wanted = ("ok", "failed") if failed else ("ok",)
-        return [s for s in self._samples if s.study == study and s.status in wanted]
+        found = [s for s in self._samples if s.study == study and s.status in wanted]
+        return [s for s in found if all(s.case.get(name) == case[name] for name in case)]
 
-    def spread(self, study: str, measure: Callable[[Sample], float | None], **case: Any) -> Values:
+    def medians(self, study: str, measure: Callable[[Sample], float | None], **case: Any) -> Values:
         """A measure of the samples of a case, by backend."""
-        found: dict[str, list[float | None]] = {}
-        for sample in self.of(study):
-            if all(sample.case.get(name) == value for name, value in case.items()):
-                found.setdefault(sample.backend, []).append(measure(sample))
-        spreads = {name: Spread.of(found[name]) for name in ordered(found)}
-        return {name: spread for name, spread in spreads.items() if spread is not None}
-
-    def group(self, name: str) -> Mapping[str, Any]:
-        """What a group of tasks has measured."""
-        for sample in self.of("tasks"):
-            if sample.case["group"] == name:
-                return sample.values
-        return {}
+        found: dict[str, list[float]] = {}
+        for sample in self.of(study, **case):
+            value = measure(sample)
+            if value is not None:
+                found.setdefault(sample.backend, []).append(value)
+        return {name: median(values) for name, values in found.items()}
 
 
 # --- measures -------------------------------------------------------------------------
 
 
-def _measured(name: str, scale: float = 1.0) -> Callable[[Sample], float | None]:
-    def measure(sample: Sample) -> float | None:
-        value = sample.values.get(name)
-        return value / scale if isinstance(value, int | float) else None
-
-    return measure
+def _measured(name: str) -> Callable[[Sample], float | None]:
+    return lambda sample: sample.values.get(name)
 
 
 def _kept(sample: Sample) -> float:
@@ -129,32 +127,75 @@ def _offered(found: Found) -> float:
     return float(found.best.values["published_bytes"] / found.best.values["publish_s"] / _MB)
 
 
-def _ceilings(found: Mapping[str, Sequence[Found]], measure: Callable[[Found], float]) -> Values:
-    spreads = {name: Spread.of(map(measure, found[name])) for name in ordered(found)}
-    return {name: spread for name, spread in spreads.items() if spread is not None}
+def _ceiling(
+    trials: Sequence[Sample],
+    axis: str,
+    of: Callable[[Found], float],
+    *,
+    what: str,
+    short: str,
+    unit: str = "",
+) -> Row:
+    """What searches for the greatest rate have found."""
+    found = searches(trials, axis, record.HARNESS)
+    values = {name: median(map(of, ends)) for name, ends in found.items()}
+    above = {name for name, ends in found.items() if any(end.is_above for end in ends)}
+    return Row(what, short, values, max, unit, frozenset(above))
 
 
-def _above(found: Mapping[str, Sequence[Found]]) -> frozenset[str]:
-    return frozenset(name for name, ends in found.items() if any(end.is_above for end in ends))
+def rows(results: Results) -> Iterator[Row]:
+    """All that was measured of several systems."""
+    stream = {"size": LARGEST, "rate": record.START}
+    kept = results.medians("record", _kept, **stream)
+    yield Row("20 topics of 640 kB at 64 Hz, 819 MB/s: kept", "819 MB/s", kept, max, " %")
+    for bytes_ in record.SIZES:
+        what = "largest load without a loss, messages of {}, in MB/s"
+        if bytes_ != record.SIZES[0]:
+            what = "the same, messages of {}"
+        trials = results.of("record", failed=True, size=bytes_)
+        about = {"what": what.format(size(bytes_)), "short": f"the load of {size(bytes_)}"}
+        yield _ceiling(trials, "rate", _offered, **about)
+    about = {"what": "a robot's log: fastest play that is kept", "short": "fast play", "unit": "x"}
+    trials = results.of("logs", failed=True)
+    yield _ceiling(trials, "speed", lambda found: found.rate or 0.0, **about)
+    for what, measure, bytes_ in (
+        ("processor time for a GB kept of messages of 40 kB, in s", _cpu, _MIDDLE),
+        ("the same of messages of 640 kB", _cpu, LARGEST),
+        ("peak memory, messages of 640 kB, in MB", _memory, LARGEST),
+        ("bytes on the disk for a byte kept of messages of 640 kB", _disk, LARGEST),
+    ):
+        used = results.medians("record", measure, size=bytes_, rate=record.START)
+        yield Row(what, "", {n: v for n, v in used.items() if n != record.HARNESS}, min)
+    for what, short, task in (
+        ("a topic of an IMU as a frame, in ms", "frames", "IMU to pandas"),
+        ("a scan at a time, at random moments, in ms", "scans", "scan at a time"),
+        ("a second of scans, in ms", "", "1 s of scans"),
+    ):
+        yield Row(what, short, results.medians("reading", _measured("ms"), task=task), min)
+    for what, short, question, when in (
+        ("poses within a region, counted for the first time, in ms", "poses", "Q3", "cold_ms"),
+        (
+            "positions on one side as a frame, asked again, in ms",
+            *("positions", "Q2 positions", "ms"),
+        ),
+        (
+            "a count over a few hundred messages, first time, in ms",
+            *("counts of few messages", "Q1", "cold_ms"),
+        ),
+        ("positions on one side, counted for the first time, in ms", "", "Q2", "cold_ms"),
+        ("grasps with the camera in front, first time, in ms", "", "Q4", "cold_ms"),
+        ("the same, asked again, in ms", "", "Q4", "ms"),
+    ):
+        values = results.medians("queries", _measured(when), question=question)
+        yield Row(what, short, values, min)
 
 
 # --- cells and tables -----------------------------------------------------------------
 
 
-def _shown(value: Spread | None, *, above: bool = False, of_hundred: bool = False) -> str:
-    """A median, and how far the values lie apart when that is more than a tenth of it."""
-    if value is None:
-        return "—"
-    if of_hundred:
-        return percent(value.median)
-    apart = value.high - value.low > 0.1 * abs(value.median)
-    spread = f" ({number(value.low)}…{number(value.high)})" if apart else ""
-    return f"{'≥ ' if above else ''}{number(value.median)}{spread}"
-
-
-def _table(head: Sequence[str], rows: Iterable[Sequence[Cell]]) -> str:
-    lines = [_line(head), "| --- |" + " ---: |" * (len(head) - 1)]
-    return "\n".join([*lines, *(_line([cell or "—" for cell in row]) for row in rows)])
+def _table(head: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
+    rule = "| --- |" + " ---: |" * (len(head) - 1)
+    return "\n".join([_line(head), rule, *(_line([cell or "—" for cell in row]) for row in lines)])
 
 
 def _line(cells: Iterable[str]) -> str:
@@ -166,11 +207,8 @@ def escaped(text: str) -> str:
     return re.sub(r"([\\`*_|<>\[\]])", r"\\\1", printable(" ".join(text.split())))
 
 
-def _by_backend(head: Sequence[str], columns: Sequence[Mapping[str, str]]) -> str:
-    names = ordered({name for column in columns for name in column})
-    return _table(
-        head, [[title(name), *(column.get(name) for column in columns)] for name in names]
-    )
+def _ahead(behind: Sequence[str]) -> str:
+    return " and ".join(", ".join(behind).rsplit(", ", 1))
 
 
 # --- the page -------------------------------------------------------------------------
@@ -179,17 +217,8 @@ def _by_backend(head: Sequence[str], columns: Sequence[Mapping[str, str]]) -> st
 def page(journal: Journal) -> str:
     """The page of the results."""
     results = Results(journal)
-    parts = [
-        MADE,
-        "# Benchmarks: results",
-        _about(results),
-        *_recording(results),
-        *_live(results),
-        *_questions(results),
-        *_reading(results),
-        *_tasks(results),
-        *_missing(results),
-    ]
+    parts = [MADE, "# Benchmarks: results", _about(results), *_systems(results)]
+    parts += [*_live(results), *_in_use(results), *_missing(results)]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
@@ -204,23 +233,17 @@ def conditions(results: Results) -> str:
 
 def _about(results: Results) -> str:
     last = results.header
-    quick = {
-        "full": "",
-        "quick": "\n\n> **A short run: loads are only doubled, and each is searched once.**",
-        "tiny": "\n\n> **A test of the command. Its figures mean nothing.**",
-    }[results.scale]
-    option = "" if results.scale == "full" else f" --{results.scale}"
-    versions = ", ".join(
-        f"{name} {version}"
-        for name, version in (
-            ("Python", last["python"]),
-            ("MongoDB", last["mongod"]),
-            ("PostgreSQL", last["postgres"]),
-            ("SQLite", last["sqlite"]),
-            ("rosbags", last["packages"]["rosbags"]),
-            ("mcap", last["packages"]["mcap"]),
-        )
-    )
+    test = results.scale != "full"
+    warning = "\n\n> **A test of the command. Its figures mean nothing.**" if test else ""
+    versions = {
+        "Python": last["python"],
+        "MongoDB": last["mongod"],
+        "PostgreSQL": last["postgres"],
+        "SQLite": last["sqlite"],
+        "rosbags": last["packages"]["rosbags"],
+    }
+    versions["mcap"] = last["packages"]["mcap"]
+    listed = ", ".join(f"{name} {version}" for name, version in versions.items())
     spins = sorted(filter(None, (s.values.get("spin_ms") for s in results.of("record"))))
     noise = ""
     if spins:
@@ -230,171 +253,74 @@ def _about(results: Results) -> str:
             f"and {number(slow)} ms in the slowest."
         )
     return (
-        f"All figures are made by `python -m benchmarks{option}` in under an hour "
-        f"([method](benchmarks-method.md), [samples](benchmarks-results/samples.jsonl)). "
-        f"{conditions(results)} {escaped(versions)}.{noise} A cell is the median; where values "
-        f"lie more than a tenth apart, the least and the greatest follow.{quick}"
+        f"All figures are made by `python -m benchmarks{f' --{results.scale}' if test else ''}` "
+        f"([method](benchmarks-method.md), [samples](benchmarks-results/samples.jsonl)), and are "
+        f"medians. {conditions(results)} {escaped(listed)}.{noise}{warning}"
     )
 
 
-def _recording(results: Results) -> list[str]:
-    if not results.of("record"):
+def _systems(results: Results) -> list[str]:
+    found = [row for row in rows(results) if row.values]
+    if not found:
         return []
-    streams = results.streams
-    columns: list[dict[str, str]] = []
-    for bytes_ in record.SIZES:
-        above = _above(streams[bytes_])
-        values = _ceilings(streams[bytes_], _offered)
-        columns.append({n: _shown(v, above=n in above) for n, v in values.items()})
-    above = _above(results.speeds)
-    speeds = _ceilings(results.speeds, lambda found: found.rate or 0.0)
-    columns.append({n: _shown(v, above=n in above) for n, v in speeds.items()})
-    kept = results.spread("record", _kept, size=LARGEST, rate=record.START)
-    columns.append({n: f"{_shown(v, of_hundred=True)} %" for n, v in kept.items()})
-    costs = []
-    for bytes_ in record.SIZES:
-        used = results.spread("record", _cpu, size=bytes_, rate=record.START)
-        costs.append({n: _shown(v) for n, v in used.items() if n != record.HARNESS})
-    for measure, bytes_ in ((_memory, record.SIZES[1]), (_memory, LARGEST), (_disk, LARGEST)):
-        used = results.spread("record", measure, size=bytes_, rate=record.START)
-        costs.append({n: _shown(v) for n, v in used.items() if n != record.HARNESS})
-    sizes = [size(bytes_) for bytes_ in record.SIZES]
+    columns: dict[str, list[str]] = {}
+    for name, kind in BACKENDS.items():  # a system may stream in one form, and answer in another
+        if any(name in row.values for row in found):
+            columns.setdefault(kind.title, []).append(name)
+    lines = []
+    for row in found:
+        named = [row.first(names) or "" for names in columns.values()]
+        best = row.first(set(BACKENDS) - {record.HARNESS})
+        shown = [f"**{row.shown(name)}**" if name == best else row.shown(name) for name in named]
+        lines.append([row.what, *shown])
     return [
-        "## Recording",
-        "Twenty topics with messages of one size: the largest load in MB/s of which every message "
-        "was found afterwards; how much faster than real time the log of a robot "
-        f"({RATE} messages a second, with camera and laser) is kept whole; and what is kept of "
-        "640 kB at 64 Hz a topic, 819 MB/s. ≥: the harness could not offer more.",
-        _by_backend(["system", *sizes, "a robot's log, times", "kept of 819 MB/s"], columns),
-        "A trial is short, so part of a heavy stream may wait in memory: hybridlog within its "
-        "budget, files in the cache of the system. ROS bag and MCAP index no fields; the ROS bag "
-        "does not compress.",
-        "At 64 Hz a topic: seconds of processor time for a GB that was kept, servers included; "
-        "peak memory in MB, servers included; bytes on the disk over bytes kept of 640 kB, half "
-        "of which cannot be compressed. hybridlog compresses only what it has time for.",
-        _by_backend(
-            [
-                *("system", *(f"s/GB, {text}" for text in sizes)),
-                *(f"memory, {text}" for text in sizes[1:]),
-                "disk",
-            ],
-            costs,
-        ),
+        "## Beside other systems",
+        "Twenty topics with messages of one size, the log of a robot "
+        f"({RATE} messages a second, with camera and laser), and the paper's questions about "
+        "teleoperation, which all answered rightly. The best figure of a row is bold, but for that "
+        "of the harness alone. ≥: no more could be offered. ROS bag and MCAP index no fields, so "
+        "each question is a loop over messages; the ROS bag does not compress.",
+        _table(["", *columns], lines),
     ]
 
 
 def _live(results: Results) -> list[str]:
-    rows = [
-        [_about_case(str(row["case"])), str(row["recorder"]), str(row["text"])]
-        for sample in results.of("live", failed=True)
-        for row in sample.values.get("rows", ())
-    ]
-    if not rows:
+    lines = []
+    for sample in results.of("live"):
+        values, case = sample.values, CASES[str(sample.case["case"])]
+        figures = (values.get("s_per_gb"), values.get("memory_mb"))
+        cells = [number(one) if one is not None else "" for one in figures]
+        lines.append([case.about, str(values["text"]), *cells])
+    if not lines:
         return []
     return [
         "## Recording a running robot",
-        "A ROS 1 node publishes, `hybridlog record --ros1` records; it must be that nothing is "
-        "*missing without a word*. The largest age of the last message at a kill -9 is what a "
-        "crash may cost.",
-        "\n".join(
-            [_line(["case", "recorder", "what came of it"]), "| --- | --- | --- |"]
-            + [_line(row) for row in rows]
-        ),
+        "A ROS 1 node publishes, `hybridlog record --ros1` records; nothing may be missing that "
+        "the loss ledger does not count.",
+        _table(["load", "what came of it", "processor time for a GB, s", "memory, MB"], lines),
     ]
 
 
-def _about_case(name: str) -> str:
-    return CASES[name].about if name in CASES else name
-
-
-def _pivot(results: Results, study: str, axis: str, measures: Sequence[str]) -> str:
-    """A row for each question, a column for each backend."""
-    places = list(dict.fromkeys(str(s.case[axis]) for s in results.of(study)))
-    names = ordered({s.backend for s in results.of(study)})
-    rows = []
-    for place in places:
-        found = [results.spread(study, _measured(one), **{axis: place}) for one in measures]
-        cells = []
-        for name in names:
-            values = [number(of[name].median) for of in found if name in of]
-            cells.append(" / ".join(values) or None)
-        rows.append([place, *cells])
-    return _table(["ms", *map(title, names)], rows)
-
-
-def _questions(results: Results) -> list[str]:
-    if not results.of("queries"):
+def _in_use(results: Results) -> list[str]:
+    lines: list[list[str]] = []
+    for sample in results.of("tasks"):
+        for name, values in sample.values["rows"].items():
+            what = f"SQL: {name}" if sample.case["group"] == "sql" else name
+            alone = values.get("duckdb_ms")
+            beside = "" if alone is None else f" (DuckDB alone {number(alone)})"
+            measured = [values.get(one) for one in ("cpu_ms", "peak_mb")]
+            cells = [number(one) if one is not None else "" for one in measured]
+            lines.append([what, number(values["ms"]) + beside, *cells])
+    if not lines:
         return []
-    case = results.of("queries")[0].case
+    case = results.of("tasks")[0].case
     return [
-        "## Questions",
-        f"Milliseconds, asked for the first time / again by a process that has opened the store, "
-        f"on {case['sessions']} x {case['minutes']:g} minutes of teleoperation (the "
-        "paper's study). Q1: how often the gripper was closed. Q2: viewpoints behind the robot. "
-        "Q3: poses of the arm within a region. Q4: grasps with the camera in front within half a "
-        "second. All systems gave the true answers. The databases have the paper's indexes; for "
-        "the ROS bag it is a loop over the messages.",
-        _pivot(results, "queries", "question", ("cold_ms", "ms")),
+        "## A store in use",
+        f"A recording of {case['seconds']} s of the robot's log, {case['seconds'] * RATE:,} "
+        f"messages; then a store of {case['recordings']:,} recordings, and the page of "
+        "`hybridlog view`. Commands are processes of their own.",
+        _table(["", "ms", "of the processor", "memory, MB"], lines),
     ]
-
-
-def _reading(results: Results) -> list[str]:
-    if not results.of("reading"):
-        return []
-    return [
-        "## Reading",
-        "Milliseconds, decoded, from an open store: a second of laser scans, the scan at a random "
-        "moment, an IMU's topic as a pandas frame.",
-        _pivot(results, "reading", "task", ("ms",)),
-    ]
-
-
-def _tasks(results: Results) -> list[str]:
-    parts = ["## A store in use"] if results.of("tasks") else []
-    commands, many = results.group("commands"), results.group("many")
-    if commands:
-        case = next(s.case for s in results.of("tasks") if s.case["group"] == "commands")
-        parts += [
-            f"One recording of {case['seconds']} s of the robot's log, {case['seconds'] * RATE:,} "
-            f"messages: {size(commands['log_bytes'])} of MCAP, {size(commands['segment_bytes'])} "
-            f"of segments, {size(commands['disk_bytes'])} with all indexes. Each command is a "
-            "process of its own.",
-            _rows("command", commands["rows"]),
-        ]
-    page_, sql = (results.group(name) for name in ("page", "sql"))
-    if sql:
-        head = ["SQL in an open store", "ms", "DuckDB alone, ms"]
-        rows = [[n, _ms(v), number(v["duckdb_ms"])] for n, v in sql["rows"].items()]
-        parts.append(_table(head, rows))
-    if many:
-        case = next(s.case for s in results.of("tasks") if s.case["group"] == "many")
-        parts.append(_rows(f"store of {case['recordings']:,} recordings", many["rows"]))
-    if page_:
-        memory = f"page of `hybridlog view` ({number(page_['memory_mb'])} MB)"
-        rows = [[name, _ms(values)] for name, values in page_["rows"].items()]
-        parts.append(_table([memory, "ms"], rows))
-    if bucket := results.group("remote"):
-        head = ["a store in a bucket", "requests", "bytes received", "bytes sent"]
-        names = ("requests", "received", "sent")
-        rows = [[row["step"], *(f"{row[name]:,}" for name in names)] for row in bucket["rows"]]
-        parts.append(_table(head, rows))
-    return parts
-
-
-def _rows(what: str, rows: Mapping[str, Mapping[str, float]]) -> str:
-    """Time on the clock, of the processor, and memory where it was measured."""
-    has_memory = any("peak_mb" in values for values in rows.values())
-    head = [what, "ms", "of the processor", *(["memory, MB"] if has_memory else [])]
-    cells = []
-    for name, values in rows.items():
-        peak = [number(values["peak_mb"]) if "peak_mb" in values else "—"] if has_memory else []
-        cells.append([name, _ms(values), number(values["cpu_ms"]), *peak])
-    return _table(head, cells)
-
-
-def _ms(values: Mapping[str, float]) -> str:
-    low, high = values.get("low", values["ms"]), values.get("high", values["ms"])
-    return _shown(Spread(values["ms"], low, high))
 
 
 def _missing(results: Results) -> list[str]:
@@ -410,93 +336,25 @@ def _missing(results: Results) -> list[str]:
 # --- the README -----------------------------------------------------------------------
 
 
-def readme_rows(results: Results) -> list[Row]:
-    """The rows of the README's table."""
-    ms = _measured("ms")
-    stream = {"size": LARGEST, "rate": record.START}
-    rows = [
-        Row(
-            "20 topics of 640 kB at 64 Hz, 819 MB/s: kept",
-            "819 MB/s",
-            results.spread("record", _kept, **stream),
-            max,
-            " %",
-        )
-    ]
-    for bytes_ in record.SIZES:
-        what = "largest load without a loss, messages of {}, in MB/s"
-        if bytes_ != record.SIZES[0]:
-            what = "the same, messages of {}"
-        found = results.streams[bytes_]
-        values = _ceilings(found, _offered)
-        short = f"the load of {size(bytes_)}"
-        rows.append(Row(what.format(size(bytes_)), short, values, max, above=_above(found)))
-    speeds = _ceilings(results.speeds, lambda found: found.rate or 0.0)
-    above = _above(results.speeds)
-    rows.append(
-        Row("a robot's log: fastest play that is kept", "fast play", speeds, max, "x", above)
-    )
-    frame, moment = (
-        results.spread("reading", ms, task=task) for task in ("IMU to pandas", "scan at a time")
-    )
-    cold = _measured("cold_ms")
-    return [
-        *rows,
-        Row("a topic of an IMU as a frame, in ms", "frames", frame, min),
-        Row("a scan at a time, at random moments, in ms", "scans", moment, min),
-        Row(
-            "poses within a region, counted for the first time, in ms",
-            "poses",
-            results.spread("queries", cold, question="Q3"),
-            min,
-        ),
-        Row(
-            "positions on one side as a frame, asked again, in ms",
-            "positions",
-            results.spread("queries", ms, question="Q2 positions"),
-            min,
-        ),
-        Row(
-            "a count over a few hundred messages, first time, in ms",
-            "counts of few messages",
-            results.spread("queries", cold, question="Q1"),
-            min,
-        ),
-    ]
-
-
 def readme(journal: Journal) -> str:
     """The README's table with what belongs to it, from `BEGIN` to `END`."""
     results = Results(journal)
-    lines, bags, at_least = [], [], False
-    for what, short, values, best, unit, above in readme_rows(results):
-
-        def shown(name: str, of: Values = values, unit: str = unit, up: Any = above) -> str:
-            median = of[name].median
-            text = percent(median) if unit == " %" else number(median)
-            return f"{'≥ ' if name in up else ''}{text}{unit}"
-
-        rivals = {n: v.median for n, v in values.items() if n not in FLOORS and n != OURS}
-        strongest = best(rivals, key=rivals.__getitem__) if rivals else None
-        rival = f"{shown(strongest)} ({title(strongest).split(' (')[0]})" if strongest else ""
-        bag = shown("bagfile") if "bagfile" in values else ""
-        at_least |= bool(above)
-        lines.append(_line([what, shown(OURS) if OURS in values else "", rival, bag]))
-        if bag and OURS in values:
-            two = {name: values[name].median for name in (OURS, "bagfile")}
-            if shown(OURS) != bag and best(two, key=two.__getitem__) == "bagfile":
-                bags.append(short)
-    names = " and ".join(", ".join(bags).rsplit(", ", 1))
-    ahead = f"A ROS bag is ahead in {names}. " if bags else ""
-    option = "" if results.scale == "full" else f" --{results.scale}"
-    offered = "≥: no more could be offered, so two such figures rank nothing. " if at_least else ""
-    short = "It was a short run, in which loads are only doubled. " if option else ""
+    found = [row for row in rows(results) if row.short]
+    lines = []
+    for row in found:
+        best = row.first([name for name in row.values if name not in FLOORS and name != OURS])
+        rival = f"{row.shown(best)} ({title(best)})" if best else ""
+        lines.append(_line([row.what, row.shown(OURS), rival, row.shown("bagfile")]))
+    bags = [row.short for row in found if row.is_behind(["bagfile"])]
+    ahead = f"A ROS bag is ahead in {_ahead(bags)}. " if bags else ""
+    above = any(row.above for row in found)
+    offered = "≥: no more could be offered, so two such figures rank nothing. " if above else ""
     text = (
-        f"{conditions(results)} `python -m benchmarks{option}` makes them again in under an hour. "
-        f"{short}{offered}The best database is the best of MongoDB, PostgreSQL and SQLite. "
+        f"{conditions(results)} `python -m benchmarks` makes them again in under an hour. "
+        f"{offered}The best database is the best of MongoDB, PostgreSQL and SQLite. "
         f"{ahead}A ROS bag neither compresses nor indexes; to count in it is a loop over its "
-        "messages. The [benchmarks](docs/benchmarks.md) have the other systems, the spread of "
-        "each figure, and what a store costs in use."
+        "messages. The [benchmarks](docs/benchmarks.md) have the other systems, and what a store "
+        "costs in use."
     )
     head = ["", "hybridlog", "the best database", "a ROS bag"]
     table = "\n".join(["| | " + " | ".join(head[1:]) + " |", "|---|---|---|---|", *lines])

@@ -12,8 +12,8 @@ from typing import Any, Literal
 from hybridlog_storage.errors import UsageError
 
 Status = Literal["ok", "missing", "failed"]
-Scale = Literal["full", "quick", "tiny"]
-"""How much is measured: for publication, in a third of the time, or only that it works."""
+Scale = Literal["full", "tiny"]
+"""How much is measured: for publication, or only that it works."""
 NAME = "samples.jsonl"
 
 

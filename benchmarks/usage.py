@@ -15,12 +15,6 @@ _MONGOD_END_S = 60.0
 _SPIN = 250_000
 
 
-def stolen_s() -> float:
-    """CPU time that the host of a virtual machine let it wait since it was started, seconds."""
-    found: float = psutil.cpu_times().steal
-    return found
-
-
 def with_children(pids: Iterable[int]) -> set[int]:
     """Processes that are there, and all that descend from them."""
     found: set[int] = set()

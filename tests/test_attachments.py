@@ -148,13 +148,6 @@ def test_a_slice_has_the_attachments_from_before_its_end(store: hl.Store, tmp_pa
     assert contents(tmp_path / "b.mcap")["attachments"] == []
 
 
-def test_recording_a_slice_follows_the_same_rule(log: Path, tmp_path: Path) -> None:
-    with hl.open(tmp_path / "s", create=True) as store:
-        report = store.record(log, between=(TIMES[2], TIMES[5]))
-        assert (report.entry.attachments, report.attachments_left_out) == (3, 2)
-        assert listed(store.attachments("drive")) == ATTACHMENTS[:3]
-
-
 def test_commands(store: hl.Store, tmp_path: Path) -> None:
     path = store.directory.path
     rows = run("info", "drive", "--attachments", "--json", store=path).json

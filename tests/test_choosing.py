@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import pyarrow.parquet as parquet
 import pytest
 
 import hybridlog as hl
@@ -297,49 +296,6 @@ def test_one_recording_is_named_on_request(store: hl.Store) -> None:
     assert asked.column_names == ["log_time", "robot", "robot_", "n"]
     with pytest.raises(TopicError, match=r"a tag 'colour'[.] The tags are: place, robot"):
         one.tags("colour")
-
-
-def test_a_tag_called_as_a_column_of_ours(tmp_path: Path) -> None:
-    tags = {"topic": "t", "log_time": "l", "log_time_ns": "n", "stamp": "s", "n": "tag"}
-    with hl.open(tmp_path / "store", create=True) as store:
-        write(tmp_path / "log.mcap", 0, {"/a": ("t", [1])})
-        store.record(tmp_path / "log.mcap", tags=tags)
-        query = store.topic("a").tags(*tags)
-        wanted = {
-            "topic_": "t", "log_time_": "l", "log_time_ns_": "n", "stamp_": "s", "n": "tag",
-            "n_": 1, "robot": "x",
-        }  # fmt: skip
-        assert query.to_arrow().drop(["log_time"]).to_pylist() == [wanted]
-        (line,) = next(query.to_json_lines())
-        assert json.loads(line) == {"log_time_ns": START, "topic": "/a"} | wanted
-
-
-def test_columns_of_recordings_in_files(store: hl.Store, tmp_path: Path) -> None:
-    fetch = ["fetch", "-t", "/scan", "--tags", "robot,place", "-q"]
-    done = call(store, *fetch, "-r", "mon*", "--fields", "n", "-F", "csv")
-    assert done.out.splitlines()[:2] == [
-        '"log_time","recording","robot","place","n"',
-        '2025-06-03 00:00:00.000000000Z,"monday 1","7","lab",1',
-    ]
-    assert call(store, *fetch, "-o", str(tmp_path / "x.parquet")).code == 0
-    assert parquet.read_table(tmp_path / "x.parquet").column_names == [
-        "log_time", "recording", "robot", "place", "n", "robot_",
-    ]  # fmt: skip
-    assert "does nothing in mcap" in call(store, *fetch, "-o", str(tmp_path / "x.mcap")).err
-    # Each file of an export names the recordings, also that of a topic that only one has.
-    words = ["export", str(tmp_path / "all"), "-F", "csv", "--tags", "robot", "-q"]
-    assert call(store, *words).code == 0
-    for path in (tmp_path / "all").iterdir():
-        with path.open() as file:
-            assert file.readline() == '"log_time","recording","robot","n","robot_"\n', path.name
-    assert "does nothing in mcap" in call(store, "export", "x.mcap", "--tags", "robot").err
-
-
-def test_copy_from_chooses_in_the_other_store(store: hl.Store, tmp_path: Path) -> None:
-    path = tmp_path / "copy"
-    words = ["copy", "--from", str(store.directory.path), "--tag", "robot=7"]
-    assert answer(*words, store=path).out == "copied monday 1\ncopied tuesday\n"
-    assert "robot=7" in answer(*words[:-1], "robot=9", store=path, code=None).err
 
 
 def test_a_running_recording_reaches_until_now() -> None:

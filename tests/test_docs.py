@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import atexit
 import contextlib
-import functools
 import inspect
 import json
 import math
@@ -35,15 +33,12 @@ from hybridlog.query import times, topics
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.types import check
 from hybridlog_storage import errors
-from hybridlog_storage.errors import HybridlogError, ManifestError
+from hybridlog_storage.errors import HybridlogError
 from hybridlog_storage.messages import Channel, Schema
 from tests import places
-from tests.cli.fork_server import ForkServer
 from tests.format_reader import (
     Content,
-    Damaged,
     FormatReader,
-    Manifest,
     Recording,
     Told,
     collection_name,
@@ -64,8 +59,6 @@ TUTORIAL = DOCS / "tutorial.md"
 """It goes on where the README ends."""
 # A terminal of this many columns.
 COLUMNS = 150
-HEAVY = ("pyarrow.dataset", "duckdb", "matplotlib.pyplot", "PIL.Image", "mcap.reader")
-"""Modules that many commands of the pages import."""
 START_NS = 1_748_937_600_000_000_000
 
 
@@ -216,19 +209,10 @@ def missing_lines(shown: list[str], output: str, *, counts: bool = False) -> lis
 # --- running it -----------------------------------------------------------------------
 
 
-@functools.cache
-def forking() -> ForkServer:
-    """Commands of the pages."""
-    server = ForkServer({**os.environ, "LC_ALL": "C.UTF-8"}, *HEAVY)
-    atexit.register(server.close)
-    return server
-
-
 class Shell:
     """Runs commands one by one; what they export and where they go is kept.
 
-    Standard output is a terminal, because that is where people read it. Commands of hybridlog are
-    forked from a process that has imported what they need.
+    Standard output is a terminal, because that is where people read it.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -238,7 +222,7 @@ class Shell:
         hidden = ("HYBRIDLOG_", "COLUMNS", "LINES")
         self._env = {
             **{k: v for k, v in os.environ.items() if not k.startswith(hidden)},
-            "PATH": os.pathsep.join([str(forking().path), python, os.environ["PATH"]]),
+            "PATH": os.pathsep.join([python, os.environ["PATH"]]),
             "LC_ALL": "C.UTF-8",
             "TERM": "xterm",
             "NO_COLOR": "1",
@@ -412,16 +396,6 @@ def test_what_is_shown_runs(page: Path, troubles: dict[Path, Future[str]]) -> No
     assert not found, found
 
 
-@pytest.mark.parametrize("page", RUN, ids=lambda page: page.name)
-def test_a_page_disturbs_no_other(page: Path) -> None:
-    """All pages can be taken after the README: each but the tutorial has its own directory."""
-    commands = [step.text for step in steps(page) if step.kind == "shell"]
-    uses = [text for text in commands if "hybridlog-demo" in text]
-    if page.parent == DOCS and page != TUTORIAL:
-        assert all(text.startswith(f"mkdir -p {page.stem} && ln ") for text in uses)
-        assert uses or "robot.bag" not in " ".join(commands)
-
-
 # --- links ----------------------------------------------------------------------------
 
 
@@ -475,16 +449,6 @@ def test_the_map_of_the_source_tree() -> None:
 # --- the README and the changelog -----------------------------------------------------
 
 
-def test_the_two_commands_stand_where_the_machine_reads_them() -> None:
-    text = (ROOT / "README.md").read_text("utf-8")
-    (block,) = re.findall(r"<!-- commands -->\n(.*?)<!-- end -->", text, flags=re.DOTALL)
-    lines = [line for line in block.splitlines() if line.strip()]
-    assert len(lines) == 2
-    assert all(line.startswith("    python3 -m venv .venv && ") for line in lines)
-    assert lines[0].endswith(".venv/bin/hybridlog demo")
-    assert lines[1].endswith(".venv/bin/pytest -q")
-
-
 def test_the_figures_shown_are_those_of_the_results() -> None:
     """The page and the README's table are what `python -m benchmarks` makes of the samples."""
     journal = Journal(DOCS / "benchmarks-results")
@@ -494,14 +458,6 @@ def test_the_figures_shown_are_those_of_the_results() -> None:
     text = (DOCS / "benchmarks.md").read_text("utf-8")
     assert text == page.page(journal)
     assert len(text.splitlines()) < 150
-
-
-def test_the_changelog_has_this_version() -> None:
-    assert re.search(
-        rf"^## \[{re.escape(hl.__version__)}\]",
-        (ROOT / "CHANGELOG.md").read_text("utf-8"),
-        re.MULTILINE,
-    )
 
 
 # --- the command line -----------------------------------------------------------------
@@ -998,20 +954,6 @@ def test_what_people_wrote_is_read_from_the_manifest(recorded: hl.Store, tmp_pat
     assert (mark["text"], mark["tags"]) == ("bump", {"how": "hard"})
     seqs = sorted(m.seq for _, m in recording.messages())
     assert seqs == list(range(len(seqs)))
-
-
-def test_a_manifest_with_any_other_byte_is_damaged(recorded: hl.Store, tmp_path: Path) -> None:
-    robot = places.folder(copied(recorded, tmp_path / "store"), "robot")
-    manifest = places.manifest_of(robot)
-    data = manifest.read_bytes()
-    for at in range(0, len(data), len(data) // 20):
-        manifest.write_bytes(data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :])
-        with pytest.raises(Damaged):
-            Manifest(manifest.read_bytes())
-        with pytest.raises(ManifestError):
-            places.read_in(robot)
-    manifest.write_bytes(data)
-    assert Manifest(data).id == robot.name
 
 
 def test_the_index_is_as_specified(recorded: hl.Store) -> None:

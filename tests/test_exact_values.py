@@ -12,16 +12,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import duckdb
 import numpy as np
 import pandas as pd
-import polars as pl
 import pyarrow as pa
 import pytest
 from mcap.reader import make_reader
 
 import hybridlog as hl
-from hybridlog_storage.errors import PayloadError, TopicError
+from hybridlog_storage.errors import TopicError
 from hybridlog_storage.messages import Channel, Schema
 from tests.every_output import parquet, written
 from tests.limits import Limit
@@ -179,16 +177,6 @@ def test_odd_values_stay_apart(tmp_path: Path) -> None:
         ]
 
 
-def test_values_of_several_types_are_json_text(store: hl.Store) -> None:
-    query = store.topic("/mix").in_recording("json_optional_keys")
-    wanted = [json.loads(payload)["v"] for payload in payloads("json_optional_keys.mcap", "/mix")]
-    for table in (query.to_arrow(), parquet(query)):
-        assert [json.loads(text) for text in table["v"].to_pylist()] == wanted
-    assert [json.loads(text) for text in query.to_pandas()["v"]] == wanted
-    assert [json.loads(row["v"]) for row in csv_rows(query)] == wanted
-    assert query.to_arrow().schema.field("v").type == pa.json_()
-
-
 def test_a_late_key_and_a_late_type(tmp_path: Path, limit: Limit) -> None:
 
     limit(output_held_bytes=0, frame_block_rows=1)
@@ -235,20 +223,6 @@ def test_unsigned_extremes(store: hl.Store) -> None:
     summary = query.fields("bigs.max", "arr.min", "arr.n", "bigs").to_pandas()
     assert summary["bigs.max"].tolist() == [max(cell) for cell in arrays]
     assert summary["arr.n"].tolist() == [len(message.arr) for message in messages]
-
-
-def test_one_odd_message_hides_no_others(store: hl.Store) -> None:
-    arrays = store.topic("/c").to_numpy()
-    sizes = [len(data) for data in store.topic("/c").to_pandas()["data"]]
-    assert [cloud.nbytes for cloud in arrays] == sizes
-    assert 0 in sizes
-    images = store.topic("/images")
-    assert [array.tolist() for array in images.to_numpy()] == [[[1, 2]], [[3, 4]]]
-    assert images.counters.unreadable == 1
-    with pytest.raises(PayloadError, match="unknown encoding"):
-        images.at(1001).to_numpy()
-    with pytest.raises(PayloadError, match="no array form"):
-        store.topic("/plain").to_numpy()
 
 
 # --- protobuf ---------------------------------------------------------------------------
@@ -359,15 +333,3 @@ EVERY = [
     *("/j", "/k", "/a", "/opt", "/ints", "/ints2", "/mix"),
     *("/zoo", "/cam", "/raw", "/pc", "/log", "/c", "/own", "/plain"),
 ]
-
-
-def test_duckdb_reads_arrow_and_parquet(store: hl.Store, tmp_path: Path) -> None:
-    for number, topic in enumerate(EVERY):
-        rows = store.topic(topic).to_arrow()
-        path = tmp_path / f"{number}.parquet"
-        path.write_bytes(written(store.topic(topic), "parquet"))
-        one = duckdb.connect().sql("select * from rows").fetchall()
-        assert len(one) == rows.num_rows
-        assert len(duckdb.connect().sql(f"select * from '{path}'").fetchall()) == rows.num_rows
-        assert pl.read_parquet(path).height == rows.num_rows
-        assert pl.from_arrow(rows).shape[0] == rows.num_rows

@@ -22,13 +22,10 @@ from mcap.opcode import Opcode
 import hybridlog as hl
 from benchmarks.simulator.topics import RobotConfig
 from benchmarks.simulator.write import write_bag
-from hybridlog_storage.catalog import CATALOG, RecordingEntry
-from hybridlog_storage.errors import DatabaseError, SegmentError, StoreError
-from hybridlog_storage.messages import Channel
-from hybridlog_storage.mongo.database import Database
-from hybridlog_storage.mongo.index_state import RECORDINGS, STORE
+from hybridlog_storage.catalog import RecordingEntry
+from hybridlog_storage.errors import StoreError
+from hybridlog_storage.mongo.index_state import RECORDINGS
 from hybridlog_storage.mongo.mongod import EmbeddedMongod
-from hybridlog_storage.segments.segment_reader import SegmentReader
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import independent, places
 from tests.calls import Calls
@@ -155,23 +152,6 @@ def test_a_killed_recorder_loses_nothing_that_was_written(
         )
 
 
-def test_what_was_cut_short_can_be_recorded_again(path: Path, robot: Path) -> None:
-    run("record", robot, "--quiet", "--name", "whole", store=path, code=0)
-    whole = bytes_of(path, "whole")
-    with hl.open(path) as store:
-        store.remove("whole")
-    kill_recorder(path, robot, "robot", whole // 2)
-    refused = run("record", robot, "--quiet", store=path, code=8)
-    assert "cut short" in refused.err
-    assert "--again" in refused.err
-    run("record", robot, "--quiet", "--again", store=path, code=0)
-    with hl.open(path, require_database=True) as store:
-        part, again = sorted(store.recordings(), key=lambda r: r.created)
-        assert (part.status, again.status) == ("recovered", "complete")
-        assert 0 < part.messages < again.messages
-        assert store.verify().findings == []
-
-
 # MongoDB that is killed.
 
 
@@ -207,54 +187,6 @@ def test_mongod_killed_while_a_log_is_recorded(
         assert store.verify().findings == []
 
 
-def test_each_message_that_is_missing_in_the_index_is_counted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Those of chunks that were sent in vain, and those of chunks that were not sent then."""
-    log = tmp_path / "a.mcap"
-    channel = Channel("/a", "json", None)
-    independent.write_mcap(log, [(channel, at, b'{"x": "%0100d"}' % at) for at in range(8000)])
-
-    def refused(*_: object, **__: object) -> int:
-        raise DatabaseError("MongoDB refuses it.")
-
-    with hl.open(tmp_path / "store", create=True, require_database=True) as store:
-        with monkeypatch.context() as broken:
-            broken.setattr(Database, "insert_raw", refused)
-            report = store.record(log, settings=SegmentSettings(chunk_size=6000))
-        assert (report.indexed, report.missed, report.entry.messages) == (0, 8000, 8000)
-    with hl.open(tmp_path / "store", require_database=True) as store:
-        assert store.topic("/a").where("x exists").count() == 8000
-
-
-def test_mongod_killed_and_not_to_be_had_again(
-    tmp_path: Path, robot: Path, spoken: dict[str, list[Message]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    place = tmp_path / "store"
-    killed = False
-
-    def progress(_done: int, messages: int) -> None:
-        nonlocal killed
-        if messages > 3000 and not killed:
-            killed = True
-            monkeypatch.setenv("HYBRIDLOG_MONGOD", "/bin/false")
-            kill_mongod(place)
-
-    whole = Counter(m for part in spoken.values() for m in part)
-    with hl.open(place, create=True, require_database=True) as store:
-        report = store.record(robot, progress=progress)
-        assert isinstance(report.failure, DatabaseError)
-        assert report.missed > 0
-        assert report.indexed + report.missed == report.entry.messages == whole.total()
-        # By time it can be fetched even now, out of the segments alone.
-        assert content(fetched(store, "robot")) == whole
-    monkeypatch.delenv("HYBRIDLOG_MONGOD")
-    with hl.open(place, require_database=True) as store:
-        assert store.repairs.indexed["robot"] > 0
-        assert store.verify().findings == []
-        assert store.topic("/imu/data").where("_meta.t > 0").count() == len(spoken["/imu/data"])
-
-
 # A disk that is full.
 
 
@@ -284,14 +216,6 @@ def test_a_disk_that_fills_up(path: Path, robot: Path) -> None:
     run("record", robot, "--quiet", store=path, code=0)
 
 
-def data_end(segment: bytes) -> int:
-    """Where the data section ends: the record DataEnd."""
-    at = 8
-    while segment[at] != 0x0F:
-        at += 9 + int(struct.unpack_from("<Q", segment, at + 1)[0])
-    return at
-
-
 # Segments that are lost or altered after sealing.
 
 
@@ -304,16 +228,6 @@ class Place:
     number: int
     offset: int
     length: int
-
-
-def place_in_the_middle(store: hl.Store) -> Place:
-    number, path = places.segments(
-        store.directory.path, places.id_of(store.directory.path, "short")
-    )[1]
-    with SegmentReader(path, number) as reader:
-        chunks = reader.summary().chunks
-    chunk = chunks[len(chunks) // 2]
-    return Place(number, path, chunk.number, chunk.offset, chunk.length)
 
 
 def lost(entry: RecordingEntry) -> Counter[str]:
@@ -331,29 +245,6 @@ def topics_of(messages: Counter[Message]) -> Counter[str]:
     return found
 
 
-def check_the_rest(store: hl.Store, said: Counter[Message], lost: set[tuple[int, int]]) -> None:
-    """Every chunk that is not among the lost ones can still be fetched, by its place."""
-    (entry,) = store.select(["short"])
-    topics = {c.id: c.topic for c in entry.channels}
-    got: set[int] = set()
-    tables = {segment: store.catalog.table(entry, segment) for segment, _, _ in entry.spans}
-    for segment, number in (
-        (s, n) for s, table in tables.items() for n in range(len(table.chunks))
-    ):
-        if (segment, number) in lost:
-            continue
-        # Bounds that no other chunk of these topics can be needed for.
-        parts = tables[segment].chunk_parts(number)
-        query = store.query([topics[int(c)] for c in parts["channel"]]).where(
-            {"_meta.ref.chunk": number, "_meta.ref.seg": segment}
-        )
-        found = list(query)
-        assert len(found) == parts["messages"].sum()
-        assert not content(found) - said
-        got |= {m.seq for m in found}
-    assert got
-
-
 def reopened(store: hl.Store) -> hl.Store:
     return hl.open(store.directory.path, require_database=True)
 
@@ -362,72 +253,6 @@ def flip(place: Place) -> None:
     data = bytearray(place.path.read_bytes())
     data[place.offset + place.length - 5] ^= 0x10
     place.path.write_bytes(data)
-
-
-def test_a_flipped_bit(store: hl.Store, said: Counter[Message]) -> None:
-    place = place_in_the_middle(store)
-    flip(place)
-    with reopened(store) as opened:
-        findings = opened.verify().findings
-        assert any(
-            f.recording == "short" and place.path.name in f.place and str(place.offset) in f.place
-            for f in findings
-        )
-        with pytest.raises(SegmentError, match=rf"byte {place.offset} of .*{place.path.name}"):
-            fetched(opened, "short")
-        check_the_rest(opened, said, {(place.segment, place.number)})
-    done = run("verify", store=store.directory.path, code=1)
-    assert place.path.name in done.out
-
-
-def damage_summary(path: Path) -> None:
-    whole = path.read_bytes()
-    data = bytearray(whole)
-    data[data_end(whole) + 40] ^= 1
-    path.write_bytes(data)
-
-
-@pytest.mark.parametrize("part", ["summary", "chunk"])
-def test_one_damaged_recording_keeps_no_other_out_of_the_index(
-    store: hl.Store, short: Path, said: Counter[Message], part: str
-) -> None:
-    """The database was lost, and a segment is damaged."""
-    other = store.record(short, again=True, name="zz").entry.id
-    place = place_in_the_middle(store)
-    if part == "summary":
-        damage_summary(place.path)
-    else:
-        flip(place)
-    assert store.database is not None
-    for name in store.database.list_collections():
-        if name != STORE:
-            store.database._database.drop_collection(name)
-    with reopened(store) as opened:
-        assert opened.repairs.indexed.keys() == {"short", "zz"}
-        assert content(fetched(opened, other)) == said
-        assert opened.verify([other]).findings == []
-        (entry,) = opened.select(["short"])
-        assert entry.status == "damaged"
-        assert {row["file"] for row in entry.end["losses"]} == {place.path.name}
-        found = opened.query(sorted(topics_of(said)), ["short"]).where("_meta.seq >= 0")
-        if part == "summary":
-            assert found.count() == said.total() - lost(entry).total()
-        else:
-            with pytest.raises(SegmentError, match=rf"byte {place.offset} of .*{place.path.name}"):
-                found.count()
-            # What does not need the chunk is answered.
-            hurt = set(lost(entry))
-            for topic, count in topics_of(said).items():
-                if topic not in hurt:
-                    own = opened.query([topic], ["short"]).where("_meta.seq >= 0")
-                    assert own.count() == count
-            assert opened.query(sorted(topics_of(said)), [other]).count() == said.total()
-        # Of a chunk it is known without the catalog, too.
-        before = entry
-    (store.directory.path / CATALOG).unlink()
-    with reopened(store) as opened:
-        (entry,) = opened.select(["short"])
-        assert (entry.status, entry.end) == (before.status, before.end)
 
 
 def list_otherwise(path: Path, place: int, change: Callable[[int], int]) -> None:

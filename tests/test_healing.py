@@ -8,8 +8,6 @@ import resource
 import shutil
 import signal
 import sqlite3
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -25,11 +23,9 @@ from benchmarks.simulator.write import write_bag
 from benchmarks.usage import working_below
 from hybridlog.columns.topic_table import TableRows, TopicTable
 from hybridlog.index import access
-from hybridlog.query.index_reader import IndexReader
 from hybridlog.query.planner import Planner
 from hybridlog_storage.catalog import CATALOG
 from hybridlog_storage.errors import (
-    ConnectionLostError,
     DatabaseError,
     ResourceError,
     StoreError,
@@ -258,20 +254,6 @@ def test_chunks_go_on_where_a_table_fails(store: Path, monkeypatch: pytest.Monke
         assert len(want) > 100
 
 
-def test_what_only_mongodb_knows_is_asked_once_more(store: Path, calls: Calls) -> None:
-    def breaking(*_: object) -> None:
-        if len(read) == 1:
-            raise ConnectionLostError("gone")
-
-    with hl.open(store, require_database=True) as opened:
-        asked = opened.topic(IMU).where({"header.seq": {"$mod": [7, 0]}})
-        want = [(m.recording, m.seq) for m in asked]
-        assert len(want) > 20
-        read = calls(IndexReader, "_numbers", breaking)
-        assert [(m.recording, m.seq) for m in asked] == want
-        assert len(read) == 3  # two groups of recordings, one of them twice
-
-
 @pytest.mark.parametrize("name", ["mongod", "mongod/data"])
 def test_an_index_deleted_under_an_open_store(store: Path, name: str) -> None:
     with hl.open(store, require_database=True) as opened:
@@ -348,20 +330,6 @@ def test_a_user_who_may_only_read_can_ask_everything(
 
 
 LIMITED = ["prlimit", "--nofile=24:24"]
-
-
-def test_too_few_handles_are_told_as_that(store: Path) -> None:
-    """Nothing is damaged, and nothing is made again."""
-    before = {p: p.read_bytes() for p in (store / "mongod" / "data").iterdir() if p.is_file()}
-    command = [sys.executable, "-m", "hybridlog", "verify", "--store", str(store)]
-    done = subprocess.run([*LIMITED, *command], capture_output=True, text=True, check=False)
-    assert done.returncode == 6, done.stderr
-    assert "Too many open files" in done.stderr
-    assert "damaged" not in done.stderr
-    assert "all is well in the files" in done.stdout
-    ended(store)
-    assert before.keys() <= set((store / "mongod" / "data").iterdir())
-    assert run("verify", store=store).err == ""
 
 
 @pytest.mark.parametrize("has_catalog", [True, False])

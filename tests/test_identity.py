@@ -30,7 +30,6 @@ from hybridlog_storage.errors import (
     StoreError,
     TimeError,
     TopicError,
-    UsageError,
 )
 from hybridlog_storage.manifest import replace
 from hybridlog_storage.manifests import MANIFEST_LOCK, manifests_at
@@ -39,7 +38,6 @@ from hybridlog_storage.mongo.database import Database
 from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
-from tests.cli.within import answer
 from tests.copies import bring
 from tests.damage import flip
 from tests.faults import logs
@@ -172,25 +170,6 @@ def test_a_copied_store_with_a_uri_removes_nothing(place: Path, mongo: str, tmp_
     assert documents(mongo) == before
 
 
-def test_a_copy_with_an_embedded_index_gets_one_of_its_own(tmp_path: Path) -> None:
-    log = make_log(tmp_path / "log.mcap", 100)
-    with hl.open(tmp_path / "store", create=True, require_database=True) as store:
-        store.record(log, name="one")
-    copy = tmp_path / "copy"
-    shutil.copytree(tmp_path / "store", copy)
-    done = answer("verify", "--repair", "--new-id", store=copy)
-    assert done.err.count("The store has a new id now.") == 1
-    assert "all is well" in answer("verify", "--repair", store=copy).out
-    with hl.open(copy, require_database=True) as store:
-        assert store.verify().index
-        assert store.record(log, name="two", again=True).indexed == COUNT
-        assert not store.verify().findings
-        store.remove("one")
-    with hl.open(tmp_path / "store", require_database=True) as store:
-        assert answers(store) == right()
-        assert not store.verify().findings
-
-
 def test_a_moved_store_takes_its_index_along(place: Path, mongo: str, tmp_path: Path) -> None:
     moved = place.rename(tmp_path / "moved")
     with hl.open(moved, mongo=mongo) as store:
@@ -202,48 +181,6 @@ def test_a_moved_store_takes_its_index_along(place: Path, mongo: str, tmp_path: 
             owner = IndexState(database).owner()
             assert owner is not None
             assert owner.place.endswith(f":{moved.resolve()}")
-
-
-def test_what_people_say_of_a_recording(place: Path, mongo: str) -> None:
-    """That it is kept, whatever happens, the model says."""
-    with hl.open(place, mongo=mongo) as store:
-        store.edit("one", name="second floor")
-        with pytest.raises(UsageError, match="no tag 'x'"):
-            store.edit("second floor", untag=["x"])
-        for odd in ({"name": ""}, {"name": " "}, {"note": ""}, {"note": 5}, {"name": b"a"}):
-            with pytest.raises(UsageError, match=f"A {next(iter(odd))} needs a text"):
-                store.edit("second floor", tag={"a": "4"}, **odd)  # type: ignore[arg-type]
-        for tags in ({"": "x"}, {"a\0": "x"}, "a=b", {"a": 1}, {1: "a"}, ["a"]):
-            with pytest.raises(UsageError, match="Tags are texts by keys, not empty"):
-                store.edit("second floor", name="x", tag=tags)  # type: ignore[arg-type]
-        store.mark("second floor", "+10s", "slip", {"kind": "odd"})
-        store.mark("second floor", "110.5", "after")
-        with pytest.raises(TimeError):
-            store.mark("second floor", "never", "x")
-        with pytest.raises(TopicError):
-            store.edit("one", tag={"a": "1"})
-        (found,) = store.recordings()
-        assert (found.name, found.tags) == ("second floor", {"a": "1"})
-        marks = store.topic("/hybridlog/marks")
-        assert [(m.log_time_ns, m.fields["text"]) for m in marks] == [
-            (110 * SECOND, "slip"),
-            (110 * SECOND + SECOND // 2, "after"),
-        ]
-        assert marks.where("text == 'slip'").count() == 1
-        near = store.topic("/n").during(marks.where("tags.kind == 'odd'").windows("1s", "1s"))
-        assert [m.fields["n"] for m in near] == [109, 110]
-        assert answers(store, "second floor") == right()
-
-
-def test_marks_need_no_mongodb(place: Path, mongo: str) -> None:
-    with hl.open(place, mongo=NOWHERE) as store:
-        store.mark("one", "+1s", "seen")
-        assert [m.fields["text"] for m in store.topic("marks")] == ["seen"]
-    with hl.open(place, mongo=mongo) as store:
-        assert store.topic("marks").where("text == 'seen'").count() == 1
-        assert store.verify().findings == []
-        with pytest.raises(TopicError, match="marks that somebody set are not in MongoDB"):
-            store.topic("marks").where({"text": "seen"}).count()
 
 
 def test_a_running_recording_is_marked_while_it_runs(tmp_path: Path) -> None:
@@ -492,21 +429,6 @@ def test_names_are_unique_when_recordings_begin_and_are_renamed(tmp_path: Path) 
         assert store.edit(ids["my run-1"], name="my run/1").name == "my run-1"
         assert store.record(log, name="my run/1", again=True).entry.name == "my run-1-3"
         assert {*before} < {*places.folders(path)}  # nothing moves
-
-
-def test_two_of_one_name_are_told_apart_by_their_ids(
-    place: Path, mongo: str, tmp_path: Path
-) -> None:
-    """As a store that cannot be written shows recordings that were copied by hand."""
-    with hl.open(place, mongo=mongo) as store:
-        one = store.entry("one").id
-        other = store.record(make_log(tmp_path / "b.mcap", 500), name="two").entry.id
-    places.change_in(places.root(place) / other, lambda now: replace(now, name="one"))
-    with hl.open(place, mongo=NOWHERE) as store:
-        with pytest.raises(TopicError, match=f"'one' is ambiguous. There are: {one}, {other}"):
-            store.select(["one"])
-        assert [entry.id for entry in store.select([one[-16:], other[-6:]][:1])] == [one]
-        assert store.entry(other).name == "one"
 
 
 def test_an_id_comes_before_a_name(place: Path, mongo: str, tmp_path: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import re
 import struct
 from base64 import b64decode
 from collections.abc import Iterator
@@ -19,7 +18,6 @@ from hybridlog.drawing.notebook import message_html, recordings_html, shown
 from hybridlog.drawing.pixels import SIDE
 from hybridlog.message import Message
 from hybridlog_storage.messages import Channel, Schema
-from tests.limits import Limit
 from tests.test_snapshot import summary
 
 HOSTILE = "<script>alert('x')</script>&\"\x1b[31m"
@@ -169,19 +167,3 @@ def test_images_have_a_thumbnail(store: hl.Store) -> None:
             assert max(seen.size) <= SIDE
             assert seen.size == (134, 100)
             assert seen.getpixel((50, 50)) == colour
-
-
-@pytest.mark.parametrize("topic", ["/wrong", "/unknown"])
-def test_what_is_no_picture_has_none(store: hl.Store, topic: str) -> None:
-    parsed = Parsed(only(store, topic)._repr_html_())
-    assert parsed.images == []
-    assert "sensor_msgs/Image" in parsed.text
-
-
-def test_a_large_image_is_not_decoded(store: hl.Store, limit: Limit) -> None:
-    limit(shown_bytes=1000)
-    assert Parsed(only(store, "/image")._repr_html_()).images == []
-
-
-def test_a_message_says_what_it_is(store: hl.Store) -> None:
-    assert re.fullmatch(r"<Message /image .* 360041 B>", repr(only(store, "/image")))

@@ -24,7 +24,7 @@ from hybridlog_storage.errors import (
     TopicError,
     UsageError,
 )
-from hybridlog_storage.messages import Channel, Schema
+from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.indexed import documents_of
 
@@ -165,45 +165,7 @@ def test_a_limit_bounds_what_is_read(store: hl.Store, robot: Truth) -> None:
 # What it answers.
 
 
-def test_a_table_without_rows_has_all_columns(store: hl.Store) -> None:
-    start = start_of(store)
-    query = store.topic("/battery").between(start, start + 1)
-    assert query.count() == 0
-    assert query.to_arrow().num_rows == 0
-    whole = store.topic("/battery").to_arrow().column_names
-    assert query.to_arrow().column_names == whole
-    assert list(query.to_pandas().columns) == whole[1:]
-    assert list(query) == []
-
-
 # Which messages.
-
-
-def test_a_range_that_is_empty_in_some_recordings(tmp_path: Path) -> None:
-    """`2025-01-01` to `end` leaves out what was recorded before, and is no mistake."""
-    first, later = 1_600_000_000 * SECOND, 1_700_000_000 * SECOND
-    with hl.open(tmp_path / "store", create=True, mongo="none") as store:
-        for name, epoch in (("first", first), ("later", later)):
-            with store.start(name) as recording:
-                for t in range(5):
-                    recording.write(Channel("/x", "json", None), b"{}", log_time=epoch + SECOND * t)
-        query = store.topic("/x")
-        for begin, end, want in (
-            (1_650_000_000 * SECOND, "end", [later + SECOND * t for t in range(5)]),
-            ("+3s", 1_650_000_000.0, [first + SECOND * 3, first + SECOND * 4]),
-            ("2023-01-01", "-3s", [later, later + SECOND]),
-        ):
-            asked = query.between(begin, end)
-            assert [m.log_time_ns for m in asked] == want
-            assert asked.count() == len(asked.to_pandas()) == len(want)
-        for begin, end, words in (
-            ("2030-01-01", "end", "first spans .*; later spans"),
-            ("2030-01-01", "2029-01-01", "empty"),
-            ("-1s", "+1s", "empty"),
-            (1_650_000_000, 1_650_000_001, "later spans"),
-        ):
-            with pytest.raises(TimeError, match=words):
-                list(query.between(begin, end))
 
 
 # What is refused.
@@ -277,30 +239,3 @@ def test_memory_is_bounded_by_chunks_not_by_the_store(tmp_path: Path) -> None:
             tracemalloc.stop()
             assert total > 0
             assert peak < size / 3, each
-
-
-def test_an_answer_survives_its_store(base: Path, store: hl.Store, robot: Truth) -> None:
-    with hl.open(base / "store", require_database=True) as other:
-        messages = list(other.topic("/odom").in_recording("robot").limit(10))
-    assert [m.raw for m in messages] == [m.raw for m in robot["/odom"][:10]]
-    stamps = [m.message.header.stamp for m in robot["/odom"][:10]]
-    assert [m.header_stamp_ns for m in messages] == [s.sec * SECOND + s.nanosec for s in stamps]
-
-
-def test_tables_in_parts_are_one_table_in_order(tmp_path: Path) -> None:
-    """Parts of bounded size end between messages, on every topic at the same time."""
-    count = 75_000
-    number_type = Schema("std_msgs/Int32", "ros1msg", b"int32 data\n")
-    channels = [Channel(topic, "ros1", number_type) for topic in ("/x", "/y")]
-    settings = SegmentSettings(chunk_size=1 << 20)
-    with hl.open(tmp_path / "store", create=True, mongo="none") as store:
-        with store.start("many", settings=settings) as recording:
-            for number in range(count):
-                for channel in channels:
-                    recording.write(channel, number.to_bytes(4, "little"), log_time=number)
-        for query in (store.topic("/x", "/y"), store.topic("/x", "/y").reverse()):
-            parts = list(query.to_tables())
-            assert len(parts) > 1
-            numbers = [n for part in parts for n in part["data"].to_pylist()]
-            assert len(numbers) == 2 * count
-            assert numbers == sorted(numbers, reverse=query.question.reverse)

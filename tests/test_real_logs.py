@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 
 import bson
@@ -15,8 +14,7 @@ from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 
 import hybridlog as hl
-from hybridlog_storage.errors import AlreadyRecordedError, SourceError
-from hybridlog_storage.messages import Channel, Schema
+from hybridlog_storage.errors import SourceError
 from tests import independent, places
 from tests.data import DATA, needs_data
 
@@ -130,17 +128,6 @@ def test_what_is_no_log_leaves_nothing(store: hl.Store, name: str) -> None:
     assert store.directory.ids() == before
 
 
-def test_the_same_file_is_noticed(store: hl.Store) -> None:
-    with suppress(AlreadyRecordedError):  # by the test of all logs
-        store.record(DATA / "real/tilt_laser.bag", name="real-tilt_laser")
-    with pytest.raises(AlreadyRecordedError, match="real-tilt_laser"):
-        store.record(DATA / "real/tilt_laser.bag")
-    report = store.record(DATA / "real/tilt_laser.bag", again=True, name="twice")
-    assert report.entry.messages == 4093
-    store.remove("twice")
-    assert "twice" not in {one.name for one in store.summaries()}
-
-
 def test_segments_pass_the_official_readers(store: hl.Store) -> None:
     assert sorted(r.id for r in store.recordings()) == store.directory.ids()
     for entry in store.recordings():
@@ -176,24 +163,3 @@ def test_verify_finds_nothing_and_reindex_changes_nothing(store: hl.Store) -> No
     assert sum(map(len, before.values())) > 150_000
     store.index.rebuild()
     assert dump(store) == before
-
-
-@pytest.mark.parametrize("name", [name for name in WHOLE if name.startswith("real/")])
-def test_segments_are_hardly_larger_than_a_plain_mcap_file(name: str, tmp_path: Path) -> None:
-    """One that the `mcap` package writes with its defaults: chunks of 1 MiB, zstd."""
-    with hl.open(tmp_path / "store", mongo="none", create=True) as store:
-        label = store.record(DATA / name).entry.name
-    size, rows = 0, []
-    channels: dict[int, Channel] = {}
-    for path in sorted(places.folder(tmp_path / "store", label).glob("*.mcap")):
-        size += path.stat().st_size
-        with path.open("rb") as file:
-            for schema, channel, message in make_reader(file).iter_messages():
-                if channel.id not in channels:
-                    kind = schema and Schema(schema.name, schema.encoding, schema.data)
-                    about = (channel.topic, channel.message_encoding, kind, channel.metadata)
-                    channels[channel.id] = Channel(*about)
-                times = (message.publish_time, message.sequence)
-                rows.append((channels[channel.id], message.log_time, message.data, *times))
-    plain = independent.write_mcap(tmp_path / "plain.mcap", rows)
-    assert size <= 1.05 * plain.stat().st_size

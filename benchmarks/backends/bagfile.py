@@ -21,7 +21,9 @@ _ANY_MD5 = "*"
 class BagFile(FileBackend):
     """An uncompressed ROS 1 bag, as `rosbag record` writes it: the paper's flat file."""
 
-    name = "bagfile"
+    name, title = "bagfile", "ROS bag"
+    asker = "benchmarks.questions.files:BagAsker"
+    reader = "benchmarks.questions.files:BagReading"
     suffix = ".bag"
 
     def _record(self, path: Path) -> Recorder:

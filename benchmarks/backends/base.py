@@ -1,6 +1,7 @@
 """What a system must be able to do to take part: this is all that the harness knows.
 
-To add one, write a class in a module of its own, and name it in `registry.py`.
+To add one, write a class in a module of its own, and name it in `registry.py`. Classes in
+`benchmarks.questions` ask it and read from it.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -21,6 +23,20 @@ class BackendMissingError(Exception):
 
 class BackendFailedError(Exception):
     """A system has stopped working in the middle: a dead server, a full disk."""
+
+
+def need(module: str, package: str) -> None:
+    """See that a package can be imported, without importing it.
+
+    Args:
+        module: What is imported.
+        package: What is installed, as pip calls it.
+    """
+    if find_spec(module) is None:
+        raise BackendMissingError(
+            f"The package {package} is not installed. Install it: pip install {package}, "
+            "or all that the benchmarks use: pip install 'hybridlog[bench]'."
+        )
 
 
 @contextmanager
@@ -40,10 +56,18 @@ class Backend(ABC):
             process has left there, which `open` then goes on with.
 
     Attributes:
-        name: As on the command line and in tables.
+        name: As on the command line.
+        title: As in tables.
+        records: Whether streams and logs are published to it.
+        asker: Class that asks it the questions, `module:class`; empty for none.
+        reader: Class that reads messages back from it, the same way.
     """
 
     name: ClassVar[str]
+    title: ClassVar[str]
+    records: ClassVar[bool] = True
+    asker: ClassVar[str] = ""
+    reader: ClassVar[str] = ""
 
     def __init__(self, directory: Path) -> None:
         self.directory = directory

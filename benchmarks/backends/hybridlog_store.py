@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 class Hybridlog(Backend):
     """A store with its default settings; each run is a recording of its own."""
 
-    name = "hybridlog"
+    name = title = "hybridlog"
+    asker = "benchmarks.questions.api:HybridlogAsker"
+    reader = "benchmarks.questions.api:HybridlogReading"
 
     def __init__(self, directory: Path) -> None:
         super().__init__(directory)

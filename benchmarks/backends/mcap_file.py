@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 class McapFile(FileBackend):
     """The `mcap` package's writer with its default settings: chunks of 1 MiB, zstd."""
 
-    name = "mcap"
+    name, title = "mcap", "plain MCAP"
+    reader = "benchmarks.questions.files:McapReading"
     suffix = ".mcap"
 
     def _record(self, path: Path) -> Recorder:

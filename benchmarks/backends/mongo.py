@@ -59,7 +59,7 @@ class Mongo(DatabaseBackend):
     is on, the write concern is the default one. One client is shared by all threads.
     """
 
-    name = "mongo"
+    name, title = "mongo", "MongoDB"
 
     _is_indexed = False
 
@@ -187,8 +187,9 @@ class MongoIndexed(Mongo):
     `_meta.inserted_at`.
     """
 
-    name = "mongo_indexed"
-
+    name, records = "mongo_indexed", False
+    asker = "benchmarks.questions.mongo:MongoAsker"
+    reader = "benchmarks.questions.mongo:MongoReading"
     _is_indexed = True
 
 

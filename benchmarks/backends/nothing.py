@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 from benchmarks.backends.base import Backend, BackendFailedError
 
@@ -24,7 +24,7 @@ class Nothing(Backend):
     those of a real system.
     """
 
-    name: ClassVar[str] = "nothing"
+    name, title = "nothing", "harness alone"
 
     def __init__(self, directory: Path) -> None:
         super().__init__(directory)

@@ -12,10 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from benchmarks.backends import postgres_server
-from benchmarks.backends.base import BackendFailedError, failing
+from benchmarks.backends.base import BackendFailedError, failing, need
 from benchmarks.backends.conversion import T
 from benchmarks.backends.database import DatabaseBackend
-from benchmarks.backends.requirements import need
 from benchmarks.backends.server import Server
 from hybridlog_storage.mongo.collection_names import collection_of
 
@@ -78,7 +77,7 @@ class Postgres(DatabaseBackend):
     The column is `json`, as in the paper; `postgres_indexed` has `jsonb`.
     """
 
-    name = "postgres"
+    name, title = "postgres", "PostgreSQL"
 
     _type: ClassVar[str] = "json"
     _is_indexed: ClassVar[bool] = False
@@ -212,7 +211,8 @@ class PostgresIndexed(Postgres):
     times as fast. Each table has an index on `_meta.t`.
     """
 
-    name = "postgres_indexed"
-
+    name, records = "postgres_indexed", False
+    asker = "benchmarks.questions.postgres:PostgresAsker"
+    reader = "benchmarks.questions.postgres:PostgresReading"
     _type = "jsonb"
     _is_indexed = True

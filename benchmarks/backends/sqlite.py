@@ -9,10 +9,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from benchmarks.backends.base import BackendFailedError, failing
+from benchmarks.backends.base import BackendFailedError, failing, need
 from benchmarks.backends.conversion import T
 from benchmarks.backends.database import DatabaseBackend
-from benchmarks.backends.requirements import need
 from hybridlog_storage.mongo.collection_names import collection_of
 
 if TYPE_CHECKING:
@@ -49,7 +48,7 @@ class Sqlite(DatabaseBackend):
     WAL, `synchronous` is NORMAL.
     """
 
-    name = "sqlite"
+    name, title = "sqlite", "SQLite"
 
     _is_indexed: ClassVar[bool] = False
 
@@ -133,8 +132,9 @@ class SqliteIndexed(Sqlite):
     them, and of `_meta.t`.
     """
 
-    name = "sqlite_indexed"
-
+    name, records = "sqlite_indexed", False
+    asker = "benchmarks.questions.sqlite:SqliteAsker"
+    reader = "benchmarks.questions.sqlite:SqliteReading"
     _is_indexed = True
 
     def __init__(self, directory: Path) -> None:

@@ -174,7 +174,6 @@ class _Meter:
         self._system = system
         self._servers = usage.cpu_s(self._pids())
         self._own = self._own_cpu()
-        self._stolen = usage.stolen_s()
         self._started = self._stopped = time.monotonic_ns()
 
     def stop(self) -> None:
@@ -184,7 +183,6 @@ class _Meter:
         pids = self._pids()
         self._servers = max(usage.cpu_s(pids) - self._servers, 0.0)
         self._server_peak = usage.peak_rss(pids)
-        self._stolen = max(usage.stolen_s() - self._stolen, 0.0)
 
     def note(self, values: Values, published: dict[str, Any]) -> None:
         """Note what was used.
@@ -201,7 +199,6 @@ class _Meter:
             "cpu_s": self._own,
             "server_cpu_s": self._servers,
             "server_peak_rss": self._server_peak,
-            "steal_s": self._stolen,
         }
 
     def _pids(self) -> set[int]:

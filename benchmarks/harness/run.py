@@ -49,7 +49,7 @@ def run(load: Load, backend: type[Backend], directory: Path, speed: float = 1.0)
     first until the last message should be published), `publish_s` (until it was),
     `wall_s` (from the first publication until `finish` had returned), `cpu_s` of the logger,
     `server_cpu_s`, `server_peak_rss`, `peak_rss` (without the payloads), `disk_bytes`,
-    `steal_s` of the machine, `spin_ms`.
+    `spin_ms`.
 
     Args:
         load: What; its directory must stay where it is.

@@ -99,17 +99,6 @@ class Recorder:
             used,
         )
 
-    def kill(self) -> int:
-        """Ends it without a word.
-
-        Returns:
-            When, ns since the epoch.
-        """
-        self.process.kill()
-        now = time.time_ns()
-        self.process.wait()
-        return now
-
     def close(self) -> None:
         """Ends it when it still runs."""
         self.process.kill()

@@ -43,7 +43,7 @@ class Load(NamedTuple):
         topics: How many, `/t0` and on.
         size: Bytes of a message.
         hz: Messages a second on each topic.
-        seconds: How long; 0 until it is killed.
+        seconds: How long.
         queue: Messages a connection may have waiting.
     """
 
@@ -57,23 +57,6 @@ class Load(NamedTuple):
     def megabytes_per_s(self) -> float:
         """What is offered."""
         return self.topics * self.size * self.hz / 1e6
-
-
-class Data:
-    """Random bytes, other ones in each message: a part of one long row of them.
-
-    Args:
-        size: Bytes of a message.
-    """
-
-    def __init__(self, size: int) -> None:
-        self._row = memoryview(random.Random(1).randbytes(_ROW + size))
-        self._size = max(size - _HEAD.size, 0)
-
-    def of(self, sequence: int) -> memoryview:
-        """What stands in a message."""
-        begin = sequence * _STEP % _ROW
-        return self._row[begin : begin + self._size]
 
 
 @dataclass(slots=True)
@@ -154,17 +137,19 @@ class Talker:
 
     def _speak(self) -> int:
         load = self._load
-        data = Data(load.size)
-        total = int(load.seconds * load.hz) if load.seconds else sys.maxsize
+        # Random bytes, other ones in each message: a part of one long row of them.
+        row = memoryview(random.Random(1).randbytes(_ROW + load.size))
+        length = load.size - _HEAD.size
         sequence = 0
         begin = time.perf_counter()
-        while sequence < total:
+        while sequence < int(load.seconds * load.hz):
             wait = begin + sequence / load.hz - time.perf_counter()
             if wait > 0.0003:
                 time.sleep(wait)
             sequence += 1
+            at = sequence * _STEP % _ROW
             for connections in self._connections:
-                message = _message(sequence, data.of(sequence))
+                message = _message(sequence, row[at : at + length])
                 for connection in connections:
                     connection.put(message, load.queue)
                     connection.flush()

@@ -5,7 +5,7 @@ changed now and then, and opens and closes the grippers. Topics and types are th
 the study's own launch file records; `docs/benchmarks-method.md` has the sources.
 
 Everything is planned first, so what must be answered about the load is known before a
-message is made: a file of answers lies beside it. No message lies within a millisecond of
+message is made: a file of answers lies beside it. No viewpoint lies within a millisecond of
 the edge of a window, so that a system that keeps milliseconds finds the same.
 """
 
@@ -22,18 +22,7 @@ from benchmarks.loads import made, user
 from benchmarks.loads.made import RobotTypes, Values, payloads, yaw
 from benchmarks.loads.spool import Spool
 from benchmarks.loads.user import ARM_GRID, GRASPS, TICK_NS, Drag, ViewpointPlan, plan_drags
-from benchmarks.questions.base import (
-    ARM,
-    BEFORE_NS,
-    ERROR,
-    GRIPPER,
-    ROSOUT,
-    VIEWPOINT,
-    Answer,
-    checked,
-    whole_minutes,
-    windows_before,
-)
+from benchmarks.questions.base import ARM, GRIPPER, VIEWPOINT, Answer
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -48,6 +37,7 @@ LEFT_GRIPPER = "/l_gripper_controller/command"
 LEFT_ARM = "/l_cart/command_pose"
 FEEDBACK = "/pr2_marker_control_transparent/feedback"
 DIAGNOSTICS = "/diagnostics_agg"
+ROSOUT = "/rosout"
 
 _ANSWERS = "answers.json"
 _GRIPPER = "pr2_controllers_msgs/msg/Pr2GripperCommand"
@@ -55,18 +45,10 @@ START_NS = 1_383_588_000_000_000_000  # 2013-11-04 18:00 UTC
 GAP_S = 1200
 """Seconds between two sessions: another user comes."""
 _INFO_LEVEL, _WARN_LEVEL = 2, 4
-_CLEAR_NS = 1_500_000
-"""No message is nearer to the edge of a window than this."""
 _REST = {ARM: 20, LEFT_ARM: 400}
 """Mean ticks between two drags of an arm."""
 _MARKERS = {ARM: "r_gripper_control", LEFT_ARM: "l_gripper_control"}
 _POSE_UPDATE, _MOUSE_DOWN, _MOUSE_UP = 1, 4, 5
-_ERRORS = (
-    "EtherCAT dropped a packet: motors halted",
-    "r_wrist_roll_joint: motor over-temperature, motors halted",
-    "Lost the connection to l_forearm_cam",
-    "Exception while sending pose command: no transform to base_link",
-)
 _REMARKS = (
     (_INFO_LEVEL, "Re-initializing all control markers"),
     (_INFO_LEVEL, "sending gripper command"),
@@ -87,13 +69,7 @@ _TYPES = {
 """Type and node of each topic."""
 
 
-def hcr_like(
-    directory: Path,
-    *,
-    seed: int,
-    sessions: int,
-    minutes: float,
-) -> Load:
+def hcr_like(directory: Path, *, seed: int, sessions: int, minutes: float) -> Load:
     """Make a load of some sessions, one after the other with a gap, and its answers.
 
     Args:
@@ -135,7 +111,6 @@ class _Plan:
     drags: Mapping[str, list[Drag]]
     left: NDArray[np.float64]
     times: dict[str, Times] = field(default_factory=dict)
-    errors: list[int] = field(default_factory=list)
 
     def rng(self, use: str) -> np.random.Generator:
         """The random numbers of one part of the session."""
@@ -175,7 +150,6 @@ def _plan(seed: int, number: int, start: int, ticks: int) -> _Plan:
         feedback.append(plan.at(_ticks_of(plan.drags[arm], ends=True), offset - 4))
     times[FEEDBACK] = np.concatenate(feedback)
     _plan_robot(plan)
-    _plan_errors(plan)
     return plan
 
 
@@ -195,62 +169,20 @@ def _plan_robot(plan: _Plan) -> None:
     times[DIAGNOSTICS] = made.received(rng, plan.start + stamps, 0.004, 0.001)
 
 
-def _plan_errors(plan: _Plan) -> None:
-    """Choose when the robot fails, away from all messages, and so do the windows' edges."""
-    rng = plan.rng("errors")
-    length = round(plan.seconds * 1e9)
-    times = np.sort(np.concatenate(list(plan.times.values())))
-    for _ in range(max(1, round(plan.seconds / 180))):
-        near = plan.start + int(rng.uniform(0.15, 0.95) * length)
-        for moment in range(near, near + length // 50, 1_000_000):
-            others = np.array([edge for e in plan.errors for edge in (e, e - BEFORE_NS)])
-            edges = (moment, moment - BEFORE_NS)
-            is_clear = all(_is_clear(times, edge) for edge in edges)
-            if is_clear and (np.abs(others - moment) > _CLEAR_NS).all():
-                plan.errors.append(moment)
-                times = np.insert(times, np.searchsorted(times, moment), moment)
-                break
-    plan.errors.sort()
-
-
-def _is_clear(times: Times, edge: int) -> bool:
-    """Whether no time is near an edge; `times` ascend."""
-    first, last = np.searchsorted(times, (edge - _CLEAR_NS, edge + _CLEAR_NS))
-    return bool(first == last)
-
-
 def _answers(plans: Sequence[_Plan]) -> dict[str, Answer]:
     """What the plans say, added up."""
     behind = np.concatenate([plan.viewpoint.behind() for plan in plans])
     users = [plan.viewpoint for plan in plans]
-    before_errors = 0
-    for plan in plans:
-        times = np.sort(np.concatenate([*plan.times.values(), np.array(plan.errors, np.int64)]))
-        for window in windows_before(plan.errors):
-            first, last = np.searchsorted(times, window)
-            before_errors += int(last - first)
-    closed = [
-        plan.at(ticks, -TICK_NS / 2e6).tolist() for plan in plans for ticks in plan.viewpoint.closed
-    ]
     return {
         "Q1": sum(command.position == 0.0 for one in users for command in one.commands),
         "Q2": len(behind),
         "Q3": sum(drag.inside for plan in plans for drag in plan.drags[ARM]),
         "Q4": sum(one.wide for one in users),
         "Q2 positions": [float(len(behind)), *(behind.sum(axis=0) / user.GRID).tolist()],
-        "Q4 ±0.1 s": sum(one.near for one in users),
-        "viewpoint changes": sum(one.changes for one in users),
-        "closed minutes": checked(whole_minutes(closed)),
-        "before errors": before_errors,
     }
 
 
-def _write(
-    spool: Spool,
-    types: RobotTypes,
-    topics: Sequence[str],
-    plan: _Plan,
-) -> None:
+def _write(spool: Spool, types: RobotTypes, topics: Sequence[str], plan: _Plan) -> None:
     """Add the messages of a session."""
 
     def add(topic: str, times: Times, values: Values, columns: Values) -> None:
@@ -302,21 +234,11 @@ def _write_arms(add: _Add, plan: _Plan) -> None:
 
 
 def _write_rosout(add: _Add, plan: _Plan) -> None:
-    rng = plan.rng("texts")
-    chosen = rng.integers(0, len(_REMARKS), len(plan.times[ROSOUT]))
-    said: list[tuple[int, int, str, str]] = [
-        (time, *_REMARKS[choice], "/pr2_marker_control")
-        for time, choice in zip(plan.times[ROSOUT].tolist(), chosen.tolist(), strict=True)
-    ]
-    said += [
-        (time, ERROR, _ERRORS[int(rng.integers(len(_ERRORS)))], "/realtime_loop")
-        for time in plan.errors
-    ]
-    said.sort()
-    times = np.array([time for time, *_ in said], np.int64)
-    names = ("level", "msg", "name")
-    columns = {name: [line[n] for line in said] for n, name in enumerate(names, 1)}
-    add(ROSOUT, times, {"topics": ["/rosout", *_MARKERS]}, _stamped(times, 500_000) | columns)
+    times = plan.times[ROSOUT]
+    chosen = plan.rng("texts").integers(0, len(_REMARKS), len(times)).tolist()
+    columns = {name: [_REMARKS[n][at] for n in chosen] for at, name in enumerate(("level", "msg"))}
+    values = {"topics": ["/rosout", *_MARKERS], "name": "/pr2_marker_control"}
+    add(ROSOUT, times, values, _stamped(times, 500_000) | columns)
 
 
 def _stamped(times: Times, before_ns: int) -> Values:

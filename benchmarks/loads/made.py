@@ -24,9 +24,6 @@ _STALL_PART, _STALL_NS = 0.001, (5e6, 25e6)
 class RobotTypes(Types):
     """The message types of ROS 1, and the channels of a bag."""
 
-    def __init__(self) -> None:
-        super().__init__(1)
-
     def channel(self, topic: str, msgtype: str, node: str) -> Channel:
         """The channel of a topic, as a ROS 1 bag describes it."""
         text, checksum = self.store.generate_msgdef(msgtype, ros_version=1)

@@ -36,8 +36,6 @@ _LEAD = 24
 _NEAR = 9
 """Ticks, 0.3 s: outside of a window of 0.1 s, inside of one of 0.5 s."""
 _LEAST_HOLD, _MAX_HOLD = 60, 450
-_LEAST_LONG, _MAX_LONG = 1970, 3030
-"""65 s to 100 s: one whole minute, and far from two."""
 _MAX_EPISODE = 4 * (42 + 60) + 42 + 3 * _LEAD + 2 * _NEAR + 40
 """Ticks of an episode without the time for which the gripper stays closed."""
 _HOMEWARD = 80
@@ -49,12 +47,10 @@ class Stretch:
 
     Attributes:
         side: 1 when all its points have x > 0, -1 for x < 0, 0 for x == 0.
-        moving: Whether each point differs from the one before it.
         points: int64[n, 3], in parts of a metre.
     """
 
     side: int
-    moving: bool
     points: NDArray[np.int64]
 
 
@@ -85,10 +81,7 @@ class ViewpointPlan:
     Attributes:
         stretches: In order; they cover all ticks.
         commands: To the right gripper, in order. The last one opens it.
-        changes: Runs of moving stretches.
-        near: Closings with a viewpoint in front within 0.1 s.
         wide: Closings with a viewpoint in front within 0.5 s.
-        closed: First and last tick of each time for which the gripper was closed.
     """
 
     ticks: int
@@ -96,25 +89,17 @@ class ViewpointPlan:
     grasps: tuple[Grasp, ...]
     stretches: list[Stretch] = field(default_factory=list)
     commands: list[Command] = field(default_factory=list)
-    changes: int = 0
-    near: int = 0
     wide: int = 0
-    closed: list[tuple[int, int]] = field(default_factory=list)
     _done: int = 0
     _here: Point = HOME
 
     def __post_init__(self) -> None:
         """Make the plan."""
         self._rest(30)
-        number, had_long = 0, False
-        while True:
-            left = self.ticks - self._done - _HOMEWARD - _MAX_EPISODE
-            if left < _MAX_HOLD:
-                break
-            is_long = left >= _MAX_LONG and (not had_long or self.rng.random() < 0.05)
-            had_long |= is_long
-            least, most = (_LEAST_LONG, _MAX_LONG) if is_long else (_LEAST_HOLD, _MAX_HOLD)
-            self._episode(self.grasps[number % len(self.grasps)], self._number(least, most))
+        number = 0
+        while self.ticks - self._done - _HOMEWARD - _MAX_EPISODE >= _MAX_HOLD:
+            hold = self._number(_LEAST_HOLD, _MAX_HOLD)
+            self._episode(self.grasps[number % len(self.grasps)], hold)
             number += 1
         self._move(HOME, self._number(20, 40))
         self._rest(self.ticks - self._done)
@@ -162,18 +147,16 @@ class ViewpointPlan:
                 self._move(self._somewhere(self._number(-1, 1)), self._number(8, 40))
             self._rest(min(left, self._number(1, 60)) if left <= 60 else self._number(1, 15))
         self.commands.append(Command(self._done, OPEN, 100.0))
-        self.closed.append((start, self._done))
         self._rest(2)
 
     def _close(self, grasp: Grasp) -> int:
         self.commands.append(Command(self._done, 0.0, (50.0, 100.0)[self._number(0, 1)]))
-        self.near += grasp in {"front", "level"}
         self.wide += grasp != "behind"
         return self._done
 
     def _rest(self, ticks: int) -> None:
         points = np.tile(np.array(self._here, np.int64), (ticks, 1))
-        self._add(Stretch(int(np.sign(self._here[0])), False, points))
+        self._add(Stretch(int(np.sign(self._here[0])), points))
 
     def _move(self, to: Point, steps: int) -> None:
         """Move on in a straight line; to another side the first step is a leap."""
@@ -187,13 +170,11 @@ class ViewpointPlan:
         line = line[(line != before).any(axis=1)]
         if len(line):
             self._here = to
-            self._add(Stretch(side, True, line))
+            self._add(Stretch(side, line))
 
     def _add(self, stretch: Stretch) -> None:
         if not len(stretch.points):
             return
-        if stretch.moving and not self.stretches[-1].moving:
-            self.changes += 1
         self.stretches.append(stretch)
         self._done += len(stretch.points)
 

@@ -6,16 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from benchmarks.questions.base import (
-    ARM,
-    ERROR,
-    GRIPPER,
-    ROSOUT,
-    VIEWPOINT,
-    Asker,
-    Reading,
-    checked,
-)
+from benchmarks.questions.base import ARM, GRIPPER, VIEWPOINT, Asker, Reading
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -63,19 +54,6 @@ class HybridlogAsker(_Stored, Asker):
         )
         in_front = self.store.topic(VIEWPOINT).where("position.x >= 0")
         return len(closings.containing(in_front))
-
-    def changes(self) -> int:
-        # The viewpoint comes every 33 ms: a pause of less than two of these is none.
-        viewpoint = self.store.topic(VIEWPOINT)
-        return len(viewpoint.changes("position", "orientation", pause="50ms"))
-
-    def closed_minutes(self) -> list[int]:
-        found = self.store.topic(GRIPPER).where("position == 0").intervals(length="1min")
-        return checked(minute.begin_ns for minute in found)
-
-    def before_errors(self) -> int:
-        errors = self.store.topic(ROSOUT).where(f"level == {ERROR}")
-        return self.store.all_topics().during(errors.windows("5min")).count()
 
 
 class HybridlogReading(_Stored, Reading):

@@ -7,7 +7,7 @@ are plain values, compared with what the load's plan says must be found.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from operator import methodcaller
 from typing import TYPE_CHECKING, ClassVar, Final
 
@@ -15,28 +15,17 @@ import numpy as np
 
 if TYPE_CHECKING:
     from benchmarks.backends.base import Backend
-    from hybridlog_storage.messages import Channel
 
 GRIPPER: Final = "/r_gripper_controller/command"
 VIEWPOINT: Final = "/rviz_camera_publisher/camera_pose"
 ARM: Final = "/r_cart/command_pose"
-ROSOUT: Final = "/rosout"
-ERROR: Final = 8
-"""Level of a system error."""
 
 SECOND_NS: Final = 10**9
-MINUTE_NS: Final = 60 * SECOND_NS
-BEFORE_NS: Final = 5 * MINUTE_NS
 WIDE_NS: Final = SECOND_NS // 2
 """Half of the window of Q4, as the code in the paper's appendix has it."""
-NEAR_NS: Final = SECOND_NS // 10
-"""The same as the paper's text has it."""
-_CHECK = 1_000_000_007
 
-Answer = int | list[int] | list[float]
+Answer = int | list[float]
 """A number, or a number and what else tells one answer from another."""
-Window = tuple[int, int]
-"""`[begin, end)`, ns."""
 
 
 class Asker(ABC):
@@ -44,11 +33,9 @@ class Asker(ABC):
 
     Args:
         backend: Open, with the load in it.
-        channels: Those of the load.
     """
 
-    def __init__(self, backend: Backend, channels: Sequence[Channel]) -> None:
-        self.topics = list(dict.fromkeys(channel.topic for channel in channels))
+    def __init__(self, backend: Backend) -> None:
         self.start(backend)
 
     @abstractmethod
@@ -75,18 +62,6 @@ class Asker(ABC):
     def grasps(self, half_ns: int) -> int:
         """Q4: closings with a viewpoint in front of the robot nearer than half the window."""
 
-    @abstractmethod
-    def changes(self) -> int:
-        """How many times did the user change the viewpoint."""
-
-    @abstractmethod
-    def closed_minutes(self) -> list[int]:
-        """Non-overlapping minutes in which the gripper was closed: `checked(begins)`."""
-
-    @abstractmethod
-    def before_errors(self) -> int:
-        """Messages of all topics in the five minutes before each system error."""
-
     def close(self) -> None:  # noqa: B027 - most have nothing to give back
         """Give back what `start` took."""
 
@@ -97,18 +72,8 @@ QUESTIONS: Final[dict[str, Callable[[Asker], Answer]]] = {
     "Q3": methodcaller("in_region"),
     "Q4": methodcaller("grasps", WIDE_NS),
     "Q2 positions": methodcaller("positions"),
-    "Q4 ±0.1 s": methodcaller("grasps", NEAR_NS),
-    "viewpoint changes": methodcaller("changes"),
-    "closed minutes": methodcaller("closed_minutes"),
-    "before errors": methodcaller("before_errors"),
 }
 """By name; the first four are those of the paper's Table 1."""
-
-
-def checked(times: Iterable[int]) -> list[int]:
-    """How many times, ns, and a number that nearly every other list of times changes."""
-    listed = [int(time) for time in times]
-    return [len(listed), sum(listed) % _CHECK]
 
 
 def sums(rows: Sequence[Sequence[float]]) -> list[float]:
@@ -117,33 +82,11 @@ def sums(rows: Sequence[Sequence[float]]) -> list[float]:
     return [float(len(rows)), *map(float, columns)]
 
 
-def whole_minutes(closed: Iterable[Window]) -> list[int]:
-    """Where the minutes begin into which intervals can be cut."""
-    return [
-        begin + minute * MINUTE_NS
-        for begin, end in closed
-        for minute in range((end - begin) // MINUTE_NS)
-    ]
-
-
-def windows_before(errors: Iterable[int]) -> list[Window]:
-    """The five minutes before each error, those that overlap as one."""
-    found: list[Window] = []
-    for error in sorted(errors):
-        begin = error - BEFORE_NS
-        if found and begin <= found[-1][1]:
-            found[-1] = (found[-1][0], error)
-        else:
-            found.append((begin, error))
-    return found
-
-
 class Reading(ABC):
     """Reads messages back from one open backend.
 
     Args:
         backend: Open, with the load in it.
-        channels: Those of the load.
     """
 
     columns: ClassVar[tuple[str, ...]] = (
@@ -156,8 +99,7 @@ class Reading(ABC):
     )
     """What is compared of an IMU's table."""
 
-    def __init__(self, backend: Backend, channels: Sequence[Channel]) -> None:
-        self.channels = channels
+    def __init__(self, backend: Backend) -> None:
         self.start(backend)
 
     @abstractmethod

@@ -17,20 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from benchmarks.backends.conversion import typestore_of
-from benchmarks.questions.base import (
-    ARM,
-    ERROR,
-    GRIPPER,
-    ROSOUT,
-    VIEWPOINT,
-    Asker,
-    Reading,
-    Window,
-    checked,
-    sums,
-    whole_minutes,
-    windows_before,
-)
+from benchmarks.questions.base import ARM, GRIPPER, VIEWPOINT, Asker, Reading, sums
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -124,11 +111,6 @@ class _Bag(_File):
             chosen = [c for c in reader.connections if c.topic in topics]
             for connection, time, raw in reader.messages(chosen, start=begin, stop=end):
                 yield connection.topic, time, reader.deserialize(raw, connection.msgtype)
-
-    def times(self) -> Iterator[int]:
-        with self.opened() as reader:
-            for _, time, _ in reader.messages():
-                yield time
 
     def last_before(self, topic: str, time: int) -> Any:
         with self.opened() as reader:
@@ -229,36 +211,6 @@ class BagAsker(_Bag, Asker):
             bisect_right(in_front, time - half_ns) < bisect_left(in_front, time + half_ns)
             for time in closings
         )
-
-    def changes(self) -> int:
-        found, last, was_moving = 0, None, False
-        for _, _, message in self.messages([VIEWPOINT]):
-            here = (message.position, message.orientation)
-            is_moving = last is not None and here != last
-            found += is_moving and not was_moving
-            last, was_moving = here, is_moving
-        return found
-
-    def closed_minutes(self) -> list[int]:
-        closed: list[Window] = []
-        since: int | None = None
-        for _, time, message in self.messages([GRIPPER]):
-            if message.position == 0.0:
-                since = time if since is None else since
-            elif since is not None:
-                closed.append((since, time))
-                since = None
-        return checked(whole_minutes(closed))
-
-    def before_errors(self) -> int:
-        errors = [time for _, time, m in self.messages([ROSOUT]) if m.level == ERROR]
-        windows = windows_before(errors)
-        begins, ends = [begin for begin, _ in windows], [end for _, end in windows]
-        found = 0
-        for time in self.times():
-            place = bisect_right(begins, time) - 1
-            found += place >= 0 and time < ends[place]
-        return found
 
 
 class BagReading(_Bag, _FileReading):

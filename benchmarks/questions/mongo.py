@@ -7,19 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from benchmarks.questions.base import (
-    ARM,
-    ERROR,
-    GRIPPER,
-    ROSOUT,
-    VIEWPOINT,
-    Asker,
-    Reading,
-    checked,
-    sums,
-    whole_minutes,
-    windows_before,
-)
+from benchmarks.questions.base import ARM, GRIPPER, VIEWPOINT, Asker, Reading, sums
 from hybridlog_storage.mongo.collection_names import collection_of
 
 if TYPE_CHECKING:
@@ -79,57 +67,6 @@ class MongoAsker(Asker):
             )
             found += row is not None
         return found
-
-    def changes(self) -> int:
-        """With window functions, which MongoDB has from version 5 on."""
-        by_time = {"t": 1}
-        last = {"last": {"$shift": {"output": "$pose", "by": -1}}}
-        before = {"before": {"$shift": {"output": "$differs", "by": -1, "default": False}}}
-        pose = {"p": "$position", "o": "$orientation"}
-        found = self._of(VIEWPOINT).aggregate(
-            [
-                {"$project": {"_id": 0, "t": "$_meta.t", "pose": pose}},
-                {"$setWindowFields": {"sortBy": by_time, "output": last}},
-                {
-                    "$set": {
-                        "differs": {"$and": [{"$ne": ["$last", None]}, {"$ne": ["$pose", "$last"]}]}
-                    }
-                },
-                {"$setWindowFields": {"sortBy": by_time, "output": before}},
-                {"$match": {"differs": True, "before": False}},
-                {"$count": "n"},
-            ],
-            allowDiskUse=True,
-        )
-        return next((int(row["n"]) for row in found), 0)
-
-    def closed_minutes(self) -> list[int]:
-        by_time = {"t": 1}
-        before = {"before": {"$shift": {"output": "$closed", "by": -1}}}
-        until = {"until": {"$shift": {"output": "$t", "by": 1}}}
-        closed = {"$eq": ["$position", 0.0]}
-        found = self._of(GRIPPER).aggregate(
-            [
-                {"$project": {"_id": 0, "t": "$_meta.t", "closed": closed}},
-                {"$setWindowFields": {"sortBy": by_time, "output": before}},
-                {"$match": {"$expr": {"$ne": ["$closed", "$before"]}}},
-                {"$setWindowFields": {"sortBy": by_time, "output": until}},
-                {"$match": {"closed": True, "until": {"$ne": None}}},
-            ],
-            allowDiskUse=True,
-        )
-        return checked(whole_minutes((row["t"], row["until"]) for row in found))
-
-    def before_errors(self) -> int:
-        errors = self._of(ROSOUT).find({"level": ERROR}, {"_meta.t": 1})
-        windows = windows_before(row["_meta"]["t"] for row in errors)
-        return sum(
-            self._of(topic).count_documents(
-                {"_meta.inserted_at": {"$gte": _date(begin), "$lt": _date(end)}}
-            )
-            for topic in self.topics
-            for begin, end in windows
-        )
 
     def _of(self, topic: str) -> Collection[dict[str, Any]]:
         return self._database[collection_of(topic)]

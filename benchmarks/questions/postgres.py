@@ -47,9 +47,6 @@ class _Connected(Sql):
 class PostgresAsker(_Connected, SqlAsker):
     """With the casts that the expression indexes are on."""
 
-    def pose(self) -> str:
-        return "(data->>'position') || (data->>'orientation')"
-
 
 class PostgresReading(_Connected, SqlReading):
     """Only the field that is asked for is read of a scan."""

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from benchmarks.harness.run import Outcome
 from benchmarks.samples import Sample
 from benchmarks.side import SideError, run_side, spelled, warm_cache
-from benchmarks.studies.runs import Context, chosen, run_directory
+from benchmarks.studies.runs import Context, run_directory
 
 if TYPE_CHECKING:
     from benchmarks.backends.base import Backend
@@ -20,24 +20,26 @@ _TIMEOUT_S = 900.0
 
 
 def turns(
-    context: Context, side: str, askers: Mapping[str, str], load: Load, repetitions: int
+    context: Context, side: Literal["ask", "read"], load: Load, repetitions: int
 ) -> Iterator[tuple[str, Outcome, dict[str, Any]]]:
     """Every backend's turn: its name, how it ended, and its results by question or task.
 
     Args:
         context: Where and how.
         side: Function of `benchmarks.questions.sides`.
-        askers: Who asks which backend, `module:class`.
         load: What it is filled with.
         repetitions: Of each question.
     """
-    for name, kind in chosen(context.backends, list(askers)).items():
+    for name, kind in context.backends.items():
+        asker = kind.asker if side == "ask" else kind.reader
+        if not asker:
+            continue
         reason = context.missing.get(name)
         if reason is not None:
             yield name, Outcome("missing", {}, reason), {}
             continue
         with context.progress.step(f"{side}: {name}"):
-            more = {"asker": askers[name], "repetitions": repetitions}
+            more = {"asker": asker, "repetitions": repetitions}
             outcome, results = _run(context, kind, load, side, more)
         if outcome.status == "missing":
             context.missing[name] = outcome.reason

@@ -6,12 +6,12 @@ Sides, run by `benchmarks.side.run_side`.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, closing, contextmanager
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from benchmarks import usage
 from benchmarks.backends.base import Backend, BackendFailedError, BackendMissingError
@@ -20,9 +20,6 @@ from benchmarks.loads.base import Load
 from benchmarks.questions import tasks
 from benchmarks.questions.base import QUESTIONS
 from benchmarks.side import Values, named
-
-if TYPE_CHECKING:
-    from hybridlog_storage.messages import Channel
 
 _Opener = Callable[[], AbstractContextManager[Backend]]
 """Opens the backend that was filled."""
@@ -46,9 +43,9 @@ def ask(*, load: str, backend: str, directory: str, asker: str, repetitions: int
     """
     results: dict[str, dict[str, Any]] = {}
 
-    def use(reopened: _Opener, channels: Sequence[Channel]) -> None:
+    def use(reopened: _Opener) -> None:
         for opening in range(repetitions):
-            with reopened() as system, closing(named(asker)(system, channels)) as asking:
+            with reopened() as system, closing(named(asker)(system)) as asking:
                 for name, question in QUESTIONS.items():
                     known = results.setdefault(name, {"cold_ms": [], "ms": []})
                     _ask(partial(question, asking), known, "cold_ms")
@@ -79,8 +76,8 @@ def read(*, load: str, backend: str, directory: str, asker: str, repetitions: in
     opened = Load.open(Path(load))
     results: dict[str, list[dict[str, Any]]] = {}
 
-    def use(reopened: _Opener, channels: Sequence[Channel]) -> None:
-        with reopened() as system, closing(named(asker)(system, channels)) as reading:
+    def use(reopened: _Opener) -> None:
+        with reopened() as system, closing(named(asker)(system)) as reading:
             for name, task in tasks.TASKS.items():
                 results[name] = [
                     _caught(partial(task, reading, opened, repetition))
@@ -90,12 +87,7 @@ def read(*, load: str, backend: str, directory: str, asker: str, repetitions: in
     return _filled(load, backend, directory, use) | {"results": results}
 
 
-def _filled(
-    load: str,
-    backend: str,
-    directory: str,
-    use: Callable[[_Opener, Sequence[Channel]], None],
-) -> Values:
+def _filled(load: str, backend: str, directory: str, use: Callable[[_Opener], None]) -> Values:
     for package in ("pandas", "pyarrow"):
         import_module(package)  # whoever needs it first must not pay for all
     opened = Load.open(Path(load))
@@ -109,7 +101,7 @@ def _filled(
                 fill(system, opened)
                 values["load_s"] = time.perf_counter() - started
             values["disk_bytes"] = usage.disk_bytes(Path(directory))
-            use(partial(_open, kind, directory, opened), opened.channels)
+            use(partial(_open, kind, directory, opened))
         except BackendMissingError as error:
             values |= {"status": "missing", "reason": str(error)}
         except (BackendFailedError, StoppedError) as error:

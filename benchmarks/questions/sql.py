@@ -8,19 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from benchmarks.questions.base import (
-    ARM,
-    ERROR,
-    GRIPPER,
-    ROSOUT,
-    VIEWPOINT,
-    Asker,
-    Reading,
-    checked,
-    sums,
-    whole_minutes,
-    windows_before,
-)
+from benchmarks.questions.base import ARM, GRIPPER, VIEWPOINT, Asker, Reading, sums
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -54,10 +42,9 @@ class Sql:
         """The one number that a query answers."""
         return int(self.rows(query, values)[0][0])
 
-    def count(self, topic: str, condition: str, values: Sequence[object] = ()) -> int:
+    def count(self, topic: str, condition: str) -> int:
         """How many rows of a topic fulfil a condition."""
-        query = f"SELECT COUNT(*) FROM {self.name(topic)} WHERE {condition}"
-        return self.number(query, values)
+        return self.number(f"SELECT COUNT(*) FROM {self.name(topic)} WHERE {condition}")
 
 
 class SqlAsker(Sql, Asker):
@@ -91,39 +78,6 @@ class SqlAsker(Sql, Asker):
         x, y, z = (self.field(f"position.{axis}") for axis in "xyz")
         query = f"SELECT {x}, {y}, {z} FROM {self.name(VIEWPOINT)} WHERE {x} <= 0"
         return sums(self.rows(query))
-
-    @abstractmethod
-    def pose(self) -> str:
-        """Expression of a viewpoint as a whole."""
-
-    def changes(self) -> int:
-        read = f"SELECT {self.time} AS t, {self.pose()} AS pose FROM {self.name(VIEWPOINT)}"
-        return self.number(
-            "WITH poses AS (SELECT t, pose, lag(pose) OVER (ORDER BY t) AS last "
-            f"FROM ({read}) AS read), "
-            "steps AS (SELECT t, CASE WHEN last IS NOT NULL AND pose <> last THEN 1 ELSE 0 END "
-            "AS differs FROM poses), "
-            "runs AS (SELECT differs, lag(differs) OVER (ORDER BY t) AS before FROM steps) "
-            "SELECT COUNT(*) FROM runs WHERE differs = 1 AND coalesce(before, 0) = 0"
-        )
-
-    def closed_minutes(self) -> list[int]:
-        closes = f"CASE WHEN {self.field('position')} = 0 THEN 1 ELSE 0 END"
-        found = self.rows(
-            "WITH commands AS (SELECT t, closed, lag(closed) OVER (ORDER BY t) AS before FROM "
-            f"(SELECT {self.time} AS t, {closes} AS closed FROM {self.name(GRIPPER)}) AS read), "
-            "changes AS (SELECT t, closed, lead(t) OVER (ORDER BY t) AS until FROM commands "
-            "WHERE before IS NULL OR closed <> before) "
-            "SELECT t, until FROM changes WHERE closed = 1 AND until IS NOT NULL"
-        )
-        return checked(whole_minutes((begin, end) for begin, end in found))
-
-    def before_errors(self) -> int:
-        level = self.field("level")
-        query = f"SELECT {self.time} FROM {self.name(ROSOUT)} WHERE {level} = {ERROR}"
-        windows = windows_before(row[0] for row in self.rows(query))
-        within = f"{self.time} >= {self.mark} AND {self.time} < {self.mark}"
-        return sum(self.count(topic, within, w) for topic in self.topics for w in windows)
 
 
 class SqlReading(Sql, Reading):

@@ -48,9 +48,6 @@ class SqliteAsker(_Connected, SqlAsker):
     # Keeps the planner off the index on x, which half of all rows are in.
     front = "+"
 
-    def pose(self) -> str:
-        return f"{expression('position')} || {expression('orientation')}"
-
 
 class SqliteReading(_Connected, SqlReading):
     """By `_meta.t`, on which there is an index."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import zlib
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -50,23 +50,18 @@ DEMO = RobotConfig(cloud_columns=100, jpeg=75, intensity_step=50.0)
 
 
 class Types:
-    """Message types of ROS 1 or ROS 2."""
+    """Message types of ROS 1."""
 
-    def __init__(self, ros: Literal[1, 2]) -> None:
-        self.ros = ros
-        self.store = get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_HUMBLE)
+    def __init__(self) -> None:
+        self.store = get_typestore(Stores.ROS1_NOETIC)
         command = "pr2_controllers_msgs/msg/Pr2GripperCommand"
         self.store.register(get_types_from_msg(_GRIPPER, command))
-        if ros == 1:
-            transforms = "geometry_msgs/TransformStamped[] transforms\n"
-            self.store.register(get_types_from_msg(transforms, "tf2_msgs/msg/TFMessage"))
-        self.log_type = "rosgraph_msgs/msg/Log" if ros == 1 else "rcl_interfaces/msg/Log"
+        transforms = "geometry_msgs/TransformStamped[] transforms\n"
+        self.store.register(get_types_from_msg(transforms, "tf2_msgs/msg/TFMessage"))
 
     def encode(self, message: object, msgtype: str) -> bytes:
         """A message as bytes."""
-        if self.ros == 1:
-            return bytes(self.store.serialize_ros1(message, msgtype))
-        return bytes(self.store.serialize_cdr(message, msgtype, little_endian=True))
+        return bytes(self.store.serialize_ros1(message, msgtype))
 
     def make(self, msgtype: str, values: Values) -> Any:
         """A message with values by path; the other fields are zero or empty."""
@@ -166,9 +161,10 @@ class Topic(NamedTuple):
     latched: bool = False
     fill: Fill = lambda _speaker, _ticks: ({}, {})
 
-    def type_in(self, types: Types) -> str:
+    @property
+    def spelled(self) -> str:
         """Message type as rosbags spells it."""
-        return types.log_type if self.name == "/rosout" else self.msgtype.replace("/", "/msg/")
+        return self.msgtype.replace("/", "/msg/")
 
     def ticks(self, start: float, end: float, block: int, robot: Robot) -> Ticks:
         """The message times in `[start, end)` seconds."""
@@ -193,7 +189,7 @@ class Topic(NamedTuple):
     def messages(self, speaker: Speaker, ticks: Ticks) -> Iterator[Any]:
         """Each message; the next one overwrites it."""
         values, columns = self.fill(speaker, ticks)
-        message = speaker.types.make(self.type_in(speaker.types), values)
+        message = speaker.types.make(self.spelled, values)
         if hasattr(message, "header"):
             columns |= {"header.stamp": ticks.stamp, "header.seq": ticks.number}
         yield from speaker.types.filled(message, columns, len(ticks.seconds))
@@ -333,10 +329,8 @@ def _info(speaker: Speaker, _ticks: Ticks) -> Filled:
     values |= {"width": camera.width, "distortion_model": "plumb_bob"}
     k = np.array([[camera.focal, 0, cx], [0, camera.focal, cy], [0, 0, 1]])
     p = np.append(k, np.zeros((3, 1)), axis=1)
-    matrices = {"d": np.zeros(5), "k": k.ravel(), "r": np.eye(3).ravel(), "p": p.ravel()}
-    for name, numbers in matrices.items():
-        values[name.upper() if speaker.types.ros == 1 else name] = numbers
-    return values, {}
+    matrices = {"D": np.zeros(5), "K": k.ravel(), "R": np.eye(3).ravel(), "P": p.ravel()}
+    return values | matrices, {}
 
 
 topic(
@@ -526,8 +520,7 @@ def _diagnostics(speaker: Speaker, ticks: Ticks) -> Filled:
 
 @topic("/rosout", "rosgraph_msgs/Log", "/rosout", moments=lambda r: [m.seconds for m in r.remarks])
 def _text_log(speaker: Speaker, ticks: Ticks) -> Filled:
-    levels = (2, 4, 8) if speaker.types.ros == 1 else (20, 30, 40)
-    grades = dict(zip(("info", "warn", "error"), levels, strict=True))
+    grades = {"info": 2, "warn": 4, "error": 8}
     remarks = [speaker.robot.remarks[k] for k in ticks.number]
     rows = [(grades[r.severity], r.node, r.text, 100 + len(r.text)) for r in remarks]
     columns: Values = dict(

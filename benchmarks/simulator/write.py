@@ -9,11 +9,11 @@ from __future__ import annotations
 import json
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import lz4.frame
 import numpy as np
-from rosbags import rosbag1, rosbag2
+from rosbags import rosbag1
 
 from benchmarks.simulator.robot import Robot
 from benchmarks.simulator.topics import DEMO, RobotConfig, Speaker, Types, topics_of
@@ -50,8 +50,6 @@ def write_bag(
     *,
     duration_s: float = DEFAULT_DURATION_S,
     seed: int = DEFAULT_SEED,
-    ros: Literal[1, 2] = 1,
-    storage: Literal["mcap", "sqlite3"] = "mcap",
     is_compressed: bool = False,
     topics: Iterable[str] | None = None,
     config: RobotConfig | None = None,
@@ -59,37 +57,43 @@ def write_bag(
     """Simulate a robot and write its log.
 
     Args:
-        path: The bag, which must not exist: a `.bag` file for ROS 1, a directory for ROS 2.
+        path: The bag, which must not exist.
         duration_s: Seconds of log time; the bag spans `[0, duration_s)`.
         seed: Determines the furniture, the noise and the day.
-        ros: Version of the messages and the bag.
-        storage: File format within a ROS 2 bag.
-        is_compressed: Whether the chunks of a ROS 1 bag are, by lz4.
+        is_compressed: Whether the chunks of the bag are, by lz4.
         topics: Exact names; None for all.
         config: Sizes of the large messages.
     """
     path = Path(path)
-    speaker = Speaker(Robot(duration_s, seed), config or RobotConfig(), Types(ros))
+    speaker = Speaker(Robot(duration_s, seed), config or RobotConfig(), Types())
     wanted = None if topics is None else {*topics}
     every = topics_of(speaker.config)
     chosen = [topic for topic in every if wanted is None or topic.name in wanted]
     assert wanted is None or len(chosen) == len(wanted), wanted
     counts = Counter({topic.name: 0 for topic in chosen})
     truth = Counter({fact: 0 for fact, _ in _FACTS.values()})
-    with _writer(path, ros, storage, is_compressed=is_compressed) as writer:
-        connections = []
-        for topic in chosen:
-            about: dict[str, Any] = {"typestore": speaker.types.store}
-            if ros == 1:
-                about |= {"callerid": topic.node, "latching": int(topic.latched) or None}
-            msgtype = topic.type_in(speaker.types)
-            connections.append(writer.add_connection(topic.name, msgtype, **about))
+    writer = rosbag1.Writer(path)
+    if is_compressed:
+        writer.set_compression(writer.CompressionFormat.LZ4)
+        # A tenth smaller, and read as fast.
+        writer.compressor = lambda chunk: bytes(lz4.frame.compress(chunk, compression_level=12))
+    with writer:
+        connections = [
+            writer.add_connection(
+                topic.name,
+                topic.spelled,
+                typestore=speaker.types.store,
+                callerid=topic.node,
+                latching=int(topic.latched) or None,
+            )
+            for topic in chosen
+        ]
         for log_time, _, index, payload, fact in _messages(speaker, chosen):
             writer.write(connections[index], log_time, payload)
             counts[chosen[index].name] += 1
             truth[fact] += 1
     del truth[""]
-    size = sum(f.stat().st_size for f in ([path] if path.is_file() else path.iterdir()))
+    size = path.stat().st_size
     return BagSummary(path, size, dict(counts), speaker.robot.start_ns, dict(truth))
 
 
@@ -121,7 +125,7 @@ def _messages(speaker: Speaker, topics: list[Topic]) -> Iterator[tuple[int, int,
             for log_time, message in zip(log_times.tolist(), messages, strict=True):
                 # Messages that arrive after the recording has stopped are not in it.
                 if log_time < end_ns:
-                    payload = speaker.types.encode(message, topic.type_in(speaker.types))
+                    payload = speaker.types.encode(message, topic.spelled)
                     fact = name if shows(message) else ""
                     waiting.append((log_time, arrival, index, payload, fact))
                     arrival += 1
@@ -131,15 +135,3 @@ def _messages(speaker: Speaker, topics: list[Topic]) -> Iterator[tuple[int, int,
         ready = sum(message[0] < border for message in waiting)
         yield from waiting[:ready]
         del waiting[:ready]
-
-
-def _writer(path: Path, ros: int, storage: str, *, is_compressed: bool) -> Any:
-    if ros == 2:
-        plugin = rosbag2.StoragePlugin[storage.upper()]
-        return rosbag2.Writer(path, version=9, storage_plugin=plugin)
-    writer = rosbag1.Writer(path)
-    if is_compressed:
-        writer.set_compression(writer.CompressionFormat.LZ4)
-        # A tenth smaller, and read as fast.
-        writer.compressor = lambda chunk: bytes(lz4.frame.compress(chunk, compression_level=12))
-    return writer

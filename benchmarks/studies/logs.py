@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from benchmarks.loads.robot import robot_load
 from benchmarks.samples import Sample, Scale
-from benchmarks.studies.record import BACKENDS, short
-from benchmarks.studies.runs import Context, chosen
+from benchmarks.studies.record import short
+from benchmarks.studies.runs import Context
 from benchmarks.studies.search import Bounds, Search, take_turns
 
 if TYPE_CHECKING:
@@ -32,7 +32,6 @@ class Settings(NamedTuple):
 
 SETTINGS: dict[Scale, Settings] = {
     "full": Settings(20, Bounds(2.0, 0.5, 256.0, 1)),
-    "quick": Settings(8, Bounds(2.0, 0.5, 256.0, 0)),
     "tiny": Settings(1, Bounds(2.0, 2.0, 2.0, 0)),
 }
 
@@ -49,7 +48,7 @@ def run(context: Context, repetition: int) -> None:
 
         return Search(bounds, trial)
 
-    take_turns([search(name) for name in chosen(context.backends, BACKENDS)])
+    take_turns([search(name) for name, kind in context.backends.items() if kind.records])
 
 
 def make_load(context: Context, seconds: int) -> Load:

@@ -10,7 +10,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from benchmarks.loads.hcr_like import hcr_like, true_answers
-from benchmarks.questions.askers import ASKERS
 from benchmarks.questions.base import QUESTIONS
 from benchmarks.questions.run import judged, turns
 from benchmarks.samples import Sample, Scale
@@ -36,7 +35,6 @@ class Settings(NamedTuple):
 
 SETTINGS: dict[Scale, Settings] = {
     "full": Settings(4, 10.0, 5),
-    "quick": Settings(2, 5.0, 3),
     "tiny": Settings(1, 1.0, 1),
 }
 
@@ -52,7 +50,7 @@ def run(context: Context) -> None:
         lambda place: hcr_like(place, seed=seed, sessions=sessions, minutes=minutes),
     )
     truth = true_answers(load)
-    for name, outcome, results in turns(context, "ask", ASKERS, load, repetitions):
+    for name, outcome, results in turns(context, "ask", load, repetitions):
         for question in QUESTIONS:
             case = {"question": question, **about}
             result = results.get(question)

@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from benchmarks.questions import tasks
-from benchmarks.questions.askers import READERS
 from benchmarks.questions.run import judged, turns
 from benchmarks.samples import Sample, Scale
 from benchmarks.studies import logs
@@ -32,7 +31,6 @@ class Settings(NamedTuple):
 
 SETTINGS: dict[Scale, Settings] = {
     "full": Settings(30, 3),
-    "quick": Settings(20, 2),
     "tiny": Settings(2, 1),
 }
 
@@ -42,7 +40,7 @@ def run(context: Context) -> None:
     seconds, repetitions = SETTINGS[context.scale]
     load = logs.make_load(context, seconds)
     truth = tasks.true_answers(load, repetitions)
-    for name, outcome, results in turns(context, "read", READERS, load, repetitions):
+    for name, outcome, results in turns(context, "read", load, repetitions):
         for task in tasks.TASKS:
             found = results.get(task, [None] * repetitions)
             for repetition, result in enumerate(found):

@@ -14,14 +14,13 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from benchmarks.loads import streams
 from benchmarks.samples import Sample, Scale
-from benchmarks.studies.runs import Context, chosen
+from benchmarks.studies.runs import Context
 from benchmarks.studies.search import Bounds, Search, take_turns
 
 if TYPE_CHECKING:
     from benchmarks.loads.base import Load
 
 STUDY = "record"
-BACKENDS = ("hybridlog", "mongo", "postgres", "sqlite", "bagfile", "mcap", "nothing")
 HARNESS = "nothing"
 """The backend that shows what the harness itself can carry."""
 SIZES = (5_000, 40_000, 640_000)
@@ -48,7 +47,6 @@ class Settings(NamedTuple):
 
 SETTINGS: dict[Scale, Settings] = {
     "full": Settings(5.0, 60, Bounds(START, 1.0, 16_384.0, 1)),
-    "quick": Settings(2.0, 25, Bounds(START, 1.0, 16_384.0, 0)),
     "tiny": Settings(0.1, 3, Bounds(START, START, START, 0)),
 }
 
@@ -61,7 +59,7 @@ def run(context: Context, size: int, repetition: int) -> None:
         size: Bytes of a message.
         repetition: Which of the searches.
     """
-    names = chosen(context.backends, BACKENDS)
+    names = [name for name, kind in context.backends.items() if kind.records]
     take_turns([_search(context, name, size, repetition) for name in names])
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,15 +14,10 @@ from benchmarks.harness.run import run as run_load
 from benchmarks.loads.base import Load
 from benchmarks.progress import Progress
 from benchmarks.samples import Journal, Sample, Scale
-from hybridlog_storage.threads import processors
 
 if TYPE_CHECKING:
     from benchmarks.backends.base import Backend
 
-_TAKEN_SHARE = 0.05
-"""A host that takes more of the processors' time away than this disturbs a run."""
-_MAX_RUNS = 3
-"""So often a disturbed run is done altogether."""
 _DIGESTED_S = 500e6  # bytes a second of what a run has kept that the machine is done with,
 _DIGESTING_S = 12.0  # and seconds after which it is done with all
 
@@ -67,7 +62,7 @@ class Context:
         return Load.open(place)
 
     def run(self, wanted: Sample, load: Callable[[], Load], *, speed: float = 1.0) -> Sample:
-        """Run one case with one backend; a full run does it again when the host disturbed it.
+        """Run one case with one backend.
 
         Args:
             wanted: Study, case, backend and repetition.
@@ -82,26 +77,11 @@ class Context:
             sample = replace(wanted, status="missing", reason=reason)
         else:
             with self.progress.step(_described(wanted)):
-                sample = self._run_undisturbed(wanted, load(), speed)
+                sample = self._run(wanted, load(), speed)
         if sample.status == "missing":
             self.missing[wanted.backend] = sample.reason
         self.journal.add(sample)
         return sample
-
-    def _run_undisturbed(self, wanted: Sample, load: Load, speed: float) -> Sample:
-        """The sample of the run that the host disturbed least."""
-        best = self._run(wanted, load, speed)
-        for _ in range(1, _MAX_RUNS):
-            values = best.values
-            # A run that kept everything kept it in spite of the machine.
-            lost = best.status == "ok" and values["published"] != values["persisted"]
-            if self.scale != "full" or not lost or _share_taken(values) <= _TAKEN_SHARE:
-                break
-            again = self._run(wanted, load, speed)
-            if again.status != "ok":
-                return again
-            best = min(again, best, key=lambda sample: _share_taken(sample.values))
-        return best
 
     def _run(self, wanted: Sample, load: Load, speed: float) -> Sample:
         backend = self.backends[wanted.backend]
@@ -114,21 +94,10 @@ class Context:
         return replace(wanted, status=outcome.status, values=values, reason=outcome.reason)
 
 
-def chosen(backends: Mapping[str, type[Backend]], names: Sequence[str]) -> dict[str, type[Backend]]:
-    """Those of the backends that a study has, in its order."""
-    return {name: backends[name] for name in names if name in backends}
-
-
 def _described(sample: Sample) -> str:
     """A run in a line of progress."""
     case = ", ".join(f"{name} {value}" for name, value in sample.case.items())
     return f"{sample.study}: {sample.backend}, {case}, round {sample.repetition + 1}"
-
-
-def _share_taken(values: Mapping[str, Any]) -> float:
-    """Share of all processors' time that the host of this machine took during a run."""
-    taken: float = values["steal_s"]
-    return taken / (values["wall_s"] * processors())
 
 
 def _digesting_s(values: Mapping[str, Any]) -> float:

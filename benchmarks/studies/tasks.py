@@ -1,6 +1,6 @@
-"""What a user does with a store: commands, SQL, many recordings, the page, buckets.
+"""What a user does with a store: commands, SQL, many recordings, the page.
 
-All of it but `many` and `remote` is about one recording of the robot's log. Each group runs
+All of it but `many` is about one recording of the robot's log. Each group runs
 in a process of its own; a figure is the median of several times after a first one, on the clock
 and of the processor (that of MongoDB is not counted).
 """
@@ -17,7 +17,6 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -55,7 +54,6 @@ class Settings(NamedTuple):
 
 SETTINGS: dict[Scale, Settings] = {
     "full": Settings(600, 1000, 5),
-    "quick": Settings(300, 1000, 3),
     "tiny": Settings(10, 10, 1),
 }
 NEAR = "/odom: twist.twist.linear.x > 1.2"
@@ -111,7 +109,7 @@ def run(context: Context, group: str) -> None:
     with context.progress.step(f"tasks: {group}"), run_directory(context.work) as directory:
         arguments = {"directory": str(directory), "seed": context.seed, **settings._asdict()}
         try:
-            if group not in {"many", "remote"}:
+            if group != "many":
                 arguments["store"] = str(robot_store(context, settings))
             side = f"{__name__}:{group}_side"
             values = run_side(side, arguments, directory, _TIMEOUT_S)
@@ -347,12 +345,5 @@ def _resident_mb(pid: int) -> float:
     return rss(with_children([pid])) / 1e6
 
 
-def remote_side(*, directory: str, **_: Any) -> Values:
-    """Requests and bytes of a bucket."""
-    from benchmarks.remote import measure
-
-    return {"rows": [asdict(cost) for cost in measure(Path(directory))]}
-
-
-GROUPS = ("commands", "sql", "many", "page", "remote")
+GROUPS = ("commands", "sql", "many", "page")
 """In their order; `<name>_side` does each."""

@@ -149,7 +149,6 @@ def test_values_of_a_good_run(tmp_path: Path, start: Runner) -> None:
     assert 5 << 20 < values["peak_rss"] < 200 << 20
     assert values["disk_bytes"] > 0
     assert 1 < values["spin_ms"] < 2000
-    assert values["steal_s"] >= 0
 
 
 def test_a_full_queue_drops_and_only_its_own_messages(tmp_path: Path, start: Runner) -> None:

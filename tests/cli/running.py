@@ -1,4 +1,4 @@
-"""Runs the command line as a user does: in a process of its own."""
+"""Runs the command line as a user does: in this process, or in one of its own."""
 
 from __future__ import annotations
 
@@ -9,20 +9,23 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+import pytest
+from click.testing import CliRunner
+
+from hybridlog.cli.main import _run as run_app
 from tests import places
-from tests.cli.fork_server import fork_server
 from tests.cli.within import Answer
 
 COMMAND = [sys.executable, "-m", "hybridlog"]
 BACKGROUND = ("sh", "-c", 'trap "" INT; exec "$@"', "sh")
 """A wrapper: SIGINT is ignored, as for background jobs of scripts."""
+NOT_INHERITED = ("HYBRIDLOG_STORE", "COLUMNS", "PYTHONUNBUFFERED")
 _LIMIT_S = 120
 
 
 def environment(**extra: str) -> dict[str, str]:
     """No store or MongoDB by accident, and output as users have it, whatever the terminal is."""
-    without = {"HYBRIDLOG_STORE", "COLUMNS", "PYTHONUNBUFFERED"}
-    kept = {k: v for k, v in os.environ.items() if k not in without}
+    kept = {k: v for k, v in os.environ.items() if k not in NOT_INHERITED}
     return {**kept, "LC_ALL": "C.UTF-8", **extra}
 
 
@@ -33,39 +36,53 @@ def run(
     before: Callable[[], None] | None = None,
     **env: str,
 ) -> Answer:
-    """Run a command to its end.
+    """Run a command to its end, as its process would.
 
     Args:
         arguments: Of the command.
         store: What HYBRIDLOG_STORE says.
         code: The exit code that is expected; None for any.
-        before: Called in its process, which is then a fresh one.
+        before: Called in a process of its own, which then runs the command.
         env: Variables.
     """
     if store is not None:
         env["HYBRIDLOG_STORE"] = str(store)
     words = [os.fsdecode(a) if isinstance(a, bytes) else str(a) for a in arguments]
-    variables = environment(**env)
-    forked = None if before else fork_server().run(words, variables, _LIMIT_S)
-    ended = forked or subprocess.run(
-        [*COMMAND, *words],
-        stdin=subprocess.DEVNULL,
-        preexec_fn=before,
-        capture_output=True,
-        env=variables,
-        timeout=_LIMIT_S,
-        check=False,
-    )
-    done = Answer(
-        ended.stdout.decode("utf-8", "replace"),
-        ended.stderr.decode("utf-8", "replace"),
-        ended.returncode,
-        ended.stdout,
-    )
+    done = _within(words, env) if before is None else _apart(words, env, before)
     assert "Traceback" not in done.err, done.err
     if code is not None:
         assert done.code == code, (done.code, done.out[-2000:], done.err[-2000:])
     return done
+
+
+def _within(words: list[str], env: dict[str, str]) -> Answer:
+    variables = {**dict.fromkeys(NOT_INHERITED), "LC_ALL": "C.UTF-8", **env}
+    with (
+        CliRunner().isolation(env=variables) as (out, err, _),
+        pytest.MonkeyPatch.context() as patch,
+    ):
+        patch.setattr(sys, "argv", ["hybridlog", *words])
+        for stream in (sys.stdout, sys.stderr):
+            stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
+        code = run_app()
+        for stream in (sys.stdout, sys.stderr):
+            stream.flush()
+        raw, said = out.getvalue(), err.getvalue()
+    return Answer(raw.decode("utf-8", "replace"), said.decode("utf-8", "replace"), code, raw)
+
+
+def _apart(words: list[str], env: dict[str, str], before: Callable[[], None]) -> Answer:
+    ended = subprocess.run(
+        [*COMMAND, *words],
+        stdin=subprocess.DEVNULL,
+        preexec_fn=before,
+        capture_output=True,
+        env=environment(**env),
+        timeout=_LIMIT_S,
+        check=False,
+    )
+    said = (ended.stdout.decode("utf-8", "replace"), ended.stderr.decode("utf-8", "replace"))
+    return Answer(*said, ended.returncode, ended.stdout)
 
 
 def complete(words: str) -> list[str]:
@@ -83,11 +100,6 @@ def complete(words: str) -> list[str]:
     )
     assert ended.stderr == ""
     return [line.partition(",")[2] for line in ended.stdout.splitlines() if line]
-
-
-def forked() -> list[str]:
-    """`COMMAND`, faster, for processes that nobody kills and no terminal controls."""
-    return [str(fork_server().path / "hybridlog")]
 
 
 @contextmanager

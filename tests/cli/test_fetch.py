@@ -7,12 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from hybridlog.cli import output
-from hybridlog.cli.answers import print_end
-from hybridlog.query.question import Counters
-from tests.independent import Seen, read_bag, read_mcap
+from tests.independent import Seen, read_bag
 
-from . import odd_log
 from .running import COMMAND, environment, run
 
 SCAN = ("fetch", "-t", "/base/scan", "-r", "robot")
@@ -57,27 +53,6 @@ def test_a_wrong_predicate_is_pointed_at(store: Path) -> None:
     assert message.startswith("hybridlog: ")
     assert text.strip() == "ranges.min << 0.5"
     assert text[caret.index("^")] == "<"
-
-
-def test_latched_messages_stand_in_front(store: Path, seen: list[Seen], tmp_path: Path) -> None:
-    asked = ("-t", "scan", "-t", "tf_static", "-r", "robot", "--between", "+2s", "+3s")
-    done = run("fetch", *asked, "-o", tmp_path / "x.mcap", "-v", store=store)
-    static = next(m for m in seen if m.topic == "/tf_static")
-    found = read_mcap(tmp_path / "x.mcap")
-    assert found[0].payload == static.payload
-    assert found[0].log_time > static.log_time
-    assert f"{len(found) - 1} messages and 1 latched message in front, " in done.err
-    done = run("export", *asked, tmp_path / "y.mcap", "--original-times", store=store)
-    assert f"{len(found) - 1} messages and 1 latched message in front, " in done.err
-    assert read_mcap(tmp_path / "y.mcap") == [static, *found[1:]]
-    done = run("fetch", *asked, "-o", tmp_path / "z.mcap", "--no-latched", store=store)
-    assert read_mcap(tmp_path / "z.mcap") == found[1:]
-    assert "latched" not in done.err
-    done = run("fetch", *asked, "-o", tmp_path / "x.mcap", "--force", store=store)
-    assert done.err == "1 latched message in front\n"
-    # The message at a time is one message.
-    at = ("fetch", "-t", "tf_static", "-r", "robot", "--at", "+2s", "-o", tmp_path / "at.mcap")
-    assert "1 message, " in run(*at, "-v", store=store).err
 
 
 def test_nothing_is_overwritten_without_force(store: Path, tmp_path: Path) -> None:
@@ -140,28 +115,6 @@ def test_damage_that_has_cost_no_message(logs: Path, tmp_path: Path) -> None:
     assert "coverage   complete, although its source was damaged in 1 place" in info
     assert "source damaged: open.mcap" in info
     assert "messages lost" not in info
-
-
-@pytest.mark.parametrize("topic", ["code", "recursive", "cbor", "no_definition"])
-def test_what_is_no_table_is_still_exact(topic: str, store: Path) -> None:
-    refused = run("fetch", "-t", topic, store=store, code=10)
-    assert "--format raw" in refused.err
-    assert run("fetch", "-t", topic, "-F", "raw", store=store).raw
-
-
-def test_messages_that_do_not_fit_are_counted(store: Path, tmp_path: Path) -> None:
-    done = run("fetch", "-t", "long", "-o", tmp_path / "x.csv", store=store)
-    assert f"{odd_log.PER_TOPIC} messages do not fit their definition" in done.err
-    one = run("fetch", "-t", "long", "-n", "1", store=store)
-    assert "1 message does not fit its definition and is not in this answer" in one.err
-    exact = run("fetch", "-t", "long", "-F", "raw", store=store)
-    assert exact.raw == odd_log.claims_4_gb() * odd_log.PER_TOPIC
-
-
-def test_the_closing_line_counts_what_is_given(capsys: pytest.CaptureFixture[str]) -> None:
-    output.begin(None)
-    print_end(Counters(messages=251, reduced=12), 0.1, verbose=True)
-    assert capsys.readouterr().err.startswith("239 messages, ")
 
 
 def test_remarks_follow_the_closing_line(store: Path) -> None:

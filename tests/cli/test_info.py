@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import re
 import struct
 from pathlib import Path
-from shlex import quote
 
 import hybridlog as hl
 from hybridlog.cli.output import quoted
 from hybridlog.wording import parse_size
 from hybridlog_storage.messages import Channel, Schema
-from tests import places
-from tests.independent import read_bag, write_mcap
+from tests.independent import read_bag
 
 from .odd_log import HOSTILE_NAME
 from .running import run
@@ -64,35 +61,6 @@ def test_info_without_a_name_shows_all_and_the_losses(store: Path) -> None:
     assert done.err == ""
 
 
-def test_info_of_what_a_program_recorded_names_no_address(tmp_path: Path) -> None:
-    with (
-        hl.open(tmp_path / "store", create=True) as store,
-        store.start("mine") as recording,
-    ):
-        recording.write(Channel("/n", "json", Schema("", "", b"")), b"{}")
-    text = run("info", "mine", store=tmp_path / "store").out
-    assert re.search(r"^source +live *$", text, re.MULTILINE)
-
-
-def test_info_of_a_segment(logs: Path, store: Path) -> None:
-    path = places.segment(store, "robot")
-    found = run("info", path, "--json").json
-    assert found["recording"]["name"] == "robot"
-    assert found["recording"]["id"] == run("info", "robot", "--json", store=store).json[0]["id"]
-    paths = places.folder(store, "robot").glob("*.mcap")
-    channels = [c for one in paths for c in run("info", one, "--json").json["channels"]]
-    assert sum(c["messages"] for c in channels) == len(read_bag(logs / "robot.bag"))
-    assert "/tf_static" in run("info", path).out
-
-
-def test_a_log_is_told_from_a_recording(logs: Path, store: Path, tmp_path: Path) -> None:
-    (tmp_path / "a bag").mkdir()
-    for log in (logs / "odd.mcap", logs / "robot.bag", tmp_path / "a bag"):
-        refused = run("info", log, store=store, code=5).err
-        assert f"{log} is no whole segment of a store. " in refused
-        assert f"`hybridlog record {quote(str(log))}` makes a recording." in refused
-
-
 def test_stamps_that_were_not_set_are_no_delay(tmp_path: Path) -> None:
     kind = Schema("test_msgs/A", "ros1msg", b"Header header\n" + HEADER)
     stamps = {"/never": [0, 0], "/late": [0, 5], "/all": [5, 5]}
@@ -132,44 +100,6 @@ def test_schema(store: Path) -> None:
     fields = {f["path"]: f["type"] for f in found["fields"]}
     assert fields["header.stamp"] == "time"
     assert fields["angle_min"] == "float32"
-
-
-def test_schema_of_a_topic_whose_type_changes(store: Path) -> None:
-    found = run("info", "-t", "change", "--json", store=store).json
-    assert [item["type"] for item in found] == ["std_msgs/msg/String", "std_msgs/msg/Int32"]
-
-
-def test_schema_of_json_has_the_fields_that_messages_have(store: Path, tmp_path: Path) -> None:
-    (found,) = run("info", "-t", "json", "--json", store=store).json
-    assert found["observed"]
-    assert [(f["path"], f["type"]) for f in found["fields"]] == [
-        ("a", "integer"),
-        ("b", "integer[]"),
-    ]
-    messages = [
-        {"wind": {"speed": 1, "odd name": None}, "gusts": [{"v": 1}, {"v": 2}]},
-        {"wind": {"speed": 0.5}, "gusts": [], "ok": True},
-        [1, 2],
-    ]
-    channel = Channel("/weather", "json", None)
-    said = [(channel, time, json.dumps(message).encode()) for time, message in enumerate(messages)]
-    write_mcap(tmp_path / "weather.mcap", [*said, (channel, 9, b"{")])
-    run("record", tmp_path / "weather.mcap", store=tmp_path / "s")
-    (found,) = run("info", "-t", "weather", "--json", store=tmp_path / "s").json
-    fields = {f["path"]: (f["type"], f["array"]) for f in found["fields"]}
-    assert fields == {
-        "wind": ("object", False),
-        "wind.speed": ("number", False),
-        "wind.`odd name`": ("null", False),
-        "gusts": ("array|object[]", True),
-        "gusts[].v": ("integer", True),
-        "ok": ("bool", False),
-    }
-    for path in fields:
-        where = ("--where", f"{path} exists", "--count")
-        assert int(run("fetch", "-t", "weather", *where, store=tmp_path / "s").out) > 0
-    shown = run("info", "-t", "weather", store=tmp_path / "s").out
-    assert "No definition fixes the fields" in shown
 
 
 def test_control_characters_are_shown_not_obeyed(store: Path) -> None:

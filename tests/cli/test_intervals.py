@@ -2,17 +2,9 @@
 
 from __future__ import annotations
 
-import io
-import json
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-
-from hybridlog.cli.render import Column, print_table
-from hybridlog.formats.answer import Answer
-from hybridlog.formats.jsonl import write_json
-from tests.limits import Limit
 
 from .running import run
 
@@ -32,37 +24,6 @@ def test_intervals_as_a_table(store: Path) -> None:
     assert run(*asked, "--at-least", "1min", "--json", store=store).json == []
     assert run(*asked, "--between", "+1s", "+2s", "--json", store=store).json[0]["messages"] > 10
     assert len(run(*asked, "--max-gap", "1ms", "--json", store=store).json) > 100
-
-
-def test_long_answers_are_printed_some_rows_at_a_time(
-    capsys: pytest.CaptureFixture[str], limit: Limit
-) -> None:
-    limit(printed_rows_at_once=2)
-    printed: list[str] = []
-
-    def rows() -> Iterator[list[str]]:
-        for n in range(5):
-            printed.append(capsys.readouterr().out)
-            yield [str(10**n), "x" * (5 - n)]
-
-    print_table([Column("number", 0, "right"), Column("text", 1)], rows())
-    printed.append(capsys.readouterr().out)
-    assert [bool(text) for text in printed] == [False, False, True, False, True, True]
-    assert "".join(printed).splitlines() == [
-        "number  text",
-        "     1  xxxxx",
-        "    10  xxxx",
-        "   100  xxx",
-        "  1000  xx",
-        " 10000  x",
-    ]
-    print_table([Column("none")], [])
-    assert capsys.readouterr().out == ""
-    for values in ([], [{"a": "1\n2", "b": [1, {"c": None}]}, {}], [3]):
-        target = io.BytesIO()
-        texts = [json.dumps(value) for value in values]
-        write_json(Answer(lines=[[line] for one in texts for line in (one, iter(one))]), target)
-        assert json.loads(target.getvalue()) == [one for one in values for _ in range(2)]
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -60,36 +59,6 @@ def test_rows_have_all_forms(words: tuple[str, ...], store: Path, tmp_path: Path
 def _set(row: dict[str, object]) -> dict[str, object]:
     """The row without its nulls, which few of the forms have."""
     return {name: value for name, value in row.items() if value is not None}
-
-
-def test_ages_choose(tmp_path: Path) -> None:
-    now = time.time_ns()
-    day = 86_400 * 10**9
-    with hl.open(tmp_path / "s", create=True) as opened:
-        for name, ages in (("old", (40, 35)), ("both", (35, 1)), ("new", (2, 1))):
-            with opened.start(name) as recording:
-                for age in ages:
-                    text = json.dumps({"age": age}).encode()
-                    recording.write(CHANNEL, text, log_time=now - age * day)
-        labels = [one.name for one in opened.recordings(older_than="30d")]
-        assert labels == ["old"]
-
-    def found(*words: str) -> list[str]:
-        return [one["name"] for one in answer("ls", *words, "--json", store=tmp_path / "s").json]
-
-    assert found("--last", "30d") == ["both", "new"]
-    assert found("--older-than", "30d") == ["old"]
-    assert found("--older-than", "12h", "--last", "30d") == ["both", "new"]
-    # Messages of day 35 are in a recording of the last thirty days, and are none of them.
-    assert answer("fetch", "n", "--last", "30d", "--count", store=tmp_path / "s").out == "3\n"
-    assert answer("stats", "n", "--last", "30d", "--json", store=tmp_path / "s").json[0]["max"] == 2
-    for other in ("--between", "--during"):
-        assert (
-            f"--last and {other} exclude each other"
-            in answer(
-                "fetch", "n", "--last", "30d", other, "start", "end", store=tmp_path / "s", code=2
-            ).err
-        )
 
 
 def test_what_needs_another_option(store: Path) -> None:

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import os
-import shutil
-from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
-import hybridlog as hl
 from tests import places
 from tests.independent import read_bag
 from tests.json_schemas import misfit, schema_of
 
-from .running import run, started
+from .running import run
 
 pytestmark = pytest.mark.mongo
 
@@ -87,26 +83,6 @@ def test_choices(logs: Path, tmp_path: Path) -> None:
     assert {c.compression for c in summary.chunk_indexes} <= {"lz4", ""}
 
 
-def test_a_slice_has_latched_messages_in_front(logs: Path, tmp_path: Path) -> None:
-    seen = read_bag(logs / "robot.bag")
-    start = min(m.log_time for m in seen) + 2 * 10**9
-    asked = ("record", logs / "robot.bag", "-t", "tf_static", "-t", "odom", "--again")
-    between = ("--between", "+2s", "+2100ms")
-    inside = [m for m in seen if m.topic == "/odom" and start <= m.log_time < start + 10**8]
-    with hl.open(tmp_path / "s", create=True):
-        done = run(*asked, *between, store=tmp_path / "s")
-        told = {name: cells for name, *cells in map(str.split, done.lines)}
-        assert (told["messages"], told["from"]) == ([str(len(inside) + 1)], ["before", "1"])
-        assert told["left"] == ["out", str(len(seen) - len(inside) - 1)]
-        found = run(*asked, *between, "--no-latched", "--json", store=tmp_path / "s").json[0]
-        assert (found["messages"], found["messages_latched"]) == (len(inside), 0)
-        # A range without messages is refused, although a latched message is in force.
-        first = min(m.log_time for m in inside)
-        empty = ("--between", f"{first + 1}ns", f"{first + 2}ns")
-        assert "has no message from" in run(*asked, *empty, store=tmp_path / "s", code=2).err
-        assert len(places.names(tmp_path / "s")) == 2
-
-
 def test_what_cannot_be_indexed_is_said(logs: Path, tmp_path: Path) -> None:
     done = run("record", logs / "odd.mcap", store=tmp_path / "s")
     for topic in ("/code", "/recursive", "/no_definition", "/cbor"):
@@ -160,27 +136,3 @@ def test_a_damaged_log_says_where(logs: Path, tmp_path: Path) -> None:
     assert damage["file"].endswith("torn.bag")
     assert 0 < damage["offset"] <= (logs / "torn.bag").stat().st_size
     run("verify", store=tmp_path / "s")
-
-
-def test_names_that_are_no_utf_8(logs: Path, tmp_path: Path) -> None:
-    odd = Path(os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9.mcap"))
-    shutil.copy(logs / "odd.mcap", odd)
-    tag = os.fsdecode(b"who=Ren\xe9")
-    run("record", odd, "--set-tag", tag, "-q", store=tmp_path / "s")
-    (found,) = run("ls", "--json", store=tmp_path / "s").json
-    assert found["name"] == "caf\\xe9"
-    assert found["tags"] == {"who": "Ren\\xe9"}
-    assert "all is well" in run("verify", store=tmp_path / "s").out
-
-
-def test_one_log_recorded_three_times_at_once(logs: Path, tmp_path: Path) -> None:
-    with ExitStack() as running:
-        three = [
-            running.enter_context(
-                started("record", logs / "small.bag", "--store", tmp_path / "s", output=out)
-            )
-            for out in [tmp_path / "out"] * 3
-        ]
-        codes = sorted(process.wait(120) for process in three)
-    assert codes == [0, 8, 8], (tmp_path / "out").read_text()
-    assert places.names(tmp_path / "s") == ["small"]

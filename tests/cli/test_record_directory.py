@@ -103,42 +103,6 @@ def test_one_error_does_not_stop_the_others(top: Path, store: Path) -> None:
     assert f"{inner} is a store and is not searched; `hybridlog copy --from {inner}`" in err
 
 
-def test_parts_that_are_there_are_not_recorded_twice(top: Path, store: Path) -> None:
-    record(store, top / "bag" / "x_0.mcap")
-    assert record(store, top)[0] == 0
-    assert counts(store) == {"a": 1, "run": 5, "other": 4, "x_0": 5, "x_1": 6}
-    code, _, err = record(store, top / "bag")
-    assert code == 8
-    assert "in the store already, part by part: x_0, x_1." in err
-    assert record(store, top / "bag", "--again", "-q")[0] == 0
-    assert counts(store)["bag"] == 11
-
-
-def test_a_directory_of_one_log_is_that_log(tmp_path: Path, store: Path) -> None:
-    mcap(tmp_path / "drive" / "drive_0.mcap", 2)
-    mcap(tmp_path / "drive" / "drive_1.mcap", 3)
-    assert record(store, tmp_path / "drive", "--name", "first")[0] == 0
-    assert counts(store) == {"first": 5}
-    code, _, err = record(store, tmp_path / "drive")
-    assert (code, "as 'first'" in err) == (8, True)
-    (tmp_path / "nothing").mkdir()
-    assert record(store, tmp_path / "nothing")[0] == 3
-
-
-def test_what_does_not_fit_a_directory(top: Path, tmp_path: Path) -> None:
-    store = tmp_path / "store"
-    for words, said in (
-        ((top, "--name", "x"), "there are 4 logs"),
-        ((top, "--watch", "--name", "x"), "--watch and --name exclude each other"),
-        ((top / "a.mcap", "--watch"), "takes directories"),
-        (("--replay", top / "a.mcap", "--watch"), "--replay and --watch exclude each other"),
-        ((top, "--watch", "--settle", "soon"), "not a duration"),
-    ):
-        code, _, err = record(store, *words)
-        assert (code, said in err) == (2, True), err
-    assert not store.exists()
-
-
 @pytest.fixture
 def looks(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """Sets what happens between the looks of a watch; then it is stopped."""

@@ -14,25 +14,17 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import replace
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import hybridlog as hl
-from hybridlog.cli import record_live
-from hybridlog.cli.live_table import drawn, summary
-from hybridlog.live.sources.base import Sink
-from hybridlog.live.state import RecorderState, TopicState
 from hybridlog_storage.errors import UsageError
 from tests import places
 from tests.cli.running import BACKGROUND, COMMAND, complete, environment, run
 from tests.cli.within import answer
 from tests.independent import read
-from tests.limits import Limit
-from tests.live.speaker import Speaker, text, text_channel
 from tests.waiting import wait_for
 
 pytestmark = pytest.mark.mongo
@@ -139,29 +131,6 @@ def named(row: str, cell: int) -> set[str]:
     return {*re.findall(r"`(\w+)`", row.split("|")[cell])}
 
 
-def test_each_key_of_its_json_is_in_the_documentation(logs: Path, tmp_path: Path) -> None:
-    text = (Path(__file__).parents[2] / "docs/live.md").read_text("utf-8")
-    section = text.partition("## State for other programs")[2].partition("\n## ")[0]
-    with recorder(
-        tmp_path / "store", "--replay", logs / "small.bag", "--max-messages", 50, "--ring", "9s"
-    ) as process:
-        assert process.stdout is not None
-        lines = [json.loads(line) for line in process.stdout]
-    states = [line["state"] for line in lines[:-1]]
-    keys = {key for line in section.splitlines() if line[:3] == "| `" for key in named(line, 1)}
-    assert keys == states[-1].keys()
-    (topics,) = (named(line, 2) for line in section.splitlines() if line[:10] == "| `topics`")
-    assert {key for state in states for topic in state["topics"] for key in topic} <= topics
-    assert states[-1]["memory_bytes"] > 10 << 20
-    (told,) = (line for line in section.splitlines() if line.startswith("The report has"))
-    report = lines[-1]["report"]
-    assert (report["exit_code"], report["ended"]) == (0, "the limit of messages is reached")
-    assert report.keys() <= {*re.findall(r"`(\w+)`", told)}
-    failed = run("record", "--replay", tmp_path / "none.bag", "--json", store=tmp_path, code=None)
-    assert failed.code != 0
-    assert json.loads(failed.lines[-1])["report"]["exit_code"] == failed.code
-
-
 RECOVERS_WHEN_TOLD = """
 import sys, threading, time
 from importlib import import_module
@@ -211,27 +180,6 @@ def test_what_a_power_cut_left_is_recovered_behind_the_new_recording(
     assert kept is not None
     assert found["robot"]["messages"] == int(kept[1]) > 0
     assert "all is well" in run("verify", store=store).out
-
-
-def test_what_is_thinned_out_is_told(logs: Path, tmp_path: Path) -> None:
-    store = tmp_path / "store"
-    with recorder(
-        store, "--replay", logs / "small.bag", "--throttle", "/imu/data", "5Hz", "-x", "/tf"
-    ) as process:
-        report = end(process, None)
-    topics = report["topics"]
-    assert "/tf" not in topics
-    counted = {t: n["received"] for t, n in topics.items()}
-    lost = report["lost"]["throttle"]
-    assert 0 < lost < counted["/imu/data"]
-    (recording,) = report["recordings"]
-    assert recording["messages"] + lost == report["messages_received"]
-    rows = run("info", "--losses", "--json", "-t", "imu/data", store=store).json
-    assert sum(row["count"] for row in rows) == lost
-    assert {row["cause"] for row in rows} == {"throttle"}
-    assert run("info", "--losses", "--json", "-t", "/joint_states", store=store).json == []
-    assert "left out by a throttle" in run("fetch", "-t", "imu/data", "--count", store=store).err
-    assert "/imu/data" in run("info", "--losses", store=store).out
 
 
 @pytest.mark.parametrize("stream", ["stdout", "stderr"])
@@ -295,57 +243,6 @@ def assert_ctrl_c_leaves_top(store: Path) -> None:
     watching.send_signal(signal.SIGINT)
     _, err = watching.communicate(timeout=30)
     assert (watching.returncode, err) == (0, "")
-
-
-def test_a_ring_keeps_the_end_and_what_is_pinned(logs: Path, tmp_path: Path) -> None:
-    store = tmp_path / "store"
-    with recorder(
-        *(store, "--replay", logs / "robot.bag", "--speed", 0.3, "--flush-interval", "100ms"),
-        *("--ring", "1s", "--before", "500ms", "--after", "300ms", "--quiet", "--name", "the ring"),
-    ) as process:
-        until_it_speaks(process)
-        time.sleep(2)
-        run("mark", "bump", "--pin", "500ms", "300ms", "-r", "the ring", store=store)
-        time.sleep(5)
-        os.kill(process.pid, signal.SIGUSR1)
-        time.sleep(1.5)
-        report, said = end_and_hear(process)
-    assert said == ""  # what is pinned is no trouble
-    (entry,) = run("ls", "--json", store=store).json
-    assert 0 < entry["messages"] < report["messages_received"]
-    (told,) = run("info", "--json", store=store).json
-    assert [pin["reason"] for pin in told["pins"]] == ["bump", "SIGUSR1"]
-    run("export", tmp_path / "part.mcap", "--split-by", "mark", "-q", store=store)
-    assert len([*tmp_path.glob("part-*.mcap")]) == 2
-
-
-LOADS_LITTLE = """
-import sys
-from importlib import import_module
-from hybridlog.live.recorder import Recorder
-
-look = Recorder.look
-
-def checked(self):
-    assert not {"pyarrow", "pandas", "pymongo"} & {*sys.modules}
-    return look(self)
-
-Recorder.look = checked
-import_module("hybridlog.cli.main").main()
-"""
-
-
-def test_a_recorder_loads_nothing_of_what_its_follower_does(logs: Path, tmp_path: Path) -> None:
-    store = tmp_path / "store"
-    with hl.open(store, create=True) as opened:
-        opened.directory.change_settings(retention={"quota": "4MB"})
-    words = ("--replay", logs / "robot.bag", "--speed", 5, "--split-size", "1MiB")
-    program = (sys.executable, "-c", LOADS_LITTLE)
-    with recorder(store, *words, "--trigger", "/map: data == 0", program=program) as process:
-        report = end(process, None)
-    (recording,) = report["recordings"]
-    assert recording["messages"] == recording["messages_indexed"] == report["messages_received"]
-    assert any(log.gone == "expired" for log in places.manifest(store, "robot").logs.values())
 
 
 def test_what_a_follower_has_left_is_made_by_the_next_command(logs: Path, tmp_path: Path) -> None:
@@ -491,75 +388,96 @@ def test_a_robot_that_was_never_there_is_told(tmp_path: Path) -> None:
     assert run("ls", "--json", store=tmp_path / "store").json == []
 
 
-def state_with(lost: dict[str, int], *, lag: int = 0, failure: str = "") -> RecorderState:
-    return RecorderState("r", 1.0, [], 9, 9, lost, 0.0, lag, failure, 10**9, 10**6)
+def test_each_key_of_its_json_is_in_the_documentation(logs: Path, tmp_path: Path) -> None:
+    text = (Path(__file__).parents[2] / "docs/live.md").read_text("utf-8")
+    section = text.partition("## State for other programs")[2].partition("\n## ")[0]
+    with recorder(
+        tmp_path / "store", "--replay", logs / "small.bag", "--max-messages", 50, "--ring", "9s"
+    ) as process:
+        assert process.stdout is not None
+        lines = [json.loads(line) for line in process.stdout]
+    states = [line["state"] for line in lines[:-1]]
+    keys = {key for line in section.splitlines() if line[:3] == "| `" for key in named(line, 1)}
+    assert keys == states[-1].keys()
+    (topics,) = (named(line, 2) for line in section.splitlines() if line[:10] == "| `topics`")
+    assert {key for state in states for topic in state["topics"] for key in topic} <= topics
+    assert states[-1]["memory_bytes"] > 10 << 20
+    (told,) = (line for line in section.splitlines() if line.startswith("The report has"))
+    report = lines[-1]["report"]
+    assert (report["exit_code"], report["ended"]) == (0, "the limit of messages is reached")
+    assert report.keys() <= {*re.findall(r"`(\w+)`", told)}
+    failed = run("record", "--replay", tmp_path / "none.bag", "--json", store=tmp_path, code=None)
+    assert failed.code != 0
+    assert json.loads(failed.lines[-1])["report"]["exit_code"] == failed.code
 
 
-def test_a_number_of_losses_that_nobody_knows() -> None:
-    assert "lost unknown (unreadable unknown)" in summary(state_with({"unreadable": 0}))
+def test_what_is_thinned_out_is_told(logs: Path, tmp_path: Path) -> None:
+    store = tmp_path / "store"
+    with recorder(
+        store, "--replay", logs / "small.bag", "--throttle", "/imu/data", "5Hz", "-x", "/tf"
+    ) as process:
+        report = end(process, None)
+    topics = report["topics"]
+    assert "/tf" not in topics
+    counted = {t: n["received"] for t, n in topics.items()}
+    lost = report["lost"]["throttle"]
+    assert 0 < lost < counted["/imu/data"]
+    (recording,) = report["recordings"]
+    assert recording["messages"] + lost == report["messages_received"]
+    rows = run("info", "--losses", "--json", "-t", "imu/data", store=store).json
+    assert sum(row["count"] for row in rows) == lost
+    assert {row["cause"] for row in rows} == {"throttle"}
+    assert run("info", "--losses", "--json", "-t", "/joint_states", store=store).json == []
+    assert "left out by a throttle" in run("fetch", "-t", "imu/data", "--count", store=store).err
+    assert "/imu/data" in run("info", "--losses", store=store).out
 
 
-def test_an_index_that_lags_says_why() -> None:
-    failure = "MongoDB at localhost:1 does not answer. Is it running? See the log."
-    line = summary(state_with({}, lag=238, failure=failure))
-    assert "index 238 behind: MongoDB at localhost:1 does not answer ·" in line
+def test_a_ring_keeps_the_end_and_what_is_pinned(logs: Path, tmp_path: Path) -> None:
+    store = tmp_path / "store"
+    with recorder(
+        *(store, "--replay", logs / "robot.bag", "--speed", 0.3, "--flush-interval", "100ms"),
+        *("--ring", "1s", "--before", "500ms", "--after", "300ms", "--quiet", "--name", "the ring"),
+    ) as process:
+        until_it_speaks(process)
+        time.sleep(2)
+        run("mark", "bump", "--pin", "500ms", "300ms", "-r", "the ring", store=store)
+        time.sleep(5)
+        os.kill(process.pid, signal.SIGUSR1)
+        time.sleep(1.5)
+        report, said = end_and_hear(process)
+    assert said == ""  # what is pinned is no trouble
+    (entry,) = run("ls", "--json", store=store).json
+    assert 0 < entry["messages"] < report["messages_received"]
+    (told,) = run("info", "--json", store=store).json
+    assert [pin["reason"] for pin in told["pins"]] == ["bump", "SIGUSR1"]
+    run("export", tmp_path / "part.mcap", "--split-by", "mark", "-q", store=store)
+    assert len([*tmp_path.glob("part-*.mcap")]) == 2
 
 
-@pytest.mark.parametrize(
-    ("width", "headings"),
-    [
-        (60, "Hz messages lost"),
-        (80, "Hz messages thinned lost"),
-        (100, "Hz usual MB/s messages thinned lost"),
-        (140, "Hz usual MB/s jitter ms messages thinned lost"),
-    ],
-)
-@pytest.mark.parametrize("height", [None, 24])
-def test_the_table_of_a_recorder_is_legible(width: int, headings: str, height: int | None) -> None:
-    topics = [
-        TopicState(
-            *(f"/camera_{n:02}/colour/image_raw/compressed/camera_info", "t", 123_400 + n, 9),
-            *(1234.5, 1250.25, 98.76e6, 12.3, 0.0, 10, 12_345 if n == 28 else 0),
-        )
-        for n in range(30)
-    ]
-    state = replace(state_with({"queue": 12_345}), topics=topics)
-    first, *lines = drawn(state, width=width, height=height, below=["/odom x: nothing yet"])
-    assert max(map(len, lines)) <= width
-    assert height is None or 1 + len(lines) == height
-    assert first.split() == ["topic", *headings.split()]
-    rows = [line.split() for line in lines if line.startswith("/camera_")]
-    more = len(topics) - len(rows)
-    assert len({name for name, *_ in rows}) == len(rows)
-    assert all(name.endswith("camera_info") for name, *_ in rows)
-    assert all({"1234.5", f"1234{row[0][8:10]}"} < {*row} for row in rows)
-    assert [row[-1] for row in rows].count("12345") == 1
-    assert any(f"… and {more} more topics" in line for line in lines) == bool(more)
-    parts = " ".join(line.rstrip() for line in lines[len(rows) :]).split(" · ")
-    assert {"index up to date", "lost 12345 (queue 12345) /odom x: nothing yet"} < {*parts}
-    assert all(line.rstrip().endswith(("·", ")", "yet", "topics")) for line in lines[len(rows) :])
+LOADS_LITTLE = """
+import sys
+from importlib import import_module
+from hybridlog.live.recorder import Recorder
+
+look = Recorder.look
+
+def checked(self):
+    assert not {"pyarrow", "pandas", "pymongo"} & {*sys.modules}
+    return look(self)
+
+Recorder.look = checked
+import_module("hybridlog.cli.main").main()
+"""
 
 
-@pytest.mark.parametrize("said", [5, 9])
-def test_another_recording_goes_on_when_a_manifest_is_full(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: Limit, said: int
-) -> None:
-    """The limits are those of both, and each has what came in its time."""
-    limit(full_manifest_bytes=1)
-    numbers = iter(range(100))
-
-    def speak(sink: Sink) -> None:
-        for number in islice(numbers, 3):
-            sink.take(text_channel(), text(str(number)), received=time.time_ns())
-
-    monkeypatch.setattr(record_live, "sources_of", lambda _: [Speaker(speak)])
-    words = ("--ros1", "--name", "run", "--max-messages", said, "--reserve", 0, "--json")
-    done = answer("record", *words, "--mongo", "none", store=tmp_path / "store")
-    report = json.loads(done.out.splitlines()[-1])["report"]
-    names = ["run", "run-2", "run-3"][: -(-said // 3)]
-    assert [one["recording"] for one in report["recordings"]] == names
-    assert f"the manifest of {names[-2]} is full: {names[-1]} goes on" in done.err
-    with hl.open(tmp_path / "store", mongo="none") as store:
-        found = [[int(m.fields["data"]) for m in store.query(["/chatter"], [n])] for n in names]
-        assert found == [[*range(n, min(n + 3, said))] for n in range(0, said, 3)]
-        assert store.verify().findings == []
+def test_a_recorder_loads_nothing_of_what_its_follower_does(logs: Path, tmp_path: Path) -> None:
+    store = tmp_path / "store"
+    with hl.open(store, create=True) as opened:
+        opened.directory.change_settings(retention={"quota": "4MB"})
+    words = ("--replay", logs / "robot.bag", "--speed", 5, "--split-size", "1MiB")
+    program = (sys.executable, "-c", LOADS_LITTLE)
+    with recorder(store, *words, "--trigger", "/map: data == 0", program=program) as process:
+        report = end(process, None)
+    (recording,) = report["recordings"]
+    assert recording["messages"] == recording["messages_indexed"] == report["messages_received"]
+    assert any(log.gone == "expired" for log in places.manifest(store, "robot").logs.values())

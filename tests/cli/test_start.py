@@ -83,28 +83,6 @@ def test_looking_imports_neither_numbers_nor_tables(store: Path) -> None:
         assert not packages_of(*arguments, **variables) & (HEAVY - {"mcap", "zstandard"})
 
 
-def test_threads_that_use_numpy_first_at_once_have_it() -> None:
-    """It is imported at its first use, which may be in many threads."""
-    program = """
-import sys
-from concurrent.futures import ThreadPoolExecutor
-from threading import Barrier
-from hybridlog_storage.lazy import import_numpy_late
-import_numpy_late()
-import numpy as np
-assert "__file__" not in vars(np)
-ready = Barrier(8)
-def use(number):
-    ready.wait()
-    return int(np.arange(number).sum())
-with ThreadPoolExecutor(8) as threads:
-    assert [*threads.map(use, range(8))] == [0, 0, 1, 3, 6, 10, 15, 21]
-import numpy.linalg
-assert np.ndarray is sys.modules["numpy"].ndarray and np.linalg is numpy.linalg
-"""
-    subprocess.run([sys.executable, "-c", program], check=True)
-
-
 def test_help_names_commands_and_exit_codes() -> None:
     out = run("--help").out
     assert run("-h").out == out
@@ -233,35 +211,6 @@ def test_paths_are_checked_by_the_library() -> None:
     assert not PATH.readable
 
 
-@pytest.mark.parametrize(
-    ("words", "hint"),
-    [
-        ("fech", "Did you mean 'fetch'?"),
-        ("fetch --betwee", "'--between'"),
-        ("check robot", "robot is a recording: -r robot."),
-        ("fetch robot", "\nrobot is a recording: -r robot.\n"),
-        ("fetch nosuch", " more\n"),
-        ("ls robot", "unexpected extra argument (robot)"),
-        ("fetch scan --between +1s --where n>1", ": --between takes two values: --between T0 T1."),
-        ("sql --limt x", "No such option '--limt'. (Did you mean one of: '--limit', "),
-        ("tf -r robot battery odom", "There is no frame 'battery'; there are map, odom"),
-    ],
-)
-def test_a_slip_gets_a_hint(words: str, hint: str, store: Path) -> None:
-    assert hint in run(*words.split(), store=store, code=2).err
-
-
-@pytest.mark.parametrize("name", COMMANDS)
-def test_help_breaks_no_word_at_eighty_columns(name: str) -> None:
-    lines = run(name, "--help", COLUMNS="80").lines
-    assert max(map(len, lines)) < 80
-    if name == "fetch":
-        shown = [line.split()[0].strip(",") for line in lines if line.startswith("  -")]
-        assert shown[:6] == ["-t", "--between", "--where", "--fields", "-o", "-F"]
-        sections = [line for line in lines if line.endswith(":") and not line.startswith(" ")]
-        assert sections[1:] == ["Options:", "Choosing recordings:", "Common options:"]
-
-
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
 def test_a_shell_gets_its_completion_script(shell: str) -> None:
     script = run(_HYBRIDLOG_COMPLETE=f"{shell}_source").out
@@ -337,19 +286,6 @@ def test_a_fetch_by_topic_and_time_imports_what_it_needs(
     assert len(ours) < most, sorted(ours)
 
 
-def test_a_question_by_content_imports_what_it_needs(store: Path, tmp_path: Path) -> None:
-    question = ("fetch", "--store", store, "-t", "scan", "--where", "ranges.min < 1", "--count")
-    loaded = modules_of(*question)
-    # Where pyarrow and numpy are at work, too.
-    for form in ("table", "csv", "parquet", "npz"):
-        to = ("-F", form) if form == "table" else ("-o", tmp_path / f"x.{form}")
-        assert "pandas" not in packages_of(*question[:-1], *to)
-    # A table answers.
-    unneeded = {"pandas", "pydantic", "rich", "pymongo", "rosbags"}
-    assert {name.split(".")[0] for name in loaded} & unneeded == set()
-    assert not loaded & {"numpy.ma", "hybridlog.record.recorder", "hybridlog.follow.follower"}
-
-
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -388,8 +324,3 @@ def test_every_command_with_json_has_a_schema() -> None:
     for name, one in group.commands.items():
         if any(parameter.name == "as_json" for parameter in one.params):
             assert schema_of(["index", name])
-
-
-def test_a_terminal_encoding_without_a_character_is_no_error(store: Path) -> None:
-    done = run("info", "odd", store=store, LC_ALL="C", PYTHONIOENCODING="ascii")
-    assert done.out.isascii()

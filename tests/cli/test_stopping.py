@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import random
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
-from importlib import import_module
 from pathlib import Path
 
 import pytest
 from pymongo import MongoClient
 
-from hybridlog.cli.signals import SIGNALS
 from tests import places
-from tests.calls import Calls
 from tests.independent import read_bag
 from tests.servers.mongods import Mongod
 from tests.waiting import wait_for
@@ -141,27 +136,6 @@ def test_a_signal_never_finds_a_lock_that_it_leaves_held(
     assert places.names(fresh) == ["small"]
 
 
-@pytest.mark.exhaustive
-def test_a_stop_at_any_time_ends_it_and_leaves_nothing(
-    logs: Path, fresh: Path, tmp_path: Path
-) -> None:
-    chance = random.Random(4)
-    command = ("record", logs / "robot.bag", "--store", fresh, "--level", "12")
-    for number in range(400):
-        pause, signals = chance.uniform(0.2, 2.5), chance.choices(SIGNALS, k=chance.choice([1, 2]))
-        out = tmp_path / f"{number}"
-        with started(*command, output=out) as process:
-            time.sleep(pause)
-            for one in signals:
-                process.send_signal(one)
-            code = process.wait(60)
-        assert code in {0, -signals[0], *(128 + one for one in signals)}, out.read_text()
-        assert code <= 0 or "Traceback" not in out.read_text()
-        if "robot" in places.names(fresh):
-            run("rm", "robot", "--yes", store=fresh)
-        assert places.names(fresh) == ["small"]
-
-
 STOPS_ITSELF = """
 import os, signal, sys
 
@@ -215,33 +189,6 @@ def test_a_stopped_record_says_what_is_stored(
     assert ended.returncode == 130, ended.stderr
     whole = said.replace("{robot.bag}", str(logs / "robot.bag"))
     assert ended.stderr.rstrip().endswith(f"hybridlog: interrupted. {whole}")
-
-
-@pytest.mark.parametrize(
-    ("form", "moment"),
-    [
-        ("mcap", "return beside"),
-        ("mcap", "return Sink.__init__"),
-        ("mcap", "return Whole.__enter__"),
-        ("mcap", "call Whole.__exit__"),
-        ("mcap", "call McapWriter.commit"),
-        ("mcap", "call Unfinished.publish"),
-        ("bag", "return BagWriter.__init__"),
-        ("bag", "call Whole.__exit__"),
-        ("raw", "return Directory.__init__"),
-        ("raw", "call Whole.__exit__"),
-    ],
-)
-def test_no_instant_leaves_a_part(form: str, moment: str, store: Path, tmp_path: Path) -> None:
-    target = tmp_path / f"new.{form}"
-    command = ["export", str(target)]
-    if form == "raw":
-        command = ["fetch", "-t", "/base/scan", "-F", "raw", "-o", str(target)]
-    ended = stop_at(moment, *command, "-r", "robot", store=store)
-    assert ended.returncode == 130, ended.stderr
-    assert f"{target} is not written" in ended.stderr
-    assert "Traceback" not in ended.stderr
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_directory_of_tables_is_complete_or_absent(store: Path, tmp_path: Path) -> None:
@@ -313,11 +260,3 @@ def test_a_database_of_another_store(server: Server, logs: Path, tmp_path: Path)
     done = run("record", logs / "odd.mcap", "--mongo", uri, store=tmp_path / "two", code=6)
     assert "another store" in done.err
     assert not (tmp_path / "two").exists()
-
-
-def test_too_little_memory_is_no_mistake_of_ours(
-    calls: Calls, capsys: pytest.CaptureFixture[str]
-) -> None:
-    calls.fail(import_module("hybridlog.cli.app").app, "make_context", MemoryError)
-    assert import_module("hybridlog.cli.main")._run() == 1
-    assert "not enough memory" in capsys.readouterr().err

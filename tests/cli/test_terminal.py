@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import fcntl
-import json
 import os
 import pty
 import re
@@ -14,16 +13,13 @@ import subprocess
 import termios
 import time
 from collections.abc import Callable
-from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 
-import hybridlog as hl
-from hybridlog_storage.messages import Channel
 from tests import places
 
-from .running import COMMAND, environment, open_bytes, run
+from .running import COMMAND, environment, open_bytes
 
 CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]|\x1b[()][A-Z0-9]")
 
@@ -97,14 +93,6 @@ def test_a_bar_with_rate_and_remaining_time_and_then_the_table(logs: Path, tmp_p
     assert re.search(r"indexed\s+\d+", last)
 
 
-def test_a_bar_counts_rows_of_unknown_number(store: Path, tmp_path: Path) -> None:
-    rows = ("sql", "select * from odom", "--store", store, "-o")
-    code, shown = on_terminal(*rows, tmp_path / "a.csv", width=120)
-    assert code == 0
-    assert re.search(r"csv ━+ +\S* *\S* +\d+ rows", plain(shown))
-    assert "rows" not in on_terminal(*rows, tmp_path / "b.csv", "--quiet")[1]
-
-
 def test_no_bar_elsewhere_or_when_quiet(logs: Path, tmp_path: Path) -> None:
     code, shown = on_terminal("record", logs / "small.bag", "-q", "--store", tmp_path / "s")
     assert (code, shown) == (0, "")
@@ -135,52 +123,6 @@ def test_tables_keep_within_the_screen(width: int, store: Path) -> None:
     assert (code, max(map(len, lines)) <= width) == (0, True)
 
 
-def test_eighty_columns_hold_a_robot_without_a_fold(store: Path) -> None:
-    topics = {one["topic"] for one in run("check", "-r", "robot", "--json", store=store).json}
-    segments = [("info", path) for path in sorted(places.folder(store, "robot").glob("*.mcap"))]
-    assert segments
-    for commands in ([("info", "robot")], segments, [("check", "-r", "robot")]):
-        found: set[str] = set()
-        for command in commands:
-            code, shown = on_terminal(*command, "--store", store, width=80)
-            assert code == 0
-            found.update(re.findall(r"(?m)^(/\S+)  ", plain(shown)))
-            assert max(map(len, plain(shown).splitlines())) <= 80
-        assert found == topics
-    code, shown = on_terminal("ls", "--store", store, width=80)
-    labels = [line.split()[0] for line in plain(shown).splitlines()[1:]]
-    assert {*labels} == {"robot", "odd", "torn"}
-
-
-def test_info_on_a_narrow_screen_folds_no_type_of_the_robot(store: Path) -> None:
-    code, shown = on_terminal("info", "robot", "--store", store, width=80)
-    assert code == 0
-    assert re.search(r"(?m)^/base/scan +LaserScan +\d", plain(shown))
-    assert "over time" not in shown
-    code, shown = on_terminal("info", "robot", "--store", store, width=160)
-    assert re.search(r"(?m)^/base/scan +sensor_msgs/LaserScan +\d", plain(shown))
-    # What is whole, and when the messages came.
-    assert re.search(r"(?m)^coverage +█{40} *\n +complete *$", plain(shown))
-    rows = plain(shown).splitlines()
-    place = next(row for row in rows if "over time" in row).index("over time")
-    lines = {row.split()[0]: row[place : place + 20] for row in rows if row.startswith("/")}
-    assert set(lines["/base/scan"]) <= {*"▆▇█"}
-    assert lines["/tf_static"].strip() == "█"
-    assert len(plain(shown).splitlines()[-1]) <= 160
-
-
-def test_a_plot_of_text_fits_the_screen(store: Path) -> None:
-    ask = ("plot", "-t", "odom", "-r", "robot", "--fields", "twist.twist.linear", "-q")
-    for width, letters in ((80, 20), (160, 60)):
-        code, shown = on_terminal(*ask, "--store", store, width=width)
-        assert code == 0
-        head, *rows = plain(shown).splitlines()
-        assert head.split() == ["field", "least", "greatest"]
-        assert [row.split()[0][-1] for row in rows] == ["x", "y", "z"]
-        assert max(map(len, rows)) <= width
-        assert len({*rows[0][-letters:]} & {*"▁▂▃▄▅▆▇█"}) > 2
-
-
 def test_an_answer_is_a_table_when_it_fits(store: Path) -> None:
     command = ("fetch", "-t", "scan", "-r", "robot", "--fields", "angle_min,scan_time", "-v")
     code, shown = on_terminal(*command, "--store", store, width=80)
@@ -200,23 +142,6 @@ def test_an_answer_is_a_block_a_message_when_it_does_not(store: Path) -> None:
     assert len(re.findall(r"(?m)^\d{4}-\S+Z$", text)) == 2
     assert len(re.findall(r"(?m)^  header\.frame_id +\S", text)) == 2
     assert re.search(r"ranges +\[\S+, \S+, … \d+ in all\]", text)
-
-
-def test_a_long_text_of_a_block_is_whole_and_breaks_between_words(tmp_path: Path) -> None:
-    text = "Something went wrong loading the typesupport library for message type Debug of it all"
-    with (
-        hl.open(tmp_path / "store", mongo="none", create=True) as opened,
-        opened.start("one") as recording,
-    ):
-        fields = {"name": "node", "msg": text, "file": "/opt/ros/include/rclcpp/publisher.hpp"}
-        recording.write(Channel("/rosout", "json", None), json.dumps(fields).encode(), log_time=1)
-    code, shown = on_terminal("fetch", "rosout", "--store", tmp_path / "store")
-    lines = plain(shown).splitlines()
-    assert code == 0
-    assert max(map(len, lines)) <= 80
-    begin = next(n for n, line in enumerate(lines) if line.startswith("  msg "))
-    assert " ".join([lines[begin].split(maxsplit=1)[1], lines[begin + 1].strip()]) == text
-    assert lines[begin + 1].startswith(" " * 8)
 
 
 def test_binary_formats_are_kept_off_the_terminal(store: Path) -> None:
@@ -252,26 +177,3 @@ def test_ctrl_c(logs: Path, fresh: Path) -> None:
     # The cursor that the bar has hidden is back.
     assert shown.rindex("\x1b[?25h") > shown.rindex("\x1b[?25l")
     assert places.names(fresh) == ["small"]
-
-
-def test_eighty_columns_lose_no_end_and_no_late_start(store: Path) -> None:
-    intervals = ("intervals", "scan", "--where", "ranges.min < 5", "-r", "robot")
-    rows = run(*intervals, "--json", store=store).json
-    heading, *lines = plain(on_terminal(*intervals, "--store", store)[1]).splitlines()
-    assert {"begin", "end"} <= {*heading.split()}
-    assert max(map(len, lines)) <= 80
-    for row, line in zip(rows[:5], lines, strict=False):
-        for ns, date in ((row["begin_ns"], "%Y-%m-%dT%H:%M:%S"), (row["end_ns"], "%H:%M:%S")):
-            assert datetime.fromtimestamp(ns // 10**9, UTC).strftime(date) in line
-    heading = plain(on_terminal("check", "-r", "robot", "--store", store)[1]).splitlines()[0]
-    assert {"late", "early"} <= {*heading.split()}
-
-
-def test_a_message_breaks_between_words() -> None:
-    for width in (60, 80):
-        code, shown = on_terminal("ls", "--store", "nowhere/robot-logs", width=width)
-        lines = shown.splitlines()
-        assert code == 5
-        assert len(lines) > 1
-        assert max(map(len, lines)) <= width
-        assert " ".join(lines) == run("ls", "--store", "nowhere/robot-logs", code=5).err.strip()

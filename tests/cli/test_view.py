@@ -50,6 +50,7 @@ def test_it_serves_until_it_is_stopped(store: Path, number: signal.Signals) -> N
         urllib.request.urlopen(said["url"])
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # of its socket
 def test_what_is_refused_before_anything_is_served(store: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]

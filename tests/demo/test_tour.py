@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import shlex
 import sys
@@ -11,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from hybridlog.demo import tour
-from hybridlog_storage.errors import DiskFullError, UsageError
+from hybridlog_storage.errors import UsageError
 
 # Stands in for each command, so that the tour alone is under test.
 FAKE = """\
@@ -77,32 +76,6 @@ def test_the_last_line_can_be_typed(
     typed = "hybridlog" if on_path else f"{sys.executable} -m hybridlog"
     place = shlex.quote(str(tmp_path / tour.STORE))
     assert capfd.readouterr().out.endswith(f"look at them: {typed} view --store {place}\n")
-
-
-def test_a_failing_command_ends_the_tour_with_its_code(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    pretend(monkeypatch, fail="ls")
-    assert tour.run(tmp_path) == 6
-    out, err = capfd.readouterr()
-    assert "hybridlog ls --store robot-logs` failed with exit code 6" in err
-    assert "hybridlog info" not in out
-    assert (tmp_path / "robot.bag").exists()
-
-
-def test_an_unusable_directory_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("x")
-    with pytest.raises(UsageError, match="cannot write to"):
-        tour.run(tmp_path / "file" / "below")
-
-
-def test_a_full_disk_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr("shutil.copyfile", full)
-    with pytest.raises(DiskFullError, match="no space left in"):
-        tour.run(tmp_path)
 
 
 def test_the_real_tour_answers_as_the_simulation_counted(

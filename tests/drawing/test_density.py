@@ -16,15 +16,12 @@ from numpy.typing import NDArray
 import hybridlog as hl
 from hybridlog.drawing.times import aligned, evenly, lane_of
 from hybridlog.query.planner import Planner
-from hybridlog_storage.catalog import RecordingEntry
-from hybridlog_storage.errors import TopicError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_reader import SegmentReader
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
 from tests.calls import Calls
 from tests.independent import write_mcap
-from tests.waiting import wait_for
 
 from .conftest import BASE, MS
 
@@ -119,15 +116,6 @@ def test_a_picture_reads_its_topics_once_and_no_payload(store: hl.Store, calls: 
     assert len(asked) == 2
 
 
-def test_usual_periods(store: hl.Store) -> None:
-    """Of messages in chunks of many, and in chunks of their own."""
-    entry, topics = store.entry("a"), ("/steady", "/large", "/one")
-    steady, large, one = (lane_of(store.session, entry, topic).period() for topic in topics)
-    steps = np.diff(np.sort(TIMES["/steady"]))
-    assert steady == pytest.approx(np.quantile(steps, 0.9), rel=0.02)
-    assert (large, one) == (100 * MS, 0)
-
-
 def test_too_many_messages_are_estimated(store: hl.Store) -> None:
     edges = evenly((BASE - 10 * MS, BASE + LENGTH + 10 * MS), 400)
     for topic, times in TIMES.items():
@@ -159,45 +147,3 @@ def test_damaged_message_indexes(store: hl.Store, tmp_path: Path) -> None:
         begin, end = (np.searchsorted(edges, int(chunk[n])) for n in ("first", "last"))
         assert not wrong[: begin - 1].any()
         assert not wrong[end + 1 :].any()
-
-
-A, B = (Channel(name, "json", None) for name in ("/a", "/b"))
-
-
-def test_a_recording_that_goes_on(tmp_path: Path) -> None:
-    """What is flushed counts once, and sealing changes nothing."""
-    settings = SegmentSettings(chunk_size=4096, segment_size=30_000, compression="none")
-    span = BASE, BASE + 1000
-    with (
-        hl.open(tmp_path / "store", create=True) as writing,
-        writing.start("live", settings=settings, flush_interval_s=0.05) as recording,
-        hl.open(tmp_path / "store") as store,
-    ):
-        with pytest.raises(TopicError, match="'/a'"):
-            lane_of(store.session, store.entry("live"), "/a")
-
-        def live() -> RecordingEntry:
-            return store.entry("live")
-
-        def ask() -> NDArray[np.int64]:
-            lanes = (lane_of(store.session, live(), topic) for topic in ("/a", "/b"))
-            return np.stack([lane.counts(aligned(span, 1000)) for lane in lanes])
-
-        written = 0
-        for channel, messages in ((A, 100), (B, 60), (A, 1500)):
-            for _ in range(messages):
-                recording.write(channel, b"[1, 2, 3]", log_time=BASE + written // 2)
-                written += 1
-            # Segments are sealed meanwhile.
-            wait_for(lambda n=written: (n <= 160 or len(ask())) and live().messages == n)
-            if channel is B:
-                assert ask().sum() == 160
-        found = ask()
-        assert found.sum() == written
-        assert found[0][:50].tolist() == [2] * 50
-        assert found[1][50:80].tolist() == [2] * 30
-        assert live().flushed
-        assert live().digests
-        recording.close()
-        assert store.entry("live").status == "complete"
-        assert (ask() == found).all()

@@ -17,7 +17,7 @@ from PIL import Image as Pillow
 
 from hybridlog.arrays.message_arrays import IMAGES, VIDEOS, to_numpy
 from hybridlog.drawing.images import Picture, picture
-from hybridlog.drawing.pixels import pixels, png, thumbnail
+from hybridlog.drawing.pixels import pixels
 from hybridlog_storage.errors import MissingDependencyError, PayloadError, UsageError
 from tests.calls import Calls
 from tests.cli.within import Answer, answer
@@ -171,15 +171,6 @@ def test_yuv(encoding: str) -> None:
     assert np.abs(got - want).max() <= 1
 
 
-def test_yuv_of_odd_sizes() -> None:
-    pairs = np.full((1, 3, 2), 128, np.uint8)
-    pairs[..., 0] = [16, 235, 126]
-    assert seen(picture(raw("yuyv", pairs))).tolist() == [[[0] * 3, [255] * 3, [128] * 3]]
-    one = np.full((3, 1), 128, np.uint8)
-    one[:2] = 235
-    assert seen(picture(raw("nv12", one, height=2))).tolist() == [[[255] * 3]] * 2
-
-
 @pytest.mark.parametrize("order", ["rggb", "bggr", "gbrg", "grbg"])
 @pytest.mark.parametrize("bits", [8, 16])
 def test_bayer(order: str, bits: int) -> None:
@@ -203,23 +194,6 @@ def test_bayer(order: str, bits: int) -> None:
     assert got.dtype == mosaic.dtype
     assert np.array_equal(got, want)
     assert chunks_of(found.data)[b"IHDR"][8:10] == bytes([bits, 2])
-
-
-def test_a_flat_bayer_picture_stays_flat() -> None:
-    flat = np.full((1, 4), 90, np.uint8)
-    assert seen(picture(raw("bayer_rggb8", flat)))[..., :2].tolist() == [[[90, 90]] * 4]
-    assert (pixels(np.full((4, 4), 90, np.uint8), "bayer_grbg8") == 90).all()
-
-
-def test_for_the_eye_16_bits_are_spread() -> None:
-    depth = np.array([[0, 500, 1000]], np.uint16)
-    assert seen(picture(raw("16UC1", depth), raw=False)).tolist() == [[0, 127, 255]]
-    png16 = encoded(depth, "png")
-    kept = picture(compressed("16UC1; png", png16))
-    assert kept.data == png16
-    assert seen(picture(compressed("16UC1; png", png16), raw=False)).tolist() == [[0, 127, 255]]
-    # Transparency would hide a camera's picture.
-    assert np.array_equal(seen(picture(raw("rgba8", COLOURS), raw=False)), COLOURS[..., :3])
 
 
 @pytest.mark.parametrize(
@@ -250,21 +224,6 @@ def test_compressed_images_as_they_came(
         assert picture(compressed(said, data), raw=False, form="jpg").suffix == ".jpg"
 
 
-@pytest.mark.parametrize(
-    ("start", "suffix"),
-    [
-        (b"MM\0*rest", ".tif"),
-        (b"\0\0\0\x1cftypavif", ".avif"),
-        (b"\0\0\0\x0cjP  \r\n\x87\n", ".jp2"),
-        (b"\0\0\0\x0cJXL \r\n\x87\n", ".jxl"),
-        (b"\xff\x0a\0", ".jxl"),
-    ],
-)
-def test_formats_by_their_first_bytes(start: bytes, suffix: str) -> None:
-    assert picture(compressed("", start)).suffix == suffix
-    assert picture(compressed("", start)).data == start
-
-
 @pytest.mark.parametrize("data", [b"\0\0\0\x01\x67\x42", b"BMx", b"RIFF1234WAVE", b"x" * 30])
 @pytest.mark.parametrize("raw_form", [True, False])
 def test_no_known_format(data: bytes, *, raw_form: bool) -> None:
@@ -288,13 +247,6 @@ def test_compressed_depth() -> None:
         assert seen(found).tolist() == [[0, 95, 255, 0]]
     with pytest.raises(PayloadError, match="only PNG"):
         picture(compressed("16UC1; compressedDepth rvl", bytes(99)))
-
-
-def test_foxglove_images() -> None:
-    message = Sent(
-        "foxglove.RawImage", encoding="mono8", height=5, width=7, step=7, data=GREY.tobytes()
-    )
-    assert np.array_equal(seen(picture(message)), GREY)
 
 
 def test_jpeg() -> None:
@@ -341,20 +293,6 @@ SCAN = Sent(
 def test_no_pictures(message: Any, problem: str) -> None:
     with pytest.raises(PayloadError, match=problem):
         picture(message)
-
-
-def test_thumbnails_are_small() -> None:
-    image = np.zeros((480, 640), np.uint8)
-    with Pillow.open(io.BytesIO(thumbnail(image, "bayer_rggb8"))) as small:
-        assert small.size == (160, 120)
-        assert small.mode == "RGB"
-    assert thumbnail(np.empty((0, 0), np.uint8), "nv12") == b""
-
-
-def test_png_of_a_photograph_is_compressed() -> None:
-    rows, columns = np.mgrid[:200, :300]
-    smooth = ((rows + columns) // 2 % 256).astype(np.uint8)
-    assert len(png(smooth)) < smooth.size / 20
 
 
 @pytest.mark.parametrize("side", [8200, 14_000])

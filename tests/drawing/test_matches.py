@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from hybridlog.drawing.times import Match, Matches
-from hybridlog.query.planner import match_times
-from hybridlog_storage.errors import ResourceError, UsageError
+from hybridlog_storage.errors import ResourceError
 from tests.limits import Limit
 
 from .conftest import BASE, MS, Drive
@@ -40,18 +39,6 @@ def test_ticks_count_each_match_once(drive: Drive) -> None:
     assert len(times) > 500
 
 
-def test_ticks_of_many_blocks(drive: Drive, limit: Limit) -> None:
-    """Elements of long arrays are asked of the messages, a chunk at a time."""
-    limit(merged_bytes=1)
-    query = drive.store.topic("drive").where("wide[3] > 0")
-    wanted = drive.times[drive.wide[:, 3] > 0].tolist()
-    assert len([*match_times(query.session, query.question, query.counters)]) > 1
-    found = Matches(query).ticks((BASE, wanted[-1] + 1), 3)
-    want = Counter((time - BASE) // found["width"] for time in wanted)
-    assert dict(zip(found["pixels"].tolist(), found["counts"].tolist(), strict=True)) == want
-    assert found["first"][0] == wanted[0]
-
-
 def test_bands_are_the_intervals_as_far_as_pixels_tell(drive: Drive) -> None:
     query = drive.store.topic("drive").where("linear.z > 0.5")
     span = BASE + 1234, int(drive.times[-1]) + 10 * MS
@@ -75,12 +62,6 @@ def test_bands_are_the_intervals_as_far_as_pixels_tell(drive: Drive) -> None:
     assert Matches(query).bands((0, BASE - 1), 7).tolist() == []
 
 
-def test_bands_last_until_the_recording_ends(drive: Drive) -> None:
-    query = drive.store.topic("loose").where("name exists")
-    end = int(drive.times[-1])
-    assert Matches(query).bands((end - 5 * MS, end + 1), 9).tolist() == [[end - 5 * MS, end + 1]]
-
-
 @pytest.mark.parametrize("count", [1, 7, 5000])
 def test_matches_step_by_step(drive: Drive, count: int) -> None:
     matches = Matches(drive.store.topic("drive").where(PREDICATE))
@@ -92,13 +73,6 @@ def test_matches_step_by_step(drive: Drive, count: int) -> None:
         assert matches.after(place, count) == later[:count]
         assert matches.before(place, count) == earlier[-count:]
         assert matches.count_before(place) == len(earlier)
-
-
-def test_pictures_without_width_are_refused(drive: Drive) -> None:
-    matches = Matches(drive.store.topic("drive"))
-    for span, pixels in (((BASE, BASE + 1), 0), ((BASE, BASE), 9)):
-        with pytest.raises(UsageError, match="at least one pixel"):
-            matches.ticks(span, pixels)
 
 
 def test_more_matches_than_fit_are_refused(drive: Drive, limit: Limit) -> None:

@@ -23,7 +23,6 @@ from hybridlog.maintenance.expiry import expire
 from hybridlog.message import Message
 from hybridlog.query.query import Query
 from hybridlog_storage.errors import DiskFullError, PayloadError, TimeError, UsageError
-from hybridlog_storage.messages import Channel, Schema
 from tests.calls import Calls
 from tests.cli.running import run
 from tests.cli.within import answer
@@ -36,14 +35,12 @@ from .test_video import (
     DECODERS,
     ENCODERS,
     GROUP,
-    JSON,
     MS,
     STEP,
     decoded,
     drawn,
     encode,
     encoded,
-    payload,
     psnr,
     write,
 )
@@ -194,19 +191,6 @@ def test_images_are_encoded(store: hl.Store, topic: str, tmp_path: Path) -> None
         assert psnr(shown, wanted) > 20
 
 
-def test_one_picture(store: hl.Store, tmp_path: Path) -> None:
-    out = tmp_path / "one.mp4"
-    asked = ("-t", "/odd", "--at", "+11ms", "-o", out)
-    answer("fetch", *asked, store=store.directory.path)
-    _, times, _ = read(out)
-    assert times == [BASE + ODD[2]]
-    with av.open(str(out)) as file:
-        assert file.streams.video[0].duration > 0
-    asked = ("-t", "/cam", "-r", "h265", "--at", BASE + 7 * STEP, "-o", out, "--force")
-    answer("fetch", *asked, store=store.directory.path)
-    assert read(out)[1] == [BASE + n * STEP for n in (5, 6, 7)]
-
-
 def test_frames_that_cannot_be_decoded_are_left_out(store: hl.Store, tmp_path: Path) -> None:
     kept = [n for n in range(COUNT) if n not in {7, 8, 9}]
     for topic in ("/gap", "/empty"):
@@ -262,18 +246,6 @@ def test_what_is_no_video(store: hl.Store, tmp_path: Path) -> None:
     assert len(read(tmp_path / "out.mp4")[1]) == 3
 
 
-def test_frames_of_another_size_or_format(tmp_path: Path) -> None:
-    video = Channel("/cam", "json", Schema("foxglove.CompressedVideo", "jsonschema", JSON))
-    with hl.open(tmp_path / "store", create=True, mongo="none") as store:
-        with store.start("cam") as recording:
-            for n, form in enumerate(("h264", "h265")):
-                frame = payload("json", form, encoded(form)[0])
-                recording.write(video, frame, log_time=BASE + n * STEP)
-        with pytest.raises(UsageError, match="/cam has h264, then other frames, at 2025-"):
-            to_mp4(store.topic("/cam"), tmp_path / "out.mp4")
-        assert [one.name for one in tmp_path.iterdir()] == ["store"]
-
-
 def test_files_that_are_not_completed(
     store: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, calls: Calls
 ) -> None:
@@ -299,18 +271,3 @@ def test_files_that_are_not_completed(
     with pytest.raises(DiskFullError):
         to_mp4(query, tmp_path / "out.mp4")
     assert not list(tmp_path.iterdir())
-
-
-def test_export_writes_a_file_a_topic(store: hl.Store, tmp_path: Path) -> None:
-    out = tmp_path / "videos"
-    done = answer("export", out, "-F", "mp4", "-r", "h264", store=store.directory.path)
-    assert sorted(one.name for one in out.iterdir()) == ["b.mp4", "cam.mp4", "empty.mp4", "gap.mp4"]
-    assert "/none: " in done.err
-    done = answer("export", tmp_path / "i", "-F", "mp4", "-r", "images", store=store.directory.path)
-    assert sorted(one.stem for one in (tmp_path / "i").iterdir()) == ["compressed", "mixed", "odd"]
-    assert "\n/grows: /grows has pictures of 64 x 48, then of 64 x 96" in done.err
-    assert len(read(out / "cam.mp4")[1]) == COUNT
-    split = ("fetch", "-t", "/cam", "-o", tmp_path / "cam.mp4", "--split-by", "recording")
-    answer(*split, store=store.directory.path)
-    for form in ENCODERS:
-        assert np.array_equal(read(tmp_path / f"cam-{form}.mp4")[2], decoded(form))

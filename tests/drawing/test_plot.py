@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -124,62 +123,6 @@ def test_what_is_refused(
     monkeypatch.chdir(tmp_path)
     assert problem in plot(drive, "-t", "drive", "--fields", "y", *arguments, code=2).err
     assert [*tmp_path.iterdir()] == []
-
-
-def curves_of(found: list[Line]) -> str:
-    return figure(found, size=(500, 300), form="svg").decode()
-
-
-def test_names_are_no_formulas_and_letters_may_lack() -> None:
-    names = ["$x", "_hidden", "a$b^$\\frac", "\x1b[31m", "日本 \U0001f916"]
-    found = [made([0, 1], [0, 1], name, "$\\topic$") for name in names]
-    text = curves_of(found)
-    assert "$\\topic$" in text
-    for name in names:
-        want = name.replace("\x1b", "\N{REPLACEMENT CHARACTER}")
-        assert f">{want}<" in text.replace("&amp;", "&")
-    assert "$x" in curves_of(found[:1])
-    assert figure(found, size=(500, 300), form="png").startswith(b"\x89PNG")
-
-
-@pytest.mark.parametrize(
-    ("length", "unit"),
-    [(299, "seconds"), (301, "minutes"), (10_801, "hours"), (259_201, "days")],
-)
-def test_units_of_time(length: float, unit: str) -> None:
-    assert f">{unit} since " in curves_of([made([0, length], [0, 1])])
-
-
-def test_odd_lines() -> None:
-    assert "svg" in curves_of([])
-    assert "svg" in curves_of([made([], [])])
-    assert "svg" in curves_of([made([0, 1], [NAN, NAN]), made([0], [np.inf])])
-    # DBL_MAX is how some drivers say that they do not know.
-    assert "svg" in curves_of([made([0, 1, 2], [1.7e308, -1.7e308, 0])])
-    assert figure([made([0, 1], [0, 1], "f" * 300)], size=(300, 100), form="png")
-    # Above ten lines, colours are those of a map.
-    many = [made([0, 1], [n, n], f"f{n}") for n in range(12)]
-    assert len({*re.findall(r"stroke: (#[0-9a-f]{6}); stroke-width: 1\.2", curves_of(many))}) == 12
-
-
-def test_values_between_two_gaps_are_marked() -> None:
-    series = made([0, 1, 2, 3, 4, 5, 6], [1, NAN, 2, 3, NAN, np.inf, 7]).series
-    assert series.alone().tolist() == [True, False, False, False, False, False, True]
-
-
-def test_corners_of_a_line() -> None:
-    times, least = np.array([10, 20, 30]), np.array([0.0, NAN, 2.0])
-    times_, values = Series("x", times, least, least + 1, False).polyline()
-    assert times_.tolist() == [10, 10, 20, 20, 30, 30]
-    assert np.array_equal(values, [0, 1, NAN, NAN, 2, 3], equal_nan=True)
-
-
-def test_columns_of_text() -> None:
-    series = made([0, 1, 2, 3, 8, 9], [2, 4, NAN, 6, 8, np.inf]).series
-    assert series.by_column(3).tolist() == pytest.approx([4, NAN, 8], nan_ok=True)
-    assert len(series.by_column(99)) == 6
-    assert np.isnan(made([], []).series.by_column(5)).tolist() == [True]
-    assert made([5], [3]).series.by_column(5).tolist() == [3]
 
 
 def test_without_matplotlib(drive: Drive, tmp_path: Path, calls: Calls) -> None:

@@ -22,7 +22,6 @@ from hybridlog.drawing.points import Points, bounds, points
 from hybridlog.message import Message
 from hybridlog_storage.errors import PayloadError
 from hybridlog_storage.messages import Channel, Schema
-from tests.data import DATA, needs_data
 
 CODES = "?bBhHiIfd"
 
@@ -161,29 +160,6 @@ def test_packed_colours(name: str, is_big: bool, kind: int) -> None:
     assert got["values"]["rgb"].tolist() == [0xFF8001, 0x010203, 0]
 
 
-def test_colours_in_bytes_and_both_spellings() -> None:
-    rows = [struct.pack("<2f4B", 1, 2, 10, 20, 30, 255)]
-    parts = [(name, 8 + at, 2, 1) for at, name in enumerate(("red", "green", "blue", "alpha"))]
-    described = [("x", 0, 7, 1), ("y", 4, 7, 1)]
-    got = points_of("sensor_msgs/PointCloud2", cloud([*described, *parts], [rows], step=12))
-    assert got["names"] == ("rgb", "red", "green", "blue", "alpha")
-    assert got["values"]["rgb"].tolist() == [10 << 16 | 20 << 8 | 30]
-    assert got["xyz"].tolist() == [[1, 2, 0]]
-    assert got["flat"]
-    both = [("rgba", 8, 6, 1), ("rgb", 8, 7, 1)]
-    got = points_of("sensor_msgs/PointCloud2", cloud([*described, *both], [rows], step=12))
-    assert got["names"] == ("rgb",)
-    assert got["values"]["rgb"].tolist() == [30 << 16 | 20 << 8 | 10]
-
-
-def test_only_values_that_are_asked_for() -> None:
-    described = [("x", 0, 7, 1), ("y", 4, 7, 1), ("ring", 8, 4, 1), ("t", 10, 2, 1)]
-    message = cloud(described, [[struct.pack("<2fHB", 1, 2, 7, 9)]], step=11)
-    got = points_of("sensor_msgs/PointCloud2", message, values=["t", "unknown"])
-    assert list(got["values"]) == ["t"]
-    assert got["names"] == ("ring", "t")
-
-
 def test_many_points_are_thinned_after_the_invalid_ones() -> None:
     xyz = [(math.nan if place % 3 == 0 else place, 0.0, 1.0) for place in range(3000)]
     got = points_of("sensor_msgs/PointCloud2", simple(xyz), limit=500)
@@ -210,14 +186,6 @@ def test_far_from_the_origin_keeps_millimetres() -> None:
     assert np.abs(times - [1_700_000_000 + at / 1000 for at in range(10)]).max() < 1e-6
 
 
-def test_values_that_float32_cannot_hold_are_not_finite() -> None:
-    rows = [struct.pack("<3d", x, 1, 2) for x in (1e300, 5, -1e39)]
-    described = [(name, 8 * at, 8, 1) for at, name in enumerate("xyz")]
-    got = points_of("sensor_msgs/PointCloud2", cloud(described, [rows], step=24))
-    assert got["dropped"] == {"not finite": 2}
-    assert got["xyz"].tolist() == [[5, 1, 2]]
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -232,14 +200,6 @@ def test_damaged_clouds(change: dict[str, Any], message: str) -> None:
     damaged = simple([(1, 2, 3)] * 3, **change)
     with pytest.raises(PayloadError, match=message):
         points_of("sensor_msgs/PointCloud2", damaged)
-
-
-def test_256_fields_of_one_name() -> None:
-    fields = [field("x", kind=2)] * 255 + [field("y", 4)]
-    got = points_of("sensor_msgs/PointCloud2", simple([(1, 2, 3)], fields=fields))
-    assert got["names"][:2] == ("x_", "x__")
-    assert len(got["names"]) == 64
-    assert got["xyz"][0, 1] == 2
 
 
 def test_empty_messages() -> None:
@@ -291,16 +251,6 @@ def test_scans() -> None:
     assert got["names"] == ("range", "intensity", "angle")
     assert got["values"]["intensity"].tolist() == kept
     assert got["values"]["range"].tolist() == [1, 0.25, 8, 2]
-
-
-@pytest.mark.parametrize(("least", "greatest"), [(0.0, 0.0), (5.0, 1.0), (math.nan, 8.0)])
-def test_bounds_that_contradict_themselves(least: float, greatest: float) -> None:
-    message = scan([1.0, math.inf, 100.0])
-    message.range_min, message.range_max = least, greatest
-    got = points_of("sensor_msgs/LaserScan", message)
-    assert len(got["xyz"]) == 2
-    assert got["dropped"] == {"not finite": 1}
-    assert "is not below range_max" in got["remarks"][0]
 
 
 def echoes(*beams: list[float]) -> list[SimpleNamespace]:
@@ -448,37 +398,6 @@ def test_other_types() -> None:
         points_of("", SimpleNamespace())
     with pytest.raises(PayloadError, match="unusual fields"):
         points_of("sensor_msgs/LaserScan", SimpleNamespace(ranges=[]))
-
-
-def decoded(path: str, *types: str) -> list[tuple[str, Any]]:
-    from rosbags.highlevel import AnyReader
-
-    found = []
-    with AnyReader([DATA / path]) as reader:
-        chosen = [c for c in reader.connections if c.msgtype.split("/")[-1] in types]
-        for connection, _, raw in reader.messages(chosen):
-            found.append((connection.msgtype, reader.deserialize(raw, connection.msgtype)))
-    return found
-
-
-@needs_data
-def test_a_real_scan_and_the_cloud_that_its_driver_made_of_it() -> None:
-    path = "real/sick_laser_radar.bag"
-    scans = {_stamp(one): one for _, one in decoded(path, "LaserScan")}
-    clouds = {_stamp(one): one for _, one in decoded(path, "PointCloud2") if one.width == 541}
-    common = sorted(scans.keys() & clouds.keys())
-    assert len(common) > 20
-    for stamp in common[::10]:
-        laser = scans[stamp]
-        got = points_of("sensor_msgs/LaserScan", laser)
-        made = points_of("sensor_msgs/PointCloud2", clouds[stamp])
-        inside = (laser.ranges >= laser.range_min) & (laser.ranges <= laser.range_max)
-        assert got["dropped"]["out of range"] == 541 - inside.sum()
-        assert np.abs(got["xyz"] - made["xyz"][inside]).max() < 1e-3
-
-
-def _stamp(message: Any) -> int:
-    return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
 
 
 def test_columns_have_the_byte_order_of_this_machine() -> None:

@@ -12,8 +12,7 @@ import pytest
 import hybridlog as hl
 from hybridlog.drawing.log import LEVELS, Kind, Line, filtered, kind_of, lines
 from hybridlog.drawing.tree import MAX_NODES, MAX_SHOWN, MAX_TEXT, tree
-from hybridlog_storage.errors import PayloadError, UsageError
-from tests.odd_messages import HOSTILE, LOGS, LONG, LOOSE, MS, START, log_time, ros_channel
+from tests.odd_messages import HOSTILE, LOGS, LONG, MS, START, log_time, ros_channel
 from tests.ros_values import ROS1, ROS2, message_of, plain_of
 
 
@@ -86,15 +85,6 @@ def test_json_is_shown_as_it_is(odd: hl.Store) -> None:
     assert tree(at(odd, "/loose", 4))["items"][0]["name"] == "value"
 
 
-def test_long_texts_are_shown_in_parts(odd: hl.Store) -> None:
-    message = at(odd, "/loose", 0)
-    place = list(LOOSE[0]).index("long")
-    first = tree(message)["items"][place]
-    assert (len(first["text"]), first["n"]) == (MAX_TEXT, 5000)
-    part = tree(message, [place], begin=4500)
-    assert (part["text"], part["begin"]) == ("x" * 500, 4500)
-
-
 def test_an_answer_is_bounded(odd: hl.Store) -> None:
     deep, many, grid = (tree(at(odd, "/loose", second)) for second in (1, 2, 3))
     for one in (deep, many, grid):
@@ -116,18 +106,6 @@ def test_an_answer_is_bounded(odd: hl.Store) -> None:
     assert (keys["n"], len(keys["items"])) == (3000, MAX_SHOWN)
     rest = tree(at(odd, "/loose", 2), [0], begin=2990)
     assert [item["name"] for item in rest["items"]] == [f"key {n}" for n in range(2990, 3000)]
-
-
-def test_what_cannot_be_read_says_so(odd: hl.Store) -> None:
-    for topic in ("/own", "/loose"):
-        with pytest.raises(PayloadError):
-            tree(at(odd, topic, 6))
-
-
-@pytest.mark.parametrize("path", [[99], [0, 0], [6, LONG], [8, 0, 1], [-1]])
-def test_a_place_that_is_not_there_is_refused(odd: hl.Store, path: list[int]) -> None:
-    with pytest.raises(UsageError, match="no such part"):
-        tree(at(odd, "/own", 0), path)
 
 
 def _compare(node: Any, value: Any) -> None:

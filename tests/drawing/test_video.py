@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 import hybridlog as hl
 from hybridlog.arrays.bitstream import FrameOrder, frame_of, is_key_frame
 from hybridlog.arrays.video import VideoDecoder
-from hybridlog.view.playback.played import PlayedLog
 from hybridlog_storage.errors import MissingDependencyError, PayloadError, TopicError
 from hybridlog_storage.messages import Channel, Schema
 from tests.cli.within import answer
@@ -187,18 +186,6 @@ def test_pictures_at_any_time(videos: hl.Store, form: str, encoding: str) -> Non
 
 
 @pytest.mark.parametrize("form", ENCODERS)
-def test_info_counts_key_frames(videos: hl.Store, form: str) -> None:
-    encoded(form)
-    found = answer("info", form, "--json", store=videos.directory.path).json[0]["channels"]
-    about = {channel["topic"]: channel["video"] for channel in found}
-    wanted = {"formats": [form], "frames": COUNT, "key_frames": len(KEYS), "unreadable": 0}
-    for encoding in ENCODINGS:
-        assert about[f"/{encoding}"] == wanted
-    text = answer("info", form, store=videos.directory.path).out
-    assert f"{form}, {len(KEYS)} key frames" in text
-
-
-@pytest.mark.parametrize("form", ENCODERS)
 def test_a_slice_begins_with_the_key_frame(videos: hl.Store, form: str, tmp_path: Path) -> None:
     frames, right, begin = encoded(form), decoded(form), BASE + 7 * STEP
     for number, encoding in enumerate(ENCODINGS):
@@ -246,14 +233,6 @@ def test_a_recorded_slice_begins_with_the_key_frame(form: str, tmp_path: Path) -
         store=tmp_path / "other",
     )  # fmt: skip
     assert re.search(r"(?m)^from before +8$", answered.out)
-
-
-def test_a_playback_goes_on_from_the_key_frame(videos: hl.Store) -> None:
-    played = PlayedLog(videos.query(["/json", "/gap"], ["h264"]))
-    for n, wanted in ((7, [5, 6, 7]), (5, [5]), (COUNT - 1, [10, 11]), (COUNT + 5, [10, 11])):
-        blocks = played.current(["/json"], BASE + n * STEP)
-        times = [time for one in blocks for time in one.log_time.tolist()]
-        assert times == [BASE + number * STEP for number in wanted]
 
 
 def refusal(store: hl.Store, topic: str, n: int) -> str:

@@ -18,9 +18,7 @@ import lz4.frame
 import pytest
 import zstandard
 
-from hybridlog.formats.yaml_values import YamlError, parse_yaml
-from hybridlog.live.sources.ros2.source import read_overrides
-from hybridlog_storage.errors import SegmentError, UsageError
+from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.segments.compression import Compressor, decompress
 from tests.formats import test_rosbag1 as bags
 from tests.formats.test_rosbag2 import make
@@ -125,38 +123,6 @@ def test_missing_files_of_the_metadata_are_told(tmp_path: Path) -> None:
     )
     (folder / "metadata.yaml").write_text(f"{text}  files:\n{files}")
     assert read(folder)[2] == [["the file is missing; metadata.yaml lists it", 2]] * 1000
-
-
-def test_yaml_values() -> None:
-    text = "{a: 1, b: '1', c: ~, d: True, e: 1.5, f: &x [-2, null], g: *x, <<: {h: 1}, i: !!str 3}"
-    found = parse_yaml(text)
-    assert found == {
-        "a": 1,
-        "b": "1",
-        "c": None,
-        "d": True,
-        "e": "1.5",
-        "f": [-2, None],
-        "g": [-2, None],
-        "<<": {"h": 1},
-        "i": "3",
-    }
-    assert parse_yaml("a: 1\n---\n}") == {"a": 1}
-    assert parse_yaml("") is None
-    for wrong in ("{a: 1, a: 2}", "[", "{[a]: 1}", "\x00", "\ud800"):
-        with pytest.raises(YamlError):
-            parse_yaml(wrong)
-
-
-def test_overrides_that_grow_are_shown_in_short(tmp_path: Path) -> None:
-    path = tmp_path / "qos.yaml"
-    path.write_text(LAUGHS + "/a: {depth: *a11}\n")
-    with pytest.raises(UsageError, match="topic with policies") as found:
-        read_overrides(path)
-    assert len(str(found.value)) < 500
-    path.write_text("/b:\n  depth: &a0 [x]\n" + "/a: {depth: 1}\n")
-    with pytest.raises(UsageError, match="depth is a number"):
-        read_overrides(path)
 
 
 # Chunks of MCAP files
@@ -302,14 +268,6 @@ def test_messages_before_damage_in_a_large_chunk_are_not_lost(tmp_path: Path) ->
     assert "has no kind; 70 messages of its beginning were read" in damage[0][0]
 
 
-def test_several_lz4_frames_in_a_chunk(tmp_path: Path) -> None:
-    data = b"".join(lz4_(iter([message() * 10]))[0] for _ in range(3))
-    path = write(tmp_path / "a.mcap", chunk("lz4", data, len(message()) * 30))
-    assert read(path)[::2] == (30, [])
-    path = write(tmp_path / "b.mcap", chunk("lz4", data, len(message()) * 20), message())
-    assert "to more bytes" in read(path)[2][0][0]
-
-
 def test_segments_keep_to_the_ratio_that_readers_believe() -> None:
     large = bytes(300 << 20)
     assert Compressor("zstd").compress(large) == ("", large)
@@ -370,19 +328,6 @@ def test_messages_of_too_many_channels_are_counted(tmp_path: Path) -> None:
     bag = tmp_path / "a.bag"
     bag.write_bytes(bags.bag(*rows, again))
     assert read(bag) == (FULL + 1, FULL, [[reason, 100]])
-
-
-def test_definitions_without_messages(tmp_path: Path) -> None:
-    # The last definition of each id is a channel.
-    path = write(tmp_path / "a.mcap", *(channel(9, f"/t{k}") for k in range(70_000)), message())
-    assert read(path) == (1, 2, [])
-    flips = [channel(k) for k in range(1, FULL)] + [schema(1, f"a/T{k % 2}") for k in range(10_000)]
-    assert read(write(tmp_path / "b.mcap", *flips, message())) == (1, FULL - 1, [])
-    bag = tmp_path / "a.bag"
-    rows = [bags.connection(k, topic=f"/t{k}") for k in range(1, FULL + 100)]
-    bag.write_bytes(bags.bag(*rows, bags.connection(0), bags.message(0, 1, b"")))
-    reason = f"100 channels without messages are left out; a recording can have {FULL}"
-    assert read(bag) == (1, FULL, [[reason, 0]])
 
 
 def test_very_many_damaged_places_are_counted_together(tmp_path: Path) -> None:

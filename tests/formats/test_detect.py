@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 import zstandard
 
-from hybridlog.formats.detect import UNKNOWN, sniff
 from hybridlog.formats.log_set import LogSet, open_source
 from hybridlog_storage.errors import SourceError
 from tests.data import DATA, needs_data
@@ -113,11 +112,3 @@ def test_special_files_and_empty_folders(tmp_path: Path) -> None:
         open_source(tmp_path / "pipe")
     with pytest.raises(SourceError, match="without a log"):
         open_source(tmp_path)
-
-
-@pytest.mark.parametrize("data", [zstandard.compress(b"nothing"), b"\x28\xb5\x2f\xfd\xff\xff"])
-def test_zstd_that_holds_no_log(tmp_path: Path, data: bytes) -> None:
-    (tmp_path / "a.zstd").write_bytes(data)
-    assert sniff(tmp_path / "a.zstd") == (UNKNOWN, True)
-    with pytest.raises(SourceError, match="zstd"):
-        open_source(tmp_path / "a.zstd")

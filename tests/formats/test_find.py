@@ -90,19 +90,6 @@ def test_all_logs_below_a_directory(tmp_path: Path) -> None:
         assert sum(len(batch) for batch in source.batches()) == 4
 
 
-def test_symlinks_lead_to_each_directory_once(tmp_path: Path) -> None:
-    top, outside = tmp_path / "top", tmp_path / "outside"
-    mcap(top / "a" / "one.mcap")
-    mcap(outside / "two.mcap")
-    (top / "a" / "loop").symlink_to(top)
-    (top / "self").symlink_to("self")
-    (top / "nowhere").symlink_to(tmp_path / "gone")
-    (top / "twice").symlink_to(outside)
-    (top / "zwice").symlink_to(outside)
-    (top / "out").symlink_to(outside / "two.mcap")
-    assert paths(find_logs(top), top) == ["out", "a/one.mcap", "twice/two.mcap"]
-
-
 def test_what_cannot_be_read_is_told(tmp_path: Path, calls: Calls) -> None:
     mcap(tmp_path / "a" / "one.mcap")
     mcap(tmp_path / "b" / "two.mcap")
@@ -180,29 +167,6 @@ def test_a_part_is_taken_when_a_later_one_begins(tmp_path: Path) -> None:
     assert watch.unfinished() == []
 
 
-def test_a_bag_that_is_complete_is_one_log(tmp_path: Path) -> None:
-    for part in range(2):
-        database(tmp_path / "bag" / f"x_{part}.db3") if part else (tmp_path / "bag").mkdir()
-        database(tmp_path / "bag" / f"x_{part}.db3")
-    metadata = tmp_path / "bag" / "metadata.yaml"
-    metadata.write_text(METADATA.format(files="x_0.db3, x_1.db3"))
-    watch = Watch(tmp_path)
-    watch.look()
-    (log,) = watch.look().logs
-    assert log.path == tmp_path / "bag"
-    assert [path.name for path in log.files] == ["x_0.db3", "x_1.db3"]
-    assert log.name is None
-    watch.put_back(log)
-    assert watch.look().logs == [log]
-    assert watch.look().logs == []
-    # With a part that is still written, it is not.
-    mcap(tmp_path / "other" / "y_0.mcap")
-    mcap(tmp_path / "other" / "y_1.mcap", whole=False)
-    (tmp_path / "other" / "metadata.yaml").write_text(METADATA.format(files="y_0.mcap"))
-    watch.look()
-    assert paths(watch.look(), tmp_path) == ["other/y_0.mcap"]
-
-
 def test_a_file_without_an_end_is_complete_when_it_has_settled(tmp_path: Path) -> None:
     old = [database(tmp_path / name) for name in ("a.db3", "b.db3", "c.db3")]
     packed = tmp_path / "d.mcap.zstd"
@@ -224,22 +188,3 @@ def _zstd(data: bytes) -> bytes:
     import zstandard
 
     return zstandard.compress(data)
-
-
-def test_a_look_at_unchanged_files_opens_none(tmp_path: Path, calls: Calls) -> None:
-    for number in range(300):
-        mcap(tmp_path / f"{number % 3}" / f"log{number}.mcap")
-        (tmp_path / f"{number % 3}" / f"picture{number}.png").write_bytes(b"png")
-    mcap(tmp_path / "0" / "torn.mcap", whole=False)
-    (tmp_path / "2" / "metadata.yaml").write_text(METADATA.format(files="a.mcap"))
-    watch = Watch(tmp_path)
-    watch.look()
-    assert len(watch.look().logs) == 300
-    opened = calls(Path, "open")
-    assert watch.look().logs == []
-    assert [path.name for path, *_ in opened] == ["torn.mcap"]  # whether it ends by now
-    mcap(tmp_path / "1" / "new.mcap")
-    opened.clear()
-    watch.look()
-    assert len(watch.look().logs) == 1
-    assert {path.name for path, *_ in opened} == {"torn.mcap", "new.mcap"}

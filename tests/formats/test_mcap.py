@@ -21,7 +21,7 @@ from mcap.writer import CompressionType, Writer
 
 import hybridlog as hl
 from hybridlog.formats.mcap.reader import McapSource
-from hybridlog.formats.reading import BATCH_BYTES, BATCH_MESSAGES, Damage
+from hybridlog.formats.reading import BATCH_MESSAGES, Damage
 from hybridlog_storage import messages as log
 from hybridlog_storage.mcap.mcap_content import MAGIC
 from hybridlog_storage.segments.segment_format import METADATA_CHECK
@@ -250,19 +250,6 @@ def test_missing_bytes_cost_no_intact_chunk(
     assert sum(lost or 0 for lost in found.lost) == 1000 - len(times)
 
 
-def test_a_chunk_in_a_payload_of_a_damaged_chunk_is_none_of_the_file(
-    tmp_path: Path,
-) -> None:
-    rows = [(ANY_JSON, 100 + i, VARIANTS["NONE"]) for i in range(3)]
-    none = CompressionType.NONE
-    path = write_mcap(tmp_path / "a.mcap", rows, chunk_size=1, compression=none)
-    bad = bytearray(path.read_bytes())
-    del bad[120:140]
-    path.write_bytes(bad)
-    found = read(path)
-    assert [message.log_time for message in found.messages] == [101, 102]
-
-
 @pytest.mark.parametrize("summary", [True, False])
 @pytest.mark.parametrize("name", ["NONE", "ZSTD"])
 def test_a_record_marked_as_another_kind_gives_no_wrong_payload(
@@ -284,12 +271,6 @@ def test_a_record_marked_as_another_kind_gives_no_wrong_payload(
                 assert not Counter(found.messages) - wanted, (at, opcode)
                 if summary:
                     assert sum(x or 0 for x in found.lost) == 12 - len(found.messages), (at, opcode)
-
-
-def test_a_file_of_magic_only_gives_nothing_and_says_so(put: Callable[[bytes], Path]) -> None:
-    found = read(put(MAGIC))
-    assert found.messages == []
-    assert found.lost == [0]
 
 
 def raw(*records: Any, profile: str = "") -> bytes:
@@ -376,38 +357,6 @@ def test_times_past_int64_are_counted(put: Callable[[bytes], Path]) -> None:
     assert [(m.log_time, m.publish_time) for m in found.messages] == [(0, 0), (5, 5), (9, 9)]
     assert found.lost == [2, 0]
     assert all("2^63" in damage.reason for damage in found.damage)
-
-
-def test_a_summary_that_counts_more_than_there_is_raises_suspicion(
-    put: Callable[[bytes], Path],
-) -> None:
-    data = bytearray(make(enable_crcs=False))
-    at = bytes(data).rindex(struct.pack("<QHI", 12, 1, 2))
-    struct.pack_into("<Q", data, at, 15)
-    found = read(put(bytes(data)))
-    assert len(found.messages) == 12
-    assert found.lost == [3]
-
-
-def test_large_chunks_become_batches_of_bounded_size(tmp_path: Path) -> None:
-    rows = [(ANY_JSON, i, b"") for i in range(40_000)]
-    rows += [(ANY_JSON, i, bytes(300_000)) for i in range(20)]
-    with McapSource(write_mcap(tmp_path / "a.mcap", rows, chunk_size=1 << 30)) as source:
-        batches = list(source.batches())
-    assert sum(map(len, batches)) == 40_020
-    assert max(map(len, batches)) <= BATCH_MESSAGES
-    assert max(b.payload_bytes for b in batches) <= BATCH_BYTES + 300_000
-    assert min(b.payload_bytes for b in batches[3:-1]) >= BATCH_BYTES
-
-
-def test_batches_outlive_the_source(put: Callable[[bytes], Path]) -> None:
-    path = put(VARIANTS["LOOSE"])
-    with McapSource(path) as source:
-        batches = list(source.batches())
-        source.close()
-    assert [bytes(b.payload(i)) for b in batches for i in range(len(b))] == [
-        m.payload for m in official(path)
-    ]
 
 
 @pytest.mark.parametrize("use_chunking", [True, False])

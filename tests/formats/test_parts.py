@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import shutil
 import sqlite3
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
-import zstandard
 
 from hybridlog.formats.log_set import LogSet, open_source
 from hybridlog_storage.errors import SourceError
-from hybridlog_storage.messages import Channel, Schema
-from tests.independent import write_mcap
 
 BEGIN = 1_700_000_000_000_000_000
 SECOND = 10**9
@@ -42,11 +38,6 @@ def put_db3(path: Path, numbers: Sequence[int], change: Callable[[bytes], bytes]
     db.commit()
     db.close()
     return path
-
-
-def put_mcap(path: Path, numbers: Sequence[int]) -> Path:
-    channel = Channel("/n", "cdr", Schema("std_msgs/msg/UInt32", "ros2msg", b"uint32 data\n"))
-    return write_mcap(path, [(channel, BEGIN + n * SECOND, payload(n)) for n in numbers])
 
 
 def put_metadata(folder: Path, files: Sequence[str], messages: int, *more: str) -> None:
@@ -125,28 +116,6 @@ def test_part_that_nothing_lists_is_missing(
 
 
 @pytest.mark.parametrize(
-    ("listed", "count", "damage"),
-    [
-        (["x_0.db3", "x_1.db3"], 15, []),
-        (["x_0.db3"], 20, [("x_0.db3", 5)]),
-        ([], 15, []),
-        ([], 16, [("metadata.yaml", 1)]),
-    ],
-)
-def test_files_that_got_other_names(
-    bag: Path, listed: list[str], count: int, damage: list[tuple[str, int]]
-) -> None:
-    put_metadata(bag, listed, count)
-    found = Found(bag)
-    assert (found.numbers, found.damage) == (FIFTEEN, damage)
-    found = Found(bag / "bag_1.db3")
-    assert (found.numbers, found.damage) == (FIFTEEN[5:10], [])
-    put_db3(bag / "other.db3", [99])
-    with pytest.raises(SourceError, match="none of the files"):
-        open_source(bag)
-
-
-@pytest.mark.parametrize(
     ("names", "listed", "damage"),
     [
         (["0", "9", "10"], None, {"1.db3": None}),
@@ -168,19 +137,6 @@ def test_names_tell_the_order_and_what_is_missing(
     assert ("parts 11 to 99" in found.reasons[-1]) == (len(damage) == 2)
 
 
-def test_empty_parts_are_told(bag: Path) -> None:
-    (bag / "bag_1.db3").write_bytes(b"")
-    (bag / "notes.txt").touch()
-    found = Found(bag)
-    assert found.numbers == [*FIFTEEN[:5], *FIFTEEN[10:]]
-    assert found.damage == [("bag_1.db3", None)]
-    assert "empty" in found.reasons[0]
-    put_metadata(bag, ["bag_0.db3", "bag_1.db3"], 15)
-    assert Found(bag).damage == [("bag_1.db3", 5)]
-    put_metadata(bag, ["bag_0.db3"], 15)
-    assert Found(bag).damage == [("bag_1.db3", 5)]
-
-
 def test_a_part_that_cannot_be_read_costs_no_other(bag: Path) -> None:
     (bag / "bag_1.db3").write_bytes(b"SQLite format 3\0" + bytes(5000))
     found = Found(bag)
@@ -190,77 +146,3 @@ def test_a_part_that_cannot_be_read_costs_no_other(bag: Path) -> None:
         (bag / f"bag_{part}.db3").unlink()
     with pytest.raises(SourceError, match="SQLite"):
         open_source(bag).batches().__next__()
-
-
-def test_files_that_are_no_parts_are_told(bag: Path) -> None:
-    put_metadata(bag, ["bag_0.db3", "bag_1.db3"], 15)
-    put_db3(bag / "other.db3", range(100, 103))
-    put_mcap(bag / "bag_3.mcap", range(7))
-    data = (bag / "bag_0.db3").read_bytes()
-    (bag / "bag_0.db3.zstd").write_bytes(zstandard.compress(data))
-    (bag / "other_2.db3.zstd").write_bytes(zstandard.compress(data))
-    found = Found(bag)
-    assert found.numbers == FIFTEEN
-    assert sorted(found.damage) == [
-        ("bag_0.db3.zstd", 0),
-        ("bag_3.mcap", None),
-        ("other.db3", None),
-        ("other_2.db3.zstd", None),
-    ]
-
-
-def test_last_part_that_was_not_compressed_any_more(bag: Path) -> None:
-    for name in ("bag_0.db3", "bag_1.db3"):
-        packed = zstandard.compress((bag / name).read_bytes())
-        (bag / f"{name}.zstd").write_bytes(packed)
-        (bag / name).unlink()
-    found = Found(bag)
-    assert (found.numbers, found.damage) == (FIFTEEN, [])
-    put_metadata(bag, ["bag_0.db3.zstd", "bag_1.db3.zstd"], 10, "  compression_mode: FILE")
-    found = Found(bag)
-    assert (found.numbers, found.damage) == (FIFTEEN, [])
-    assert found.time_range == (BEGIN, BEGIN + 14 * SECOND + 1)
-
-
-@pytest.mark.parametrize("kind", ["db3", "mcap"])
-def test_payloads_that_are_frames_without_a_word_about_it(tmp_path: Path, kind: str) -> None:
-    path = put_db3(tmp_path / "bag" / "bag_0.db3", FIFTEEN, zstandard.compress)
-    if kind == "mcap":
-        path.unlink()
-        path = tmp_path / "bag" / "bag_0.mcap"
-        cdr, json = (Channel("/n", form, None) for form in ("cdr", "json"))
-        said = [(cdr, n, zstandard.compress(payload(n)) if n % 2 else payload(n)) for n in FIFTEEN]
-        more = [(json, 99, zstandard.compress(b"{}")), (cdr, 100, b"")]
-        write_mcap(path, [*said, *more])
-    with open_source(path) as source:
-        found = [bytes(b.payload(row)) for b in source.batches() for row in range(len(b))]
-        assert source.damage == []
-    want = [payload(n) for n in FIFTEEN]
-    # What is not CDR, and nothing says is compressed, stays as it is.
-    assert found == (want if kind == "db3" else [*want, zstandard.compress(b"{}"), b""])
-    with open_source(tmp_path / "bag") as source:
-        assert [bytes(b.payload(row)) for b in source.batches() for row in range(len(b))] == found
-
-
-def test_frames_that_do_not_unpack_are_kept(tmp_path: Path) -> None:
-    broken = [zstandard.compress(payload(n))[: 9 if n == 2 else None] for n in range(4)]
-    path = put_db3(tmp_path / "bag_0.db3", range(4), lambda data: broken[data[4]])
-    want = [payload(0), payload(1), broken[2], payload(3)]
-    with open_source(path) as source:
-        found = [bytes(b.payload(row)) for b in source.batches() for row in range(len(b))]
-        assert found == want
-        assert [d.messages_lost for d in source.damage] == [0]
-
-
-def test_wrong_statistics_of_a_split_mcap(tmp_path: Path) -> None:
-    put_mcap(tmp_path / "a_0.mcap", range(5))
-    path = put_mcap(tmp_path / "a_1.mcap", range(5, 10))
-    data = path.read_bytes()
-    # Another last time in the statistics; the checksum of the summary is switched off.
-    times = (BEGIN + 9 * SECOND).to_bytes(8, "little")
-    at = data.rindex((BEGIN + 5 * SECOND).to_bytes(8, "little") + times, 0, data.rindex(b"zstd"))
-    data = data[: at + 8] + (BEGIN + 7 * SECOND).to_bytes(8, "little") + data[at + 16 :]
-    path.write_bytes(data[:-12] + bytes(4) + data[-8:])
-    found = Found(tmp_path)
-    assert (found.numbers, found.time_range) == (FIFTEEN[:10], (BEGIN, BEGIN + 9 * SECOND + 1))
-    shutil.rmtree(tmp_path)

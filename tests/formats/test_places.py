@@ -90,21 +90,6 @@ def test_scans_become_points(store: hl.Store, tmp_path: Path) -> None:
     assert not points["z"].any()
 
 
-def test_odd_points() -> None:
-    kind = np.dtype([("x", ">f4"), ("y", "f4"), ("z", "f4"), ("a b", "i8"), ("n", "u1", (2,))])
-    points = np.zeros((2, 3), kind)
-    points["x"], points["a b"], points["n"][..., 1] = 1.5, 1 << 40, 7
-    found = read_ply(ply_of(points))
-    assert found.dtype.names == ("x", "y", "z", "a_b", "n_0", "n_1")
-    assert found["x"].tolist() == [1.5] * 6
-    assert found["a_b"].tolist() == [float(1 << 40)] * 6
-    assert found["n_1"].tolist() == [7] * 6
-    with pytest.raises(UsageError, match="clouds and scans"):
-        ply_of(np.zeros(3, [("a", "f4")]))
-    with pytest.raises(UsageError, match="name a directory"):
-        OUTPUTS["ply"].write(Answer(), io.BytesIO())
-
-
 @needs_data
 def test_poses(store: hl.Store) -> None:
     query = store.topic("/coug2/odom")
@@ -146,20 +131,3 @@ def test_fixes(store: hl.Store) -> None:
             "coordinates": [said.longitude, said.latitude, said.altitude],
         }
         assert re.match(r"20\d\d-", feature["properties"]["header.stamp"])
-
-
-def test_no_fixes() -> None:
-    table = pa.table(
-        {
-            "log_time": pa.array([0, 1, 2], pa.timestamp("ns", "UTC")),
-            "latitude": [1.0, float("nan"), 2.0],
-            "longitude": [3.0, 4.0, 5.0],
-            "altitude": [float("nan"), 1.0, None],
-        }
-    )
-    told = ["1 row without a latitude and a longitude left out."]
-    found = json.loads(written("geojson", table, notes=told))
-    assert [one["geometry"]["coordinates"] for one in found["features"]] == [[3, 1], [5, 2]]
-    assert json.loads(written("geojson")) == {"type": "FeatureCollection", "features": []}
-    with pytest.raises(UsageError, match="takes fixes"):
-        written("geojson", table.drop_columns(["latitude"]))

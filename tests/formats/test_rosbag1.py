@@ -6,7 +6,6 @@ import bz2
 import re
 import struct
 import tempfile
-import tracemalloc
 from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
@@ -15,11 +14,10 @@ import lz4.frame
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from rosbags.rosbag1 import Reader, Writer
+from rosbags.rosbag1 import Writer
 
-from hybridlog.formats import reading
 from hybridlog.formats.reading import BATCH_MESSAGES, Damage, Source
-from hybridlog.formats.rosbag1.reader import Rosbag1Source, walk
+from hybridlog.formats.rosbag1.reader import Rosbag1Source
 from hybridlog_storage.errors import SourceError
 from hybridlog_storage.messages import Channel, Schema
 from tests.data import DATA, needs_data
@@ -297,16 +295,6 @@ def test_messages_outside_of_chunks() -> None:
     assert damage == []
 
 
-def test_headers_in_any_order_and_with_more_fields() -> None:
-    orders = ["oct", "cot", "toc", "cto"]
-    rows = [message(0, time, bytes([time]), order=orders[time % 4]) for time in range(40)]
-    rows += [message(0, 40 + n, b"+", note=b"x" * n) for n in range(30)]
-    found, damage = read_bytes(bag(chunk(connection(0) + b"".join(rows))))
-    assert values(found) == [bytes([time]) for time in range(40)] + [b"+"] * 30
-    assert sorted(time for time, _ in found[("/a", "")]) == list(range(70))
-    assert damage == []
-
-
 def with_index_lengths(data: bytes, change: Callable[[int, int], int]) -> bytes:
     """A bag whose index records state other lengths: `change(length, number)`."""
     out = bytearray(data)
@@ -346,77 +334,6 @@ def test_index_records_that_state_a_wrong_length(
     with Rosbag1Source(path) as source:
         assert source.message_count == 400
         assert source.time_range == (10**18, 10**18 + 399 * 1_000_003 + 1)
-
-
-def test_a_gap_between_chunks_does_not_count_the_messages_behind_it(tmp_path: Path) -> None:
-    path = tmp_path / "a.bag"
-    expected = make(path, "none", chunk=2000, messages=400)
-    data = path.read_bytes()
-    # Neither the length nor the count of the last index record of the first chunk is right, and
-    # the length reaches into the second chunk.
-    second = data.index(b"op=\x05", data.index(b"op=\x05") + 1)
-    start = data.rindex(b"count=", 0, second)
-    (count,) = struct.unpack_from("<I", data, start + 6)
-    broken = bytearray(data)
-    struct.pack_into("<I", broken, start + 6, count + 1)
-    size = data.index(struct.pack("<I", 12 * count), start + 10)
-    struct.pack_into("<I", broken, size, 12 * count + 150)
-    path.write_bytes(broken)
-    found, damage = read(path)
-    assert found == expected
-    assert [each.messages_lost for each in damage] == [0]
-
-
-def with_zeros(data: bytes) -> bytes:
-    """A bag with zeros behind each of its index records, which states them in its chunk list."""
-    parts, moved, at = [data[:13]], {}, 13
-    while at < len(data):
-        (size,) = struct.unpack_from("<I", data, at)
-        (length,) = struct.unpack_from("<I", data, at + 4 + size)
-        end = at + 8 + size + length
-        moved[at] = sum(map(len, parts))
-        record = bytearray(data[at:end])
-        if (place := record.find(b"chunk_pos=", 0, size)) > 0:
-            struct.pack_into(
-                "<Q", record, place + 10, moved[struct.unpack_from("<Q", record, place + 10)[0]]
-            )
-        parts.append(bytes(record))
-        if b"op=\x04" in record[: 4 + size] or b"op=\x06" in record[: 4 + size]:
-            parts.append(bytes(20))
-        at = end
-    whole = bytearray(b"".join(parts))
-    place = whole.index(b"index_pos=") + 10
-    struct.pack_into("<Q", whole, place, moved[struct.unpack_from("<Q", whole, place)[0]])
-    return bytes(whole)
-
-
-@pytest.mark.parametrize("compression", ["none", "lz4"])
-def test_zeros_behind_index_records_are_a_remark(tmp_path: Path, compression: str) -> None:
-    path = tmp_path / "a.bag"
-    expected = make(path, compression, chunk=2000, messages=400)
-    path.write_bytes(with_zeros(path.read_bytes()))
-    with Rosbag1Source(path) as source:
-        assert source.message_count == 400
-        assert contents(source) == expected
-        assert source.damage == []
-        (remark,) = source.remarks
-    assert "are zeros" in remark
-
-
-@pytest.mark.parametrize("size", [0, 12, 40])
-def test_zeros_in_place_of_a_chunk_are_damage(tmp_path: Path, size: int) -> None:
-    """From the head of the second chunk, or from somewhat before it, to its end."""
-    path = tmp_path / "a.bag"
-    expected = make(path, "lz4", chunk=2000, messages=400)
-    data = bytearray(path.read_bytes())
-    first = data.index(b"compression=lz4")
-    start = data.index(b"compression=lz4", first + 1) - 8
-    end = data.index(b"op=\x04", start) - 8
-    data[start - size : end] = bytes(end - start + size)
-    path.write_bytes(data)
-    found, damage = read(path)
-    lost = total(expected) - total(found)
-    assert sum(each.messages_lost or 0 for each in damage) == lost > 0
 
 
 def test_connections_without_messages_are_channels(tmp_path: Path) -> None:
@@ -467,33 +384,6 @@ def test_chunk_length_that_lies(compression: str, lie: int) -> None:
     assert all(each.messages_lost == 0 for each in damage)
 
 
-@pytest.mark.parametrize("compression", ["none", "lz4"])
-def test_message_length_that_lies(compression: str) -> None:
-    rows = [message(0, time, bytes(30)) for time in range(20)]
-    broken = bytearray(rows[7])
-    struct.pack_into("<I", broken, len(broken) - 34, 77)
-    rows[7] = bytes(broken)
-    found, damage = read_bytes(
-        bag(chunk(connection(0) + b"".join(rows), compression), index(0, 20))
-    )
-    left = range(8, 20) if compression == "none" else ()  # damage costs the rest of the chunk
-    assert [time for time, _ in found[("/a", "")]] == [*range(7), *left]
-    assert set(values(found)) == {bytes(30)}
-    assert [each.messages_lost for each in damage] == [13 - len(left)]
-
-
-def test_unknown_compression_and_destroyed_chunk_header() -> None:
-    good = chunk(connection(0) + message(0, 1, b"a"))
-    odd = chunk(b"?" * 50, "zzz")
-    header_gone = b"\xff" * 60 + chunk(message(0, 5, b"l"), "lz4")[60:]
-    found, damage = read_bytes(
-        bag(good, index(0, 1), odd, index(0, 4), header_gone, index(0, 3), good, index(0, 1))
-    )
-    assert values(found) == [b"a", b"a"]
-    assert [each.messages_lost for each in damage] == [4, 3]
-    assert "'zzz'" in damage[0].reason
-
-
 def test_encrypted_and_old() -> None:
     with pytest.raises(SourceError, match="encrypted"):
         read_bytes(bag(encryptor=b"rosbag/AesCbcEncryptor"))
@@ -508,59 +398,3 @@ def test_the_definition_is_found_in_the_index_when_its_chunk_is_lost(tmp_path: P
     found, damage = read_bytes(bytes(data))
     assert 0 < total(found) < total(expected)
     assert [each.messages_lost for each in damage] == [total(expected) - total(found)]
-
-
-@pytest.mark.parametrize("compression", ["none", "bz2", "lz4"])
-@pytest.mark.parametrize("size", [-300, 1, 200, 20_000])
-def test_the_definition_is_found_in_an_index_that_has_moved(
-    tmp_path: Path, compression: str, size: int
-) -> None:
-    path = tmp_path / "a.bag"
-    expected = make(path, compression, chunk=700, messages=2000)
-    good = path.read_bytes()
-    with Reader(path) as reader:
-        start = reader.chunk_infos[0].pos + 60
-        whole = [chunk for chunk in reader.chunk_infos if chunk.pos > start + max(size, 0)]
-    first = min(chunk.start_time for chunk in whole)
-    added = b"\xff" * max(-size, 0)
-    path.write_bytes(good[:start] + added + good[start + max(size, 0) :])
-    found, damage = read(path)
-    for key, messages in expected.items():
-        intact = [message for message in messages if message[0] >= first]
-        assert found[key][-len(intact) :] == intact
-    assert sum(one.messages_lost or 0 for one in damage) == 2000 - total(found)
-
-
-@pytest.mark.parametrize("compression", ["bz2", "lz4"])
-def test_a_cut_chunk_gives_what_unpacks(compression: str) -> None:
-    rows = [message(0, time, bytes([time, time + 1]) * 30_000) for time in range(40)]
-    one = chunk(connection(0) + b"".join(rows), compression)
-    found, damage = read_bytes(bag(one)[: -len(one) // 4])
-    times = [time for time, _ in found[("/a", "")]]
-    assert times == list(range(len(times)))
-    assert 5 < len(times) < 40
-    assert [each.messages_lost for each in damage] == [None]
-
-
-def test_zeros_are_no_records() -> None:
-    """A small chunk may unpack to very many of them."""
-    sound = connection(0) + message(0, 1, b"a")
-    data = sound + bytes(16 << 20)
-    tracemalloc.start()
-    try:
-        run = walk(data, len(data))
-        assert tracemalloc.get_traced_memory()[1] < 1 << 20
-    finally:
-        tracemalloc.stop()
-    assert run.end == len(sound)
-    messages, damage = read_bytes(bag(chunk(sound + bytes(1 << 20), "bz2")))
-    assert values(messages) == [b"a"]
-    assert damage
-
-
-def test_batches_are_bounded(tmp_path: Path) -> None:
-    make(tmp_path / "a.bag", "none", chunk=1 << 14, messages=3000, size=200)
-    with Rosbag1Source(tmp_path / "a.bag") as source:
-        sizes = [len(batch.buffer) for batch in source.batches()]
-    assert max(sizes) <= reading.BATCH_BYTES + (1 << 16)
-    assert len(sizes) < 4

@@ -10,14 +10,13 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from hybridlog.formats.log_set import open_source
-from hybridlog.formats.reading import BATCH_BYTES, BATCH_MESSAGES, Damage, Source
+from hybridlog.formats.reading import BATCH_MESSAGES, Damage, Source
 from hybridlog.formats.rosbag2.directory import parse_metadata
 from hybridlog.formats.rosbag2.sqlite import SqliteSource
 from hybridlog.formats.yaml_values import YamlError
@@ -129,51 +128,6 @@ def test_written_by_rosbags(
         assert read(folder) == (expected, [])
 
 
-def test_no_temporary_file_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = make(tmp_path / "bag", mode=CompressionMode.FILE)
-    spool = tmp_path / "tmp"
-    spool.mkdir()
-    monkeypatch.setattr("tempfile.tempdir", str(spool))
-    with open_source(folder) as source:
-        assert list(spool.iterdir()) == []
-        assert contents(source).total() == 300
-    assert list(spool.iterdir()) == []
-
-
-def test_no_room_to_unpack(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = make(tmp_path / "bag", mode=CompressionMode.FILE)
-    usage = shutil.disk_usage(tmp_path)._replace(free=(64 << 20) + 1000)
-    monkeypatch.setattr("shutil.disk_usage", lambda _: usage)
-    with pytest.raises(SourceError, match="TMPDIR"):
-        open_source(folder)
-    # A frame that does not say its size is stopped when it has filled the room.
-    file = next(folder.glob("*.zstd"))
-    raw = zstandard.ZstdDecompressor().decompressobj().decompress(file.read_bytes())
-    file.write_bytes(zstandard.ZstdCompressor(write_content_size=False).compress(raw))
-    with pytest.raises(SourceError, match="TMPDIR"):
-        open_source(folder)
-
-
-@pytest.mark.parametrize("keep", [0.01, 0.3, 0.95])
-def test_compressed_file_cut_short(tmp_path: Path, keep: float) -> None:
-    folder = make(tmp_path / "bag", mode=CompressionMode.FILE, messages=5000)
-    expected = reference(folder)
-    file = next(folder.glob("*.zstd"))
-    data = file.read_bytes()
-    file.write_bytes(data[: int(len(data) * keep)])
-    if keep < 0.1:
-        # Not even the first block is there.
-        with pytest.raises(SourceError, match="zstd -t") as caught:
-            read(folder)
-        assert str(file) in str(caught.value)
-        return
-    found, damage = read(folder)
-    assert found <= expected
-    assert 0 < found.total() < 5000
-    assert all(each.file == file for each in damage)
-    assert sum(each.messages_lost or 0 for each in damage) == 5000 - found.total()
-
-
 @settings(max_examples=100, deadline=None)
 @given(st.text(max_size=60) | st.sampled_from(["!!python/object:os.system x", "&a [*a]"]))
 def test_metadata_is_untrusted(text: str) -> None:
@@ -232,21 +186,6 @@ def test_publish_time(tmp_path: Path) -> None:
     assert batch.publish_time.tolist() == [40, 60]
 
 
-def test_values_of_odd_types_and_unknown_topics(tmp_path: Path) -> None:
-    path = database(
-        tmp_path / "a.db3",
-        TOPICS,
-        MESSAGES,
-        TOPIC,
-        rows=[(1, 1, 5, "text"), (2, "x", 6, b"lost"), (3, 1, None, None), (9, 1, "7", b"b")],
-    )
-    with SqliteSource(path) as source:
-        (batch,) = source.batches()
-    rows = [(int(t), bytes(batch.payload(row))) for row, t in enumerate(batch.log_time)]
-    assert rows == [(5, b"text"), (0, b""), (7, b"b")]
-    assert [each.messages_lost for each in source.damage] == [1]
-
-
 def test_times_before_1970_are_left_out_and_counted(tmp_path: Path) -> None:
     path = database(
         tmp_path / "a.db3",
@@ -261,23 +200,6 @@ def test_times_before_1970_are_left_out_and_counted(tmp_path: Path) -> None:
     (damage,) = source.damage
     assert damage.messages_lost == 2
     assert "1970" in damage.reason
-
-
-def test_messages_and_topics_without_an_id(tmp_path: Path) -> None:
-    path = database(
-        tmp_path / "a.db3",
-        "CREATE TABLE topics(id, name TEXT, type TEXT, serialization_format TEXT)",
-        MESSAGES,
-        "INSERT INTO topics VALUES (NULL, '/n', 'a/B', 'cdr'), ('x', '/x', 'a/B', 'cdr')",
-        "INSERT INTO topics VALUES ('1', '/a', 'a/B', 'cdr')",
-        rows=[(1, 1, 5, b"a"), (2, None, 6, b"lost"), (3, 7, 7, b"lost")],
-    )
-    with SqliteSource(path) as source:
-        (batch,) = source.batches()
-    assert [source.channels[c].topic for c in batch.channel] == ["/a"]
-    (damage,) = source.damage
-    assert damage.messages_lost == 2
-    assert "7, NULL" in damage.reason
 
 
 @pytest.mark.parametrize(
@@ -301,14 +223,6 @@ def test_databases_that_are_no_bag(tmp_path: Path, script: list[str]) -> None:
     assert str(path) in str(caught.value)
 
 
-def test_odd_file_names(tmp_path: Path) -> None:
-    path = database(tmp_path / "a ?mode=memory&x=%41#é.db3", TOPICS, MESSAGES, TOPIC)
-    with open_source(path) as source:
-        assert list(source.batches()) == []
-        assert source.message_count == 0
-    assert [each.name for each in tmp_path.iterdir()] == [path.name]
-
-
 def test_write_ahead_log_of_a_crashed_recorder(tmp_path: Path) -> None:
     live = tmp_path / "live.db3"
     db = sqlite3.connect(live)
@@ -323,15 +237,6 @@ def test_write_ahead_log_of_a_crashed_recorder(tmp_path: Path) -> None:
     with open_source(crashed) as source:
         (batch,) = source.batches()
     assert batch.log_time.tolist() == [5]
-
-
-def test_large_payloads_are_bounded(tmp_path: Path) -> None:
-    rows = [(number, 1, number, bytes(900_000 if number > 500 else 3)) for number in range(520)]
-    path = database(tmp_path / "a.db3", TOPICS, MESSAGES, TOPIC, rows=rows)
-    with SqliteSource(path) as source:
-        sizes = [len(batch.buffer) for batch in source.batches()]
-    assert sum(sizes) == sum(len(row[3]) for row in rows)  # type: ignore[arg-type]
-    assert max(sizes) < BATCH_BYTES + 900_000
 
 
 def damaged_database(path: Path, break_page: Callable[[int, int], bool]) -> tuple[int, int]:

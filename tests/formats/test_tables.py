@@ -4,7 +4,6 @@ import csv
 import io
 import json
 import math
-import random
 import zipfile
 from pathlib import Path
 
@@ -17,10 +16,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hybridlog.formats import jsonl, tables
 from hybridlog.formats.answer import Answer
 from hybridlog.formats.json_text import json_column
-from hybridlog.formats.jsonl import json_line, json_rows, write_jsonl
+from hybridlog.formats.jsonl import json_line, write_jsonl
 from hybridlog.formats.npz import write_npz
 from hybridlog.formats.tables import write_arrow, write_csv, write_parquet
 from hybridlog_storage.errors import UsageError
@@ -88,17 +86,6 @@ def test_parquet_is_zstd_and_gathers_pieces(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("writer", "read"), WRITERS)
-@pytest.mark.parametrize("held", [1 << 20, 0])
-def test_columns_that_come_and_go(writer: object, read: object, held: int, limit: Limit) -> None:
-    limit(output_held_bytes=held)
-    one = pa.table({"a": pa.array([1], pa.int32()), "b": ["x"]})
-    two = pa.table({"b": ["y"]})
-    turned = pa.table({"b": ["z"], "a": pa.array([3], pa.int64())})
-    back = read(written(writer, one, two, turned))  # type: ignore[operator]
-    assert back.to_pylist() == [{"a": 1, "b": "x"}, {"a": None, "b": "y"}, {"a": 3, "b": "z"}]
-
-
-@pytest.mark.parametrize(("writer", "read"), WRITERS)
 def test_columns_that_appear_late(writer: object, read: object, limit: Limit) -> None:
     empty = pa.table({"a": pa.nulls(1)})
     late = pa.table({"a": [0.5], "c": [1]})
@@ -141,54 +128,10 @@ READS = (
 )
 
 
-def test_parquet_has_no_statistics_of_floats() -> None:
-    import pyarrow.parquet as pq
-
-    data = written(
-        write_parquet,
-        pa.table(
-            {
-                "a.b": [1.5, math.nan],
-                "i": [1, 2],
-                "l": [[1.5], [math.nan]],
-                "o": [{"f": 1.5, "s": "x"}, {"f": math.nan, "s": "y"}],
-            }
-        ),
-    )
-    group = pq.ParquetFile(io.BytesIO(data)).metadata.row_group(0)
-    columns = [group.column(i) for i in range(group.num_columns)]
-    assert {c.path_in_schema: c.is_stats_set for c in columns} == {
-        "a.b": False,
-        "i": True,
-        "l.list.element": False,
-        "o.f": False,
-        "o.s": True,
-    }
-
-
 @pytest.mark.parametrize(("writer", "read"), WRITERS)
 def test_no_rows_and_no_pieces(writer: object, read: object) -> None:
     assert read(written(writer, table(0))).schema.equals(table(0).schema)  # type: ignore[operator]
     assert read(written(writer)).num_rows == 0  # type: ignore[operator]
-
-
-def test_parquet_of_messages_without_fields() -> None:
-    empty = pa.table({"t": [1, 2], "e": pa.array([{}, {}], pa.struct([]))})
-    assert read_parquet(written(write_parquet, empty)).column("e").to_pylist() == [None, None]
-    nested = pa.table({"e": pa.array([[{}]], pa.list_(pa.struct([])))})
-    with pytest.raises(UsageError, match="as parquet"):
-        written(write_parquet, nested)
-
-
-def test_csv_nulls_and_nothing() -> None:
-    odd = pa.table(
-        {"a": [None, 1], "v": [None, [1, None]], "n": pa.nulls(2), "s": pa.array(["", None])}
-    )
-    assert written(write_csv, odd) == b'"a","v","n","s"\n,,,""\n1,"[1, null]",,\n'
-    assert written(write_csv) == b""
-    assert written(write_csv, pa.table({"a": pa.array([], pa.int64())})) == b'"a"\n'
-    words = pa.table({"c": pa.array(["a", "b", "a"]).dictionary_encode()})
-    assert written(write_csv, words) == b'"c"\n"a"\n"b"\n"a"\n'
 
 
 leaf = st.none() | st.integers(-(2**63), 2**63 - 1)
@@ -308,38 +251,6 @@ def test_npz_nulls_and_late_columns() -> None:
     assert arrays["o.y.offsets"].tolist() == [0, 0, 0, 1, 1]
 
 
-def test_npz_strings() -> None:
-    arrays = load(
-        written(
-            write_npz,
-            pa.table({"long": ["x" * 300, "é"], "nul": ["a\0", "b"], "short": ["é" * 256, ""]}),
-        )
-    )
-    assert arrays["long.values"].tobytes().decode() == "x" * 300 + "é"
-    assert arrays["long.offsets"].tolist() == [0, 300, 302]
-    assert arrays["nul.values"].tobytes() == b"a\0b"
-    assert arrays["short"].tolist() == ["é" * 256, ""]
-
-
-def test_npz_of_slices_and_other_types() -> None:
-    whole = table(20)
-    assert np.array_equal(
-        load(written(write_npz, whole.slice(5, 9)))["names.values.values"],
-        load(written(write_npz, pa.Table.from_pylist(whole.slice(5, 9).to_pylist(), whole.schema)))[
-            "names.values.values"
-        ],
-    )
-    words = pa.table({"c": pa.array(["a", "b", "a"]).dictionary_encode()})
-    assert load(written(write_npz, words))["c"].tolist() == ["a", "b", "a"]
-    texts = load(written(write_npz, pa.table({"a": [1]}), pa.table({"a": ["x"]})))
-    assert texts["a"].tolist() == ["1", '"x"']
-    with pytest.raises(UsageError, match="numpy does not have"):
-        written(
-            write_npz, pa.table({"a": pa.array([[("k", 1)]], pa.map_(pa.string(), pa.int64()))})
-        )
-    assert load(written(write_npz)) == {}
-
-
 def test_npz_names_stay_in_their_place() -> None:
     names = ["../../x", "..\\y", "a/b", "a_b", "v", "v.values", "n\0", ""]
     columns = [pa.array([[1]]) if name == "v" else pa.array([1]) for name in names]
@@ -348,36 +259,3 @@ def test_npz_names_stay_in_their_place() -> None:
         entries = archive.namelist()
     assert len(set(entries)) == len(entries) == len(names) + 1
     assert not any("/" in entry or "\\" in entry for entry in entries)
-
-
-def test_long_rows_in_pieces_are_the_same_text(
-    monkeypatch: pytest.MonkeyPatch, limit: Limit
-) -> None:
-    rng = random.Random(0)
-    rows = [
-        {
-            "s": rng.choice(["a", 'b"c', "é,\n", None, "", "x" * 40]),
-            "l": rng.choice([None, [], [rng.random() for _ in range(rng.choice([1, 50]))]]),
-            "n": rng.choice([None, 1, 2]),
-            "b": rng.choice([None, b"xyz" * 5, b"", b"1234"]),
-            "m": [{"x": rng.choice([1.5, math.nan]), "q": ['"', "z"] * rng.choice([0, 3])}]
-            * rng.choice([0, 1, 9]),
-            "d": {"k": rng.choice([None, True]), "t": [1] * 3},
-        }
-        for _ in range(100)
-    ]
-    table = pa.Table.from_pylist(rows)
-    records = table.to_struct_array().combine_chunks()
-
-    def written() -> tuple[bytes, bytes]:
-        csv, lines = io.BytesIO(), io.BytesIO()
-        write_csv(Answer(tables=[table]), csv)
-        write_jsonl(Answer(lines=[json_rows(records)]), lines)
-        return csv.getvalue(), lines.getvalue()
-
-    whole = written()
-    for module in (tables, jsonl):
-        monkeypatch.setattr(module, "rows_within", lambda *_: 1)
-    for size in (3, 30, 300):
-        limit(json_text_piece_bytes=size, tables_piece_bytes=size)
-        assert written() == whole

@@ -2,10 +2,8 @@ from __future__ import annotations
 
 import errno
 import gc
-import io
 import os
 import stat
-import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -24,12 +22,10 @@ from hybridlog.formats.answer import Answer
 from hybridlog.formats.writing import Sink
 from hybridlog_storage.disk import unfinished
 from hybridlog_storage.disk.unfinished import (
-    beside,
-    scratch_directory,
     undo_unfinished,
     undone,
 )
-from hybridlog_storage.errors import DiskFullError, HybridlogError, UsageError
+from hybridlog_storage.errors import DiskFullError, UsageError
 from tests.calls import Calls
 from tests.formats.batches import clouds, many, ros1_channels
 
@@ -95,15 +91,6 @@ def test_a_disk_that_fills_up_at_the_end(name: str, tmp_path: Path, calls: Calls
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("name", FILES)
-def test_a_stream_gets_the_same_bytes(name: str, tmp_path: Path) -> None:
-    stream = io.BytesIO()
-    write(name, stream)
-    write(name, tmp_path / "out")
-    assert stream.getvalue() == (tmp_path / "out").read_bytes()
-    assert not stream.closed
-
-
 @pytest.mark.parametrize("name", WRITERS)
 def test_wrong_places(name: str, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"no directory|No such file"):
@@ -119,16 +106,6 @@ def test_wrong_places(name: str, tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [tmp_path / "dir"]
 
 
-def test_a_link_stays_a_link(tmp_path: Path) -> None:
-    (tmp_path / "real").mkdir()
-    (tmp_path / "link").symlink_to(tmp_path / "real" / "file")
-    sink = Sink(tmp_path / "link")
-    sink.write(b"abc")
-    sink.commit()
-    assert (tmp_path / "link").is_symlink()
-    assert (tmp_path / "real" / "file").read_bytes() == b"abc"
-
-
 def test_a_pipe_is_written_not_replaced(tmp_path: Path) -> None:
     fifo = tmp_path / "pipe"
     os.mkfifo(fifo)
@@ -141,16 +118,6 @@ def test_a_pipe_is_written_not_replaced(tmp_path: Path) -> None:
     assert stat.S_ISFIFO(fifo.stat().st_mode)
 
 
-def test_permissions_follow_the_umask(tmp_path: Path) -> None:
-    before = os.umask(0o027)
-    try:
-        sink = Sink(tmp_path / "out")
-        sink.commit()
-    finally:
-        os.umask(before)
-    assert stat.S_IMODE((tmp_path / "out").stat().st_mode) == 0o640
-
-
 def test_a_broken_pipe_stays_one() -> None:
     read, write = os.pipe()
     os.close(read)
@@ -158,27 +125,6 @@ def test_a_broken_pipe_stays_one() -> None:
     with pytest.raises(BrokenPipeError):
         Sink(stream).write(b"x")
     stream.close()
-
-
-def test_other_failures(tmp_path: Path, calls: Calls) -> None:
-    sink = Sink(tmp_path / "out")
-    calls.fail(os, "fsync", OSError(errno.EIO, os.strerror(errno.EIO)))
-    with pytest.raises(HybridlogError, match="Input/output"):
-        sink.commit()
-    sink.abort()
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("name", ["parquet", "arrow", "csv", "npz", "mcap"])
-def test_an_aborted_stream_has_no_end(name: str) -> None:
-    stream, whole = io.BytesIO(), io.BytesIO()
-    with pytest.raises(KeyError):
-        write(name, stream, error=KeyError)
-    write(name, whole)
-    before = stream.getvalue()
-    gc.collect()
-    assert stream.getvalue() == before
-    assert not whole.getvalue() or before != whole.getvalue()
 
 
 def write_whole(name: str, target: Path) -> None:
@@ -292,38 +238,6 @@ def contents(path: Path) -> dict[str, bytes]:
     return {str(file.relative_to(path)): file.read_bytes() for file in files}
 
 
-def test_what_is_unfinished_goes_at_the_end_of_the_process(tmp_path: Path) -> None:
-    code = (
-        "import sys; from pathlib import Path; from hybridlog.formats.writing import Sink; "
-        "sink = Sink(sys.argv[1]); sink.flush(); print(len(list(Path(sys.argv[2]).iterdir())))"
-    )
-    command = [sys.executable, "-c", code, str(tmp_path / "out"), str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert done.stdout == "1\n"
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_child_process_removes_nothing_of_its_parent(tmp_path: Path) -> None:
-    file, directory = beside(tmp_path / "out"), beside(tmp_path / "dir")
-    file.path.touch()
-    directory.path.mkdir()
-    (directory.path / "inner").touch()
-    child = os.fork()
-    if not child:
-        try:
-            undo_unfinished()
-            file.remove()
-        finally:
-            os._exit(0)
-    os.waitpid(child, 0)
-    assert len(list(tmp_path.iterdir())) == 2
-    undo_unfinished()
-    assert list(tmp_path.iterdir()) == []
-    file.path.touch()  # another's by now
-    file.remove()
-    assert list(tmp_path.iterdir()) == [file.path]
-
-
 def test_what_was_done_is_undone_when_the_process_is_stopped_or_the_work_fails() -> None:
     done: list[str] = []
     with undone(lambda: done.append("over")):
@@ -339,11 +253,3 @@ def test_what_was_done_is_undone_when_the_process_is_stopped_or_the_work_fails()
         undo_unfinished()
     undo_unfinished()
     assert done == ["failed", "inner", "outer"]
-
-
-def test_a_scratch_directory_is_private(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    place = scratch_directory()
-    assert stat.S_IMODE(place.path.stat().st_mode) == 0o700
-    place.remove()
-    assert list(tmp_path.iterdir()) == []

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import signal
 import subprocess
 import threading
 import time
@@ -18,7 +17,7 @@ import hybridlog as hl
 from hybridlog.live import LiveOptions
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.messages import Channel
-from tests.cli.running import COMMAND, complete, environment, forked, run
+from tests.cli.running import COMMAND, complete, environment, run
 from tests.live.robot import Robot, robot
 from tests.waiting import wait_for
 
@@ -70,7 +69,7 @@ class Followed:
 
 @contextmanager
 def follow(store: Path, *arguments: object) -> Iterator[Followed]:
-    command = [*forked(), "fetch", "--store", str(store), "--follow", *map(str, arguments)]
+    command = [*COMMAND, "fetch", "--store", str(store), "--follow", *map(str, arguments)]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment()
     ) as process:
@@ -145,24 +144,6 @@ def test_it_goes_on_while_segments_are_sealed(path: Path) -> None:
         assert entry.segments > 2
 
 
-def test_it_follows_in_the_process_that_records(tmp_path: Path) -> None:
-    from tests.live.speaker import text, text_channel
-
-    with hl.open(tmp_path / "store", create=True) as store:
-        recording = store.start("own", flush_interval_s=0.1)
-        channel = text_channel("/a")
-        recording.write(channel, text("0"))
-        wait_until_flushed(store, 1)
-        following = store.topic("/a").follow()
-        for number in (1, 2, 3):
-            recording.write(channel, text(str(number)))
-            assert next(following).fields["data"] == str(number)
-        ending = threading.Timer(0.1, recording.close)
-        ending.start()
-        assert list(following) == []
-        ending.join()
-
-
 def test_conditions_limits_and_ranges_hold(path: Path) -> None:
     second = 1_000_000_000
     with talking(path) as (one, store):
@@ -193,20 +174,6 @@ def test_globs_take_topics_that_appear_later(path: Path) -> None:
         assert next(every).topic == next(named).topic == "/a"
         one.end()
         assert list(every) == list(named) == []
-
-
-def test_several_recordings_are_followed_until_the_last_ends(path: Path) -> None:
-    with talking(path) as (one, store), robot(path, "other") as other:
-        store.refresh()
-        following = store.topic("/a").follow()
-        other.say("/a", "of the other")
-        assert next(following).fields["data"] == "of the other"
-        other.end()
-        one.say("/a", "still")
-        message = next(following)
-        assert message.fields["data"] == "still"
-        one.end()
-        assert list(following) == []
 
 
 def test_what_has_no_end_yet_is_refused(path: Path) -> None:
@@ -259,18 +226,6 @@ def test_a_killed_recorder_ends_it(path: Path) -> None:
         assert followed.ended() == 0
         assert followed.texts == ["first", "flushed"]
         assert "live has ended: cut short by a crash" in followed.notes
-
-
-def test_ctrl_c_ends_it(path: Path) -> None:
-    with (
-        talking(path),
-        follow(path, "-t", "a", "--between", "start", "end", "-v") as followed,
-    ):
-        followed.wait(1)
-        followed.process.send_signal(signal.SIGINT)
-        assert followed.ended() == 130
-        assert "1 message" in followed.notes
-        assert "interrupted" in followed.notes
 
 
 def test_head_ends_it(path: Path) -> None:

@@ -1,8 +1,7 @@
 """A recorder on a small disk that another program fills: it goes on as long as anything may go.
 
 A file system of 270 MB is filled to the last byte and emptied, the recorder is killed twice, and
-started below its reserve. Then every message is accounted for.
-"""
+started below its reserve. Then every message is accounted for."""
 
 from __future__ import annotations
 
@@ -27,11 +26,18 @@ from tests.live.test_retention import has_expired, store_with
 from tests.waiting import wait_for
 
 FLUSH_S = 0.3
+
+
 SLACK_S = 2.0
+
+
 RESERVE = 10 << 20
+
+
 QUOTA = 200_000_000
+
+
 TOPICS = {"/camera": 1, "/points": 3, "/arm": 1}
-"""A message of each in so many steps."""
 
 
 @pytest.fixture

@@ -17,14 +17,10 @@ import pytest
 from mcap.reader import make_reader
 
 import hybridlog as hl
-from hybridlog.cli.commands.record import record_command
-from hybridlog.cli.record_choices import RecordChoices
-from hybridlog.cli.record_live import recorder_options
 from hybridlog.live import recorder as recorder_module
 from hybridlog.live import recording as recording_module
 from hybridlog.live.policy import priority_rule, throttle_rule
 from hybridlog.live.recorder import Recorder, RecorderOptions
-from hybridlog.live.recording import LiveOptions
 from hybridlog.live.state import choose, read, running, summary_of
 from hybridlog.record.losses import Cause, Loss
 from hybridlog.record.marks import MARKS
@@ -37,7 +33,7 @@ from hybridlog_storage.errors import (
     UsageError,
 )
 from hybridlog_storage.messages import SUPPLIED, Channel, Schema
-from hybridlog_storage.segments.segment_writer import RecordingWriter, SegmentSettings
+from hybridlog_storage.segments.segment_writer import RecordingWriter
 from tests import places
 from tests.calls import Calls
 from tests.indexed import documents_of
@@ -291,16 +287,6 @@ def test_bounds_of_time_and_size(store: hl.Store) -> None:
     assert robot.recorder.stop()[0].entry.messages == 4
 
 
-def test_a_publisher_that_connects_again_and_again_is_one_channel(store: hl.Store) -> None:
-    robot = Running(store)
-    for number in range(10_000):
-        robot.speaker.say(text_channel(), text(str(number)), SECOND + number)
-    assert len(robot.recorder.look().topics) == 1
-    (report,) = robot.recorder.stop()
-    assert len(report.entry.channels) == 1
-    assert report.entry.messages == 10_000
-
-
 def test_a_number_of_more_than_32_bits_is_kept_by_its_lower_ones(store: hl.Store) -> None:
     running = Running(store)
     assert running.speaker.sink is not None
@@ -314,16 +300,6 @@ def test_a_number_of_more_than_32_bits_is_kept_by_its_lower_ones(store: hl.Store
     with places.segment(store.directory.path, report.entry.name).open("rb") as file:
         found = [m.sequence for _, _, m in make_reader(file).iter_messages()]
     assert found == [7, 8, 0xFFFFFFFF, 0]
-
-
-def test_the_same_words_are_said_once_and_not_for_ever(store: hl.Store) -> None:
-    robot = Running(store)
-    for number in range(5000):
-        robot.recorder.say("the same")
-        robot.recorder.say(f"another {number}")
-    assert robot.said.count("the same") == 1
-    assert len(robot.said) == 1000
-    robot.recorder.stop()
 
 
 @pytest.mark.parametrize("place", ["before the chunks", "before the disk"])
@@ -429,24 +405,6 @@ def test_a_crash_loses_no_more_rows_than_messages(store: hl.Store, tmp_path: Pat
         assert sum(row["count"] for row in recording.end["losses"]) >= 40
 
 
-def test_fields_land_when_no_payload_finds_room(store: hl.Store, calls: Calls) -> None:
-    """Whatever their priority: three large messages are more than the budget."""
-    blocked = block_writing(calls)
-    rules = [priority_rule(f"/{word}", word) for word in ("low", "normal", "high")]
-    options = RecorderOptions(reserve_bytes=0, budget_bytes=4 << 20, priorities=rules)
-    robot = Running(store, options)
-    for number in range(10):
-        for rule in rules:
-            robot.speaker.say(scan_channel(rule.pattern), scan(number, 3_000_000))
-    blocked.set()
-    rows = robot.rows()
-    assert {cause for _, cause in rows} == {"degrade"}
-    kept = in_segments(store, robot.recorder.name)
-    for rule in rules:
-        assert kept[rule.pattern, "ros1"] + rows[rule.pattern, "degrade"] == 10
-        assert kept[rule.pattern, "hybridlog.reduced"] == rows[rule.pattern, "degrade"]
-
-
 def test_a_mark_that_is_no_text(store: hl.Store) -> None:
     robot = Running(store)
     robot.mark("bad\udcff\udcfebytes", {"a": "\udc80"})
@@ -509,26 +467,29 @@ def test_a_standard_type_without_its_definition(store: hl.Store) -> None:
     assert "no definition in the source" in str(channels["/odd"].reason)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "chunk", "segment", "span_s"),
-    [
-        (["--budget", "1GiB"], 2 << 20, 1 << 30, 600),
-        (["--budget", "256MiB"], 1 << 20, 1 << 30, 600),
-        (["--budget", "4MiB"], 512 << 10, 1 << 30, 600),
-        (["--budget", "4MiB", "--chunk-size", "4MiB"], 4 << 20, 1 << 30, 600),
-        (["--budget", "1GiB", "--split-size", "2MiB", "--split-duration", "5s"],
-         2 << 20, 2 << 20, 5),
-    ],
-)  # fmt: skip
-def test_a_small_budget_has_small_chunks_and_live_segments_are_short(
-    arguments: list[str], chunk: int, segment: int, span_s: int
-) -> None:
-    with record_command.make_context("record", ["--ros2", *arguments]) as context:
-        chosen = recorder_options(RecordChoices(**context.params)).settings
-    assert (chosen.chunk_size, chosen.segment_size, chosen.segment_span_s) == (
-        *(chunk, segment, span_s),
-    )
-    for usual in (LiveOptions().settings, FREE.settings):
-        assert (usual.segment_size, usual.segment_span_s) == (1 << 30, 600)
-    # Those of logs are not short.
-    assert (SegmentSettings().segment_size, SegmentSettings().segment_span_s) == (4 << 30, None)
+def test_a_publisher_that_connects_again_and_again_is_one_channel(store: hl.Store) -> None:
+    robot = Running(store)
+    for number in range(10_000):
+        robot.speaker.say(text_channel(), text(str(number)), SECOND + number)
+    assert len(robot.recorder.look().topics) == 1
+    (report,) = robot.recorder.stop()
+    assert len(report.entry.channels) == 1
+    assert report.entry.messages == 10_000
+
+
+def test_fields_land_when_no_payload_finds_room(store: hl.Store, calls: Calls) -> None:
+    """Whatever their priority: three large messages are more than the budget."""
+    blocked = block_writing(calls)
+    rules = [priority_rule(f"/{word}", word) for word in ("low", "normal", "high")]
+    options = RecorderOptions(reserve_bytes=0, budget_bytes=4 << 20, priorities=rules)
+    robot = Running(store, options)
+    for number in range(10):
+        for rule in rules:
+            robot.speaker.say(scan_channel(rule.pattern), scan(number, 3_000_000))
+    blocked.set()
+    rows = robot.rows()
+    assert {cause for _, cause in rows} == {"degrade"}
+    kept = in_segments(store, robot.recorder.name)
+    for rule in rules:
+        assert kept[rule.pattern, "ros1"] + rows[rule.pattern, "degrade"] == 10
+        assert kept[rule.pattern, "hybridlog.reduced"] == rows[rule.pattern, "degrade"]

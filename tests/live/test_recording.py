@@ -32,7 +32,6 @@ from hybridlog_storage.segments.segment_file import SegmentFile
 from hybridlog_storage.segments.segment_writer import RecordingWriter, SegmentSettings
 from tests import places
 from tests.calls import Calls
-from tests.limits import Limit
 from tests.live.sources.heard import must_return
 from tests.live.speaker import TEXT, text
 from tests.test_faults import kill_mongod
@@ -204,21 +203,6 @@ def test_a_full_disk(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
         (entry,) = again.recordings()
         assert entry.status == "recovered"
         assert sum(row["count"] for row in entry.end["losses"]) == taken - 1
-
-
-def test_no_mistake_of_ours_is_silent(store: hl.Store, calls: Calls) -> None:
-    recording = store.start("talk", budget_bytes=1 << 20)
-    calls.fail(RecordingWriter, "append", ZeroDivisionError)
-    own = channel("/talk")
-
-    def until_refused() -> None:
-        while True:
-            recording.write(own, text(b"x" * 100_000))
-
-    with pytest.raises(ZeroDivisionError):
-        until_refused()
-    with pytest.raises(ZeroDivisionError):
-        recording.close()
 
 
 def test_chunks_are_flushed_within_the_interval(store: hl.Store, calls: Calls) -> None:
@@ -398,27 +382,6 @@ def test_what_a_mongod_had_lost_when_it_died_is_indexed_again_and_counted_once(
     assert not store.verify().findings
 
 
-def test_documents_of_many_chunks_are_sent_together(
-    store: hl.Store, calls: Calls, limit: Limit
-) -> None:
-    """Each topic has a chunk a flush, and one insert for all of an interval."""
-    inserted = calls(Database, "insert_raw")
-    limit(index_interval=lambda _: 1e6)
-    topics = [channel(f"/topic{number}") for number in range(3)]
-    with store.start("talk", flush_interval_s=0.05) as recording:
-        totals = recording.capture.writer.totals
-        for number in range(5):
-            for own in topics:
-                recording.write(own, text(bytes([number]) * 2000), log_time=number)
-            wait_for(lambda n=number: totals.chunks == 3 * (n + 1))
-        assert recording.lag == 15
-        assert not inserted
-    names = [collection for _, collection, *_ in inserted if collection.startswith("topic")]
-    assert sorted(names) == [collection_of(own.topic) for own in topics]
-    assert [m.raw[4] for m in store.topic("/topic1")] == list(range(5))
-    assert store.verify().findings == []
-
-
 @pytest.mark.mongo("embedded")
 def test_a_mongod_that_stands_still_costs_nothing(store: hl.Store) -> None:
     speech = channel("/speech")
@@ -441,6 +404,21 @@ def test_a_mongod_that_stands_still_costs_nothing(store: hl.Store) -> None:
             os.kill(pid, signal.SIGCONT)
         wait_for(lambda: recording.lag == 0)
     assert store.topic("/speech").count() == 99
+
+
+def test_no_mistake_of_ours_is_silent(store: hl.Store, calls: Calls) -> None:
+    recording = store.start("talk", budget_bytes=1 << 20)
+    calls.fail(RecordingWriter, "append", ZeroDivisionError)
+    own = channel("/talk")
+
+    def until_refused() -> None:
+        while True:
+            recording.write(own, text(b"x" * 100_000))
+
+    with pytest.raises(ZeroDivisionError):
+        until_refused()
+    with pytest.raises(ZeroDivisionError):
+        recording.close()
 
 
 SPEAKS = """

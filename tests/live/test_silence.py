@@ -6,8 +6,6 @@ import random
 from collections import defaultdict
 from pathlib import Path
 
-import pytest
-
 import hybridlog as hl
 from hybridlog.contract import Contract, TopicRules
 from hybridlog.contract.judge import broken
@@ -17,8 +15,6 @@ from hybridlog.live.sources.replay import ReplaySource
 from hybridlog.record.marks import MARKS
 from tests.across.test_check import write_mcap
 from tests.cli.running import run
-from tests.data import DATA, needs_data
-from tests.some import EXHAUSTIVE
 
 MS = 10**6
 SECOND = 10**9
@@ -103,27 +99,6 @@ def test_played_and_stored_verdicts_are_equal_and_right(tmp_path: Path) -> None:
         assert len(lines) == sum(map(len, marked.values()))
 
 
-@needs_data
-@pytest.mark.parametrize(
-    "name",
-    [
-        "auv_ros2.mcap",
-        *(
-            pytest.param(n, marks=EXHAUSTIVE)
-            for n in ("sick_laser_radar.bag", "tilt_laser.bag", "robot_localization_test1.bag")
-        ),
-    ],
-)
-def test_real_logs_have_one_verdict(name: str, tmp_path: Path) -> None:
-    log = DATA / "real" / name
-    with hl.open(tmp_path / "s", create=True, mongo="none") as store:
-        store.record(log, name="whole")
-        contract = rules(*(one.topic for one in store.check() if one.messages))
-        label, _, marked = played(store, log, contract, speed=20.0)
-        silent = check_same(store, label, marked)
-        assert {one.topic for one in broken(store.judge(contract, label))} == silent
-
-
 class Watch(SilenceWatch):
     """Looks when it is told, and returns what it notes."""
 
@@ -172,14 +147,6 @@ def test_each_silence_is_told_once_and_ends_once() -> None:
     watch.take("o", 176)  # optional, and late
     assert watch.seen(176) == ([("o", 100, 176)], [("o", 100, 176)])
     assert watch.seen(177, is_end=True) == ([], [("b", 100, 177)])
-
-
-def test_a_simulation_that_begins_again_is_watched_on() -> None:
-    watch = Watch(a=TopicRules(longest_gap=10))
-    watch.take("a", 1000)
-    assert watch.seen(1005) == ([], [])
-    assert watch.seen(3) == ([], [])
-    assert watch.seen(14) == ([("a", 3, 14)], [])
 
 
 def test_the_command_tells_marks_runs_a_command_and_judges(tmp_path: Path) -> None:

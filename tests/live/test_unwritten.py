@@ -112,23 +112,6 @@ def test_every_command_tells_it(live: hl.Store, tmp_path: Path) -> None:
         assert "lost" not in done.err
 
 
-def test_an_import_copies_what_has_ended(tmp_path: Path) -> None:
-    path = tmp_path / "store"
-    with hl.open(path, create=True) as store:
-        for name in ("before", "zulu"):
-            recording = store.start(name)
-            recording.write(CHANNEL, text("x"), log_time=SECOND)
-            recording.close()
-    with half_written(path):
-        other = tmp_path / "other"
-        done = run("copy", "--from", path, store=other, code=5)
-        assert done.lines == ["copied before", "copied zulu"]
-        assert "'live' of" in done.err
-        assert "is being written. Copy it when it has ended." in done.err
-    with hl.open(other, mongo=NOWHERE) as store:
-        assert [one.name for one in store.recordings()] == ["before", "zulu"]
-
-
 def test_without_a_socket_it_is_told_in_words(tmp_path: Path) -> None:
     path = tmp_path / "store"
     with hl.open(path, create=True) as store:

@@ -13,7 +13,6 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
-from hybridlog_storage.catalog import CATALOG
 from hybridlog_storage.messages import Channel
 from tests.copies import bring
 from tests.imports import ROOT
@@ -220,16 +219,6 @@ def test_a_recording_is_indexed_without_a_look_at_the_others(
     assert len(costs[MANY].opened) < len(costs[FEW].opened) + 2 * MANY
 
 
-def test_a_question_after_a_change_keeps_what_was_read(stores: dict[int, Path]) -> None:
-    with hl.open(stores[MANY], mongo="none") as store:
-        asked = store.topic("pose").where("data > 4.5")
-        assert asked.count() == MANY * (MESSAGES - 5)
-        store.edit("day00004", tag={"place": "roof"})
-        cost = cost_of(store, asked.count)
-    assert cost.looks < 20
-    assert not [path for path in cost.opened if path.endswith(".parquet")]
-
-
 def test_sql_of_a_day_opens_tables_of_that_day(stores: dict[int, Path]) -> None:
     with hl.open(stores[MANY], mongo="none") as store:
         asked = f"select count(*) from pose where t >= {day(4)[0]} and t < {day(4)[1]}"
@@ -238,17 +227,6 @@ def test_sql_of_a_day_opens_tables_of_that_day(stores: dict[int, Path]) -> None:
         assert len([path for path in cost.opened if path.startswith("part-")]) < 50
         named = "select count(*) from pose where recording = 'day00007'"
         assert store.sql(named).rows() == [(MESSAGES,)]
-
-
-def test_many_at_once_are_counted_in_each_file_once(stores: dict[int, Path]) -> None:
-    with hl.open(stores[MANY], mongo="none") as store:
-        asked = store.topic("pose").where("data > 4.5")
-        first, again = (cost_of(store, asked.count) for _ in range(2))
-        verified = cost_of(store, store.verify)
-    for cost in (first, verified):
-        tables = [path for path in cost.opened if path.endswith(".parquet")]
-        assert len(tables) == len({*tables})
-    assert not [path for path in again.opened if path.endswith((".parquet", ".mcap"))]
 
 
 def test_a_shared_table_decides_a_predicate(stores: dict[int, Path]) -> None:
@@ -279,14 +257,6 @@ def test_a_shared_table_decides_a_predicate(stores: dict[int, Path]) -> None:
             assert {*cost.opened} <= {str(store.directory.path)}
         store.edit("day00012", tag={"place": "hall"})
         assert imu.where("data in [1205, 3]").count() == 2
-
-
-def test_a_small_recording_takes_little_room(stores: dict[int, Path]) -> None:
-    path = stores[MANY]
-    kept = [CATALOG, "recordings", "tables"]
-    found = [f for name in kept for f in [path / name, *(path / name).rglob("*")] if f.is_file()]
-    assert sum(f.stat().st_size for f in found) <= MANY * 30_000
-    assert len(found) <= MANY * 5 + 10  # segment, manifest, the one before, two locks
 
 
 def test_one_more_recording_costs_the_same(stores: dict[int, Path], tmp_path: Path) -> None:
@@ -332,11 +302,6 @@ def check_with_few_files(path: Path, recordings: int, limit: int) -> None:
     messages = recordings * MESSAGES
     wanted = (messages, messages - recordings * 5, messages, messages, recordings, 0)
     assert done.stdout.split() == [str(number) for number in wanted]
-
-
-def test_all_of_it_works_with_fewer_files_than_recordings(stores: dict[int, Path]) -> None:
-    with hl.open(stores[MANY], require_database=True):  # mongod needs more
-        check_with_few_files(stores[MANY], MANY, 100)
 
 
 @pytest.mark.exhaustive

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
@@ -11,7 +10,6 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
-from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.mongo.database import Database
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.calls import Calls
@@ -86,20 +84,6 @@ def test_killed_while_a_log_is_recorded(
     check(store, 3 * MESSAGES)
 
 
-def test_killed_during_a_live_recording(store: hl.Store, killing: list[str]) -> None:
-    channel = Channel("/n", "ros1", Schema("a/N", "ros1msg", b"uint32 n\n"), {}, False)
-    recording = store.start("live", flush_interval_s=0.05)
-    written = 0
-    while len(killing) < KILLED_AT + 2 or written < 1000:
-        recording.write(channel, written.to_bytes(4, "little"))
-        written += 1
-        if written % 20 == 0:
-            time.sleep(0.01)
-    report = recording.close()
-    assert report.failure is None
-    check(store, written)
-
-
 def test_the_state_of_the_index_cannot_be_rolled_back(members: ReplicaSet, tmp_path: Path) -> None:
     """It is read as a majority has it, before and after what is asked of documents."""
     log = logs.write(tmp_path / "a.mcap", logs.content(0, 10))
@@ -115,21 +99,6 @@ def test_the_state_of_the_index_cannot_be_rolled_back(members: ReplicaSet, tmp_p
     documents = [n for n, one in enumerate(asked) if one.collection == own[0]]
     assert documents
     assert asked[documents[0] - 1].collection == asked[documents[-1] + 1].collection == own[1]
-
-
-def test_questions_go_on(
-    members: ReplicaSet,
-    store: hl.Store,
-    log: Path,
-) -> None:
-    store.record(log)
-    query = store.topic("/number").where({"$expr": {"$gte": ["$n", 100]}})
-    assert query.count() == MESSAGES - 100
-    members.kill_primary()
-    assert query.count() == MESSAGES - 100
-    members.heal()
-    members.kill_primary()
-    assert [m.fields["n"] for m in query.limit(300)] == list(range(100, 400))
 
 
 def test_what_only_the_primary_had_is_not_lost(

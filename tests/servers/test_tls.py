@@ -197,13 +197,3 @@ def test_what_is_wrong_is_said_with_its_cure(
     assert "s3cret" not in done.err
     assert "_ssl.c" not in done.err
     assert len(done.err.strip().splitlines()) == 1
-
-
-def test_tls_with_a_server_that_has_none(log: Path, tmp_path: Path) -> None:
-    with Mongod(tmp_path / "mongod") as server:
-        with MongoClient(f"mongodb://{server.address}/") as client:
-            eventually(lambda: client.admin.command("ping"), "no server")
-        uri = f"mongodb://{server.address}/x?tls=true&serverSelectionTimeoutMS=1500"
-        done = run("record", log, "--mongo", uri, "-q", store=tmp_path / "store", code=None)
-        assert done.code not in {0, 1}
-        assert "tls=true" in done.err

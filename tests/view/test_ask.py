@@ -287,14 +287,6 @@ def test_losses_are_told(odd: hl.Store, asking: Callable[[hl.Store], TestClient]
     assert any(f"{lost.messages} messages lost in" in line for line in answer["remarks"])
 
 
-def test_observed_fields_are_offered(
-    odd: hl.Store, asking: Callable[[hl.Store], TestClient]
-) -> None:
-    asked = {"recording": "x [1]", "topic": "/a b", "text": "na", "place": 2}
-    answer = asking(odd).get("complete", params=asked).json()
-    assert answer["candidates"][0] == ["`odd.name`", "field", "integer"]
-
-
 def test_a_file_is_made_while_it_is_sent(
     odd: hl.Store, monkeypatch: pytest.MonkeyPatch, limit: Limit
 ) -> None:

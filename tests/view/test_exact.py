@@ -214,15 +214,6 @@ def test_pictures_at_the_ends_of_time(clocks: TestClient, label: str) -> None:
         assert found.json()["count"] == SENT
 
 
-def test_pixels_of_late_years(clocks: TestClient) -> None:
-    asked = {"recording": "far", "topic": "/v", "begin": 0, "end": SENT * MS, "pixels": 30}
-    found = clocks.get("series", params={**asked, "field": "v"}).json()
-    assert found["times"] == [str(n * 10 * MS) for n in range(30)]
-    (one,) = found["fields"]
-    assert one["least"] == [n * 10 for n in range(30)]
-    assert one["greatest"] == [n * 10 + 9 for n in range(30)]
-
-
 @pytest.mark.parametrize("label", WRONG)
 def test_messages_at_the_ends_of_time(clocks: TestClient, label: str) -> None:
     times = WRONG[label]
@@ -256,25 +247,6 @@ def click(page: Page, n: int) -> None:
 def is_shown(page: Page, n: int) -> None:
     page.locator("li[aria-current]", has_text=f"#{n + 1} ").wait_for()
     page.locator(".tree .leaf", has_text=f"id{row(n)['id']}").first.wait_for()
-
-
-@pytest.mark.peer("browser")
-def test_the_page_shows_the_match_of_several_at_one_time(page: Page, store: hl.Store) -> None:
-    def check(n: int) -> None:
-        is_shown(page, n)
-        assert page.locator("li[aria-current]").count() == 1
-
-    with served(store) as url:
-        asked_on(page, url, "twins", {"kind": "message", "topic": "/num", "options": {}})
-        for n in (4, 5, 3, 0):
-            click(page, n)
-            check(n)
-        for n in range(1, 9):
-            page.keyboard.press("n")
-            check(n)
-        for n in range(7, 0, -1):
-            page.keyboard.press("p")
-            check(n)
 
 
 @pytest.mark.peer("browser")

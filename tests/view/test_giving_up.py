@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import sys
 import threading
-import time
-from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,17 +15,14 @@ import hybridlog as hl
 from benchmarks.simulator.write import write_bag
 from hybridlog.view import context
 from hybridlog.view.loopback import Admission
-from hybridlog.view.routes import export
 from hybridlog.view.server import make_app
 from hybridlog_storage.cache import Kind
-from hybridlog_storage.messages import Channel
-from tests.calls import Calls
 from tests.limits import Limit
-from tests.view.conftest import PORT, ROBOT, TOKEN, served
+from tests.view.conftest import PORT, ROBOT, TOKEN
 from tests.view.test_ask import asked_for
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Page
+    pass
 
 
 S = 10**9
@@ -121,44 +116,3 @@ def test_a_question_that_is_given_up_waits_for_nothing(demo_store: hl.Store) -> 
         assert b"The query was stopped" in said[1]["body"]
     said = asked_for(app, "matches", QUESTIONS["matches"], leaves_after=20.0)
     assert said[0]["status"] == 200
-
-
-@pytest.fixture
-def running(tmp_path: Path) -> Iterator[hl.Store]:
-    """A store, as another process has it open, with a recording that goes on."""
-    ended = threading.Event()
-    with hl.open(tmp_path / "store", create=True) as writing, ExitStack() as stack:
-        recording = stack.enter_context(writing.start("live", flush_interval_s=0.05))
-
-        def write() -> None:
-            for n in range(1000):
-                recording.write(Channel("/a", "json", None), b'{"n": %d}' % n, log_time=S + n * MS)
-                if ended.wait(0.2):
-                    break
-
-        writer = threading.Thread(target=write)
-        writer.start()
-        stack.callback(writer.join)
-        stack.callback(ended.set)
-        with hl.open(tmp_path / "store") as store:
-            yield store
-
-
-@pytest.mark.peer("browser")
-def test_updates_do_not_starve_a_question(running: hl.Store, page: Page, calls: Calls) -> None:
-    """An answer that takes longer than the time from one update to the next comes, and again."""
-    calls(export, "question_of", lambda *_: time.sleep(1.2))
-    page.set_default_timeout(60_000)
-    while not running.summaries() or not running.entry("live").messages:
-        time.sleep(0.1)
-        running.refresh()
-    with served(running) as url:
-        page.goto(f"{url}#recording=live&panels=[]")
-        page.get_by_label("Topic of the question").locator("option").wait_for(state="attached")
-        page.get_by_label("Question", exact=True).fill("n >= 0")
-        page.keyboard.press("Enter")
-        told = page.locator(".told")
-        told.filter(has_text="match").wait_for()
-        first = told.inner_text()
-        told.filter(has_not_text=first).filter(has_text="match").wait_for()
-        page.locator(".matches li").nth(1).wait_for()

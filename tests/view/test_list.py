@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
 import pytest
 
 import hybridlog as hl
-from hybridlog.view import context
 from hybridlog_storage.messages import Channel
-from tests.view.conftest import Asking, served
+from tests.view.conftest import Asking
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -80,25 +78,6 @@ def test_a_recording_says_what_the_store_says(client: TestClient, demo_store: hl
         assert [row["first"], row["last"]] == [str(times[n] - entry.span[0]) for n in (0, -1)]
 
 
-def test_looking_for_new_recordings_is_bounded(
-    demo_store: hl.Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """It takes a tenth of the time at most, and new recordings are seen after two seconds."""
-    now, looks = [100.0], []
-
-    def look() -> None:
-        looks.append(now[0])
-        now[0] += 1.5  # it takes that long
-
-    monkeypatch.setattr(context, "time", SimpleNamespace(monotonic=lambda: now[0]))
-    monkeypatch.setattr(demo_store, "refresh", look)
-    shown = context.Context(demo_store)
-    for _ in range(100):
-        shown.refresh()
-        now[0] += 0.5
-    assert looks == [102.0, 118.5, 135.0, 151.5]
-
-
 @pytest.mark.peer("browser")
 def test_a_recording_is_found_and_opened(page: Page, demo_url: str) -> None:
     page.goto(demo_url)
@@ -116,19 +95,3 @@ def test_a_recording_is_found_and_opened(page: Page, demo_url: str) -> None:
     assert "#recording=robot" in page.url
     page.go_back()
     page.wait_for_selector("text=1 recording:")
-
-
-@pytest.mark.peer("browser")
-def test_a_new_recording_comes_into_the_list(page: Page, tmp_path: Path) -> None:
-    with hl.open(tmp_path / "store", create=True) as store, hl.open(tmp_path / "store") as other:
-        with served(other) as url:
-            page.goto(url)
-            page.get_by_text("The store is empty").wait_for()
-            with store.start("new") as recording:
-                recording.write(Channel("/a", "raw", None), b"", log_time=1)
-            row = page.get_by_role("link", name="new", exact=True)
-            row.focus()
-            with store.start("newer") as recording:
-                recording.write(Channel("/a", "raw", None), b"", log_time=1)
-            page.get_by_role("link", name="newer").wait_for()
-            assert row.evaluate("link => link === document.activeElement")

@@ -8,21 +8,17 @@ import threading
 from collections.abc import Iterator
 from copy import copy
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
-from urllib.parse import urlencode
+from typing import TYPE_CHECKING, Any
 
-import httpx2
 import pytest
-from mcap.reader import NonSeekingReader, SeekingReader
+from mcap.reader import NonSeekingReader
 from starlette.testclient import TestClient
 
 import hybridlog as hl
-from hybridlog.formats.slices import cached_slice, payload_bytes, write_mcap
+from hybridlog.formats.slices import cached_slice, write_mcap
 from hybridlog.view.loopback import Admission
 from hybridlog.view.server import make_app
-from hybridlog_storage.errors import UsageError
 from tests.independent import Seen, read_bag, read_mcap
-from tests.limits import Limit
 from tests.view.conftest import PORT, TOKEN, served
 from tests.waiting import at_once
 
@@ -52,63 +48,6 @@ def app(demo_store: hl.Store) -> TestClient:
     """The view with MCAP, without a server."""
     guarded = make_app(demo_store, Admission(token=TOKEN, port=PORT, origins=[FOXGLOVE]))
     return TestClient(guarded, base_url=f"http://127.0.0.1:{PORT}/{TOKEN}/mcap/")
-
-
-class Ranges(io.RawIOBase):
-    """A file on a server, read by ranges."""
-
-    def __init__(self, url: str) -> None:
-        self._url, self._at = url, 0
-        self.taken = 0
-        head = httpx2.head(url)
-        assert head.headers["accept-ranges"] == "bytes"
-        self.length, self.etag = int(head.headers["content-length"]), head.headers["etag"]
-
-    def readable(self) -> bool:
-        return True
-
-    def seekable(self) -> bool:
-        return True
-
-    def seek(self, offset: int, whence: int = 0) -> int:
-        self._at = (0, self._at, self.length)[whence] + offset
-        return self._at
-
-    def tell(self) -> int:
-        return self._at
-
-    def readinto(self, buffer: Any) -> int:
-        end = min(self._at + len(buffer), self.length) - 1
-        if end < self._at:
-            return 0
-        got = httpx2.get(self._url, headers={"Range": f"bytes={self._at}-{end}"})
-        assert got.status_code == 206
-        assert got.headers["content-range"] == f"bytes {self._at}-{end}/{self.length}"
-        assert got.headers["etag"] == self.etag
-        buffer[: len(got.content)] = got.content
-        self._at += len(got.content)
-        self.taken += len(got.content)
-        return len(got.content)
-
-
-def test_a_reader_opens_the_url(demo_store: hl.Store, seen: list[Seen]) -> None:
-    with served(demo_store, FOXGLOVE) as url:
-        file = Ranges(f"{url}mcap/slice.mcap?recording=robot")
-        reader = SeekingReader(cast("io.BytesIO", io.BufferedReader(file, 1 << 16)))
-        summary = reader.get_summary()
-        assert summary is not None
-        assert summary.statistics is not None
-        assert summary.statistics.message_count == len(seen)
-        assert file.taken < file.length / 4, "a part of the file is enough"
-        begin = seen[0].log_time + 5 * S
-        found = [
-            Seen(channel.topic, message.log_time, message.data)
-            for _, channel, message in reader.iter_messages(
-                topics=["/base/scan"], starting_at=begin, ending_before=begin + S
-            )
-        ]
-        wanted = [m for m in seen if m.topic == "/base/scan" and begin <= m.log_time < begin + S]
-        assert found == wanted
 
 
 def test_a_slice_is_the_one_of_the_command_line(
@@ -256,22 +195,6 @@ def test_a_page_of_foxglove_reads_ranges(demo_store: hl.Store, page: Page) -> No
         assert content_range.startswith("bytes 0-7/")
 
 
-def test_the_oldest_slices_make_room(demo_store: hl.Store, cache: Path, limit: Limit) -> None:
-    for path in cache.glob("*"):
-        path.unlink()
-    queries = [demo_store.query([topic]) for topic in ("/odom", "/tf", "/joint_states")]
-    first, second = (cached_slice(query, "a" * 300, write_mcap) for query in queries[:2])
-    taken = first.stat().st_size + second.stat().st_size
-    limit(cached_slices_bytes=taken + payload_bytes(queries[2]) - 1)
-    assert cached_slice(queries[0], "a" * 300, write_mcap) == first, "it is used again, so newer"
-    third = cached_slice(queries[2], "c", write_mcap)
-    assert sorted(cache.iterdir()) == sorted([first, third])
-    limit(cached_slices_bytes=100)
-    with pytest.raises(UsageError, match="choose fewer topics or less time"):
-        cached_slice(queries[1], "b", write_mcap)
-    assert first.exists(), "a slice that is refused removes nothing"
-
-
 def test_a_slice_is_written_once_and_wholly(demo_store: hl.Store) -> None:
     query = demo_store.query(["/odom"])
     writers = []
@@ -295,10 +218,3 @@ def test_a_slice_is_written_once_and_wholly(demo_store: hl.Store) -> None:
     with pytest.raises(OSError, match="no"):
         cached_slice(demo_store.query(["/tf"]), "wholly", fail)
     assert cached_slice(demo_store.query(["/tf"]), "wholly", write).exists()
-
-
-def test_every_parameter_survives_the_manifest(app: TestClient) -> None:
-    asked = [("recording", "robot"), ("topic", "/odom"), ("where", "child_frame_id != 'a&b=c'")]
-    (source,) = app.get(f"manifest?{urlencode(asked)}").json()["sources"]
-    data = app.get(source["url"])
-    assert len(list(NonSeekingReader(io.BytesIO(data.content)).iter_messages())) > 0

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from mcap.reader import make_reader
 from starlette.testclient import TestClient
 
@@ -17,11 +16,7 @@ from hybridlog_storage.errors import TopicError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
-from tests.every_image import (
-    COMPRESSED,
-    RAW,
-)
-from tests.odd_messages import HOSTILE, MS, START, write_odd
+from tests.odd_messages import MS, START, write_odd
 from tests.view.conftest import Asking
 
 S = 10**9
@@ -62,63 +57,6 @@ def test_a_damaged_message_is_told(odd: TestClient) -> None:
         assert found["problem"]
         assert "tree" not in found
         assert found["time"] == str(6 * S)
-
-
-def test_fields_that_can_be_drawn_can_be_drawn(client: TestClient, odd: TestClient) -> None:
-    for one, recording, topic in (
-        (client, "robot", "/base/scan"),
-        (client, "robot", "/joint_states"),
-        (client, "robot", "/odom"),
-        (odd, "odd", "/own"),
-        (odd, "odd", "/loose"),
-    ):
-        fields = got(one, "fields", topic, recording)["fields"]
-        names = [field["path"] for field in fields]
-        assert names
-        assert len(set(names)) == len(names)
-        for n in range(0, len(names), 16):
-            asked = {"field": names[n : n + 16], "begin": 0, "end": 4 * S, "pixels": 10}
-            drawn = got(one, "series", topic, recording, **asked)
-            assert [found["field"] for found in drawn["fields"]] == names[n : n + 16]
-    listed = {
-        f["path"]: f["type"] for f in got(client, "fields", "/joint_states", "robot")["fields"]
-    }
-    assert listed["position[2]"] == "float64"
-    assert listed["effort.max"] == "summary"
-    assert "position[3]" not in listed
-    loose = {f["path"]: f["type"] for f in got(odd, "fields", "/loose")["fields"]}
-    assert loose["n"] == "integer"
-    assert not any("`" in path for path in loose)
-
-
-@pytest.mark.parametrize(("topic", "kind"), [(RAW, "image/png"), (COMPRESSED, None)])
-def test_an_image_comes_once(
-    odd: TestClient, odd_store: hl.Store, topic: str, kind: str | None
-) -> None:
-    """Who has it is told that it is the same; a compressed one is sent as it came."""
-    asked: dict[str, Any] = {"recording": "images", "topic": topic, "at": 1}
-    answer = odd.get("image", params=asked)
-    times = answer.headers["Hybridlog-Time"], answer.headers["Hybridlog-Until"]
-    assert times == ("0", str(100 * MS))
-    if kind is None:
-        assert answer.content == bytes(next(iter(odd_store.topic(topic))).decode().data)
-    else:
-        assert answer.headers["Content-Type"] == kind
-    tag = {"If-None-Match": answer.headers["ETag"]}
-    again = odd.get("image", params={**asked, "at": 2}, headers=tag)
-    assert (again.status_code, again.content) == (304, b"")
-    assert again.headers["Hybridlog-Time"] == times[0]
-    assert odd.get("image", params={**asked, "at": 100 * MS}, headers=tag).status_code == 200
-    none = odd.get("image", params={**asked, "at": -1})
-    assert (none.json(), none.headers["Hybridlog-Until"]) == ({}, "0")
-
-
-@pytest.mark.parametrize("path", ["message", "fields", "series", "image", "log", "log/count"])
-def test_what_is_not_there_is_not_found(odd: TestClient, path: str) -> None:
-    asked = {"at": 0, "begin": 0, "end": 1, "pixels": 1, "field": "id"}
-    for recording, topic in (("odd", "/scan"), ("odd", "own"), ("even", "/own"), ("", HOSTILE)):
-        answer = odd.get(path, params={"recording": recording, "topic": topic, **asked})
-        assert answer.status_code == 404
 
 
 def test_the_next_time_is_found_in_any_chunk(tmp_path: Path) -> None:

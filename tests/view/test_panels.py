@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from PIL import Image
 
 import hybridlog as hl
 from hybridlog_storage.messages import Channel, Schema
-from tests.every_image import BROKEN, COMPRESSED, FORMS, HEIGHT, RAW, SAMPLES, WIDTH
-from tests.imports import ROOT
+from tests.every_image import HEIGHT, RAW, WIDTH
 from tests.odd_messages import HOSTILE, LOGS, LONG, MS, START, log_time
-from tests.view.chromium import Chromium
 from tests.view.conftest import opened, printed_by, served
 
 if TYPE_CHECKING:
@@ -81,25 +76,6 @@ def test_a_message_as_a_tree(page: Page, odd_url: str) -> None:
     tree.get_by_text("No message at or before the cursor").wait_for()
 
 
-def test_a_recording_is_first_shown_with_something(page: Page, demo_url: str) -> None:
-    page.goto(f"{demo_url}#recording=robot")
-    page.locator(".timeline .topic").first.wait_for()
-    # Types make room for the names of topics.
-    cut = """names => names
-        .filter(one => one.scrollWidth > one.clientWidth && one.nextSibling.clientWidth > 2)
-        .map(one => one.title)"""
-    assert page.locator(".timeline .topic").evaluate_all(cut) == []
-    first = """async times => {
-        const types = ["sensor_msgs/Image", "sensor_msgs/LaserScan"];
-        const of = (first, at) =>
-            ({ topic: `/${at}`, type: types[at], messages: 1, first: BigInt(first) });
-        const info = { begin: 0n, end: 100n, topics: times.map(of) };
-        return (await import("./panels.js")).firstTime({ info });
-    }"""
-    found = [page.evaluate(first, times) for times in ([3, 8], [3, 60], [70, 60], [])]
-    assert found == [8, 3, 60, 0]
-
-
 def test_hostile_names_and_values_are_text(page: Page, odd_url: str) -> None:
     kinds = [("message", "/loose", {}), ("message", HOSTILE, {}), ("log", HOSTILE, {})]
     opened(page, odd_url, "odd", *kinds, ("plot", HOSTILE, {}), at=0)
@@ -108,21 +84,6 @@ def test_hostile_names_and_values_are_text(page: Page, odd_url: str) -> None:
     panel(page, "log").locator(".line").first.wait_for()
     assert page.locator("article img, article script, article b").count() == 0
     assert page.title().startswith("odd ")
-
-
-def test_a_deep_message_opens_level_by_level(page: Page, odd_url: str) -> None:
-    opened(page, odd_url, "odd", ("message", "/loose", {}), at=S)
-    tree = panel(page, "message").locator(".tree")
-    tree.get_by_text("next").first.wait_for()
-    # Three levels are open at first, and the answer has room for sixteen.
-    for level in range(4, 22):
-        tree.locator("details:not([open]) > summary").first.click()
-        page.wait_for_function(
-            "level => document.querySelectorAll('.tree details[open]').length === level && "
-            "[...document.querySelectorAll('.tree details[open]')].every("
-            "one => one.querySelector('.inside').childElementCount)",
-            arg=level,
-        )
 
 
 def test_a_plot(page: Page, demo_store: hl.Store, start: int, demo_url: str) -> None:
@@ -168,54 +129,6 @@ def test_a_plot(page: Page, demo_store: hl.Store, start: int, demo_url: str) -> 
     page.mouse.dblclick(box["x"] + 50, box["y"] + 30)
     page.wait_for_selector(".chart[data-exact=false]")
     assert state(page, "begin") is None
-
-
-def test_fields_are_chosen_by_keyboard(page: Page, demo_url: str) -> None:
-    opened(page, demo_url, "robot", ("plot", "/joint_states", {"fields": []}), at=S)
-    plot = panel(page, "plot")
-    button = plot.get_by_role("button", name="Fields…")
-    button.focus()
-    page.keyboard.press("Enter")
-    plot.get_by_label("Search fields").wait_for()
-    page.keyboard.type("velo 1")
-    page.keyboard.press("Enter")
-    plot.locator("output[data-field='velocity[1]']").wait_for()
-    assert state(page, "panels")[0]["options"]["fields"] == ["velocity[1]"]
-    page.keyboard.type("effort.m")
-    assert plot.locator(".choices label").count() == 3  # min, max, mean
-    page.keyboard.press("Tab")
-    page.keyboard.press("Space")
-    plot.locator("output[data-field='effort.min']").wait_for()
-    plot.get_by_label("Remove velocity[1]").click()
-    assert state(page, "panels")[0]["options"]["fields"] == ["effort.min"]
-    # What is no number is told, and can be taken away again.
-    button.click()
-    page.keyboard.type("name")
-    page.keyboard.press("Enter")
-    plot.get_by_label("Remove name.n").wait_for()
-    page.keyboard.type("name[0]")
-    page.keyboard.press("Enter")
-    plot.get_by_role("alert").get_by_text("no number").wait_for()
-    page.keyboard.press("Escape")
-    plot.get_by_label("Search fields").wait_for(state="hidden")
-    plot.get_by_label("Remove name[0]").click()
-    plot.get_by_role("alert").wait_for(state="hidden")
-
-
-@pytest.mark.parametrize("topic", [RAW, COMPRESSED])
-def test_every_image_is_shown(page: Page, odd_url: str, topic: str) -> None:
-    names = [*SAMPLES, *BROKEN[:3]] if topic == RAW else [*FORMS, BROKEN[3]]
-    opened(page, odd_url, "images", ("image", topic, {}))
-    image = panel(page, "image").locator("img")
-    for n, name in enumerate(names):
-        seek(page, n * 100 * MS + 5)
-        if name in BROKEN:
-            page.get_by_role("alert").wait_for()
-            continue
-        text = f"{topic} at +{n / 10:.3f} s"
-        page.wait_for_function(SHOWN, arg=text)
-        size = image.evaluate("one => [one.naturalWidth, one.naturalHeight]")
-        assert size == [WIDTH, HEIGHT], name
 
 
 def test_a_log(page: Page, odd_url: str) -> None:
@@ -325,23 +238,6 @@ def copied(page: Page) -> list[str]:
     return found
 
 
-def test_panels_fit_the_page(page: Page, demo_url: str) -> None:
-    topics = [
-        ("image", "/camera/front/image_raw", {}),
-        ("plot", "/odom", {}),
-        ("message", "/base/scan", {}),
-        ("log", "/rosout", {}),
-    ]
-    opened(page, demo_url, "robot", *topics, at=5 * S)
-    for scheme, width in (("light", 1280), ("dark", 1280), ("dark", 390)):
-        page.emulate_media(color_scheme=scheme)  # type: ignore[arg-type]
-        page.set_viewport_size({"width": width, "height": 900})
-        page.locator(".picture img").wait_for()
-        page.locator(".chart canvas").wait_for()
-        page.locator(".line").first.wait_for()
-        assert page.evaluate("document.documentElement.scrollWidth") <= width
-
-
 def test_panels_of_a_recording_that_goes_on(page: Page, tmp_path: Path) -> None:
     begun = time.time_ns()  # before messages are sealed, times count from about now
     said = Channel("/said", "json", Schema("foxglove.Log", "jsonschema", b"{}"))
@@ -377,20 +273,3 @@ def test_panels_of_a_recording_that_goes_on(page: Page, tmp_path: Path) -> None:
             seek(page, state(page, "at") - 24 * S)
             panel(page, "message").get_by_text("said 5").wait_for()
             output.get_by_text("5", exact=True).wait_for()
-
-
-def test_the_picture_of_the_readme(
-    demo_store: hl.Store, installed: Chromium, tmp_path: Path
-) -> None:
-    taken = tmp_path / "view.png"
-    subprocess.run(
-        [
-            *(sys.executable, ROOT / "docs/pictures/make.py", taken),
-            *("--store", demo_store.directory.path, "--browser", installed.path),
-        ],
-        env=installed.environment or None,
-        check=True,
-    )
-    with Image.open(taken) as now, Image.open(ROOT / "docs/pictures/view.png") as shown:
-        assert now.size == shown.size
-        assert len(now.convert("RGB").getcolors(1 << 20) or ()) > 100  # no empty page

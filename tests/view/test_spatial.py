@@ -16,10 +16,10 @@ from PIL import Image
 import hybridlog as hl
 from hybridlog_storage.messages import Channel, Schema
 from tests.ros_values import ROS1
-from tests.view.conftest import opened, printed_by, served
+from tests.view.conftest import opened, served
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Page
+    from playwright.sync_api import Page
 
 S = 10**9
 BASE = 1_700_000_000 * S
@@ -187,25 +187,6 @@ def pixels(png: bytes, colour: tuple[int, int, int]) -> int:
 
 
 @pytest.mark.peer("browser")
-def test_without_webgl_clouds_are_seen_from_above(page: Page, url: str) -> None:
-    page.add_init_script(
-        "const real = HTMLCanvasElement.prototype.getContext;"
-        "HTMLCanvasElement.prototype.getContext = function (kind, ...more) {"
-        "  return kind.startsWith('webgl') ? null : real.call(this, kind, ...more); };"
-    )
-    opened(
-        page, url, "yard", ("points", "/cloud", {"colour": "ring"}), ("points", "/broken", {}), at=0
-    )
-    page.wait_for_selector(".space[data-drawing='flat']")
-    assert data(page, "/cloud")["points"] == "800"
-    words = page.locator("article[aria-label$='/cloud'] .facts").inner_text()
-    assert "This browser has no WebGL: points are shown from above" in words
-    broken = page.locator("article[aria-label$='/broken']")
-    broken.get_by_role("alert").wait_for()
-    assert "needs 14400 bytes and has 14397" in broken.get_by_role("alert").inner_text()
-
-
-@pytest.mark.peer("browser")
 def test_a_track_is_drawn(page: Page, url: str) -> None:
     opened(page, url, "yard", ("map", "/fix", {}), at=2 * S)
     page.wait_for_selector(".space[data-fixes='28'][data-fix]")
@@ -231,21 +212,3 @@ def test_a_track_is_drawn(page: Page, url: str) -> None:
     y = box_of["height"] / 2 - (5 * 11.12 - seen[1]) * seen[2]
     canvas.click(position={"x": x, "y": y})
     until(page, lambda: json.loads(data(page, "/fix")["fix"])["latitude"] == 48.0005)
-
-
-@pytest.mark.peer("browser")
-def test_python_that_gets_the_same(browser: Browser, url: str) -> None:
-    context = browser.new_context(permissions=["clipboard-read", "clipboard-write"])
-    page = context.new_page()
-    try:
-        opened(page, url, "yard", ("points", "/scan", {}), ("map", "/fix", {}), at=S)
-        said = []
-        for topic in ("/scan", "/fix"):
-            panel = page.locator(f"article[aria-label$='{topic}']")
-            panel.get_by_role("button", name="Copy as Python").click()
-            page.wait_for_selector("text=Copied as Python")
-            said.append(printed_by(page.evaluate("navigator.clipboard.readText()")))
-        assert said[0] == "(6,) ('range', 'intensity', 'angle')\n"
-        assert said[1].split()[:2] == ["latitude", "longitude"]
-    finally:
-        context.close()

@@ -11,7 +11,6 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import psutil
 import pytest
 
@@ -28,7 +27,6 @@ if TYPE_CHECKING:
     from starlette.testclient import TestClient
 
 START = 400 << 20  # what the process has before its first query, and files that it maps
-reserved: list[Any] = []
 
 PAGE = """
 import sys
@@ -56,10 +54,6 @@ def wait(_context: object) -> None:
     while True:
         check_wanted()
         time.sleep(0.01)
-
-
-def reserve(_context: object) -> None:
-    reserved.append(np.empty(SQL_MEMORY + OWN_MEMORY * 3 // 4, np.uint8))
 
 
 def end(_context: object) -> None:
@@ -104,12 +98,6 @@ def test_a_query_takes_no_more_than_it_may(client: TestClient, demo_store: hl.St
     assert psutil.Process().memory_info().rss - before < 200 << 20
 
 
-def test_rows_with_a_recording_and_no_time(client: TestClient) -> None:
-    found = client.get("sql", params={"text": "select recording, id from recordings"}).json()
-    assert [row[0] for row in found["rows"]] == ["robot"]
-    assert found["at"] == found["recordings"] == []
-
-
 def test_all_questions_share_one_process(process: SqlProcess) -> None:
     number = process.ask(pid)
     stopped = threading.Event()
@@ -143,13 +131,6 @@ def test_a_process_that_has_ended_is_started_again(process: SqlProcess) -> None:
     with pytest.raises(ResourceError, match="ask for less"):
         process.ask(end)
     assert process.ask(pid) not in {number, again}
-
-
-def test_a_process_whose_memory_is_reserved_is_replaced(process: SqlProcess) -> None:
-    number = process.ask(pid)
-    process.ask(reserve)
-    assert process.ask(pid) != number
-    assert_ends(number)
 
 
 def test_it_ends_with_its_page(demo_store: hl.Store) -> None:

@@ -57,13 +57,6 @@ def picture_of(client: TestClient, asked: dict[str, Any]) -> Picture:
     return Picture(head, lanes, len(answer.content))
 
 
-def test_an_answer_is_as_large_as_the_picture(client: TestClient) -> None:
-    topics = ["/imu/data", "/odom"]
-    for pixels in (100, 1000, 4000):
-        found = picture(client, topics, 0, 20 * SECOND, pixels)
-        assert found.size <= 2 * len(topics) * (pixels + 8) + 600
-
-
 def test_gaps_are_those_of_queries(client: TestClient, demo_store: hl.Store, start: int) -> None:
     begin, end = 0, demo_store.summaries()[0].extent[1] - start + 1
     found = picture(client, ["/r_cart/command_pose", "/imu/data", "/map"], begin, end, 2000)
@@ -86,23 +79,6 @@ def test_gaps_are_those_of_queries(client: TestClient, demo_store: hl.Store, sta
     drawn = [origin + number * width for number in around.lanes[1].gaps.ravel().tolist()]
     assert -width < drawn[0] <= 0
     assert end <= drawn[-1] < end + width
-
-
-def test_bins_that_only_just_fit(tmp_path: Path, asking: Asking) -> None:
-    """The greatest counts of one and of two bytes, and the first that need more."""
-    numbers = {255: 1, 256: 2, (1 << 16) - 1: 2, 1 << 16: 4}
-    with hl.open(tmp_path / "store", create=True) as store:
-        with store.start("full") as recording:
-            for number in numbers:
-                channel = Channel(f"/{number}", "raw", None)
-                for _ in range(number):
-                    recording.write(channel, b"", log_time=SECOND)
-        client = asking(store)
-        for number, size in numbers.items():
-            asked = {"recording": "full", "begin": 0, "end": 1, "pixels": 1}
-            found = picture_of(client, {**asked, "topic": f"/{number}"})
-            (lane,) = found.lanes
-            assert (lane.counts.tolist(), lane.counts.itemsize) == ([number], size)
 
 
 A, B = (Channel(name, "json", None) for name in ("/a", "/b"))
@@ -282,84 +258,3 @@ def hash_of(page: Page) -> dict[str, int]:
     page.wait_for_timeout(300)  # the address is written when it has been still for a moment
     pairs = dict(pair.split("=") for pair in page.evaluate("location.hash.slice(1)").split("&"))
     return {key: int(pairs[key]) for key in ("begin", "end", "at") if key in pairs}
-
-
-TICKS = """async () => {
-  const { labelOf, stepOf, ticksOf } = await import('./axis.js');
-  return [[0, 5e17], [-3e9, 9e9], [3.6e12, 3.6e12 + 1e6], [1.7e18, 1.7e18 + 1e6]].map(
-    ([begin, end]) => {
-      const step = stepOf((end - begin) / 10);
-      const ticks = ticksOf(begin, end, step);
-      return [begin, end, step, ticks, labelOf(ticks[1], step, BigInt)];
-    });
-}"""
-
-
-@pytest.mark.peer("browser")
-def test_axis_from_years_to_milliseconds(page: Page, demo_url: str) -> None:
-    page.goto(demo_url)
-    found = page.evaluate(TICKS)
-    assert [label for *_, label in found] == [
-        "1972-09-27",
-        "0:00",
-        "3600.0001 s",
-        "1700000000.0001 s",
-    ]
-    for begin, end, step, ticks, _ in found:
-        assert 5 <= len(ticks) <= 11
-        assert begin <= ticks[0] < ticks[-1] <= end
-        assert ticks == [pytest.approx(ticks[0] + n * step, abs=256) for n in range(len(ticks))]
-
-
-@pytest.mark.peer("browser")
-def test_keys_alone(page: Page, demo_url: str) -> None:
-    page.goto(f"{demo_url}#recording=robot&panels=[]")
-    page.locator(".timeline .density").wait_for()
-    length = float(page.locator(".density").get_attribute("aria-valuemax") or "nan")
-    page.keyboard.press("End")
-    until(page, f"Number(document.querySelector('.density').ariaValueNow) > {length - 0.001}")
-    page.keyboard.press("Home")
-    until(page, "Number(document.querySelector('.density').ariaValueNow) === 0")
-    page.keyboard.press("ArrowRight")
-    until(page, "Number(document.querySelector('.density').ariaValueNow) > 0")
-    assert cursor(page) == pytest.approx(length * SECOND / 50, rel=0.01)
-    page.locator(".density").focus()
-    page.keyboard.press("+")
-    page.keyboard.press("PageDown")
-    until(page, "location.hash.includes('begin=')")
-    page.keyboard.press("-")
-    page.keyboard.press("?")
-    page.get_by_role("dialog").wait_for()
-    page.keyboard.press("Escape")
-    page.get_by_role("dialog").wait_for(state="hidden")
-    # Playing at ten times moves the cursor, and stops at the end.
-    page.get_by_label("Speed").select_option("10")
-    page.locator(".density").focus()
-    page.keyboard.press(" ")
-    page.get_by_role("button", name="Play or pause").filter(has_text="Pause").wait_for()
-    until(page, f"Number(document.querySelector('.density').ariaValueNow) > {length / 3}")
-    page.keyboard.press(" ")
-    page.get_by_role("button", name="Play or pause").filter(has_text="Play").wait_for()
-    at = cursor(page)
-    page.wait_for_timeout(200)
-    assert cursor(page) == at
-    page.keyboard.press(" ")
-    until(page, f"Number(document.querySelector('.density').ariaValueNow) > {length - 0.001}")
-    page.get_by_role("button", name="Play or pause").filter(has_text="Play").wait_for()
-
-
-@pytest.mark.peer("browser")
-@pytest.mark.parametrize("range_of", ["", "&begin=-5000000000&end=5000000000"])
-def test_a_range_longer_than_the_recording_is_not_asked_for_forever(
-    tmp_path: Path, page: Page, range_of: str
-) -> None:
-    asked: list[str] = []
-    page.on("request", lambda one: asked.append(one.url) if "/timeline?" in one.url else None)
-    with hl.open(tmp_path / "store", create=True) as store:
-        with store.start("one") as recording:
-            recording.write(Channel("/a", "json", None), b"{}", log_time=SECOND)
-        with served(store) as url:
-            page.goto(f"{url}#recording=one&panels=[]{range_of}")
-            page.locator(".timeline .density").wait_for()
-            page.wait_for_load_state("networkidle")
-    assert len(asked) < 4  # once more for what was drawn meanwhile

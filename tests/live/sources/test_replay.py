@@ -21,7 +21,7 @@ from tests import independent
 from tests.calls import Calls
 from tests.data import DATA, needs_data
 from tests.limits import Limit
-from tests.live.sources.heard import Heard, must_return
+from tests.live.sources.heard import Heard
 
 BEGIN = 1_700_000_000_000_000_000
 SECOND = 1_000_000_000
@@ -182,17 +182,6 @@ def test_nothing_comes_before_its_time(
         assert -1e-6 <= late <= replay._MIN_PAUSE_S + 1e-6
 
 
-def test_many_small_messages_do_not_cost_a_pause_each(tmp_path: Path, calls: Calls) -> None:
-    count = 5000
-    path = write(tmp_path / "a.mcap", [("/a", BEGIN + at * 100_000, b"") for at in range(count)])
-    pauses = calls(ReplaySource, "_pause")
-    heard = Heard()
-    play(path, heard, speed=1.0)
-    assert len(heard.taken) == count
-    # The log takes half a second, and no pause is shorter than a millisecond.
-    assert 1 <= len(pauses) <= 501
-
-
 def test_looking_ahead_is_bounded_and_loses_nothing(tmp_path: Path, limit: Limit) -> None:
     limit(replay_window_bytes=10_000, replay_window_rows=300)
     dice = random.Random(2)
@@ -259,20 +248,6 @@ def test_falling_behind_is_said_once(tmp_path: Path, limit: Limit) -> None:
     (line,) = heard.said
     assert "cannot be played at speed 1e+09" in line
     assert len(heard.taken) == 100
-
-
-def test_a_long_pause_is_said_and_can_be_left(tmp_path: Path) -> None:
-    path = write(tmp_path / "a.mcap", [("/a", BEGIN, b"1"), ("/a", BEGIN + 7200 * SECOND, b"2")])
-    heard = Heard()
-    with ReplaySource(path) as source:
-        source.start(heard)
-        heard.until(lambda h: h.said)
-        must_return(source.stop)
-        must_return(source.stop)
-        assert [t for t in threading.enumerate() if t.name.startswith("hybridlog-replay")] == []
-    assert heard.payloads() == [b"1"]
-    assert "takes 7200 s" in heard.said[0]
-    assert heard.ends == []
 
 
 def test_what_is_not_wanted_takes_its_time_all_the_same(

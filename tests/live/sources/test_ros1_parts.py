@@ -42,23 +42,6 @@ def test_any_bytes_are_a_header_or_an_error() -> None:
         channel_of("/t", fields)
 
 
-def test_a_channel_looks_as_if_it_came_from_a_bag() -> None:
-    fields = {
-        "callerid": "/camera",
-        "latching": "1",
-        "md5sum": "abc",
-        "message_definition": "uint8 x # ü\n",
-        "topic": "/other",
-        "type": "a_msgs/B",
-    }
-    channel = channel_of("/topic", fields)
-    assert channel.topic == "/topic"
-    assert channel.message_encoding == "ros1"
-    assert channel.schema == Schema("a_msgs/B", "ros1msg", "uint8 x # ü\n".encode())
-    assert channel.metadata == {"callerid": "/camera", "latching": "1", "md5sum": "abc"}
-    assert not channel.has_publish_time
-
-
 @pytest.mark.parametrize(
     ("definition", "numbered"),
     [
@@ -129,31 +112,6 @@ def test_addresses(uri: str, endpoint: tuple[str, int]) -> None:
 def test_what_is_no_address(uri: str) -> None:
     with pytest.raises(PeerError, match="not an address"):
         endpoint_of(uri)
-
-
-@pytest.mark.parametrize("turns", range(6))
-def test_who_calls_while_the_server_is_stopped_is_hung_up_on(turns: int) -> None:
-    async def stopped_after_turns() -> None:
-        with socket.create_server(("127.0.0.1", 0)) as listening:
-            listening.setblocking(False)
-            serving = asyncio.create_task(RpcServer(listening, {}).serve())
-            await asyncio.sleep(0.01)
-            with socket.create_connection(listening.getsockname()) as caller:
-                for _ in range(turns):
-                    await asyncio.sleep(0)
-                serving.cancel()
-                await asyncio.wait([serving])
-                gc.collect()
-                caller.settimeout(5)
-                try:
-                    assert caller.recv(1) == b""
-                except ConnectionResetError:
-                    pass  # nobody had taken the call yet
-
-    with warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("always")
-        asyncio.run(stopped_after_turns())
-    assert [str(warning.message) for warning in told] == []
 
 
 _NUMBERED = Channel(
@@ -253,3 +211,28 @@ def test_a_connection_that_is_reset() -> None:
     (loss,) = sink.losses
     assert (loss.cause, loss.count) == (Cause.CONNECTION, None)
     assert "the connection broke" in ends[0]
+
+
+@pytest.mark.parametrize("turns", range(6))
+def test_who_calls_while_the_server_is_stopped_is_hung_up_on(turns: int) -> None:
+    async def stopped_after_turns() -> None:
+        with socket.create_server(("127.0.0.1", 0)) as listening:
+            listening.setblocking(False)
+            serving = asyncio.create_task(RpcServer(listening, {}).serve())
+            await asyncio.sleep(0.01)
+            with socket.create_connection(listening.getsockname()) as caller:
+                for _ in range(turns):
+                    await asyncio.sleep(0)
+                serving.cancel()
+                await asyncio.wait([serving])
+                gc.collect()
+                caller.settimeout(5)
+                try:
+                    assert caller.recv(1) == b""
+                except ConnectionResetError:
+                    pass  # nobody had taken the call yet
+
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        asyncio.run(stopped_after_turns())
+    assert [str(warning.message) for warning in told] == []

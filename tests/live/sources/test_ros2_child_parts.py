@@ -6,7 +6,6 @@ import ast
 import json
 import socket
 import sys
-import tempfile
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -49,14 +48,6 @@ def test_the_profile_is_there_while_ros_comes_up_and_no_longer(
     assert int(found["receiveBufferSize"] or 0) >= 1 << 17
 
 
-@pytest.mark.parametrize(
-    ("allowed", "size"),
-    [("212992\n", 212992), ("1000", 1 << 17), ("", 1 << 17), ("-5", 1 << 17), ("9" * 30, 32 << 20)],
-)
-def test_sockets_are_asked_for_what_the_kernel_allows(allowed: str, size: int) -> None:
-    assert f"<receiveBufferSize>{size}<" in qos.profile(allowed)
-
-
 @pytest.mark.parametrize("name", [*VARIABLES, "FASTDDS_BUILTIN_TRANSPORTS", "ROS2_EASY_MODE"])
 def test_what_the_user_has_set_up_is_left_alone(tmp_path: Path, name: str) -> None:
     environment = {name: "theirs"}
@@ -68,17 +59,6 @@ def test_what_the_user_has_set_up_is_left_alone(tmp_path: Path, name: str) -> No
     assert not qos.is_set_up({name: ""}, tmp_path)
     (tmp_path / "DEFAULT_FASTDDS_PROFILES.xml").touch()
     assert qos.is_set_up({}, tmp_path)
-
-
-def test_without_a_folder_for_the_profile_ros_comes_up_all_the_same(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "missing"))
-    environment: dict[str, str] = {}
-    with qos.default_profile(environment) as is_used:
-        assert not is_used
-        assert not environment
 
 
 def test_what_is_asked_for_fits_all_publishers() -> None:
@@ -461,15 +441,6 @@ def test_without_numbers_nothing_is_counted(tmp_path: Path) -> None:
     assert "does not number messages" in rig.told("say")[0]["text"]
 
 
-def test_names_that_ros_does_not_take_are_said_once(tmp_path: Path) -> None:
-    rig = live_topic(tmp_path, offer())
-    rig.ros.invalid = {"/my-topic\x1b": "must not contain"}
-    rig.topics.look()
-    rig.topics.look()
-    [said] = rig.told("say")
-    assert said["text"].startswith("'/my-topic\\x1b' is ignored")
-
-
 def test_times_that_make_no_sense_are_not_believed(tmp_path: Path) -> None:
     rig = live_topic(tmp_path, offer())
     before = time.time_ns()
@@ -524,47 +495,6 @@ def test_each_version_of_a_type_is_a_channel_of_its_own(tmp_path: Path) -> None:
     assert [message[:2] for message in rig.messages] == [(0, b"a"), (1, b"b"), (0, b"a")]
 
 
-def test_versions_are_mixed_where_messages_do_not_name_their_publisher(tmp_path: Path) -> None:
-    rig = live_topic(tmp_path, offer(type_hash="RIHS01_a"))
-    unnamed(rig, 1)
-    both = [offer(type_hash="RIHS01_a"), offer(B, type_hash="RIHS01_b")]
-    rig.ros.graph = {("/t", "a/msg/T"): both}
-    rig.topics.look()
-    unnamed(rig, 2)
-    assert any("does not tell their messages apart" in said["text"] for said in rig.told("say"))
-    rig.ros.graph = {("/t", "a/msg/T"): both[1:]}
-    rig.topics.look()
-    unnamed(rig, 1)
-    assert [each[0] for each in channels(rig)] == ["RIHS01_a", "", "RIHS01_b"]
-    assert [message[0] for message in rig.messages] == [0, 1, 2]
-
-
-def test_a_graph_that_cannot_be_asked_costs_no_message(tmp_path: Path) -> None:
-    rig = live_topic(tmp_path, offer())
-    rig.ros.offers = lambda _topic: 1 / 0
-    rig.ros.made[0].queue = [(b"b", info(1, B))]
-    rig.child._take(0.0)
-    assert [message[:2] for message in rig.messages] == [(0, b"b")]
-    assert "its publishers are unknown for now" in rig.told("say")[0]["text"]
-
-
-@pytest.mark.parametrize(
-    "text", ["", "[]", "{}", '{"type_hashes": 5}', '{"type_hashes": [{}]}', "[" * 100_000]
-)
-def test_a_description_that_is_none_gives_no_hash(tmp_path: Path, text: str) -> None:
-    definitions = packages(tmp_path, {"a/msg/T.msg": "int8 i", "a/msg/T.json": text})
-    assert definitions.find("a/msg/T").type_hash == ""
-
-
-def test_the_hash_of_a_service_is_that_of_its_event(tmp_path: Path) -> None:
-    hashes = [{"type_name": f"a/srv/S{part}", "hash_string": f"h{part}"} for part in ("", "_Event")]
-    definitions = packages(
-        tmp_path,
-        {"a/srv/S.srv": "---\n", "a/srv/S.json": json.dumps({"type_hashes": hashes})},
-    )
-    assert definitions.find("a/srv/S_Event").type_hash == "h_Event"
-
-
 def test_the_child_runs_under_older_pythons_and_with_nothing_installed() -> None:
     for path in [*FOLDER.glob("*.py"), ROOT.joinpath(*GAPS.split(".")).with_suffix(".py")]:
         name = path.stem
@@ -577,3 +507,12 @@ def test_the_child_runs_under_older_pythons_and_with_nothing_installed() -> None
                 or used.module.startswith((f"{CHILD}.", GAPS))
                 or (name, top) == ("middleware", "rclpy")
             ), f"{name} imports {used.module}"
+
+
+def test_names_that_ros_does_not_take_are_said_once(tmp_path: Path) -> None:
+    rig = live_topic(tmp_path, offer())
+    rig.ros.invalid = {"/my-topic\x1b": "must not contain"}
+    rig.topics.look()
+    rig.topics.look()
+    [said] = rig.told("say")
+    assert said["text"].startswith("'/my-topic\\x1b' is ignored")

@@ -13,11 +13,8 @@ from pathlib import Path
 import pytest
 
 from hybridlog.live.sources.base import Cause
-from hybridlog.live.sources.ros2.child.definitions import Definitions
 from hybridlog.live.sources.ros2.source import Ros2Source
 from hybridlog.schema.codecs import codec_for
-from hybridlog.schema.definition import parse_definition
-from hybridlog_storage.messages import Schema
 from tests.indexed import index_fields
 from tests.limits import Limit
 from tests.live.sources.heard import Heard
@@ -104,19 +101,6 @@ def test_all_arrives_as_it_was_sent(python: str, talker: Robot) -> None:
     assert "durability: 2" in channel.metadata["offered_qos_profiles"]
     assert channel.metadata["topic_type_hash"].startswith("RIHS01_")
     assert all(taken.channel is channel for taken in chat)
-
-
-def test_our_own_node_is_nobody(python: str) -> None:
-    heard = Heard()
-    with Ros2Source(python) as source:
-        source.start(heard)
-        with robot(python, "other") as other:
-            other.do("make", name="/chat", kind=STRING, depth=1)
-            heard.wait(lambda: ("/chat", STRING) in heard.asked, "it should be seen")
-            only = ("/parameter_events", "rcl_interfaces/msg/ParameterEvent")
-            heard.wait(lambda: only in heard.came, "only the robot's should count")
-        heard.wait(lambda: "/chat" in heard.gone, "it should be gone")
-        heard.wait(lambda: "/parameter_events" in heard.gone, "ours does not count")
 
 
 def test_what_was_latched_before_is_heard(python: str, talker: Robot) -> None:
@@ -254,20 +238,3 @@ def test_nothing_outlives_a_recorder_that_is_killed(python: str, number: int) ->
         child = int(recorder.stdout.readline())
         recorder.send_signal(number)
     wait_for(lambda: not is_alive(child))
-
-
-def test_all_definitions_of_the_environment_can_be_read(python: str) -> None:
-    share = Path(python).parents[1] / "share"
-    definitions = Definitions([share])
-    names = [
-        f"{path.parts[-3]}/msg/{path.stem}"
-        for package in ("std_msgs", "sensor_msgs", "geometry_msgs", "rcl_interfaces")
-        for path in sorted(share.glob(f"{package}/msg/*.msg"))
-    ]
-    if not names:
-        pytest.skip("the ROS 2 that was named is no virtual environment of wheels")
-    for name in names:
-        found = definitions.find(name)
-        parse_definition(Schema(name, found.encoding, found.text))
-    assert definitions.find(IMAGE).has_bytes
-    assert not definitions.find("sensor_msgs/msg/JointState").has_bytes

@@ -13,16 +13,15 @@ from typing import Any
 
 import pytest
 
+from hybridlog_storage.errors import TimeError
 from tests import places
 
 pytest.importorskip("websockets", reason="websockets is not installed: no playback is tested")
 
 from websockets.exceptions import InvalidStatus
-from websockets.sync.client import connect
 
 import hybridlog as hl
 from hybridlog.view.playback.played import PlayedLog
-from hybridlog_storage.errors import TimeError
 from hybridlog_storage.messages import Channel, Schema
 from tests.independent import Seen, read_mcap, write_mcap
 from tests.limits import Limit
@@ -113,45 +112,6 @@ def test_every_message_comes_once_in_order_and_as_it_was(one: PlayedLog, seen: l
     assert len(found) == len(seen)
 
 
-def test_channels_are_those_of_the_sdk(one: PlayedLog) -> None:
-    """The SDK's own server describes the same channels in the same way."""
-    foxglove = pytest.importorskip("foxglove", reason="foxglove-sdk is not installed")
-    context = foxglove.Context()
-    made = []
-    for each in one.channels:
-        own = each.channel
-        if own.topic == "/bare" or own.topic == "/odd":
-            continue  # the SDK offers neither a type without definition nor one that is no UTF-8
-        schema = own.schema and foxglove.Schema(
-            name=own.schema.name, encoding=own.schema.encoding, data=own.schema.data
-        )
-        made.append(
-            foxglove.Channel(
-                own.topic, schema=schema, message_encoding=own.message_encoding, context=context
-            )
-        )
-    peer = foxglove.start_server(name="sdk", host="127.0.0.1", port=0, context=context)
-    try:
-        with connect(f"ws://127.0.0.1:{peer.port}", subprotocols=[SDK], proxy=None) as theirs:  # type: ignore[list-item]
-            theirs.recv()
-            wanted = {c["topic"]: c for c in json.loads(theirs.recv())["channels"]}
-    finally:
-        peer.stop()
-    with served(one) as url, Viewer(url) as viewer:
-        found = {c["topic"]: c for c in viewer.channels}
-    assert set(found) == {*wanted, "/bare", "/odd"}
-    assert len(viewer.channels) == len(found), "publishers of a topic are one channel"
-    for topic, channel in wanted.items():
-        ours, theirs_ = dict(found[topic]), dict(channel)
-        ours.pop("id"), theirs_.pop("id")
-        if channel["encoding"] == "json":  # without a schema, the SDK makes up a name
-            assert ours["schema"] == theirs_["schema"] == ""
-        else:
-            assert ours == theirs_, topic
-    assert found["/bare"]["schema"] == ""
-    assert found["/odd"]["schema"] == "string data # \ufffd\n"
-
-
 def test_a_seek_shows_what_is_current_and_then_plays_on(one: PlayedLog, seen: list[Seen]) -> None:
     there = BEGIN + 2 * S
     with served(one, is_paused=True) as url, Viewer(url) as viewer:
@@ -217,31 +177,6 @@ def test_messages_of_the_same_time_stay_together(tmp_path: Path, limit: Limit) -
     assert [int(m.payload) for m in found] == list(range(3000))
 
 
-def test_time_may_begin_at_zero(tmp_path: Path) -> None:
-    with recorded(tmp_path, [("/n", n * S, b"%d" % n) for n in range(3)]) as log:
-        with served(log) as url, Viewer(url) as viewer:
-            viewer.subscribe()
-            assert [m.time for m in viewer.until_end()] == [0, S, 2 * S]
-            viewer.control(plays=False, seek=0)
-            assert [m.time for m in data(viewer.quiet())] == [0]
-
-
-def test_a_late_subscriber_gets_what_is_current(one: PlayedLog) -> None:
-    with served(one, is_paused=True) as url, Viewer(url) as viewer:
-        viewer.control(plays=False, seek=BEGIN + S)
-        viewer.quiet()
-        viewer.subscribe("/map", "/proto")
-        found = data(viewer.quiet())
-        assert [(m.topic, m.time) for m in found] == [
-            ("/map", BEGIN),
-            ("/proto", BEGIN + S // 2),
-        ]
-        viewer.subscribe("/map")
-        (warning,) = viewer.quiet()
-        assert isinstance(warning, dict)
-        assert warning["level"] == 1
-
-
 def test_a_slow_viewer_loses_nothing(tmp_path: Path) -> None:
     """The log time waits for it: with 64 MB in a third of a second, anything else would drop."""
     size, count = 1 << 20, 64
@@ -289,47 +224,6 @@ def test_recordings_follow_one_another_at_once(store: hl.Store, logs: Path) -> N
         assert [Seen(*m) for m in found] == [m for m in wanted if m.topic in {"/n", "/map"}]
 
 
-def test_range_and_predicate(store: hl.Store, seen: list[Seen]) -> None:
-    query = store.topic("/n", "/map").in_recording("one").between("+1s", "+2s")
-    log = PlayedLog(query)
-    assert (log.begin, log.end) == (BEGIN + S, BEGIN + 2 * S - 1)
-    with served(log) as url, Viewer(url) as viewer:
-        viewer.subscribe()
-        found = viewer.until_end()
-    # The map is latched, so it is in force; the last /n from before is not.
-    wanted = [m for m in seen if m.topic == "/n" and BEGIN + S <= m.log_time < BEGIN + 2 * S]
-    assert [Seen(*m) for m in found] == [seen[0], *wanted]
-    odd = PlayedLog(store.topic("/n").in_recording("one").where("n >= 290"))
-    with served(odd) as url, Viewer(url) as viewer:
-        viewer.subscribe()
-        assert [json.loads(m.payload)["n"] for m in viewer.until_end()] == [*range(290, 300)]
-    with pytest.raises(TimeError, match="Nothing was recorded"):
-        PlayedLog(store.topic("/n").between("1999-01-01", "1999-01-02"))
-
-
-def test_it_begins_again_at_the_end(one: PlayedLog, seen: list[Seen]) -> None:
-    with served(one, loops=True) as url, Viewer(url) as viewer:
-        viewer.subscribe("/n", "/map")
-        found: list[Data] = []
-        while len(found) < 500:
-            if isinstance(each := viewer.read(), Data):
-                found.append(each)
-            elif isinstance(each, State):
-                assert each.status == "playing"
-    wanted = [m for m in seen if m.topic in {"/n", "/map"}]
-    assert [Seen(*m) for m in found] == [*wanted, *wanted][:500]
-
-
-def test_the_last_viewer_that_leaves_rewinds(one: PlayedLog, seen: list[Seen]) -> None:
-    with served(one) as url:
-        for _ in range(2):
-            with Viewer(url) as viewer:
-                assert viewer.first_state is not None
-                assert viewer.first_state.time == BEGIN
-                viewer.subscribe()
-                assert len(viewer.until_end()) == len(seen)
-
-
 def test_the_older_protocol_has_no_playback_control(one: PlayedLog, seen: list[Seen]) -> None:
     """Its clients take a message that they do not know for an error, so none is sent."""
     with served(one) as url, Viewer(url, protocols=[WEBSOCKET]) as viewer:
@@ -340,17 +234,6 @@ def test_the_older_protocol_has_no_playback_control(one: PlayedLog, seen: list[S
             found += viewer.quiet(0.5)
     assert len(data(found)) == len(seen)
     assert {type(each) for each in found} == {Data, Time}
-
-
-def test_publishers(one: PlayedLog) -> None:
-    with served(one) as url, Viewer(url) as viewer:
-        viewer.connection.send('{"op": "subscribeConnectionGraph"}')
-        graph = viewer.text("connectionGraphUpdate")
-        viewer.connection.send('{"op": "unsubscribeConnectionGraph"}')
-    assert graph["publishedTopics"] == [
-        {"name": "/map", "publisherIds": ["/server"]},
-        {"name": "/tf", "publisherIds": ["/a", "/b"]},
-    ]
 
 
 @pytest.mark.parametrize(
@@ -384,11 +267,6 @@ def test_web_pages(origin: str | None, host: str | None, is_welcome: bool, one: 
                 Viewer(url, origin=origin, host=host)
             assert refused.value.response.status_code == 403
     assert len(said) == (origin is not None and not is_welcome)
-
-
-def test_a_client_has_to_speak_the_protocol(one: PlayedLog) -> None:
-    with served(one) as url, pytest.raises(InvalidStatus, match="400"):
-        Viewer(url, protocols=[])
 
 
 @pytest.mark.parametrize(
@@ -441,3 +319,26 @@ def test_a_damaged_log_is_said(store: hl.Store, tmp_path: Path) -> None:
             assert said == [error["message"]]
             viewer.control(plays=True)
             assert viewer.text("status")["level"] == 2, "playing on meets the damage again"
+
+
+def test_a_client_has_to_speak_the_protocol(one: PlayedLog) -> None:
+    with served(one) as url, pytest.raises(InvalidStatus, match="400"):
+        Viewer(url, protocols=[])
+
+
+def test_range_and_predicate(store: hl.Store, seen: list[Seen]) -> None:
+    query = store.topic("/n", "/map").in_recording("one").between("+1s", "+2s")
+    log = PlayedLog(query)
+    assert (log.begin, log.end) == (BEGIN + S, BEGIN + 2 * S - 1)
+    with served(log) as url, Viewer(url) as viewer:
+        viewer.subscribe()
+        found = viewer.until_end()
+    # The map is latched, so it is in force; the last /n from before is not.
+    wanted = [m for m in seen if m.topic == "/n" and BEGIN + S <= m.log_time < BEGIN + 2 * S]
+    assert [Seen(*m) for m in found] == [seen[0], *wanted]
+    odd = PlayedLog(store.topic("/n").in_recording("one").where("n >= 290"))
+    with served(odd) as url, Viewer(url) as viewer:
+        viewer.subscribe()
+        assert [json.loads(m.payload)["n"] for m in viewer.until_end()] == [*range(290, 300)]
+    with pytest.raises(TimeError, match="Nothing was recorded"):
+        PlayedLog(store.topic("/n").between("1999-01-01", "1999-01-02"))
