@@ -333,3 +333,30 @@ EVERY = [
     *("/j", "/k", "/a", "/opt", "/ints", "/ints2", "/mix"),
     *("/zoo", "/cam", "/raw", "/pc", "/log", "/c", "/own", "/plain"),
 ]
+
+
+def test_missing_null_empty_nan_and_false_are_five_things(store: hl.Store) -> None:
+    query = store.topic("/opt").in_recording("json_optional_keys")
+    for table in (query.to_arrow(), parquet(query)):
+        assert table["err"].to_pylist() == [None, "x", None, None]
+        assert table["ok"].to_pylist() == [None, True, None, None]
+        assert table["list"].to_pylist() == [None, [1, 2], None, None]
+        assert table["temp"].to_pylist() == [1.5, 2.5, None, 3.0]
+        assert table["n"].to_pylist() == [None, 9007199254740993, 3, None]
+    frame = query.to_pandas()
+    assert frame["ok"].dtype == "boolean"
+    assert frame["err"].isna().tolist() == [True, False, True, True]
+    assert frame["list"].isna().tolist() == [True, False, True, True]
+    rows = csv_rows(query)
+    assert [row["ok"] for row in rows] == ["", "true", "", ""]
+    assert [row["list"] for row in rows] == ["", "[1, 2]", "", ""]
+
+
+def test_values_of_several_types_are_json_text(store: hl.Store) -> None:
+    query = store.topic("/mix").in_recording("json_optional_keys")
+    wanted = [json.loads(payload)["v"] for payload in payloads("json_optional_keys.mcap", "/mix")]
+    for table in (query.to_arrow(), parquet(query)):
+        assert [json.loads(text) for text in table["v"].to_pylist()] == wanted
+    assert [json.loads(text) for text in query.to_pandas()["v"]] == wanted
+    assert [json.loads(row["v"]) for row in csv_rows(query)] == wanted
+    assert query.to_arrow().schema.field("v").type == pa.json_()

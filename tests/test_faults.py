@@ -23,7 +23,9 @@ import hybridlog as hl
 from benchmarks.simulator.topics import RobotConfig
 from benchmarks.simulator.write import write_bag
 from hybridlog_storage.catalog import RecordingEntry
-from hybridlog_storage.errors import StoreError
+from hybridlog_storage.errors import DatabaseError, StoreError
+from hybridlog_storage.messages import Channel
+from hybridlog_storage.mongo.database import Database
 from hybridlog_storage.mongo.index_state import RECORDINGS
 from hybridlog_storage.mongo.mongod import EmbeddedMongod
 from hybridlog_storage.segments.segment_writer import SegmentSettings
@@ -458,3 +460,51 @@ def test_opening_does_not_take_the_directory_of_a_recording_that_begins(
     with hl.open(path, require_database=True) as store:
         store.record(short)
         assert store.verify().findings == []
+
+
+def test_each_message_that_is_missing_in_the_index_is_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those of chunks that were sent in vain, and those of chunks that were not sent then."""
+    log = tmp_path / "a.mcap"
+    channel = Channel("/a", "json", None)
+    independent.write_mcap(log, [(channel, at, b'{"x": "%0100d"}' % at) for at in range(8000)])
+
+    def refused(*_: object, **__: object) -> int:
+        raise DatabaseError("MongoDB refuses it.")
+
+    with hl.open(tmp_path / "store", create=True, require_database=True) as store:
+        with monkeypatch.context() as broken:
+            broken.setattr(Database, "insert_raw", refused)
+            report = store.record(log, settings=SegmentSettings(chunk_size=6000))
+        assert (report.indexed, report.missed, report.entry.messages) == (0, 8000, 8000)
+    with hl.open(tmp_path / "store", require_database=True) as store:
+        assert store.topic("/a").where("x exists").count() == 8000
+
+
+def test_mongod_killed_and_not_to_be_had_again(
+    tmp_path: Path, robot: Path, spoken: dict[str, list[Message]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = tmp_path / "store"
+    killed = False
+
+    def progress(_done: int, messages: int) -> None:
+        nonlocal killed
+        if messages > 3000 and not killed:
+            killed = True
+            monkeypatch.setenv("HYBRIDLOG_MONGOD", "/bin/false")
+            kill_mongod(place)
+
+    whole = Counter(m for part in spoken.values() for m in part)
+    with hl.open(place, create=True, require_database=True) as store:
+        report = store.record(robot, progress=progress)
+        assert isinstance(report.failure, DatabaseError)
+        assert report.missed > 0
+        assert report.indexed + report.missed == report.entry.messages == whole.total()
+        # By time it can be fetched even now, out of the segments alone.
+        assert content(fetched(store, "robot")) == whole
+    monkeypatch.delenv("HYBRIDLOG_MONGOD")
+    with hl.open(place, require_database=True) as store:
+        assert store.repairs.indexed["robot"] > 0
+        assert store.verify().findings == []
+        assert store.topic("/imu/data").where("_meta.t > 0").count() == len(spoken["/imu/data"])

@@ -14,17 +14,22 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import hybridlog as hl
+from hybridlog.cli import record_live
+from hybridlog.live.sources.base import Sink
 from hybridlog_storage.errors import UsageError
 from tests import places
 from tests.cli.running import BACKGROUND, COMMAND, complete, environment, run
 from tests.cli.within import answer
 from tests.independent import read
+from tests.limits import Limit
+from tests.live.speaker import Speaker, text, text_channel
 from tests.waiting import wait_for
 
 pytestmark = pytest.mark.mongo
@@ -481,3 +486,28 @@ def test_a_recorder_loads_nothing_of_what_its_follower_does(logs: Path, tmp_path
     (recording,) = report["recordings"]
     assert recording["messages"] == recording["messages_indexed"] == report["messages_received"]
     assert any(log.gone == "expired" for log in places.manifest(store, "robot").logs.values())
+
+
+@pytest.mark.parametrize("said", [5, 9])
+def test_another_recording_goes_on_when_a_manifest_is_full(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: Limit, said: int
+) -> None:
+    """The limits are those of both, and each has what came in its time."""
+    limit(full_manifest_bytes=1)
+    numbers = iter(range(100))
+
+    def speak(sink: Sink) -> None:
+        for number in islice(numbers, 3):
+            sink.take(text_channel(), text(str(number)), received=time.time_ns())
+
+    monkeypatch.setattr(record_live, "sources_of", lambda _: [Speaker(speak)])
+    words = ("--ros1", "--name", "run", "--max-messages", said, "--reserve", 0, "--json")
+    done = answer("record", *words, "--mongo", "none", store=tmp_path / "store")
+    report = json.loads(done.out.splitlines()[-1])["report"]
+    names = ["run", "run-2", "run-3"][: -(-said // 3)]
+    assert [one["recording"] for one in report["recordings"]] == names
+    assert f"the manifest of {names[-2]} is full: {names[-1]} goes on" in done.err
+    with hl.open(tmp_path / "store", mongo="none") as store:
+        found = [[int(m.fields["data"]) for m in store.query(["/chatter"], [n])] for n in names]
+        assert found == [[*range(n, min(n + 3, said))] for n in range(0, said, 3)]
+        assert store.verify().findings == []

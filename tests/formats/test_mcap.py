@@ -381,3 +381,27 @@ def test_what_stands_behind_the_last_message_is_recorded(
             metadata = {record.name: record.metadata for record in reader.iter_metadata()}
     assert found == {"before": b"first", "behind": b"last"}
     assert metadata["robot"] == {"name": "r2", METADATA_CHECK: ANY}
+
+
+def test_a_chunk_in_a_payload_of_a_damaged_chunk_is_none_of_the_file(
+    tmp_path: Path,
+) -> None:
+    rows = [(ANY_JSON, 100 + i, VARIANTS["NONE"]) for i in range(3)]
+    none = CompressionType.NONE
+    path = write_mcap(tmp_path / "a.mcap", rows, chunk_size=1, compression=none)
+    bad = bytearray(path.read_bytes())
+    del bad[120:140]
+    path.write_bytes(bad)
+    found = read(path)
+    assert [message.log_time for message in found.messages] == [101, 102]
+
+
+def test_a_summary_that_counts_more_than_there_is_raises_suspicion(
+    put: Callable[[bytes], Path],
+) -> None:
+    data = bytearray(make(enable_crcs=False))
+    at = bytes(data).rindex(struct.pack("<QHI", 12, 1, 2))
+    struct.pack_into("<Q", data, at, 15)
+    found = read(put(bytes(data)))
+    assert len(found.messages) == 12
+    assert found.lost == [3]

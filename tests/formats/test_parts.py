@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import shutil
 import sqlite3
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
+import zstandard
 
 from hybridlog.formats.log_set import LogSet, open_source
 from hybridlog_storage.errors import SourceError
+from hybridlog_storage.messages import Channel, Schema
+from tests.independent import write_mcap
 
 BEGIN = 1_700_000_000_000_000_000
 SECOND = 10**9
@@ -146,3 +150,52 @@ def test_a_part_that_cannot_be_read_costs_no_other(bag: Path) -> None:
         (bag / f"bag_{part}.db3").unlink()
     with pytest.raises(SourceError, match="SQLite"):
         open_source(bag).batches().__next__()
+
+
+def put_mcap(path: Path, numbers: Sequence[int]) -> Path:
+    channel = Channel("/n", "cdr", Schema("std_msgs/msg/UInt32", "ros2msg", b"uint32 data\n"))
+    return write_mcap(path, [(channel, BEGIN + n * SECOND, payload(n)) for n in numbers])
+
+
+def test_empty_parts_are_told(bag: Path) -> None:
+    (bag / "bag_1.db3").write_bytes(b"")
+    (bag / "notes.txt").touch()
+    found = Found(bag)
+    assert found.numbers == [*FIFTEEN[:5], *FIFTEEN[10:]]
+    assert found.damage == [("bag_1.db3", None)]
+    assert "empty" in found.reasons[0]
+    put_metadata(bag, ["bag_0.db3", "bag_1.db3"], 15)
+    assert Found(bag).damage == [("bag_1.db3", 5)]
+    put_metadata(bag, ["bag_0.db3"], 15)
+    assert Found(bag).damage == [("bag_1.db3", 5)]
+
+
+def test_files_that_are_no_parts_are_told(bag: Path) -> None:
+    put_metadata(bag, ["bag_0.db3", "bag_1.db3"], 15)
+    put_db3(bag / "other.db3", range(100, 103))
+    put_mcap(bag / "bag_3.mcap", range(7))
+    data = (bag / "bag_0.db3").read_bytes()
+    (bag / "bag_0.db3.zstd").write_bytes(zstandard.compress(data))
+    (bag / "other_2.db3.zstd").write_bytes(zstandard.compress(data))
+    found = Found(bag)
+    assert found.numbers == FIFTEEN
+    assert sorted(found.damage) == [
+        ("bag_0.db3.zstd", 0),
+        ("bag_3.mcap", None),
+        ("other.db3", None),
+        ("other_2.db3.zstd", None),
+    ]
+
+
+def test_wrong_statistics_of_a_split_mcap(tmp_path: Path) -> None:
+    put_mcap(tmp_path / "a_0.mcap", range(5))
+    path = put_mcap(tmp_path / "a_1.mcap", range(5, 10))
+    data = path.read_bytes()
+    # Another last time in the statistics; the checksum of the summary is switched off.
+    times = (BEGIN + 9 * SECOND).to_bytes(8, "little")
+    at = data.rindex((BEGIN + 5 * SECOND).to_bytes(8, "little") + times, 0, data.rindex(b"zstd"))
+    data = data[: at + 8] + (BEGIN + 7 * SECOND).to_bytes(8, "little") + data[at + 16 :]
+    path.write_bytes(data[:-12] + bytes(4) + data[-8:])
+    found = Found(tmp_path)
+    assert (found.numbers, found.time_range) == (FIFTEEN[:10], (BEGIN, BEGIN + 9 * SECOND + 1))
+    shutil.rmtree(tmp_path)

@@ -398,3 +398,81 @@ def test_the_definition_is_found_in_the_index_when_its_chunk_is_lost(tmp_path: P
     found, damage = read_bytes(bytes(data))
     assert 0 < total(found) < total(expected)
     assert [each.messages_lost for each in damage] == [total(expected) - total(found)]
+
+
+def with_zeros(data: bytes) -> bytes:
+    """A bag with zeros behind each of its index records, which states them in its chunk list."""
+    parts, moved, at = [data[:13]], {}, 13
+    while at < len(data):
+        (size,) = struct.unpack_from("<I", data, at)
+        (length,) = struct.unpack_from("<I", data, at + 4 + size)
+        end = at + 8 + size + length
+        moved[at] = sum(map(len, parts))
+        record = bytearray(data[at:end])
+        if (place := record.find(b"chunk_pos=", 0, size)) > 0:
+            struct.pack_into(
+                "<Q", record, place + 10, moved[struct.unpack_from("<Q", record, place + 10)[0]]
+            )
+        parts.append(bytes(record))
+        if b"op=\x04" in record[: 4 + size] or b"op=\x06" in record[: 4 + size]:
+            parts.append(bytes(20))
+        at = end
+    whole = bytearray(b"".join(parts))
+    place = whole.index(b"index_pos=") + 10
+    struct.pack_into("<Q", whole, place, moved[struct.unpack_from("<Q", whole, place)[0]])
+    return bytes(whole)
+
+
+@pytest.mark.parametrize("compression", ["none", "lz4"])
+def test_zeros_behind_index_records_are_a_remark(tmp_path: Path, compression: str) -> None:
+    path = tmp_path / "a.bag"
+    expected = make(path, compression, chunk=2000, messages=400)
+    path.write_bytes(with_zeros(path.read_bytes()))
+    with Rosbag1Source(path) as source:
+        assert source.message_count == 400
+        assert contents(source) == expected
+        assert source.damage == []
+        (remark,) = source.remarks
+    assert "are zeros" in remark
+
+
+@pytest.mark.parametrize("size", [0, 12, 40])
+def test_zeros_in_place_of_a_chunk_are_damage(tmp_path: Path, size: int) -> None:
+    """From the head of the second chunk, or from somewhat before it, to its end."""
+    path = tmp_path / "a.bag"
+    expected = make(path, "lz4", chunk=2000, messages=400)
+    data = bytearray(path.read_bytes())
+    first = data.index(b"compression=lz4")
+    start = data.index(b"compression=lz4", first + 1) - 8
+    end = data.index(b"op=\x04", start) - 8
+    data[start - size : end] = bytes(end - start + size)
+    path.write_bytes(data)
+    found, damage = read(path)
+    lost = total(expected) - total(found)
+    assert sum(each.messages_lost or 0 for each in damage) == lost > 0
+
+
+@pytest.mark.parametrize("compression", ["none", "lz4"])
+def test_message_length_that_lies(compression: str) -> None:
+    rows = [message(0, time, bytes(30)) for time in range(20)]
+    broken = bytearray(rows[7])
+    struct.pack_into("<I", broken, len(broken) - 34, 77)
+    rows[7] = bytes(broken)
+    found, damage = read_bytes(
+        bag(chunk(connection(0) + b"".join(rows), compression), index(0, 20))
+    )
+    left = range(8, 20) if compression == "none" else ()  # damage costs the rest of the chunk
+    assert [time for time, _ in found[("/a", "")]] == [*range(7), *left]
+    assert set(values(found)) == {bytes(30)}
+    assert [each.messages_lost for each in damage] == [13 - len(left)]
+
+
+@pytest.mark.parametrize("compression", ["bz2", "lz4"])
+def test_a_cut_chunk_gives_what_unpacks(compression: str) -> None:
+    rows = [message(0, time, bytes([time, time + 1]) * 30_000) for time in range(40)]
+    one = chunk(connection(0) + b"".join(rows), compression)
+    found, damage = read_bytes(bag(one)[: -len(one) // 4])
+    times = [time for time, _ in found[("/a", "")]]
+    assert times == list(range(len(times)))
+    assert 5 < len(times) < 40
+    assert [each.messages_lost for each in damage] == [None]

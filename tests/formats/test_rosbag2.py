@@ -317,3 +317,38 @@ def test_cut_anywhere(tmp_path_factory: pytest.TempPathFactory, data: st.DataObj
             for row in range(len(batch)):
                 assert batch.payload(row) == payloads[int(batch.log_time[row])]
         assert source.damage
+
+
+@pytest.mark.parametrize("keep", [0.01, 0.3, 0.95])
+def test_compressed_file_cut_short(tmp_path: Path, keep: float) -> None:
+    folder = make(tmp_path / "bag", mode=CompressionMode.FILE, messages=5000)
+    expected = reference(folder)
+    file = next(folder.glob("*.zstd"))
+    data = file.read_bytes()
+    file.write_bytes(data[: int(len(data) * keep)])
+    if keep < 0.1:
+        # Not even the first block is there.
+        with pytest.raises(SourceError, match="zstd -t") as caught:
+            read(folder)
+        assert str(file) in str(caught.value)
+        return
+    found, damage = read(folder)
+    assert found <= expected
+    assert 0 < found.total() < 5000
+    assert all(each.file == file for each in damage)
+    assert sum(each.messages_lost or 0 for each in damage) == 5000 - found.total()
+
+
+def test_values_of_odd_types_and_unknown_topics(tmp_path: Path) -> None:
+    path = database(
+        tmp_path / "a.db3",
+        TOPICS,
+        MESSAGES,
+        TOPIC,
+        rows=[(1, 1, 5, "text"), (2, "x", 6, b"lost"), (3, 1, None, None), (9, 1, "7", b"b")],
+    )
+    with SqliteSource(path) as source:
+        (batch,) = source.batches()
+    rows = [(int(t), bytes(batch.payload(row))) for row, t in enumerate(batch.log_time)]
+    assert rows == [(5, b"text"), (0, b""), (7, b"b")]
+    assert [each.messages_lost for each in source.damage] == [1]

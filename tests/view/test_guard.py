@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import http.client
 import json
 import re
 import socket
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from importlib import import_module
 from pathlib import Path
@@ -471,3 +473,32 @@ def test_a_hostile_address_shows_a_page_that_works(page: Page, demo_url: str) ->
         page.wait_for_selector("#main > *")
     assert "hybridlog" in page.title()
     assert page.locator("img[src=x]").count() == 0
+
+
+def test_no_upgrade_to_a_web_socket(door: Door) -> None:
+    headers = {"Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Version": "13"}
+    answer = door.below("recordings", {**headers, "Sec-WebSocket-Key": "x" * 24})
+    assert answer.status == 200  # as without it
+    assert "upgrade" not in answer.headers
+
+
+def test_answers_do_not_wait_for_acknowledgements() -> None:
+    """Of an answer in two parts, the second would come 40 ms after the first."""
+
+    async def options() -> list[int]:
+        found: list[int] = []
+
+        async def accept(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            peer = writer.get_extra_info("socket")
+            found.append(peer.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY))
+            writer.close()
+
+        listening = loopback.listen(0)
+        async with await asyncio.start_server(accept, sock=listening):
+            reader, writer = await asyncio.open_connection(*listening.getsockname())
+            await reader.read()
+            writer.close()
+        return found
+
+    with ThreadPoolExecutor(1) as pool:  # playwright has a loop in this thread
+        assert pool.submit(asyncio.run, options()).result() == [1]
