@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ import pytest
 import hybridlog as hl
 from hybridlog.across.match import interpolated
 from hybridlog_storage.errors import TimeError, TopicError, UsageError
-from hybridlog_storage.messages import Channel
+from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
 from tests.cli.within import answer as run
@@ -226,6 +227,22 @@ def test_cells_without_a_value_are_counted_by_column(tmp_path: Path) -> None:
             "/b: 1 of 6 rows is empty: no message came before.",
             "b.x: 1 of 6 rows is empty: the message has no such value.",
         ]
+
+
+def test_a_message_that_cannot_be_read_is_no_other(tmp_path: Path) -> None:
+    """Not the one before it, and none of its log time."""
+    schema = Schema("p/N", "ros1msg", b"float64 x")
+    with hl.open(tmp_path / "store", create=True) as store:
+        with store.start("now") as recording:
+            for n in range(5):
+                for topic, times in (("/a", 1), ("/b", 2 if n == 3 else 1)):
+                    for _ in range(times):
+                        payload = b"" if topic == "/b" and n in {1, 3} else struct.pack("<d", n)
+                        recording.write(Channel(topic, "ros1", schema), payload, log_time=BASE + n)
+        aligned = store.align("/a", "/b")
+        assert aligned.to_arrow()["b.x"].to_pylist() == [0, None, 2, None, 4]
+        assert aligned.empty == {"b.x": {"the message has no such value": 2}}
+        assert "3 messages do not fit" in " ".join(aligned.remarks())
 
 
 def test_lost_messages_explain_empty_cells(tmp_path: Path) -> None:

@@ -21,9 +21,9 @@ from hybridlog_storage.errors import IncompleteError, TopicError, UsageError
 from tests.cli.running import run
 from tests.data import DATA, needs_data
 from tests.formats.test_places import read_ply
-from tests.odd_messages import ros_channel
-from tests.ros_values import ROS2
 from tests.tf.test_oracle import Oracle
+from tests.tf.test_tree import S
+from tests.tf.test_trees import TYPES, Said, header, moved, recorded
 
 TILT = DATA / "real/tilt_laser.bag"
 
@@ -157,67 +157,44 @@ def test_poses_of_many_rows(demo: Path, store: hl.Store) -> None:
 
 def test_lists_of_poses(tmp_path: Path) -> None:
     """A path and an array of poses: each pose by its own frame, or by that of the message."""
-    types = ROS2.types
-    stamped, pose, point, turn, header, moment = (
-        types[f"{name[0]}/msg/{name[1]}"]
-        for name in (
-            ("geometry_msgs", "PoseStamped"),
-            ("geometry_msgs", "Pose"),
-            ("geometry_msgs", "Point"),
-            ("geometry_msgs", "Quaternion"),
-            ("std_msgs", "Header"),
-            ("builtin_interfaces", "Time"),
-        )
-    )
-    transform, vector = types["geometry_msgs/msg/Transform"], types["geometry_msgs/msg/Vector3"]
-    frame = types["geometry_msgs/msg/TransformStamped"]
+    names = ("PoseStamped", "Pose", "Point", "Quaternion")
+    stamped, pose, place, turn = (TYPES[f"geometry_msgs/msg/{name}"] for name in names)
     half = float(np.sqrt(0.5))
 
-    def head(name: str) -> Any:
-        return header(stamp=moment(sec=1, nanosec=0), frame_id=name)
-
     def at(x: float) -> Any:
-        return pose(point(x=x, y=1.0, z=0.0), turn(x=0.0, y=0.0, z=0.0, w=1.0))
+        return pose(place(x=x, y=1.0, z=0.0), turn(x=0.0, y=0.0, z=0.0, w=1.0))
 
-    turned = turn(x=0.0, y=0.0, z=half, w=half)
-    links = [
-        frame(head("map"), name, transform(vector(x=shift, y=0.0, z=0.0), turned))
-        for name, shift in (("odom", 10.0), ("other", 20.0))
+    links = [moved("map", name, S, x) for name, x in (("odom", 10.0), ("other", 20.0))]
+    for link in links:
+        link.transform.rotation = turn(x=0.0, y=0.0, z=half, w=half)
+    own = [
+        stamped(header(name, S), at(float(n)))
+        for n, name in enumerate(["odom", "", "other", "nowhere"])
     ]
-    own = ["odom", "", "other", "nowhere"]
-    sent: list[tuple[str, str, Any]] = [
-        ("/tf_static", "tf2_msgs/msg/TFMessage", types["tf2_msgs/msg/TFMessage"](links)),
-        *(
-            ("/path", "nav_msgs/msg/Path", types["nav_msgs/msg/Path"](head(of), listed))
-            for of, listed in (
-                ("odom", []),
-                ("odom", [stamped(head(name), at(float(n))) for n, name in enumerate(own)]),
-                ("nowhere", [stamped(head(""), at(0.0))]),
-            )
-        ),
-        *(
-            ("/array", "geometry_msgs/msg/PoseArray", types["geometry_msgs/msg/PoseArray"](*one))
-            for one in ((head("odom"), [at(0.0), at(1.0)]), (head("other"), [at(2.0)]))
-        ),
+    path, array = TYPES["nav_msgs/msg/Path"], TYPES["geometry_msgs/msg/PoseArray"]
+    sent: list[Said] = [
+        ("/tf_static", TYPES["tf2_msgs/msg/TFMessage"](links), S),
+        ("/path", path(header("odom", S), []), S),
+        ("/path", path(header("odom", S), own), S),
+        ("/path", path(header("nowhere", S), [stamped(header("", S), at(0.0))]), S),
+        ("/array", array(header("odom", S), [at(0.0), at(1.0)]), S),
+        ("/array", array(header("other", S), [at(2.0)]), S),
     ]
     with hl.open(tmp_path / "store", create=True, mongo="none") as made:
-        with made.start("x") as recording:
-            for n, (topic, kind, message) in enumerate(sent):
-                data = bytes(ROS2.serialize_cdr(message, kind))
-                recording.write(ros_channel(topic, kind, 2), data, log_time=10**9 + n)
+        recorded(made, "x", sent)
         query = made.topic("/path").in_frame("map")
         table = query.to_arrow()
         plain = made.topic("/path").to_arrow()
         assert table.schema.field("poses").type.equals(plain.schema.field("poses").type)
-        empty, path, lost = table["poses"].to_pylist()
+        empty, found, lost = table["poses"].to_pylist()
         assert empty == []
-        places = [[one["pose"]["position"][axis] for axis in "xyz"] for one in path]
+        places = [[one["pose"]["position"][axis] for axis in "xyz"] for one in found]
         # A quarter turn to the left makes x of y.
         assert places[3] == [None] * 3
         np.testing.assert_allclose(places[:3], [[9, 0, 0], [9, 1, 0], [19, 2, 0]], atol=1e-12)
-        rotation = [path[0]["pose"]["orientation"][axis] for axis in "xyzw"]
+        rotation = [found[0]["pose"]["orientation"][axis] for axis in "xyzw"]
         np.testing.assert_allclose(rotation, [0, 0, half, half])
-        assert {one["header"]["frame_id"] for one in path} == {"map"}
+        assert {one["header"]["frame_id"] for one in found} == {"map"}
         assert lost[0]["pose"]["position"] == dict.fromkeys("xyz")
         assert (
             dict(query.counters.no_transform)
