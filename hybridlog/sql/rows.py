@@ -271,9 +271,7 @@ class TopicOfRecording:
                 has_publish_time=channel.channel.has_publish_time,
                 columns=lambda one: one.arrow(),
             )
-            records = piece.fields
-            if records is None:
-                records = pa.nulls(len(rows), pa.struct([]))
+            records = piece.fields_as(pa.struct([]))
             summaries, ours = records, dict(piece.own)
             if decoded is not None and isinstance(decoded.records, LeftFields):
                 summaries = without(decoded.records.summarised(), decoded.rows, len(rows))
