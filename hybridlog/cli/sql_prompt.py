@@ -69,7 +69,9 @@ class _Prompt(InteractiveConsole):
             self._found = []
             with suppress(HybridlogError):
                 line = "\n".join([*self.buffer, readline.get_line_buffer()])
-                self._found = candidates(self._connection, line, text)
+                self._found = candidates(
+                    self._connection.names(), self._connection.schema, line, text
+                )
         return self._found[state] if state < len(self._found) else None
 
 

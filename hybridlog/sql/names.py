@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, Final
 
 from hybridlog.columns.layout import column_names
 from hybridlog_storage.mongo.collection_names import collection_of
-
-if TYPE_CHECKING:
-    from hybridlog.sql.engine import SqlConnection
 
 TABLES: Final = ("recordings", "topics", "losses", "marks")
 """Tables about the store itself; their names are reserved."""
@@ -101,17 +98,18 @@ def word_before(text: str) -> str:
     return text[max(text.rfind(mark) for mark in DELIMITERS) + 1 :]
 
 
-def candidates(connection: SqlConnection, line: str, text: str) -> list[str]:
+def candidates(
+    names: Iterable[str], schema_of: Callable[[str], Any], line: str, text: str
+) -> list[str]:
     """Views, columns, fields and words that begin with a text, such as `pose.po`, sorted.
 
     Columns are those of the views in the line, the statement so far.
     """
-    names = connection.names()
     words = {word.casefold() for word in PLAIN.findall(line)}
     views = [name for name in names if name.casefold() in words and name != text]
     columns: dict[str, None] = {}
     for view in views:
-        schema = connection.schema(view)
+        schema = schema_of(view)
         above, _, _ = text.rpartition(".")
         columns.update(dict.fromkeys(_below(schema, above)))
         if above:

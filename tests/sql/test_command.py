@@ -200,7 +200,7 @@ def test_completion(store: hl.Store) -> None:
 
     def candidates(line: str, text: str | None = None) -> list[str]:
         word = line.rpartition(" ")[2] if text is None else text
-        return found(connection, line, word)
+        return found(connection.names(), connection.schema, line, word)
 
     assert candidates("select * from sca") == ["scan"]
     assert candidates("select b") == ["base__scan", "between", "by"]

@@ -111,7 +111,7 @@ def sql_completion(context: Context, text: str, place: int) -> dict[str, Any]:
 
     word = word_before(text[:place])
     with closing(context.store.sql_engine.connect(SQL_MEMORY, only_reads=True)) as connection:
-        found = candidates(connection, text, word)
+        found = candidates(connection.names(), connection.schema, text, word)
     offered = [[name, "word", ""] for name in found[:_MAX_CANDIDATES]]
     return {"begin": place - len(word), "candidates": offered}
 
