@@ -542,12 +542,12 @@ class Store:
             TopicError: No such recording, or several; no topic has transforms, or only those of
                 several namespaces.
         """
-        from hybridlog.tf.reader import trees_in
+        from hybridlog.tf.reader import Trees
 
         now = self.snapshot()
         chosen = now.recordings(recording).check()
         only = chosen.topic(*topics).topics if topics else ()
-        trees = trees_in(now.session, chosen.summaries, only)
+        trees = Trees(now.session, chosen.summaries, only)
         return trees.tree(of if of is None else chosen.topic(of).topics[0])
 
     def check(self, recording: Texts = None) -> list[TopicCheck]:

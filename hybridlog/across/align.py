@@ -118,42 +118,38 @@ class Aligned:
         names = [name for reader in self._others for name in reader.question.topics]
         return f"<Aligned {', '.join(names)}; {self._how}>"
 
-    def to_tables(self, told: int | None = None) -> Iterator[pa.Table]:
-        """The rows in Arrow tables of bounded size; at least one, possibly empty.
+    def to_tables(self, limit: int | None = None) -> Iterator[pa.Table]:
+        """The rows, or the first ones, in Arrow tables of bounded size; at least one table.
 
         The type of a column may differ between tables if no definition fixes it.
-
-        Args:
-            told: `rows`, `empty` and `remarks` are about so many first rows; None for all.
         """
         for reader in self._readers:
             reader.counters.reset()
         self.rows, self.empty = 0, {}
         base, beside = self._base, [self._beside(reader) for reader in self._others]
         several = len(self._session.chosen(base.question)) > 1
-        given = False
-        for resolved in RangeResolver(self._session, base.question).resolve():
+        chosen = RangeResolver(self._session, base.question).resolve()
+        for resolved in chosen if limit != 0 else ():
             for one in beside:
                 one.enter(resolved.summary.id)
             name = resolved.summary.name if several else None
             for times, table in base.rows(resolved.summary.id):
                 matched = [one.match(times) for one in beside]
-                given, begin = True, 0
+                begin = 0
                 while begin < len(times):
+                    left = len(times) - begin if limit is None else limit - self.rows
+                    if left <= 0:
+                        return
                     room = [one.fitting(m, begin) for one, m in zip(beside, matched, strict=True)]
-                    end = begin + min([len(times) - begin, *room])
-                    if is_told := told is None or self.rows < told:
-                        end = end if told is None else min(end, begin + told - self.rows)
-                        self.rows += end - begin
+                    end = begin + min([len(times) - begin, left, *room])
                     own = table.slice(begin, end - begin)
                     parts = [Matched._make(column[begin:end] for column in m) for m in matched]
-                    found = [*zip(beside, parts, strict=True)]
-                    yield self._rows(times[begin:end], own, name, found, is_told=is_told)
+                    yield self._rows(times[begin:end], own, name, beside, parts)
                     begin = end
-        if not given:
+        if not self.rows:
             none = np.empty(0, np.int64)
-            found = [(one, Matched(none, none, none)) for one in beside]
-            yield self._rows(none, base.empty, "" if several else None, found, is_told=True)
+            parts = [Matched(none, none, none)] * len(beside)
+            yield self._rows(none, base.empty, "" if several else None, beside, parts)
 
     def _beside(self, reader: TopicReader) -> Beside:
         if isinstance(self._base, RegularTimes) and self._how in AGGREGATES:
@@ -165,20 +161,20 @@ class Aligned:
         times: NDArray[np.int64],
         own: pa.Table,
         recording: str | None,
-        found: Sequence[tuple[Beside, Matched]],
-        *,
-        is_told: bool,
+        beside: Sequence[Beside],
+        found: Sequence[Matched],
     ) -> pa.Table:
-        """Some rows with what was found beside them, which counts if they are told about."""
+        """Some rows with what was found beside them."""
+        self.rows += len(times)
         empty = Counter[tuple[str, str]]()
         columns: dict[str, Any] = {TIME: own[TIME]}
         if recording is not None:
             columns[RECORDING] = text_column(recording, len(times))
         if isinstance(self._base, TopicReader):
             self._base.add(columns, own, empty, 0)
-        for one, matched in found:
+        for one, matched in zip(beside, found, strict=True):
             one.add(columns, times, matched, empty)
-        for (name, reason), rows in (+empty).items() if is_told else ():
+        for (name, reason), rows in (+empty).items():
             reasons = self.empty.setdefault(name, {})
             reasons[reason] = reasons.get(reason, 0) + rows
         return pa.table(columns)

@@ -15,7 +15,7 @@ from hybridlog.across.match import UNKNOWN, Matched, interpolated, match, quater
 from hybridlog.frames.names import free_name
 from hybridlog.query.answers.lost import lost_times
 from hybridlog.query.intervals import Intervals, joined
-from hybridlog.query.planner import Planner, match_times
+from hybridlog.query.planner import Planner, log_times
 from hybridlog.query.question import Counters
 from hybridlog.query.times import format_duration
 from hybridlog.schema.arrow_columns import DURATION, numbers
@@ -158,25 +158,22 @@ class TopicReader:
         if self.elsewhere(recording) is not None:
             return Moments(none, none, none)
         counters, question = Counters(), replace(self._beside(recording), frame=None)
-        log_times, times = [none], [none]
+        log_time, time = none, none
         with suppress(TimeError):  # the range does not touch the recording
             if self._time == TIME:
-                question = replace(question, fields=None)
-                log_times += [p.log_time for p in match_times(self._session, question, counters)]
+                log_time = log_times(self._session, replace(question, fields=None), counters)
             else:
                 question = replace(question, fields=(self._time,))
-                for table in stream(Planner(self._session, question, counters)):
-                    log_times.append(nanoseconds(table[TIME]))
-                    times.append(self._times(table, recording))
+                tables = stream(Planner(self._session, question, counters))
+                found = [(nanoseconds(one[TIME]), self._times(one, recording)) for one in tables]
+                log_time, time = (np.concatenate(parts) for parts in zip(*found, strict=True))
         counters.messages = counters.payload_bytes = 0
         if question.predicate is None:
             counters.unreadable = 0
         self.counters.add(counters)
-        log_time = np.concatenate(log_times)
         if self._time == TIME:
             log_time = np.sort(log_time) if self.is_apart else log_time
             return Moments(log_time, log_time, np.arange(len(log_time)))
-        time = np.concatenate(times)
         order = np.argsort(time, kind="stable")
         order = order[time[order] != UNKNOWN]
         return Moments(log_time, time[order], order)

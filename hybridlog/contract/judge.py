@@ -15,7 +15,7 @@ from hybridlog.arrays.message_arrays import plain_type
 from hybridlog.query.answers.lost import completeness_of
 from hybridlog.query.answers.marks import marks_in
 from hybridlog.query.answers.statistics import check
-from hybridlog.query.planner import match_times
+from hybridlog.query.planner import log_times
 from hybridlog.query.query import Query
 from hybridlog.query.question import Question
 from hybridlog.query.times import format_duration
@@ -171,8 +171,7 @@ class _Judge:
             yield self._result(one.topic, "share", wanted, found, holds=holds)
 
     def _times(self, topic: str) -> NDArray[np.int64]:
-        found = match_times(self._session, self._question(topic))
-        return np.concatenate([np.empty(0, np.int64), *(one.log_time for one in found)])
+        return log_times(self._session, self._question(topic))
 
     def _at_most(self, topic: str, rule: str, limit: int | None, ns: float) -> Iterator[Result]:
         if limit is not None:

@@ -240,6 +240,14 @@ def match_times(
             yield RowBatch(found.log_time[holds], found.seq[holds], holds[holds])
 
 
+def log_times(
+    session: Session, question: Question, counters: Counters | None = None
+) -> NDArray[np.int64]:
+    """All times of `match_times`, ns: those of a recording and topic ascend."""
+    found = (one.log_time for one in match_times(session, question, counters))
+    return np.concatenate([np.empty(0, np.int64), *found])
+
+
 def _decimated(runs: Iterator[MessageRun], question: Question) -> Iterator[MessageRun]:
     """Every n-th message of each topic, up to the limit."""
     seen: Counter[str] = Counter()

@@ -164,7 +164,7 @@ class _Looked:
         if recording not in self._trees:
             snapshot = self._session.look([recording])
             summary = snapshot.summaries[snapshot.by_id[recording]]
-            trees = Trees(self._session, summary, self._question.tf_topics)
+            trees = Trees(self._session, [summary], self._question.tf_topics)
             try:
                 trees.check(self._topic, self.target)
                 self._trees[recording] = trees

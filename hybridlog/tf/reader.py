@@ -15,7 +15,7 @@ import pyarrow.compute as pc
 from hybridlog.arrays.message_arrays import plain_type
 from hybridlog.frames.answer import stream, to_arrow
 from hybridlog.query.answers.lost import completeness_of
-from hybridlog.query.planner import Planner, match_times
+from hybridlog.query.planner import Planner, log_times
 from hybridlog.query.question import Counters, Question
 from hybridlog.tf import is_of_transforms
 from hybridlog.tf.epochs import epochs_of
@@ -46,6 +46,7 @@ class Trees:
     root's, to which Foxglove's messages belong, whatever their topic.
 
     Args:
+        summaries: The recording; a TopicError if there are several.
         only: Topics of one tree that takes the place of all others.
 
     Attributes:
@@ -54,13 +55,17 @@ class Trees:
     """
 
     def __init__(
-        self, session: Session, recording: RecordingSummary, only: Sequence[str] = ()
+        self, session: Session, summaries: Sequence[RecordingSummary], only: Sequence[str] = ()
     ) -> None:
-        self._session, self._recording = session, recording
-        self.epochs = epochs_of(session, recording.id)
-        names = only or sorted(session.look([recording.id]).topics_of(recording))
+        if len(summaries) > 1:
+            names = listed([one.name for one in summaries])
+            raise TopicError(f"Frames belong to one recording: name one of {names}.")
+        self._session, self._recording = session, summaries[0]
+        entry = session.entry_of(self._recording)
+        self.epochs = epochs_of(session, entry.id)
         found: dict[str, list[str]] = {}
-        for topic, name in sorted(_types_of(session, recording, names).items()):
+        types = {one.topic: one.type for one in entry.channels if not only or one.topic in only}
+        for topic, name in sorted(types.items()):
             above, _, last = topic.lstrip("/").rpartition("/")
             if is_of_transforms(name) and (only or plain_type(name).startswith("foxglove.")):
                 found.setdefault("", []).append(topic)
@@ -169,28 +174,6 @@ class Trees:
         return FrameTree(frames, self._recording.extent, dict(invalid), lacks)
 
 
-def trees_in(
-    session: Session, summaries: Sequence[RecordingSummary], topics: Sequence[str] = ()
-) -> Trees:
-    """The trees of a single recording; of `topics` alone if some are given.
-
-    Raises:
-        TopicError: Several recordings.
-    """
-    if len(summaries) > 1:
-        names = listed([one.name for one in summaries])
-        raise TopicError(f"Frames belong to one recording: name one of {names}.")
-    return Trees(session, summaries[0], topics)
-
-
-def _types_of(
-    session: Session, recording: RecordingSummary, topics: Sequence[str]
-) -> dict[str, str]:
-    """Message types of topics with definitions, by topic."""
-    planner = Planner(session, Question(tuple(topics), (recording.id,)))
-    return {c.channel.topic: c.channel.schema.name for c in planner.channels() if c.channel.schema}
-
-
 def frames_and_stamps(
     session: Session, question: Question, counters: Counters
 ) -> tuple[list[str], NDArray[np.int64], NDArray[np.int64]]:
@@ -201,8 +184,7 @@ def frames_and_stamps(
     known = session.field_types(question.topics, question.recordings) or {}
     wanted = [name for name in ("header.stamp", "header.frame_id") if name in known]
     if "header.stamp" not in wanted:  # no message has to be read
-        times = match_times(session, question, counters)
-        log_time = np.concatenate([np.empty(0, np.int64), *(one.log_time for one in times)])
+        log_time = log_times(session, question, counters)
         return [], log_time, log_time
     table = to_arrow(Planner(session, replace(question, fields=tuple(wanted)), counters))
     frames = table["header.frame_id"].unique().to_pylist() if len(wanted) == 2 else []

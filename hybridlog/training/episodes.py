@@ -16,7 +16,7 @@ import pyarrow.compute as pc
 from hybridlog.across.match import match
 from hybridlog.drawing.images import shown_pixels
 from hybridlog.query.periods import GAP_PERIODS, usual_period
-from hybridlog.query.planner import match_times
+from hybridlog.query.planner import log_times
 from hybridlog.query.query import Query
 from hybridlog.query.question import Question
 from hybridlog.query.ranges import RangeResolver
@@ -173,8 +173,7 @@ def _query(session: Session, recording: str, topic: str, begin: int, end: int) -
 
 def _times(query: Query) -> NDArray[np.int64]:
     """Log times of the messages, ns; at least one."""
-    parts = match_times(query.session, query.question)
-    times = np.concatenate([np.empty(0, np.int64), *(part.log_time for part in parts)])
+    times = log_times(query.session, query.question)
     _check(query, times)
     return times
 

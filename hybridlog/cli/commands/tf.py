@@ -69,7 +69,7 @@ def tf_command(given: _Given) -> None:
     """
     if given.target is None and (given.topic or given.topic_type or given.between):
         raise UsageError("Times are those of a transform: name its TARGET and SOURCE frames.")
-    from hybridlog.tf.reader import trees_in
+    from hybridlog.tf.reader import Trees
 
     with given.opened(snapshot=True) as store:
         chosen = given.recordings_in(store).check()
@@ -78,7 +78,7 @@ def tf_command(given: _Given) -> None:
         if query is not None and len(query.topics) > 1:
             raise UsageError(f"Times are those of one topic, not of {listed(query.topics)}.")
         only = chosen.topic(*given.tf_topic).topics if given.tf_topic else ()
-        trees = trees_in(store.session, chosen.summaries, only)
+        trees = Trees(store.session, chosen.summaries, only)
         names = [topics[0] for topics in trees.topics.values()]
         if given.target is not None or not names:
             names = [] if query is None else [*query.topics]
