@@ -391,7 +391,7 @@ class Beside:
         """Hold the messages from one log time to another, ns; those that are held stay."""
         if self._first <= first <= self._last:
             begin = int(np.searchsorted(nanoseconds(self._held[TIME]), first))
-            kept, start = self._held.slice(begin), min(self._last + 1, last)
+            kept, start = self._held.slice(begin), self._last + 1
         else:
             kept, start, self._last = self._reader.empty, first, BEGIN
         self._first = first

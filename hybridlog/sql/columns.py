@@ -34,6 +34,7 @@ from hybridlog.schema.arrow_types import (
     summary,
     with_values,
 )
+from hybridlog_storage.errors import UsageError
 
 OWN: Final = pa.schema(
     [
@@ -53,10 +54,6 @@ _RESERVED: Final = frozenset({*OWN_COLUMNS, *OWN.names})
 _types = pa.types
 Key = tuple[tuple[str, ...], bool]
 """Of a column that is no struct: the path of its field, and whether it is a summary."""
-
-
-class UnfitValueError(Exception):
-    """A value that the type of its column does not represent."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +140,7 @@ def _columns(message: Any, path: tuple[str, ...], reserved: Iterable[str]) -> It
     for (_, name), (_, field, is_twin) in zip(named, fields, strict=True):
         source = (*path, field.name)
         if is_twin:
-            kind = summary_type(field.type)
+            kind = summary(pa.nulls(0, field.type)).type
             yield ViewColumn(name, source, kind, sql_type(kind), is_summary=True)
         elif _types.is_struct(field.type) and field.type.num_fields:
             inner = tuple(_columns(field.type, source, ()))
@@ -158,11 +155,6 @@ def _may_be_summary(kind: Any) -> bool:
     if _types.is_fixed_size_list(kind):
         return bool(kind.list_size > LIMIT)
     return is_array(kind)
-
-
-def summary_type(kind: Any) -> Any:
-    """Type of the summary of an array."""
-    return summary(pa.nulls(0, kind)).type
 
 
 def merged(kinds: Sequence[Any]) -> Any:
@@ -256,7 +248,7 @@ _SQL_TYPES: Final[Sequence[tuple[Callable[[Any], bool], Callable[[Any], Any]]]] 
 def fitted(array: Any, kind: Any) -> Any:
     """Values of a field, as a codec or a table gives them, in the type that SQL has for it.
 
-    An `UnfitValueError` says that the type does not represent one.
+    A `UsageError` says that the type does not represent one.
     """
     target = sql_type(kind)
     if array.type == target and kind != pa.json_():
@@ -283,7 +275,7 @@ def _converted(array: Any, kind: Any, target: Any) -> Any:
     try:
         return array.cast(target)
     except pa.ArrowException as error:
-        raise UnfitValueError(f"{have} is not {target}: {error}") from error
+        raise UsageError(f"{have} is not {target}: {error}") from error
 
 
 def _fitted_struct(array: Any, kind: Any) -> Any:
