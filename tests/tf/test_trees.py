@@ -205,7 +205,7 @@ def test_topics_by_type(store: hl.Store, tmp_path: Path) -> None:
     recorded(store, "x", [*messages, ("/tf", tf("map", "base", S, 1), BEGIN)])
     assert store.topics("PointStamped") == store.topics("geometry_msgs/*") == ["/a", "/b"]
     assert store.recordings("x").topics(POINT, "TFMessage") == store.topics()
-    with pytest.raises(TopicError, match="did you mean .*PointStamped"):
+    with pytest.raises(TopicError, match=r"did you mean .*PointStamped"):
         store.topics("PointStampd")
     path = tmp_path / "store"
     assert run("fetch", "--topic-type", "Point*", "--count", store=path).out == "2\n"
