@@ -33,7 +33,6 @@ from hybridlog_storage.catalog import (
     spans_of,
 )
 from hybridlog_storage.errors import (
-    CatalogError,
     ManifestError,
     SegmentError,
     StoreError,
@@ -343,21 +342,6 @@ def put_entry(
 def with_said(entry: RecordingEntry, manifest: Manifest) -> RecordingEntry:
     """The entry with what people say of its recording by a manifest."""
     return replace(entry, name=manifest.name, tags=dict(manifest.tags), **_said(manifest))
-
-
-def read_again(directory: StoreDirectory, catalog: Catalog, entry: RecordingEntry) -> None:
-    """Read the files of a recording again, after one of them was not what its entry says."""
-    is_open = directory.is_recorded(entry.id)
-    now = describe_now(directory, catalog, entry.id, is_open=is_open)
-    catalog.put(now)
-    for number, _, _ in entry.spans:
-        try:
-            catalog.table(entry, number)
-        except CatalogError as error:
-            raise StoreError(
-                f"The files of recording {entry.name!r} have changed since the store was "
-                "opened. Open it again."
-            ) from error
 
 
 def summary_by(

@@ -1,25 +1,21 @@
-"""An open store: its newest state, of which each question takes a moment; repairs; closing."""
+"""An open store: its newest state, of which each question takes a moment; recovery; closing."""
 
 from __future__ import annotations
 
-import math
-import threading
 import time
 from contextlib import suppress
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from hybridlog.index.access import IndexAccess
 from hybridlog.session import Session
 from hybridlog.shared import Shared
-from hybridlog.snapshot import UNFINISHED
+from hybridlog.snapshot import UNFINISHED, Snapshot
 from hybridlog_storage.disk import files
-from hybridlog_storage.errors import DatabaseError, DiskFullError, HybridlogError
+from hybridlog_storage.errors import DatabaseError, HybridlogError
 
 if TYPE_CHECKING:
     from hybridlog.maintenance.report import Progress
     from hybridlog.record.recorder import RecordReport
-    from hybridlog.snapshot import Snapshot
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.summary import RecordingSummary
 
@@ -37,46 +33,22 @@ class OpenStore(Shared):
         mongo: str | None,
         progress: Progress | None,
         cache_mb: int | None = None,
-        *,
-        recover: bool = True,
     ) -> None:
         super().__init__(directory)
-        self.index = IndexAccess(self, mongo, cache_mb, progress, recovers=recover)
-        self._recovers = recover
-        self._is_opened = False  # what a crash left was repaired, unless it is left to another
+        self.index = IndexAccess(self, mongo, cache_mb, progress)
         self._latest: Session | None = None
         self._changed = 0, False  # as of the latest state, see `StoreDirectory.changed`
         self._names: list[str] = []  # ids of recordings
         self._listed_at = 0.0  # when they were compared last, by `monotonic`
-        self._mending = threading.Lock()
 
     def now(self) -> Session:
         """The store at this moment, for one question; no file is read if nothing has changed."""
         self.check_process()
         latest = self._latest
-        if latest is None:
-            return self._read()
-        if self._has_names_changed():
-            self.catch_up()
-            return self._latest or self._read()
+        if latest is None or self._has_names_changed():
+            latest = self.catch_up()
         # What running recordings have flushed since is for this question to see.
         return latest.again() if latest.snapshot().unfinished else latest
-
-    def _read(self) -> Session:
-        with self.following:  # or a thread might keep an older state than `_changed` says
-            if self._latest is not None:
-                return self._latest
-            mends, self._is_opened = self._recovers and not self._is_opened, True
-            self._changed = self.directory.changed()
-            self._names = self.directory.ids()
-            try:
-                found = replace(self._files, mends=mends).look_at_all()
-            except DiskFullError as error:
-                # The store remains readable, and recordings can be removed.
-                self.repairs.disk_full = error
-                found = self._files.look_at_all()
-            self._latest = Session(self, found)
-            return self._latest
 
     def _has_names_changed(self) -> bool:
         """True if recordings have come or gone since the latest state."""
@@ -89,39 +61,29 @@ class OpenStore(Shared):
         self._changed = now if is_same else (0, False)
         return not is_same
 
-    def has_changed(self) -> bool:
-        """True if recordings look different by now."""
-        latest = self._latest
-        return latest is None or self.newest() is not latest.snapshot()
-
     def replace_latest(self, before: Snapshot, now: Session) -> None:
         """Let later questions begin with what one has seen, unless there is a newer state."""
         if self._latest is not None and self._latest.snapshot() is before:
             self._latest = now.again()
 
-    def catch_up(self, *recordings: str, mends: bool = False) -> None:
-        """See which recordings came or went, and how some others are now.
+    def catch_up(self, *recordings: str) -> Session:
+        """See which recordings came or went, and how some others are now; at first, all.
 
-        All else that was read stays, so this costs little in a store of thousands. With `mends`,
-        those that a crash has cut short are recovered.
+        All else that was read stays, so this costs little in a store of thousands.
         """
         with self.following:
-            if self._latest is None:
-                return
             self.catalog.has_changed |= bool(recordings)
-            before = self._latest.snapshot()
+            before = Snapshot((), {}) if self._latest is None else self._latest.snapshot()
             changed, names = self.directory.changed(), self.directory.ids()
             known = before.by_id.keys()
-            moved = known ^ {*names}  # they came or went
-            ids = moved | ({*recordings} & known)
-            now = replace(self._files, mends=mends).catch_up(before, ids)
-            if now is None or (moved and self.directory.changed()[0] != changed[0]):
-                self.invalidate()
-                return
+            ids = (known ^ {*names}) | self.repairs.unreadable.keys() | ({*recordings} & known)
+            if self._latest is not None and not ids:
+                return self._latest
+            self._latest = latest = Session(self, self._files.look(before, ids))
             self._changed, self._names = changed, names
-            self._latest = Session(self, now)
             self.index.note_changes()
             self._invalidate_recordings(ids & known)
+            return latest
 
     def newest(self) -> Snapshot:
         """All recordings; those that look different by now are read again."""
@@ -144,47 +106,19 @@ class OpenStore(Shared):
         self.cache.drop("column")
         vars(self).pop("tables", None)
 
-    # Repairs.
+    def recover(self) -> None:
+        """Finish what crashes and killed commands have left, before this process changes things.
 
-    def mend(self, seconds: float = math.inf) -> None:
-        """Repair what questions met: recordings after a crash, missing and damaged tables.
-
-        Tables that are not made in so many seconds stay in `repairs.noted_tables`.
+        Questions write nothing: of what a recorder that died has left, they read what is flushed.
         """
-        self.check_process()
-        if self.directory.is_writable:
-            with self._mending:
-                self._mend(time.monotonic() + seconds)
-
-    def _mend(self, until: float) -> None:
-        repairs = self.repairs
-        known = self.now().snapshot().summaries
-        died = [one.id for one in known if one.status == "unfinished"]
-        if died and time.monotonic() < until:
-            with self.following:
-                for recording in died:
-                    self._running.pop(recording, None)
-                self.catch_up(*died, mends=True)
-        session = self.now()
-        for recording in {recording for recording, _ in repairs.noted_tables}:
-            from hybridlog.maintenance.tables import missing
-
-            entry = session.entry_if_there(recording)
-            topics = set() if entry is None else missing(self.directory, entry, self.tables)
-            if entry is not None and topics:
-                from hybridlog.follow.follower import make_tables
-
-                try:
-                    problem = make_tables(
-                        self.directory, self.catalog, entry, topics=topics, until=until
-                    )
-                except TimeoutError:
-                    continue
-                if not problem:
-                    self.tables.look_again()
-                    made = (one for one in sorted(topics) if self.tables.of(entry, one) is not None)
-                    repairs.tables += [(entry.name, one) for one in made]
-            repairs.noted_tables = {one for one in repairs.noted_tables if one[0] != recording}
+        with self.following:
+            self.check_process()
+            known = self.catch_up().look().summaries
+            done = self._files.recover([one.id for one in known if one.status == "unfinished"])
+            for recording in done:
+                self._running.pop(recording, None)
+            if done:
+                self.catch_up(*done)
 
     def recorded(self, report: RecordReport) -> None:
         """See a recording that has ended; if MongoDB is available again, index the rest."""

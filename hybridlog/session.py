@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import numpy as np
 
-from hybridlog.entries import channels_of, read_again, summary_of, take_inventory
+from hybridlog.entries import channels_of, put_entry, summary_of, take_inventory
 from hybridlog.query.chunk_columns import PARTS, ChunkColumns, log_bounds
 from hybridlog.query.question import Question, RecordedChannel, field_types
 from hybridlog.query.topics import resolve
@@ -218,12 +218,6 @@ class Session:
             return [*self.entries(self._recordings.summaries)]
         snapshot = self._recordings
         return [self.entry_of(snapshot.summaries[place]) for place in self.named(names)]
-
-    def as_now(self, ids: Iterable[str]) -> list[RecordingEntry]:
-        """Recordings as they are now, oldest first; those that are gone are left out."""
-        snapshot = self._recordings
-        places = sorted(snapshot.by_id.get(one, -1) for one in ids)
-        return [self.entry_of(snapshot.summaries[place]) for place in places if place >= 0]
 
     def named(self, names: Iterable[str | RecordingEntry]) -> list[int]:
         """Positions of recordings in the snapshot, each once, in the order of the names."""
@@ -445,10 +439,9 @@ class Session:
         """The chunks of a recording's segment; a `ChangedError` if its file is another one."""
         try:
             return self.catalog.table(recording, number)
-        except CatalogError:
+        except CatalogError as error:
             self._check_same(recording, number, reads=False)
-            read_again(self.directory, self.catalog, recording)
-            return self.catalog.table(recording, number)
+            raise StoreError(f"{error} Ask again.") from error
 
     def parts(
         self, recording: RecordingEntry, channels: Collection[int], span: tuple[int, int]
@@ -549,7 +542,10 @@ class Session:
         place = self._recordings.by_id.get(entry.id)
         look = None if place is None else self._recordings.summaries[place].look
         if self.directory.looks([entry.id]).get(entry.id) == look:
-            return
+            if reads:
+                return
+            is_open = self.directory.is_recorded(entry.id)
+            put_entry(self.directory, self.catalog, entry.id, is_open=is_open)
         self.shared.catch_up(entry.id)
         now: RecordingEntry | None = self.shared.now().entry_if_there(entry.id)
         if now is None:
@@ -562,18 +558,10 @@ class Session:
             raise _changed(entry)
 
     def table(self, recording: RecordingEntry, topic: str) -> TopicTable | None:
-        """The table of a topic; None without one. A missing one is noted for `OpenStore.mend`."""
+        """The table of a topic; None without one."""
         if recording.status in UNFINISHED or (topic == MARKS and recording.marks):
             return None
-        found = self.tables.of(recording, topic)
-        if found is None:
-            self.shared.repairs.noted_tables.add((recording.id, topic))
-        return found
-
-    def reject_table(self, recording: RecordingEntry, topic: str) -> None:
-        """Drop a table that turned out to be damaged; `OpenStore.mend` makes it again."""
-        self.tables.reject(recording, topic)
-        self.shared.repairs.noted_tables.add((recording.id, topic))
+        return self.tables.of(recording, topic)
 
 
 def _file_in(entry: RecordingEntry, number: int) -> tuple[object, ...]:

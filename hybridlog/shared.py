@@ -97,7 +97,7 @@ class Shared(ABC):
 
         return Tables(self.directory.path, self.cache)
 
-    @property
+    @lazy
     def _files(self) -> StoreFiles:
         return StoreFiles(self.directory, self.catalog, self.repairs)
 
@@ -108,8 +108,12 @@ class Shared(ABC):
         """The store at this moment."""
 
     @abstractmethod
-    def catch_up(self, *recordings: str) -> None:
+    def catch_up(self, *recordings: str) -> Any:
         """See which recordings came, went, or got another name, and how some others are now."""
+
+    @abstractmethod
+    def recover(self) -> None:
+        """Finish what crashes and killed commands have left."""
 
     @abstractmethod
     def replace_latest(self, before: Snapshot, now: Any) -> None:

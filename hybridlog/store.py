@@ -3,25 +3,20 @@
 from __future__ import annotations
 
 import os
-import re
-import secrets
-import time as clock
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from copy import copy
 from functools import partial
 from pathlib import Path
 from typing import (
     TYPE_CHECKING,
     Any,
-    Final,
     Literal,
     Self,
     TypeAlias,
     cast,
 )
 
-from hybridlog.entries import free_name_in, put_entry, text
 from hybridlog.index import consent
 from hybridlog.index.access import again_if_lost
 from hybridlog.index.of_store import Index
@@ -30,20 +25,14 @@ from hybridlog.opened import OpenStore
 from hybridlog.query.choice import Choice
 from hybridlog.query.query import Query, narrowed, of_now
 from hybridlog.query.question import Question
-from hybridlog.query.times import parse_range, parse_time
-from hybridlog.record.losses import extent_of
 from hybridlog.session import Asked, Session
 from hybridlog_storage.catalog import Catalog, RecordingEntry
 from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.errors import (
-    HeldError,
-    ResourceError,
     StoreError,
-    TimeError,
     TopicError,
     UsageError,
 )
-from hybridlog_storage.manifest import Manifest, Note, free_name, replace
 from hybridlog_storage.remote import address_of, directory_of
 from hybridlog_storage.settings import (
     EMBEDDED,
@@ -63,18 +52,16 @@ if TYPE_CHECKING:
     from hybridlog.contract.judge import Result
     from hybridlog.formats.reading import Source
     from hybridlog.live import LiveOptions, LiveRecording
-    from hybridlog.maintenance.copying import CopyOptions, CopyReport, Target
+    from hybridlog.maintenance.copying import CopyOptions, CopyReport
     from hybridlog.maintenance.keep import KeepReport
-    from hybridlog.maintenance.report import Repaired
     from hybridlog.maintenance.sizes import Sizes
-    from hybridlog.maintenance.verify import Finding, Verification
+    from hybridlog.maintenance.verify import Verification
     from hybridlog.query.answers.statistics import TopicCheck
     from hybridlog.query.choice import During, Tags, Texts
     from hybridlog.query.question import Clock
     from hybridlog.query.times import DurationLike, TimeLike
     from hybridlog.record.recorder import RecordOptions, RecordReport
     from hybridlog.recordings import Recordings
-    from hybridlog.snapshot import Snapshot
     from hybridlog.sql.engine import SqlAnswer, SqlEngine
     from hybridlog.tf.tree import FrameTree
     from hybridlog.training.lerobot import LerobotReport
@@ -82,12 +69,8 @@ if TYPE_CHECKING:
     from hybridlog_storage.summary import RecordingSummary
 
 DEFAULT_STORE = "hybridlog-store"
-_MENDING_S: Final = 2.0
-"""Longest time that a command repairs what it met, after its answer."""
 Names: TypeAlias = "Iterable[str | RecordingEntry]"
 """Recordings by name or id, or their entries."""
-_ELSEWHERE: Final = re.compile(r"[^/:]+:(.*)")
-"""A URL, or a place on a server as scp has it."""
 
 
 def store_path(path: str | Path | None = None) -> Path:
@@ -103,12 +86,12 @@ def open_store(
     require_database: bool = False,
     progress: Progress | None = None,
     cache_mb: int | None = None,
-    recover: bool = True,
     read_only: bool = False,
 ) -> Store:
-    """Open a store; recover first after a crash.
+    """Open a store.
 
-    MongoDB is connected when a question needs it.
+    MongoDB is connected when a question needs it. What a crash has left answers as it is; who
+    changes the store seals it first.
 
     Args:
         path: Its directory; by default `HYBRIDLOG_STORE` or `./hybridlog-store`.
@@ -120,10 +103,7 @@ def open_store(
         cache_mb: Size of the embedded MongoDB's cache in MiB, from 256; by default
             `HYBRIDLOG_CACHE_SIZE`, the store's own setting, or 256. A new store keeps it. A
             MongoDB that runs already is not changed.
-        recover: False to leave recordings that a crash has cut, and what the index lacks of
-            others, to the next opening: a recorder need not wait for them.
-        read_only: Never write a byte in it, as if this user could not: nothing is repaired, and
-            no MongoDB is used.
+        read_only: Never write a byte in it, as if this user could not, and use no MongoDB.
 
     Raises:
         UsageError: MongoDB does not accept such a cache.
@@ -132,6 +112,7 @@ def open_store(
     """
     where = store_path(path)
     wanted = NONE if read_only else mongo or os.environ.get("HYBRIDLOG_MONGO_URI")
+    cache = None
     if address_of(where) is not None:
         directory = directory_of(where, read_only=read_only)
         if create:
@@ -143,28 +124,37 @@ def open_store(
                 f"{directory.place} is a store in a bucket, which has no index in MongoDB. Do this "
                 "in a store on a disk."
             )
-        return Store(directory, mongo=NONE, recover=False)
-    if cache_mb is not None:
-        checked_cache_mb(cache_mb, "The size of the cache")
-    cache = cache_mb or cache_mb_from_environment()
-    if create:
-        own = None if mongo in {None, EMBEDDED} else mongo
-        is_new = not os.path.lexists(where / NAME)
-        directory = StoreDirectory.create(where, mongo=own, cache_mb=cache_mb)
-        directory.check_writable()
-        if is_new and is_uri(own):
-            with suppress(StoreError):  # without a home directory, each command must name it again
-                consent.trust(directory.settings.store_id, own)
+        wanted = NONE
     else:
-        directory = StoreDirectory(where, read_only=read_only)
-    store = Store(directory, mongo=wanted, progress=progress, cache_mb=cache, recover=recover)
+        if cache_mb is not None:
+            checked_cache_mb(cache_mb, "The size of the cache")
+        cache = cache_mb or cache_mb_from_environment()
+        directory = (
+            _created(where, mongo, cache_mb)
+            if create
+            else StoreDirectory(where, read_only=read_only)
+        )
+    shared = OpenStore(directory, wanted, progress, cache)
     try:
+        shared.now()
         if require_database:
-            store.connect()
+            shared.index.connect()
     except BaseException:
-        store.close()
+        shared.close()
         raise
-    return store
+    return Store(shared)
+
+
+def _created(where: Path, mongo: str | None, cache_mb: int | None) -> StoreDirectory:
+    """The directory of a store, made if there is none."""
+    own = None if mongo in {None, EMBEDDED} else mongo
+    is_new = not os.path.lexists(where / NAME)
+    directory = StoreDirectory.create(where, mongo=own, cache_mb=cache_mb)
+    directory.check_writable()
+    if is_new and is_uri(own):
+        with suppress(StoreError):  # without a home directory, each command must name it again
+            consent.trust(directory.settings.store_id, own)
+    return directory
 
 
 def _session_of(address: str | Path, mongo: str | None) -> Session:
@@ -172,111 +162,28 @@ def _session_of(address: str | Path, mongo: str | None) -> Session:
     return open_store(address, mongo=mongo).session
 
 
-@contextmanager
-def _target(to: str | Path, options: CopyOptions, store: Store) -> Iterator[Target]:
-    """The place that recordings of a store are copied to."""
-    from hybridlog.follow.follower import make_tables
-    from hybridlog.maintenance.copying import Target
-    from hybridlog_storage.copy_places import Directory
-
-    source, address = store.directory, address_of(to)
-    if str(to).startswith("ssh://"):
-        from hybridlog_storage.sftp import Server
-
-        with Server(str(to), options.ssh) as server:
-            server.begin()
-            yield Target(server, lambda name: free_name(name, server.names()))
-        return
-    if address is not None:
-        from hybridlog.maintenance.derived import bring_derived
-        from hybridlog_storage.remote.store import RemoteDirectory
-
-        if source.place == address:
-            raise UsageError(f"{address} is this very store: there is nothing to copy.")
-        target = RemoteDirectory.create_in(address)
-        found = Target(
-            target.source,
-            lambda name: free_name_in(target.manifests.each(target.ids()), name),
-        )
-        try:
-            yield found
-        finally:
-            bring_derived(store.shared, target, found.arrived)
-        return
-    path = _local(to)
-    if not source.is_remote and source.path.resolve() in path.resolve().parents:
-        raise UsageError(f"{to} lies inside the store {source.path}: copy to another directory.")
-    with open_store(path, create=True) as other:
-        _ = other.session  # what a crash has left is mended before
-        found = Target(
-            Directory(path.absolute()),
-            lambda name: free_name_in(other.shared.newest().summaries, name),
-        )
-        yield found
-        other.shared.catch_up()
-        for entry in other.select(found.arrived):  # so that other readers find them
-            make_tables(other.directory, other.catalog, entry)
-
-
-def _local(to: str | Path) -> Path:
-    """The directory to copy to; one that is written like a place elsewhere is refused."""
-    found = _ELSEWHERE.fullmatch(str(to))
-    if found is not None and (found[1].startswith("/") or not os.path.lexists(to)):
-        raise UsageError(
-            f"{to} is no place to copy to. Write ssh://user@host/path for a server, s3://, gs:// "
-            "or az:// for a bucket, and ./ in front of a directory with a colon in its name."
-        )
-    try:
-        return Path(to).expanduser()
-    except RuntimeError as error:
-        raise UsageError(f"{to}: there is no such home directory.") from error
-
-
 class Store:
     """A directory of recordings and the database that indexes them.
 
     Opened by `hybridlog.open`. A context manager; several threads may read from one store.
-
-    Args:
-        directory: Its directory.
-        mongo: URI of the MongoDB that holds the index, or `embedded`; None for the one in the
-            store's settings.
-        progress: Called while an index is brought up to date.
-        cache_mb: Size of the embedded MongoDB's cache in MiB; None for the one in the store's
-            settings.
-        recover: False to leave what a crash has cut to another opening.
 
     Attributes:
         directory: The store's directory.
         catalog: Recordings, channels, chunks and schemas, in a local file.
     """
 
-    def __init__(
-        self,
-        directory: StoreDirectory,
-        *,
-        mongo: str | None = None,
-        progress: Progress | None = None,
-        cache_mb: int | None = None,
-        recover: bool = True,
-    ) -> None:
-        self.directory = directory
-        self.shared = OpenStore(directory, mongo, progress, cache_mb, recover=recover)
-        self._source: Asked = self.shared
+    def __init__(self, shared: OpenStore) -> None:
+        self.directory, self.shared = shared.directory, shared
+        self._source: Asked = shared
         self._sql: SqlEngine | None = None
-        try:
-            self.shared.now()
-        except BaseException:
-            self.shared.catalog.close()
-            raise
 
     def __enter__(self) -> Self:
         """Return this store."""
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Close; an interruption repairs nothing."""
-        self._close(mends=kind is None or issubclass(kind, Exception))
+    def __exit__(self, *_: object) -> None:
+        """Close."""
+        self.close()
 
     @property
     def session(self) -> Session:
@@ -287,11 +194,16 @@ class Store:
         """
         return self._source.now()
 
-    def _to_change(self) -> OpenStore:
-        """The open store, about to be changed; a snapshot, or one of before a fork, is refused."""
+    def _itself(self) -> OpenStore:
+        """The open store; a snapshot, or one of before a fork, is refused."""
         self.shared.check_process()
         if self._source is not self.shared:
             raise UsageError("A snapshot of a store only answers: change the store itself.")
+        return self.shared
+
+    def _to_change(self) -> OpenStore:
+        """The open store, about to be changed: what crashes have left is finished first."""
+        self._itself().recover()
         return self.shared
 
     def __repr__(self) -> str:
@@ -313,7 +225,7 @@ class Store:
 
     @property
     def repairs(self) -> RepairReport:
-        """Repairs made when the store was opened."""
+        """Repairs made by this process, and what cannot be read."""
         return self.shared.repairs
 
     # The index.
@@ -335,11 +247,11 @@ class Store:
             DatabaseError: MongoDB does not answer.
             StoreError: It holds the index of another store, or this store is a copy.
         """
-        return self._to_change().index.connect()
+        return self._itself().index.connect()
 
     def refresh(self) -> None:
         """Drop the snapshot of the catalog, to see new recordings of other processes."""
-        self._to_change().invalidate()
+        self._itself().invalidate()
 
     def snapshot(self) -> Store:
         """The store at one moment: all questions to what this returns see the same recordings.
@@ -352,30 +264,13 @@ class Store:
         vars(found).update(_source=self.session, _sql=None)
         return found
 
-    def mend(self, seconds: float = _MENDING_S) -> None:
-        """Repair what questions met: recordings after a crash, missing and damaged tables.
-
-        Questions repair nothing: they answer from what is whole. `close` calls this.
-
-        Args:
-            seconds: What takes longer is left; `repairs` names it. `verify(repair=True)` does all.
-        """
-        with suppress(StoreError, ResourceError):
-            self.shared.mend(seconds)
-
     def close(self) -> None:
-        """Repair what questions met, and close files and connections. May be called again."""
-        self._close(mends=True)
-
-    def _close(self, *, mends: bool) -> None:
+        """Close files and connections; of a snapshot, those of its own. May be called again."""
         if self.shared.is_closed or self.shared.is_inherited:  # or another's to close
             return
-        is_open = self._source is self.shared  # and no snapshot
-        if mends and is_open:
-            self.mend()
         if self._sql is not None:
             self._sql.close()
-        if is_open:
+        if self._source is self.shared:
             self.shared.close()
 
     # Recordings and topics.
@@ -442,16 +337,6 @@ class Store:
             TopicError: It does not exist.
         """
         return self.session.entry(recording)
-
-    def select(self, names: Names | None) -> list[RecordingEntry]:
-        """Recordings by name, id, or the beginning of one of these; None for all.
-
-        Entries stand for themselves, so `recordings` gives what this takes.
-
-        Raises:
-            TopicError: No recording matches, or several do.
-        """
-        return self.session.select(names)
 
     def topics(self, *types: str) -> list[str]:
         """Names of all topics, sorted; includes those whose messages are all lost.
@@ -831,18 +716,19 @@ class Store:
         from hybridlog.formats.reading import fingerprint
         from hybridlog.record.recorder import RecordOptions, record
 
+        shared = self._to_change()
         with open_source(Path(log)) if isinstance(log, str | Path) else log as source:
             report = record(
                 source,
                 self.directory,
                 self.catalog,
-                self._to_change().index.index_to_record("Recording a log"),
-                self._newest(),
+                shared.index.index_to_record("Recording a log"),
+                shared.newest,
                 fingerprint=fingerprint(source.files),
                 options=options or RecordOptions(**choices),
                 progress=progress,
             )
-        self.shared.recorded(report)
+        shared.recorded(report)
         return report
 
     def start(self, name: str, options: LiveOptions | None = None, **choices: Any) -> LiveRecording:
@@ -865,14 +751,9 @@ class Store:
             in_thread(self.directory, self.catalog, target, follow_interval_s(chosen)),
             name,
             chosen,
-            known=self._newest(),
+            known=shared.newest,
             on_close=shared.recorded,
         )
-
-    def _newest(self) -> Callable[[], Snapshot]:
-        """Tells all recordings as they are when one begins."""
-        _ = self.session  # what a crash has left is mended before
-        return self.shared.newest
 
     @again_if_lost
     def sizes(self, recordings: Names | None = None) -> Sizes:
@@ -890,7 +771,7 @@ class Store:
         """
         from hybridlog.maintenance.sizes import sizes_of
 
-        return sizes_of(self.directory, self.catalog, self.select(recordings), self.database)
+        return sizes_of(self.directory, self.session.select(recordings), self.database)
 
     @again_if_lost
     def verify(
@@ -910,44 +791,19 @@ class Store:
         from hybridlog.maintenance.verify import verify
 
         if repair:
-            self._check_on_disk()
-            self._to_change().mend()
+            self._to_change()
         self.refresh()
         names = None if recordings is None else self._with_unreadable(recordings)
-        done, left = self._repair(names, progress) if repair else ([], [])
-        found = verify(
-            self.directory, self.catalog, self.database, recordings=names, progress=progress
-        )
-        told = {(one.recording, one.place) for one in left}
-        left += [one for one in found.findings if (one.recording, one.place) not in told]
-        found.repaired, found.findings = done, left
-        return found
+        return verify(self.shared, names, progress, repairs=repair)
 
     def _with_unreadable(self, names: Names) -> dict[str, str]:
         """Names of recordings by id, where ids of those that cannot be read stand for them."""
         unreadable, names = self.repairs.unreadable, [*names]
         found = {one: one for one in names if isinstance(one, str) and one in unreadable}
-        others = self.select([one for one in names if not isinstance(one, str) or one not in found])
+        others = self.session.select(
+            [one for one in names if not isinstance(one, str) or one not in found]
+        )
         return found | {one.id: one.name for one in others}
-
-    def _repair(
-        self, names: Mapping[str, str] | None, progress: Progress | None
-    ) -> tuple[list[Repaired], list[Finding]]:
-        from hybridlog.maintenance.verify import repair, repair_index
-
-        done, left = repair(self.directory, self.catalog, self.repairs, names)
-        self.refresh()
-        database = self.shared.index.writable_database
-        if database is not None:
-            done += repair_index(
-                self.directory,
-                self.catalog,
-                database,
-                self.session.select(None) if names is None else self.session.as_now(names),
-                progress=progress,
-            )
-            self.refresh()
-        return done, left
 
     def keep(
         self,
@@ -976,11 +832,8 @@ class Store:
         from hybridlog.maintenance.retention import Rules
 
         wanted = Rules.of(self.directory.settings.retention if rules is None else rules)
-        is_remote = self.directory.is_remote
-        wanted.check_place(is_remote=is_remote)
-        put = partial(put_entry, self.directory, self.catalog)
-        remove = partial(remove_if, self.shared)
-        keeper = Keeper(self.directory, remove, changed=put if is_remote else lambda _: None)
+        wanted.check_place(is_remote=self.directory.is_remote)
+        keeper = Keeper(self.directory, partial(remove_if, self.shared))
         if dry_run:
             return KeepReport(keeper.plan(wanted))
         self._to_change()
@@ -1013,25 +866,9 @@ class Store:
         Raises:
             TimeError: A time is invalid, or the range is empty or outside of the recording.
         """
-        from hybridlog.maintenance.edit import change
-        from hybridlog.maintenance.keep import may_hold, pin_of
+        from hybridlog.maintenance.edit import pin
 
-        shared = self._to_change()
-        (entry,) = self.select([recording])
-        start, stop = extent_of(entry)
-        if begin is not None or end is not None:
-            parse_range(begin, end, start=start, end=stop)
-        times = [None if t is None else parse_time(t, start=start, end=stop) for t in (begin, end)]
-        if not may_hold(entry, *times):
-            raise TimeError(f"Nothing to pin: recording {entry.name!r} has no message then.")
-        name = secrets.token_hex(4)
-        pin = pin_of(name, (times[0], times[1]), topics, text(reason))
-
-        def how(now: Manifest) -> Manifest:
-            return replace(now, pins=(*(one for one in now.pins if one.id != name), pin))
-
-        change(shared, entry, how)
-        return name
+        return pin(self._to_change(), recording, (begin, end), topics, reason)
 
     def unpin(self, *names: str) -> None:
         """Remove pins.
@@ -1039,18 +876,9 @@ class Store:
         Raises:
             UsageError: There is no pin of a name.
         """
-        from hybridlog.maintenance.edit import change
+        from hybridlog.maintenance.edit import unpin
 
-        def how(now: Manifest) -> Manifest:
-            return replace(now, pins=tuple(pin for pin in now.pins if pin.id not in names))
-
-        shared = self._to_change()
-        known = {pin["id"]: entry for entry in self.select(None) for pin in entry.pins}
-        for name in names:
-            if name not in known:
-                raise UsageError(f"There is no pin {name!r}; `hybridlog keep --pins` lists them.")
-        for entry in {known[name].id: known[name] for name in names}.values():
-            change(shared, entry, how)
+        unpin(self._to_change(), names)
 
     def remove(self, recording: str) -> None:
         """Delete a recording.
@@ -1064,8 +892,7 @@ class Store:
         from hybridlog.maintenance.edit import remove_if
 
         shared = self._to_change()
-        (entry,) = self.select([recording])
-        remove_if(shared, entry.id)
+        remove_if(shared, shared.now().entry(recording).id)
 
     def edit(
         self,
@@ -1089,35 +916,10 @@ class Store:
             UsageError: A tag to remove does not exist; a name, note or key is empty; or
                 something is no text.
         """
-        from hybridlog.maintenance import edit
+        from hybridlog.maintenance.edit import edit
 
-        for what, given in (("name", name), ("note", note)):
-            if given is not None and not (isinstance(given, str) and given.strip()):
-                raise UsageError(f"A {what} needs a text: give one that is not empty.")
-        tags = {} if tag is None else tag
-        if not isinstance(tags, Mapping) or not all(
-            isinstance(key, str) and key and "\0" not in key and isinstance(value, str)
-            for key, value in tags.items()
-        ):
-            raise UsageError(
-                'Tags are texts by keys, not empty and without NUL: tag={"place": "lab"}.'
-            )
-        shared = self._to_change()
-        shared.catch_up()
-        (entry,) = self.select([recording])
         gone = [untag] if isinstance(untag, str) else [*untag]
-        for key in gone:
-            if key not in entry.tags:
-                known = ", ".join(sorted(entry.tags)) or "none"
-                raise UsageError(f"{entry.name} has no tag {key!r}. Its tags: {known}.")
-        new = {text(key): text(value) for key, value in tags.items()}
-        notes = () if note is None else (Note(clock.time_ns(), text(note)),)
-
-        def change(now: Manifest) -> Manifest:
-            left = {key: value for key, value in now.tags.items() if key not in gone}
-            return replace(now, tags={**left, **new}, notes=(*now.notes, *notes))
-
-        return edit.change(shared, entry, change, name)
+        return edit(self._to_change(), recording, name=name, note=note, tag=tag or {}, untag=gone)
 
     def mark(
         self,
@@ -1144,15 +946,9 @@ class Store:
                 before `moment`.
             StoreError: It has 10,000 marks already, or the store cannot be written.
         """
-        from hybridlog.maintenance import edit
+        from hybridlog.maintenance.edit import mark
 
-        shared = self._to_change()
-        shared.catch_up()
-        (entry,) = self.select([recording])
-        time = edit.time_of_mark(entry, moment)
-        last = None if until is None else edit.time_of_mark(entry, until)
-        said = {text(key): text(value) for key, value in (tags or {}).items()}
-        return edit.mark(shared, entry, time, text=text(note), tags=said, end=last)
+        return mark(self._to_change(), recording, (moment, until), note, tags or {})
 
     def unmark(self, recording: str, note: str, moment: TimeLike | None = None) -> RecordingEntry:
         """Remove marks that somebody set; those that a recorder noted are messages, and stay.
@@ -1166,14 +962,9 @@ class Store:
             TimeError: `moment` is invalid.
             UsageError: There is no such mark.
         """
-        from hybridlog.maintenance import edit
+        from hybridlog.maintenance.edit import unmark
 
-        shared = self._to_change()
-        shared.catch_up()
-        (entry,) = self.select([recording])
-        start, end = extent_of(entry)
-        time = None if moment is None else parse_time(moment, start=start, end=end)
-        return edit.unmark(shared, entry, time, text=text(note))
+        return unmark(self._to_change(), recording, moment, note)
 
     def copy(
         self,
@@ -1210,41 +1001,10 @@ class Store:
             raise UsageError("Payloads that are not copied cannot expire: drop one of the two.")
         if wanted.then_expire:
             self.directory.check_writable()
-        self._to_change().catch_up()
-        chosen = self._chosen(recordings)
-        with _target(to, wanted, self) as target:
-
-            def expire(recording: str, digests: Mapping[int, str]) -> None:
-                self._expire(recording, digests, target.place.address, found, progress)
-
-            Copying(self.directory, target, wanted, found, expire, progress).run(chosen)
+        shared = self._to_change()
+        shared.catch_up()
+        Copying(shared, to, wanted, found, progress).run(self._chosen(recordings))
         return found
-
-    def _expire(
-        self,
-        recording: str,
-        digests: Mapping[int, str],
-        where: str,
-        report: CopyReport,
-        progress: Progress | None,
-    ) -> None:
-        """Let the payloads of a recording go that were proved elsewhere."""
-        from hybridlog.maintenance.edit import remove_if
-        from hybridlog.maintenance.keep import Keeper
-        from hybridlog.maintenance.retention import Rules
-
-        rules = Rules.of(self.directory.settings.retention)
-        keeper = Keeper(self.directory, partial(remove_if, self.shared))
-        try:
-            expired = keeper.expire_all(recording, digests, rules, where, progress)
-        except HeldError as error:
-            report.problems.append(f"Payloads stay: {error}")
-            report.held.append(recording)
-            return
-        finally:
-            self._to_change().catch_up(recording)
-        report.freed_bytes += expired.freed_bytes
-        report.problems += expired.problems
 
     def _chosen(self, recordings: Choice | Names | None) -> Sequence[RecordingSummary]:
         """Recordings that are to be copied."""
@@ -1254,12 +1014,8 @@ class Store:
         if recordings is None:
             return self.summaries()
         names = [recordings] if isinstance(recordings, str) else recordings
-        ids = {entry.id for entry in self.select(names)}
+        ids = {entry.id for entry in self.session.select(names)}
         return [one for one in self.summaries() if one.id in ids]
-
-    def _check_on_disk(self) -> None:
-        if self.directory.is_remote:
-            self.directory.check_writable()
 
 
 def _query_of(store: Store, name: str | Query, fields: dict[str, Sequence[str]]) -> Query:

@@ -257,7 +257,7 @@ def test_queries_of_chosen_recordings(store: hl.Store) -> None:
     assert store.verify(found).recordings == 2
     assert store.query(["/scan"], found).count() == 3
     assert {size.recording for size in store.sizes(found).rows} == {"monday 1", "tuesday"}
-    assert store.select(found) == found
+    assert store.session.select(found) == found
 
 
 def test_tables_name_recordings_and_their_tags(store: hl.Store) -> None:

@@ -773,7 +773,7 @@ def test_a_second_reader_gets_the_same_messages(recorded: hl.Store) -> None:
     assert len(second.recording("robot").segments) > 2
     for name in second.names():
         recording = second.recording(name)
-        (entry,) = recorded.select([name])
+        entry = recorded.entry(name)
         assert (recording.id, recording.status) == (entry.id, entry.status)
         assert (recording.manifest.name, recording.manifest.tags) == (entry.name, entry.tags)
         for of_files in (False, True):
@@ -897,7 +897,7 @@ def test_the_status_follows_from_the_page_alone(
         assert entry.messages == counted
         assert (recording.end or {})["status"] == entry.end["status"] == "complete"
     with hl.open(tmp_path / "store") as store:
-        (whole,) = recorded.select(["robot"])
+        whole = recorded.entry("robot")
         missing = sum(row["count"] for row in lost)
         assert entry.messages + missing == whole.messages
         seqs = [m.seq for m in store.all_topics().in_recording("robot")]
@@ -929,7 +929,7 @@ def test_a_damaged_chunk_is_the_same_loss_for_both(recorded: hl.Store, tmp_path:
     assert {f.place.split(" byte ")[0] for f in found.findings} == {"000001.mcap"}
     assert len(found.findings) == 2
     with hl.open(tmp_path / "store", require_database=True) as store:
-        (entry,) = store.select(["robot"])
+        entry = store.entry("robot")
         lost = bare(entry.end["losses"], of_files=True)
     assert entry.status == "damaged"
     assert lost == bare(second.losses, of_files=True)

@@ -33,6 +33,7 @@ from hybridlog.entries import (
 )
 from hybridlog.maintenance.opening import StoreFiles
 from hybridlog.maintenance.report import RepairReport
+from hybridlog.snapshot import Snapshot
 from hybridlog_storage.catalog import CATALOG, Catalog, RecordingEntry
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import StoreDirectory
@@ -464,8 +465,10 @@ def test_nothing_says_what_recording_it_is(directory: StoreDirectory) -> None:
 def opened(directory: StoreDirectory) -> tuple[list[RecordingEntry], RepairReport]:
     report = RepairReport()
     with closing(Catalog(directory.path, directory.settings.store_id)) as catalog:
-        store = StoreFiles(directory, catalog, report, mends=True)
-        found = store.look_at_all().summaries
+        store, nothing = StoreFiles(directory, catalog, report), Snapshot((), {})
+        found = store.look(nothing, directory.ids()).summaries
+        if store.recover([one.id for one in found if one.status == "unfinished"]):
+            found = store.look(nothing, directory.ids()).summaries
         entries = [store.current_entry(summary)[0] for summary in found]
         return [entry for entry in entries if entry is not None], report
 

@@ -92,7 +92,7 @@ def store(path: Path, short: Path) -> Iterator[hl.Store]:
 
 
 def fetched(store: hl.Store, recording: str) -> list[hl.Message]:
-    (entry,) = store.select([recording])
+    entry = store.entry(recording)
     topics = sorted({c.topic for c in entry.channels})
     return list(store.query(topics, [entry.id])) if topics else []
 
@@ -133,7 +133,7 @@ def test_a_killed_recorder_loses_nothing_that_was_written(
             if name not in {one.name for one in store.summaries()}:
                 assert moment <= 1
                 continue
-            (entry,) = store.select([name])
+            entry = store.entry(name)
             assert entry.status in {"recovered", "complete"}
             torn += entry.status == "recovered"
             messages = fetched(store, name)

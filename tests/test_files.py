@@ -130,6 +130,7 @@ def test_a_running_one_has_several_open_files(tmp_path: Path) -> None:
             assert sorted(came) == sorted(written)
     with hl.open(tmp_path / "killed", mongo="none") as killed:
         assert read(killed) == written
-        assert killed.recordings()[0].status == "recovered"
+        assert killed.edit("run", note="found").status == "recovered"
+        assert read(killed) == written
         assert killed.verify().findings == []
     assert not [*places.folder(tmp_path / "killed", "run").glob("*.open")]

@@ -7,19 +7,14 @@ import shutil
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 import hybridlog as hl
-from hybridlog.maintenance.opening import StoreFiles
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.files import System
-from hybridlog_storage.errors import DiskFullError
 from hybridlog_storage.messages import Channel
 from tests import places
-from tests.calls import Calls
-from tests.cli.within import answer
 from tests.running.running import NO_MONGODB as NOWHERE
 
 
@@ -50,7 +45,6 @@ def test_a_crash_on_a_full_disk_waits_for_room(
     with monkeypatch.context() as patch:
         patch.setattr(files, "system", FullDisk())
         with hl.open(tmp_path / "after", mongo=NOWHERE) as store:
-            assert store.repairs.disk_full is not None
             assert {r.name: r.status for r in store.recordings()} == {
                 "whole": "complete",
                 "crash": "unfinished",
@@ -60,22 +54,6 @@ def test_a_crash_on_a_full_disk_waits_for_room(
             assert [r.name for r in store.recordings()] == ["crash"]
             assert "whole" not in places.names(tmp_path / "after")
     with hl.open(tmp_path / "after", mongo=NOWHERE) as store:
-        assert store.repairs.disk_full is None
+        store.edit("crash", tag={"a": "b"})
         (entry,) = store.recordings()
         assert (entry.name, entry.status, entry.messages) == ("crash", "recovered", 50)
-
-
-def test_nothing_is_said_to_have_crashed_on_a_full_disk(tmp_path: Path, calls: Calls) -> None:
-    with hl.open(tmp_path / "store", create=True) as store:
-        with store.start("whole") as recording:
-            recording.write(Channel("/a", "json", None, {}), b'{"n": 1}')
-
-    def full(store: StoreFiles, **_: Any) -> None:
-        if store.report.disk_full is None:
-            raise DiskFullError("No space left while writing the catalog.")
-
-    calls(StoreFiles, "look_at_all", full)
-    done = answer("fetch", "-t", "/a", "--count", store=tmp_path / "store")
-    assert done.out == "1\n"
-    assert "The disk of the store is full, so nothing in it is repaired or noted." in done.err
-    assert "crash" not in done.err

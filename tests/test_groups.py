@@ -135,7 +135,7 @@ def test_a_crash_of_one_is_mended_by_the_other(place: Path) -> None:
     store = place / "lab" / "store"
     ann.python("-c", CRASH, store, code=9)
     assert list(places.folder(store, "cut").glob("*.mcap.open"))
-    done = bob.run("ls", "--store", store)
+    done = bob.run("edit", "cut", "--note", "found", "--store", store)
     assert f"{MESSAGES} messages of it are recovered" in done.err
     listed = bob.run("ls", "--json", "--store", store).json
     assert [r["messages"] for r in listed] == [MESSAGES]

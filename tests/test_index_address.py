@@ -12,8 +12,8 @@ from pymongo import MongoClient
 
 import hybridlog as hl
 from hybridlog.index.of_store import contents
+from tests import logs
 from tests.cli.running import run
-from tests.faults import logs
 from tests.limits import Limit
 
 pytestmark = pytest.mark.mongo("embedded")

@@ -20,6 +20,7 @@ from hybridlog.cli.commands.open import unplayed
 from hybridlog.entries import summary_of
 from hybridlog.maintenance import expiry
 from hybridlog.maintenance import keep as keeping
+from hybridlog.maintenance.edit import pin_of
 from hybridlog.maintenance.expiry import may_go
 from hybridlog.maintenance.keep import Keeper
 from hybridlog.maintenance.retention import Rules
@@ -357,7 +358,7 @@ def test_what_is_said_meanwhile_stops_what_is_not_listed(
     def said(now: Manifest) -> Manifest:
         if what == "tag":
             return replace(now, tags={"stay": "yes"})
-        return replace(now, pins=(keeping.pin_of("now", (None, None), None, ""),))
+        return replace(now, pins=(pin_of("now", (None, None), None, ""),))
 
     module: Any = keeping if when == "expire" else expiry
     work = getattr(module, when)
@@ -381,7 +382,7 @@ def test_what_is_said_meanwhile_keeps_a_recording(
     remove = DiskManifests.remove
 
     def said_before(*words: Any) -> Manifest:
-        pin = keeping.pin_of("now", (None, None), None, "")
+        pin = pin_of("now", (None, None), None, "")
         said = {"tags": {"stay": "yes"}} if what == "tag" else {"pins": (pin,)}
         places.change_in(places.folder(store, "run"), lambda now: replace(now, **said))
         return remove(*words)

@@ -1,17 +1,15 @@
-"""Questions repair nothing: what they meet is noted, and repaired after the answer."""
+"""Questions repair nothing: who changes the store recovers first."""
 
 from __future__ import annotations
 
 import fcntl
 import os
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
 import hybridlog as hl
-from hybridlog.cli.open_store import _print_left
 from hybridlog_storage.catalog import CATALOG
 from tests.damage import flip
 from tests.running.methods import LABEL, rows, sent
@@ -71,33 +69,25 @@ def test_a_question_about_a_recorder_that_died_writes_nothing(died: hl.Store, kn
     check(died, known)
     assert died.entry(LABEL).status == "unfinished"
     assert files_in(died) == before
-    died.mend(0)
-    assert any(name.endswith(".mcap.open") for name in files_in(died))
-    died.mend()
+    died.shared.recover()
     assert died.repairs.recovered.keys() == {LABEL}
     assert died.entry(LABEL).status == "recovered"
     assert not died.shared._running
     assert not any(name.endswith(".mcap.open") for name in files_in(died))
     check(died, known)
-    died.mend()
-    check(died, known)
 
 
-def test_one_moment_outlasts_the_repair(died: hl.Store, known: Known) -> None:
+def test_one_moment_outlasts_the_recovery(died: hl.Store, known: Known) -> None:
     then = died.snapshot()
     check(then, known)
     with hl.open(died.directory.path, mongo=NO_MONGODB) as other:
-        assert other.entry(LABEL).status == "recovered"
+        assert other.edit(LABEL, tag={"a": "b"}).status == "recovered"
     check(then, known)
     check(died, known)
 
 
-def test_a_question_that_misses_tables_writes_none(
-    died: hl.Store, known: Known, capsys: pytest.CaptureFixture[str]
-) -> None:
-    died.refresh()
-    died.entry(LABEL)
-    died.mend()
+def test_a_question_that_misses_tables_writes_none(died: hl.Store, known: Known) -> None:
+    died.verify(repair=True)
     for file in (died.directory.path / "tables").rglob("*.parquet"):
         flip(file, 1 / 2)
     died.refresh()
@@ -106,33 +96,6 @@ def test_a_question_that_misses_tables_writes_none(
     count = where.count()
     assert count == len(rows(where)) > 0
     assert files_in(died) == before
-    died.mend(0)
-    assert died.repairs.noted_tables
-    assert files_in(died) == before
-    _print_left(died)
-    number = len(died.repairs.noted_tables)
-    assert f"Left to repair: {number} table" in capsys.readouterr().err
-    died.mend()
-    assert not died.repairs.noted_tables
-    assert (LABEL, "/arm") in died.repairs.tables
+    died.verify(repair=True)
+    assert files_in(died) != before
     assert where.count() == count
-    assert not died.repairs.noted_tables
-
-
-def test_what_no_question_has_met_yet_is_repaired_too(died: hl.Store) -> None:
-    died.refresh()
-    died.mend()
-    assert died.repairs.recovered.keys() == {LABEL}
-
-
-@pytest.mark.parametrize("is_interrupted", [False, True])
-def test_closing_repairs_and_an_interruption_does_not(
-    died: hl.Store, *, is_interrupted: bool
-) -> None:
-    died.refresh()
-    died.entry(LABEL)
-    with suppress(KeyboardInterrupt), died:
-        if is_interrupted:
-            raise KeyboardInterrupt
-    left = [name for name in files_in(died) if name.endswith(".mcap.open")]
-    assert bool(left) == is_interrupted

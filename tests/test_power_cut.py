@@ -88,6 +88,7 @@ def check(found: Path, run: Run, sync: str) -> str:
 
 def look(found: Path, run: Run, sync: str) -> str:
     with closing(hl.open(found, mongo="none")) as store:
+        store.shared.recover()
         entries = store.recordings()
         if sync == "never" and store.repairs.unreadable:
             return "unreadable"

@@ -102,7 +102,7 @@ def test_a_count_reads_no_payload(store: hl.Store, robot: Truth) -> None:
 
 
 def start_of(store: hl.Store, recording: str = "robot") -> int:
-    (entry,) = store.select([recording])
+    entry = store.entry(recording)
     assert entry.span is not None
     return entry.span[0]
 
@@ -126,7 +126,7 @@ def test_each_chunk_is_read_once(store: hl.Store, robot: Truth, topic: str) -> N
 
 def test_all_topics_at_once_read_each_chunk_once(store: hl.Store) -> None:
     query = store.all_topics().in_recording("robot")
-    (entry,) = store.select(["robot"])
+    entry = store.entry("robot")
     times = [m.log_time_ns for m in query]
     assert times == sorted(times)
     assert query.counters.chunks_read == entry.chunks

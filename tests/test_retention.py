@@ -10,7 +10,7 @@ import pytest
 from msgspec import UNSET
 
 import hybridlog as hl
-from hybridlog.maintenance.keep import pin_of
+from hybridlog.maintenance.edit import pin_of
 from hybridlog.maintenance.retention import Held, Plan, Rules, held_of, plan
 from hybridlog.record.capture import remote_segment_size
 from hybridlog_storage.errors import UsageError

@@ -169,7 +169,7 @@ def test_a_store_without_a_catalog_is_listed_by_its_manifests(tmp_path: Path, ca
         read, listed = calls(DiskManifests, "_get"), calls(Cells, "each")
         for step in ({"note": "more"}, {"tag": {"k": "v"}}, {"name": "run 4"}, {"name": "z"}):
             store.edit("run 4", **step)
-        assert (len(opened), len(listed)) == (5, 0)
+        assert (len(opened), [one for one in listed if isinstance(one[-1], str)]) == (5, [])
         assert len(read) <= 4 * 4
         assert max(one.name for one in store.catalog.summaries()) == "z"
 

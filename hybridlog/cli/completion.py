@@ -33,14 +33,15 @@ def _of_store(complete: Callable[[Session, click.Context, str], Iterable[str]]) 
         from hybridlog_storage.lazy import import_numpy_late
 
         import_numpy_late()
-        from hybridlog.store import Store, store_path
+        from hybridlog.opened import OpenStore
+        from hybridlog.store import store_path
         from hybridlog_storage.remote import directory_of
 
         try:
             value: Path | None = context.params.get("store")
             # The shell has not expanded the tilde of the line that is being completed.
             path = store_path(None if value is None else os.path.expanduser(value))  # noqa: PTH111
-            with closing(Store(directory_of(path), mongo="none", recover=False).shared) as shared:
+            with closing(OpenStore(directory_of(path), "none", None)) as shared:
                 names = [*complete(shared.now(), context, incomplete)]
         except (HybridlogError, OSError):
             return []

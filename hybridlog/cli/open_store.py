@@ -48,7 +48,6 @@ def opened_store(
     import_numpy_late()
     from hybridlog.store import open_store
 
-    recover = how.get("recover", True)
     near = [] if path or how.get("create") else _stores_near()
     if len(near) == 1 and _reads():
         path = near[0]
@@ -63,14 +62,12 @@ def opened_store(
         raise
     with store:
         doing = "so the files answer"
-        if records and recover:  # else beside the recorder
+        if records:
             doing = store.shared.index.index_to_record("Recording").without
         told = _repairs(store, doing, verifies=verifies)
-        notes(told if recover else ())
+        notes(told)
         try:
             yield store.snapshot() if snapshot else store
-            store.mend()
-            _print_left(store)
         finally:
             later = _repairs(store, "" if records else doing, verifies=verifies)
             notes(one for one in later if one not in told)
@@ -109,15 +106,8 @@ def _repairs(store: Store, doing: str, *, verifies: bool) -> list[str]:
         for recording, reason in repairs.unreadable.items()
         if not (verifies and "`hybridlog verify --repair`" in reason)
     )
-    if repairs.disk_full is not None:
-        found.append(
-            "The disk of the store is full, so nothing in it is repaired or noted. Remove "
-            f"recordings with `hybridlog rm`, or make room. {repairs.disk_full}"
-        )
-    elif not (store.directory.is_writable or store.directory.is_remote):
+    if not (store.directory.is_writable or store.directory.is_remote):
         found.append(f"The store {store.directory.path} is read-only; its segments answer.")
-    if repairs.tables:
-        found.append(f"{counted(len(repairs.tables), 'table')} made again: missing or damaged.")
     if repairs.damage:
         found.append("The data files of the embedded MongoDB were damaged, and were replaced.")
     if indexed := {r: n for r, n in repairs.indexed.items() if n and r not in repairs.recovered}:
@@ -129,13 +119,6 @@ def _repairs(store: Store, doing: str, *, verifies: bool) -> list[str]:
     is_wanted = reason is not None and not isinstance(reason, WithoutMongoError)
     if doing and is_wanted and store.directory.is_writable:
         found.append(f"MongoDB is unavailable, {doing}: {reason}")
-    for done in (repairs.damage, repairs.tables, repairs.indexed, repairs.removed):
+    for done in (repairs.damage, repairs.indexed, repairs.removed):
         done.clear()
     return found
-
-
-def _print_left(store: Store) -> None:
-    """Name what was met and takes longer to repair."""
-    left = len(store.repairs.noted_tables)
-    if left and store.directory.is_writable:
-        note(f"Left to repair: {counted(left, 'table')}. `hybridlog verify --repair` does it.")

@@ -213,9 +213,9 @@ class RecordChoices(Between, Latched, InStore, AsJson, Quiet):
             level=self.level,
         )
 
-    def opened_to_record(self, *, recover: bool = True) -> AbstractContextManager[Store]:
+    def opened_to_record(self) -> AbstractContextManager[Store]:
         """The store, which is made if there is none; see `opened_store`."""
-        return self.opened(create=True, cache_mb=self.cache_size, records=True, recover=recover)
+        return self.opened(create=True, cache_mb=self.cache_size, records=not self.is_live)
 
 
 def check_choices(choices: RecordChoices) -> None:

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, Final
 from hybridlog.cli import output
 from hybridlog.cli.app import DIFFERENT
 from hybridlog.cli.live_table import LiveTable, summary
-from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.options import parse_tags
 from hybridlog.cli.record_choices import DEFAULT_CHUNK, OF_ENVIRONMENT, RecordChoices
 from hybridlog.cli.record_summary import fields_of, remarks_on, row_of
@@ -30,7 +29,6 @@ from hybridlog_storage.errors import (
     SourceDamagedError,
     SourceError,
 )
-from hybridlog_storage.settings import NONE
 from hybridlog_storage.stopping import Flag
 
 if TYPE_CHECKING:
@@ -41,11 +39,9 @@ if TYPE_CHECKING:
     from hybridlog.live.sources.base import LiveSource
     from hybridlog.live.state import RecorderState
     from hybridlog.record.recorder import RecordReport
-    from hybridlog.store import Store
 
 _MIN_CHUNK: Final = 1 << 19
 _STATE_S = 1.0
-_RECOVERY_POLL_S = 0.05
 _FOLLOWER_S: Final = 5.0
 """To wait for the follower where a service manager, or another recording, waits."""
 
@@ -89,21 +85,16 @@ def _record(choices: RecordChoices) -> int:
     with ExitStack() as held:
         for source in sources:
             held.enter_context(source).check()
-        store = held.enter_context(choices.opened_to_record(recover=False))
+        store = held.enter_context(choices.opened_to_record())
         make_room(store, options.reserve_bytes)
-        recorders: list[Recorder] = []
-        recovery = threading.Thread(target=_recover, args=(store, recorders), daemon=True)
         with _stop_flag() as stop, frozen_objects():
             full = ""
             while True:
                 recorder = Recorder(store, sources, options, display.say)
                 recorder.start()
                 stop.leave = recorder.leave
-                recorders.append(recorder)
                 if full:
                     display.say(f"the manifest of {full} is full: {recorder.name} goes on")
-                else:
-                    recovery.start()
                 with display.table or nullcontext(), _pinned_by_signal(recorder):
                     _watch(recorder, stop, display)
                 if stop.is_set or not recorder.is_full:
@@ -114,8 +105,6 @@ def _record(choices: RecordChoices) -> int:
             notify_service("STOPPING=1", "STATUS=writing what is left")
             output.remarks(["hybridlog: writing what is left; Ctrl-C leaves at once"])
             reports += recorder.stop(stop.wait_s, _tell_left)
-            while recovery.is_alive() and not stop.wait(_RECOVERY_POLL_S):
-                pass
         broken: list[Result] = []
         if options.contract is not None:
             from hybridlog.contract import judge  # loads pyarrow
@@ -262,19 +251,6 @@ def sources_of(choices: RecordChoices) -> list[LiveSource]:
 
         found.append(ReplaySource(choices.replay, speed=choices.speed))
     return found
-
-
-def _recover(store: Store, recorders: Sequence[Recorder]) -> None:
-    """Open the store again, which recovers what a crash has cut, beside the recorder.
-
-    A process that ends meanwhile cuts nothing: the next command recovers it.
-    """
-    try:
-        with opened_store(store.directory.path, NONE, quiet=True) as opened:
-            recorders[-1].recovered()
-            opened.catalog.has_changed = False  # the list of recordings is written at the end
-    except (HybridlogError, OSError) as error:
-        output.note(f"hybridlog: earlier recordings are not recovered yet: {error}")
 
 
 def _tell_left(messages: int) -> None:

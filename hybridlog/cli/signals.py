@@ -1,6 +1,6 @@
 """Ctrl-C, `kill` and a closed terminal stop a command.
 
-A command that only reads, or whose work the next opening of the store completes or takes back,
+A command that only reads, or whose work the next change of the store completes or takes back,
 ends at once, without unwinding: unfinished output files are removed, and the process leaves.
 Work in `stopping.at_safe_points` takes itself back: there `Stopped` is raised, at a safe
 point. It is no `KeyboardInterrupt`, because libraries catch that.

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import hybridlog
 from hybridlog.entries import put_entry
-from hybridlog.follow.child import ENDED, RECOVERED, Followed, Task, Trigger
+from hybridlog.follow.child import ENDED, Followed, Task, Trigger
 from hybridlog.follow.follower import Follower, begin_again, make_rows_ahead
 from hybridlog.maintenance.tables import missing
 from hybridlog.query.answers.follow import Arrivals
@@ -54,7 +54,7 @@ def serve(handle: int) -> None:
         Path("/proc/self/oom_score_adj").write_text(_FIRST_TO_GO, "ascii")
     with Connection(handle) as control, suppress(EOFError, ConnectionError):
         task: Task = control.recv()
-        store = hybridlog.open(task.store, mongo=task.mongo, cache_mb=task.cache_mb, recover=False)
+        store = hybridlog.open(task.store, mongo=task.mongo, cache_mb=task.cache_mb)
         beside = _Beside(control, task, store)
         threading.Thread(target=beside.hear, daemon=True).start()
         try:
@@ -98,8 +98,6 @@ class _Beside:
                     if self._follower is not None:
                         self._follower.is_stopped = True  # until it finishes
                     self._ended.set()
-                elif order == RECOVERED:
-                    self._recovers.start()
                 else:
                     self._check(order)
         except (EOFError, OSError):
@@ -120,6 +118,7 @@ class _Beside:
     def run(self) -> None:
         """Do all that a recording needs until its end, and the rest then."""
         self._derives.start()
+        self._recovers.start()
         self._watch(self._task.seen)
         self.tell("seen")
         for thread in (self._derives, self._recovers):
@@ -201,7 +200,7 @@ class _Beside:
     def _derive(self) -> None:
         store, task = self._store, self._task
         directory, catalog, index = store.directory, store.catalog, store.shared.index
-        target = index.index_to_record("Recording")
+        target = index.index_to_record("Recording", brings=False)
         why = index.unavailable
         if why is not None and not isinstance(why, WithoutMongoError):
             self.tell("say", f"MongoDB is unavailable, {target.without}: {why}")
@@ -225,9 +224,14 @@ class _Beside:
         follower.finish(put_entry(directory, catalog, task.recording))
 
     def _recover(self) -> None:
-        """Make documents that the index lacks of earlier recordings."""
-        self._store.shared.invalidate()
-        self._store.shared.index.database  # noqa: B018 - brings the index up to date
+        """Seal what crashes have left of earlier recordings, and make their documents."""
+        task = self._task
+        with hybridlog.open(task.store, mongo=task.mongo, cache_mb=task.cache_mb) as store:
+            store.shared.recover()
+            for name, segments in store.repairs.recovered.items():
+                kept = sum(one.messages for one in segments)
+                self.tell("say", f"{name} was cut short by a crash: {kept} messages are recovered")
+            store.database  # noqa: B018 - brings the index up to date
 
 
 def _takes(trigger: Trigger, topic: str) -> bool:

@@ -36,8 +36,6 @@ _TRIES: Final = 5
 """So often in a row it may end before it has told how far it is."""
 _PAUSE_S: Final = 1.0
 _OF_SERVICE: Final = {"NOTIFY_SOCKET", "WATCHDOG_PID", "WATCHDOG_USEC"}
-RECOVERED: Final = "recovered"
-"""Tells it that earlier recordings are sealed: it brings their documents up to date."""
 ENDED: Final = "ended"
 """Tells it that the recording is sealed."""
 

@@ -81,7 +81,6 @@ class IndexAccess:
             settings.
         cache_mb: Size of the embedded MongoDB's cache in MiB, if this process starts it; None
             for the one in the store's settings.
-        recovers: False to leave what the index lacks of cut recordings to another opening.
 
     Attributes:
         wanted: The URI that was asked for; None for the one in the store's settings.
@@ -98,8 +97,6 @@ class IndexAccess:
         mongo: str | None,
         cache_mb: int | None,
         progress: Progress | None,
-        *,
-        recovers: bool,
     ) -> None:
         self.wanted = mongo
         self.may_write = True
@@ -109,7 +106,6 @@ class IndexAccess:
         self._directory = shared.directory
         self.cache_mb = cache_mb
         self._progress = progress
-        self._recovers = recovers
         self._uri: str | None = None
         self._mongod: EmbeddedMongod | None = None
         self._database: Database | None = None
@@ -153,14 +149,13 @@ class IndexAccess:
             )
         return database
 
-    def index_to_record(self, purpose: str) -> IndexTarget:
-        """The index, for a new recording; it may lack other recordings, or be unavailable."""
+    def index_to_record(self, purpose: str, *, brings: bool = True) -> IndexTarget:
+        """The index, for a new recording; it may be unavailable, or without `brings` be behind."""
         from hybridlog.follow.follower import IndexTarget
 
         renew = partial(self.connect, brings=False)
-        # Those that a crash has cut are brought into the index by another opening.
         try:
-            database = self.database_for(purpose, writes=True, brings=self._recovers)
+            database = self.database_for(purpose, writes=True, brings=brings)
         except DatabaseError as error:
             why = self.unavailable if isinstance(self.unavailable, DatabaseError) else error
             # It does without MongoDB if none is wanted, or ours does not start.
@@ -297,8 +292,9 @@ class IndexAccess:
         changed: set[str] = set()
         database = self._open()
         if brings and self.may_write:
+            shared.recover()
             store = StoreIndex(shared.directory, shared.catalog, database, self._progress)
-            session = self._shared.now()
+            session = shared.now()
             changed = store.bring_up_to_date(
                 session.snapshot(),
                 session.entry_of,

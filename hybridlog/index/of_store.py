@@ -84,7 +84,9 @@ class Index:
         if recordings is not None and left:
             raise next(iter(left.values()))
         shared.invalidate()
-        return shared.now().as_now([entry.id for entry in chosen if entry.id not in left])
+        now = shared.now()
+        found = (now.entry_if_there(entry.id) for entry in chosen if entry.id not in left)
+        return [entry for entry in found if entry is not None]
 
     @again_if_lost
     def add(self, topic: str, *fields: str) -> _FieldIndexes:

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 from hybridlog.entries import text as as_text
 from hybridlog.entries import with_said
-from hybridlog.follow.child import RECOVERED, FollowerProcess, Task
+from hybridlog.follow.child import FollowerProcess, Task
 from hybridlog.live.clocks import CLOCK, MachineClock, SimulatedTime
 from hybridlog.live.incidents import GROUPS, RULE, Incidents, Moment, Ring, Silence, SilenceWatch
 from hybridlog.live.memory import resident_bytes
@@ -279,10 +279,6 @@ class Recorder:
     def wait(self, seconds: float) -> bool:
         """Wait for the end for at most so long; returns True once it has come."""
         return self._over.wait(seconds)
-
-    def recovered(self) -> None:
-        """Earlier recordings are sealed: the follower brings the index up to date with them."""
-        self._follower.order(RECOVERED)
 
     def leave(self) -> bool:
         """Leave to the next command what the follower has not done; False before all is sealed."""

@@ -331,7 +331,7 @@ class LiveRecording:
 
         Raises:
             DiskFullError: The disk has no room even to seal; flushed messages stay, and the
-                next opening of the store seals them.
+                next command that changes the store seals them.
             UsageError: Closing has failed before, or the same thread is closing already, as
                 in a signal handler.
         """
@@ -347,7 +347,7 @@ class LiveRecording:
         if self._is_closing:
             raise UsageError(
                 f"The recording {self.name!r} is being closed, or closing it was interrupted; "
-                "the next opening of the store seals the flushed messages."
+                "the next command that changes the store seals the flushed messages."
             )
         self._is_closing = True
         self._stop()

@@ -5,19 +5,23 @@ What a copy is, and what it proves, is in `hybridlog_storage.copy`.
 
 from __future__ import annotations
 
+import os
+import re
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
+from hybridlog.entries import free_name_in
+from hybridlog.opened import OpenStore
 from hybridlog.wording import counted
 from hybridlog_storage import copy
 from hybridlog_storage.copy_places import Directory, RefusedError
 from hybridlog_storage.disk import files
-from hybridlog_storage.disk.directory import gone
+from hybridlog_storage.disk.directory import StoreDirectory, gone
 from hybridlog_storage.errors import (
     DiskFullError,
     HeldError,
@@ -26,14 +30,18 @@ from hybridlog_storage.errors import (
     StoreError,
     UsageError,
 )
+from hybridlog_storage.manifest import free_name
 from hybridlog_storage.manifests import RECORDINGS
+from hybridlog_storage.remote import address_of
 
 if TYPE_CHECKING:
     from hybridlog.maintenance.report import Progress
     from hybridlog_storage.copy_places import Place, Source
-    from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.manifest import File, Manifest
     from hybridlog_storage.summary import RecordingSummary
+
+_ELSEWHERE: Final = re.compile(r"[^/:]+:(.*)")
+"""A URL, or a place on a server as scp has it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,47 +89,36 @@ class CopyReport:
     problems: list[str] = field(default_factory=list)
 
 
-@dataclass(frozen=True, slots=True)
-class Target:
-    """The place that recordings are copied to.
-
-    `named` makes a name that no recording there has; `arrived` are the ids of those of which
-    something was copied.
-    """
-
-    place: Place
-    named: Callable[[str], str]
-    arrived: list[str] = field(default_factory=list)
-
-
 @dataclass
 class Copying:
-    """Copies recordings of a store.
+    """Copies recordings of a store `to` another one.
 
     Args:
         report: Takes the result, as it grows.
-        expire: With `then_expire`, called with the id of each recording and the digests of logs
-            whose copies were proved just now, by number.
         progress: Called with the bytes copied and checked, of all that are to be copied.
     """
 
-    directory: StoreDirectory
-    target: Target
+    shared: OpenStore
+    to: str | Path
     options: CopyOptions
     report: CopyReport
-    expire: Callable[[str, Mapping[int, str]], None]
     progress: Progress | None
 
     def run(self, chosen: Sequence[RecordingSummary]) -> None:
         """Copy some recordings; after an error what was copied stays, and it can be run again."""
-        self._place, self._source = self.target.place, self._source_of(self.directory)
-        if self._is_same():
-            raise UsageError(f"{self._place.address} is this very store: there is nothing to copy.")
+        self._directory = self.shared.directory
+        self._source = self._source_of(self._directory)
+        self._arrived: list[str] = []  # ids of recordings of which something was copied
         self._done = 0  # bytes of recordings before, and after this one
         self._left = sum(one.stored_bytes for one in chosen)
-        for one in chosen:
-            self._left -= one.stored_bytes
-            self._copy(one)
+        with self._opened() as (self._place, self._named):
+            if self._is_same():
+                raise UsageError(
+                    f"{self._place.address} is this very store: there is nothing to copy."
+                )
+            for one in chosen:
+                self._left -= one.stored_bytes
+                self._copy(one)
 
     @staticmethod
     def _source_of(directory: StoreDirectory) -> Source:
@@ -131,12 +128,64 @@ class Copying:
             return mount(directory.place)
         return Directory(directory.path)
 
+    @contextmanager
+    def _opened(self) -> Iterator[tuple[Place, Callable[[str], str]]]:
+        """The place to copy to, and what makes a name that no recording there has."""
+        if str(self.to).startswith("ssh://"):
+            from hybridlog_storage.sftp import Server
+
+            with Server(str(self.to), self.options.ssh) as server:
+                server.begin()
+                yield server, lambda name: free_name(name, server.names())
+        elif (address := address_of(self.to)) is not None:
+            from hybridlog.maintenance.derived import bring_derived
+            from hybridlog_storage.remote.store import RemoteDirectory
+
+            target = RemoteDirectory.create_in(address)
+            try:
+                yield target.source, _naming(lambda: target.manifests.each(target.ids()))
+            finally:
+                bring_derived(self.shared, target, self._arrived)
+        else:
+            from hybridlog.follow.follower import make_tables
+
+            path = self._local()
+            with closing(OpenStore(StoreDirectory.create(path), None, None)) as other:
+                other.directory.check_writable()
+                other.recover()
+                yield Directory(path.absolute()), _naming(lambda: other.newest().summaries)
+                other.catch_up()
+                for entry in other.now().select(self._arrived):  # so that other readers find them
+                    make_tables(other.directory, other.catalog, entry)
+
+    def _local(self) -> Path:
+        """The directory to copy to; one that is written like a place elsewhere is refused."""
+        to, source = self.to, self._directory
+        found = _ELSEWHERE.fullmatch(str(to))
+        if found is not None and (found[1].startswith("/") or not os.path.lexists(to)):
+            raise UsageError(
+                f"{to} is no place to copy to. Write ssh://user@host/path for a server, s3://, "
+                "gs:// or az:// for a bucket, and ./ in front of a directory with a colon in its "
+                "name."
+            )
+        try:
+            path = Path(to).expanduser()
+        except RuntimeError as error:
+            raise UsageError(f"{to}: there is no such home directory.") from error
+        if not source.is_remote and source.path.resolve() in path.resolve().parents:
+            raise UsageError(
+                f"{to} lies inside the store {source.path}: copy to another directory."
+            )
+        return path
+
     def _is_same(self) -> bool:
         """True if the place is the source: it sees a file that was made here this moment.
 
         Paths do not tell, nor does the id of a store, which its backups have, too.
         """
-        if not isinstance(self._source, Directory) or not self.directory.is_writable:
+        if not isinstance(self._source, Directory):
+            return self._source.address == self._place.address
+        if not self._directory.is_writable:
             return False  # nothing of it can be deleted
         try:
             with self._source.marked() as mark:
@@ -157,7 +206,7 @@ class Copying:
             self._without_payloads if options.only_fields else None,
             options.check,
             options.limit_rate,
-            self.target.named,
+            self._named,
             progress,
             partial(self._let_go, one) if options.then_expire else None,
         )
@@ -170,9 +219,9 @@ class Copying:
         with tempfile.TemporaryDirectory(prefix="hybridlog-") as place:
             into = Path(place) / RECORDINGS / now.id
             files.make_folders(into)
-            path, numbers = self.directory.recording(now.id), [log.number for log in logs]
+            path, numbers = self._directory.recording(now.id), [log.number for log in logs]
             try:
-                made = without_payloads(path, now, numbers, into, self.directory.address)
+                made = without_payloads(path, now, numbers, into, self._directory.address)
             except DiskFullError:
                 raise
             except StoreError as error:  # it is damaged, or has changed meanwhile
@@ -180,14 +229,14 @@ class Copying:
             yield made, Directory(Path(place))
 
     def _copy(self, one: RecordingSummary) -> None:
-        report, name = self.report, f"Recording {one.name!r} of {self.directory.place}"
+        report, name = self.report, f"Recording {one.name!r} of {self._directory.place}"
         try:
             if one.status == "open":
                 raise RefusedError(f"{name} is being written. Copy it when it has ended.")
             if one.status == "unfinished":
                 raise RefusedError(
-                    f"{name} was cut short by a crash. Open that store once with write "
-                    "permission, which recovers it, then copy it."
+                    f"{name} was cut short by a crash. Run `hybridlog verify --repair` there, "
+                    "then copy it."
                 )
             self._note(one, copy.copy(self._source, self._place, one.id, self._how(one)))
         except (RefusedError, ManifestError) as error:
@@ -209,7 +258,7 @@ class Copying:
                 "store may have them."
             )
         if copied.sent or copied.is_new:
-            self.target.arrived.append(one.id)
+            self._arrived.append(one.id)
             report.copied.append(name)
         elif not copied.lost:
             report.known.append(name)
@@ -226,4 +275,28 @@ class Copying:
                 f"{self._place.address} have lost some."
             )
         if digests:
-            self.expire(one.id, digests)
+            self._expire(one.id, digests)
+
+    def _expire(self, recording: str, digests: Mapping[int, str]) -> None:
+        from hybridlog.maintenance.edit import remove_if
+        from hybridlog.maintenance.keep import Keeper
+        from hybridlog.maintenance.retention import Rules
+
+        rules, report = Rules.of(self._directory.settings.retention), self.report
+        keeper = Keeper(self._directory, partial(remove_if, self.shared))
+        try:
+            expired = keeper.expire_all(
+                recording, digests, rules, self._place.address, self.progress
+            )
+        except HeldError as error:
+            report.problems.append(f"Payloads stay: {error}")
+            report.held.append(recording)
+            return
+        finally:
+            self.shared.catch_up(recording)
+        report.freed_bytes += expired.freed_bytes
+        report.problems += expired.problems
+
+
+def _naming(others: Callable[[], Iterable[RecordingSummary | Manifest]]) -> Callable[[str], str]:
+    return lambda name: free_name_in(others(), name)

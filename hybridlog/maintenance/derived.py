@@ -123,7 +123,7 @@ class StoreIndex:
     def rebuild(self, entries: Iterable[RecordingEntry]) -> dict[str, HybridlogError]:
         """Rebuild the index of recordings from their segments; returns why some are unchanged.
 
-        The next opening finishes an interrupted rebuild. Unchanged ones, by id, are gone, or
+        The next connection finishes an interrupted rebuild. Unchanged ones, by id, are gone, or
         another process holds them.
         """
         left: dict[str, HybridlogError] = {}

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import secrets
 import time as clock
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING
 
 from hybridlog.entries import free_name_in, text
 from hybridlog.maintenance import tables
-from hybridlog.query.times import TimeLike, format_time, parse_time
+from hybridlog.query.times import TimeLike, format_time, parse_range, parse_time
 from hybridlog.record.losses import extent_of
 from hybridlog_storage.disk.directory import LOCK_WAIT_S, gone
 from hybridlog_storage.errors import (
@@ -23,6 +24,7 @@ from hybridlog_storage.manifest import (
     MAX_MARKS,
     Manifest,
     Mark,
+    Note,
     Pin,
     new_random,
     replace,
@@ -87,24 +89,110 @@ def time_of_mark(entry: RecordingEntry, moment: TimeLike) -> int:
     return time
 
 
+def edit(
+    shared: OpenStore,
+    recording: str | RecordingEntry,
+    *,
+    name: str | None,
+    note: str | None,
+    tag: Mapping[str, str],
+    untag: Sequence[str],
+) -> RecordingEntry:
+    """Change what is said about a recording, as of `Store.edit`."""
+    for what, given in (("name", name), ("note", note)):
+        if given is not None and not (isinstance(given, str) and given.strip()):
+            raise UsageError(f"A {what} needs a text: give one that is not empty.")
+    if not isinstance(tag, Mapping) or not all(
+        isinstance(key, str) and key and "\0" not in key and isinstance(value, str)
+        for key, value in tag.items()
+    ):
+        raise UsageError('Tags are texts by keys, not empty and without NUL: tag={"place": "lab"}.')
+    (entry,) = shared.now().select([recording])
+    for key in untag:
+        if key not in entry.tags:
+            known = ", ".join(sorted(entry.tags)) or "none"
+            raise UsageError(f"{entry.name} has no tag {key!r}. Its tags: {known}.")
+    new = {text(key): text(value) for key, value in tag.items()}
+    notes = () if note is None else (Note(clock.time_ns(), text(note)),)
+
+    def how(now: Manifest) -> Manifest:
+        left = {key: value for key, value in now.tags.items() if key not in untag}
+        return replace(now, tags={**left, **new}, notes=(*now.notes, *notes))
+
+    return change(shared, entry, how, name)
+
+
+def pin(
+    shared: OpenStore,
+    recording: str | RecordingEntry,
+    span: tuple[TimeLike | None, TimeLike | None],
+    topics: Sequence[str] | None,
+    reason: str,
+) -> str:
+    """Pin a time of a recording, as of `Store.pin`."""
+    (entry,) = shared.now().select([recording])
+    start, stop = extent_of(entry)
+    if span != (None, None):
+        parse_range(*span, start=start, end=stop)
+    begin, end = (None if t is None else parse_time(t, start=start, end=stop) for t in span)
+    if not may_hold(entry, begin, end):
+        raise TimeError(f"Nothing to pin: recording {entry.name!r} has no message then.")
+    made = pin_of(secrets.token_hex(4), (begin, end), topics, text(reason))
+
+    def how(now: Manifest) -> Manifest:
+        return replace(now, pins=(*(one for one in now.pins if one.id != made.id), made))
+
+    change(shared, entry, how)
+    return made.id
+
+
+def unpin(shared: OpenStore, names: Sequence[str]) -> None:
+    """Remove pins; UsageError if there is none of a name."""
+
+    def how(now: Manifest) -> Manifest:
+        return replace(now, pins=tuple(one for one in now.pins if one.id not in names))
+
+    known = {one["id"]: entry for entry in shared.now().select(None) for one in entry.pins}
+    for name in names:
+        if name not in known:
+            raise UsageError(f"There is no pin {name!r}; `hybridlog keep --pins` lists them.")
+    for entry in {known[name].id: known[name] for name in names}.values():
+        change(shared, entry, how)
+
+
+def may_hold(entry: RecordingEntry, begin: int | None, end: int | None) -> bool:
+    """True if a recording may have messages in a range of time; a running one, later ones."""
+    start, stop = extent_of(entry)
+    is_over = entry.status not in {"open", "unfinished"}
+    return (end is None or end > start) and not (is_over and begin is not None and begin >= stop)
+
+
+def pin_of(
+    name: str, span: tuple[int | None, int | None], topics: Sequence[str] | None, reason: str
+) -> Pin:
+    """A pin of `[first, end)` of log time, ns, with None for no bound; without topics, of all."""
+    begin, end = span
+    last = None if end is None else end - 1
+    return Pin(name, begin, last, None if topics is None else tuple(topics), reason)
+
+
 def mark(
     shared: OpenStore,
-    entry: RecordingEntry,
-    moment: int,
-    *,
-    text: str,
+    recording: str,
+    span: tuple[TimeLike, TimeLike | None],
+    note: str,
     tags: Mapping[str, str],
-    end: int | None = None,
 ) -> RecordingEntry:
-    """Set a mark in the manifest of a recording, also of a running one, and return it.
-
-    `moment` and `end` are log times, ns; without `end` it is the mark of a moment.
-    """
-    if moment < 0:
+    """Set a mark in the manifest of a recording, as of `Store.mark`."""
+    entry = shared.now().entry(recording)
+    begin, end = (None if one is None else time_of_mark(entry, one) for one in span)
+    assert begin is not None
+    if begin < 0:
         raise TimeError("A mark cannot be set before 1970: its log time has no sign.")
-    if end is not None and end < moment:
+    if end is not None and end < begin:
         raise TimeError("A mark cannot end before it begins.")
-    made = Mark(new_random(), moment, text, dict(tags), end)
+    said = {text(key): text(value) for key, value in tags.items()}
+    made = Mark(new_random(), begin, text(note), said, end)
     now = change(shared, entry, lambda known: with_mark(known, made))
     if all(one["id"] != made.id for one in now.marks):
         raise too_many_marks(entry.name)
@@ -150,20 +238,21 @@ def too_many_marks(name: str) -> StoreError:
     )
 
 
-def unmark(
-    shared: OpenStore, entry: RecordingEntry, moment: int | None, *, text: str
-) -> RecordingEntry:
-    """Remove marks of a text, at a log time (ns) or None for any, and return the recording."""
+def unmark(shared: OpenStore, recording: str, moment: TimeLike | None, note: str) -> RecordingEntry:
+    """Remove marks of a text, at a log time or None for any, and return the recording."""
+    entry = shared.now().entry(recording)
+    start, end = extent_of(entry)
+    time = None if moment is None else parse_time(moment, start=start, end=end)
 
     def how(now: Manifest) -> Manifest:
-        left = tuple(one for one in now.marks if one.text != text or moment not in {None, one.time})
-        if len(left) == len(now.marks):
-            when = "" if moment is None else " at this time"
+        gone = [one for one in now.marks if one.text == text(note) and time in {None, one.time}]
+        if not gone:
+            when = "" if time is None else " at this time"
             raise UsageError(
-                f"{entry.name} has no mark {text!r}{when} that somebody set: those that its "
+                f"{entry.name} has no mark {note!r}{when} that somebody set: those that its "
                 "recorder noted are messages, and stay."
             )
-        return replace(now, marks=left)
+        return replace(now, marks=tuple(one for one in now.marks if one not in gone))
 
     return change(shared, entry, how)
 
@@ -186,7 +275,7 @@ def remove_if(
                 directory.manifests.remove(entry.id, check)
             except RecordingGoneError as error:
                 raise gone(entry.name) from error
-            with suppress(OSError, StoreError):  # or else the next opening does both
+            with suppress(OSError, StoreError):  # or else the next change does both
                 tables.remove(directory, entry.id, entry)
                 shared.catalog.remove(entry.id)
             if database is not None:

@@ -4,7 +4,7 @@ What is left of the messages of a log are files of rows: the fields as in tables
 hashes (`columns/rows_file.py`). They are written once and listed beside the log, as soon as it is
 sealed where a store has rules, else before it goes. Then one change of the manifest says that logs
 are gone; from then on their rows are the truth. A crash on either side of a change leaves files
-that the next opening removes.
+that the next change of the store removes.
 """
 
 from __future__ import annotations
@@ -206,7 +206,7 @@ def _list(
     try:
         return manifests.change(recording, how)
     finally:
-        with suppress(StoreError):  # or else the next opening does it
+        with suppress(StoreError):  # or else the next change does it
             listed = {file.name for file in manifests.read(recording).files}
             new = [file.name for rows in made.values() for file in rows]
             directory.drop(recording, [name for name in new if name not in listed])

@@ -12,7 +12,7 @@ import shutil
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -29,7 +29,6 @@ from hybridlog.maintenance.retention import (
     plan,
 )
 from hybridlog.maintenance.sizes import disk_bytes
-from hybridlog.record.losses import extent_of
 from hybridlog.wording import listed
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import LOCK_WAIT_S
@@ -41,12 +40,10 @@ from hybridlog_storage.errors import (
     StoreError,
     TopicError,
 )
-from hybridlog_storage.manifest import Pin
 from hybridlog_storage.settings import read_settings
 
 if TYPE_CHECKING:
     from hybridlog.maintenance.report import Progress
-    from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.manifest import Manifest
 
@@ -86,7 +83,6 @@ class Keeper:
         judged: Returns the numbers of its segments that triggers have seen, None for all: the
             others go last.
         is_wanted: Returns whether to go on; asked before each deletion.
-        changed: Called with the id of each recording that lost payloads, while it is held.
     """
 
     def __init__(
@@ -98,7 +94,6 @@ class Keeper:
         window: int = 0,
         judged: Callable[[], Collection[int] | None] = lambda: None,
         is_wanted: Callable[[], bool] = lambda: True,
-        changed: Callable[[str], object] = lambda _: None,
     ) -> None:
         self._directory = directory
         self._remove = remove
@@ -106,7 +101,6 @@ class Keeper:
         self._window = window
         self._judged = judged
         self._is_wanted = is_wanted
-        self._changed = changed
         # Segments that this pass could not change, by recording; -1 for all of it.
         self._failed: defaultdict[str, set[int]] = defaultdict(set)
         self._unproven: set[str] = set()  # names of recordings whose manifests were made again
@@ -253,7 +247,6 @@ class Keeper:
                     is_followed=is_own,
                     **how,
                 )
-            self._changed(step.id)
         return done
 
 
@@ -291,22 +284,6 @@ def use_spare(directory: StoreDirectory) -> bool:
     except OSError:
         return False
     return True
-
-
-def may_hold(entry: RecordingEntry, begin: int | None, end: int | None) -> bool:
-    """True if a recording may have messages in a range of time; a running one, later ones."""
-    start, stop = extent_of(entry)
-    is_over = entry.status not in {"open", "unfinished"}
-    return (end is None or end > start) and not (is_over and begin is not None and begin >= stop)
-
-
-def pin_of(
-    name: str, span: tuple[int | None, int | None], topics: Sequence[str] | None, reason: str
-) -> Pin:
-    """A pin of `[first, end)` of log time, ns, with None for no bound; without topics, of all."""
-    begin, end = span
-    last = None if end is None else end - 1
-    return Pin(name, begin, last, None if topics is None else tuple(topics), reason)
 
 
 LOOK_S: Final = 5.0

@@ -1,43 +1,38 @@
-"""Opens a store: recovers recordings after a crash and brings the catalog up to date.
+"""Looks at the recordings of a store, and finishes what a crash or a killed command has left.
 
-No server is needed. If the state of a recording's files matches its catalog row, the files
-are not opened.
+A look writes nothing but the catalog. If the state of a recording's files matches its catalog
+row, the files are not opened. No server is needed.
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Collection, Mapping
-from collections.abc import Set as AbstractSet
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from dataclasses import replace as replaced
 from typing import TYPE_CHECKING
 
 from msgspec import to_builtins
 
 from hybridlog.entries import (
     NO_MANIFEST,
-    describe_now,
+    describe,
     described_of,
     ended,
     inventory_of,
     listed,
     lost_in_crash,
     state_of,
+    steady_inventory,
     summary_by,
     take_inventory,
     unlisted,
     with_said,
 )
+from hybridlog.maintenance import tables
 from hybridlog.snapshot import UNFINISHED, Snapshot
 from hybridlog_storage.catalog import Catalog, Described
-from hybridlog_storage.errors import (
-    DiskFullError,
-    HeldError,
-    RecordingGoneError,
-    StoreError,
-    TopicError,
-)
+from hybridlog_storage.errors import DiskFullError, RecordingGoneError, StoreError, TopicError
 from hybridlog_storage.manifest import Manifest, replace
 
 if TYPE_CHECKING:
@@ -59,58 +54,34 @@ def open_catalog(directory: StoreDirectory) -> Catalog:
     )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class StoreFiles:
-    """The recordings of a store, compared with their files, and recovered if it `mends`."""
+    """The recordings of a store, compared with their files."""
 
     directory: StoreDirectory
     catalog: Catalog
     report: RepairReport
-    mends: bool = False
+    _left: set[str] = field(default_factory=set)  # ids of those that `recover` would change
+    _gone: set[str] = field(default_factory=set)  # of those that only the catalog has
+    _is_swept: bool = False
 
-    def look_at_all(self) -> Snapshot:
-        """All recordings.
+    def look(self, before: Snapshot, recordings: Collection[str]) -> Snapshot:
+        """`before`, with some recordings as they are now; those that are gone are left out.
 
         The files of a recording are read if it is new, or looks different from outside. All
         others are compared with their files before they first answer, see `current_entry`.
         """
-        from hybridlog.maintenance import tables
-
         directory, catalog, report = self.directory, self.catalog, self.report
-        mends = self.mends and not catalog.is_in_memory
-        rows = catalog.summaries()
-        report.unreadable.clear()
-        ids = directory.ids()
-        found = self._find(directory.looks(ids), {one.id: one for one in rows})
-        if mends:
-            directory.manifests.clear()  # what killed processes left
+        is_first = not before.summaries  # of all
+        rows = {one.id: one for one in catalog.summaries(None if is_first else recordings)}
+        self._gone |= rows.keys() - {*recordings} if is_first else set()
+        for recording in recordings:
+            report.unreadable.pop(recording, None)
+        found = self._find(directory.looks(sorted(recordings)), rows)
         for name in directory.manifests.without():
             report.unreadable[name] = _lost(directory, name)
-        # The row of a recording that is unreadable now may be valid again later.
-        known = found.keys() | report.unreadable.keys()
-        gone = {one.id for one in rows} - known
-        if mends:
-            tables.clear(directory, gone, known)
-        for recording in gone if mends or catalog.is_in_memory else ():
-            catalog.remove(recording)
         topics = {one.topics: catalog.topics(one.topics) for one in found.values()}
-        return Snapshot(found.values(), topics)
-
-    def catch_up(self, snapshot: Snapshot, recordings: AbstractSet[str]) -> Snapshot | None:
-        """All recordings after some came, went or changed; None if only `look_at_all` can tell."""
-        directory, catalog, report = self.directory, self.catalog, self.report
-        if report.unreadable:
-            return None
-        try:
-            rows = {summary.id: summary for summary in catalog.summaries(recordings)}
-            looks = directory.looks(sorted(recordings))
-            found = self._find(looks, rows)
-            if report.unreadable or any(map(directory.has, recordings - looks.keys())):
-                return None
-            topics = {one.topics: catalog.topics(one.topics) for one in found.values()}
-        except StoreError:
-            return None
-        return snapshot.with_changes(found.values(), topics, recordings)
+        return before.with_changes(found.values(), topics, recordings)
 
     def _find(
         self,
@@ -130,8 +101,6 @@ class StoreFiles:
         for recording in sorted(due - whole.keys()):
             try:
                 summary = self._look_again(recording)
-            except DiskFullError:
-                raise
             except StoreError as error:
                 if self.directory.has(recording):  # another process may have removed it
                     self.report.unreadable[recording] = str(error)
@@ -164,11 +133,10 @@ class StoreFiles:
         """The summary of a recording as its files are now; None if it is gone."""
         known = self._known(recording)
         if known is None:
-            described = self._refresh(recording)
+            described = self._read(recording)
             return described.summary if described is not None else None
         found = described_of(*known)
-        is_noted = self.catalog.recording(recording) == (found.files, found.entry)
-        if found.entry.status not in UNFINISHED or not is_noted:
+        if found.entry.status not in UNFINISHED:
             self.catalog.put(found)
         return found.summary
 
@@ -188,7 +156,7 @@ class StoreFiles:
             return None
         if files != state_of(listing, manifest):
             return None
-        if not manifest.is_ended or listing.open or listing.left_over(manifest):
+        if _has_left(listing, manifest):
             holder = directory.holder(recording)
             if holder is None or not (holder.is_recording or entry.status != "open"):
                 return None
@@ -199,34 +167,66 @@ class StoreFiles:
         known = self._known(summary.id)
         if known is not None:
             return known[0], False
-        described = self._refresh(summary.id)
+        described = self._read(summary.id)
         return (described.entry if described is not None else None), True
 
-    def _refresh(self, recording: str) -> Described | None:
-        """Read what is whole of a recording, and put it into the catalog; None if it is gone.
-
-        With `mends`, what a crash has left is mended.
-        """
+    def _read(self, recording: str) -> Described | None:
+        """Read what is whole of a recording, and put it into the catalog; None if it is gone."""
         directory, catalog = self.directory, self.catalog
-        mends = self.mends and self.report.disk_full is None and not catalog.is_in_memory
         try:
-            if mends and os.access(directory.recording(recording), os.W_OK):
-                with suppress(HeldError, TopicError), directory.writing(recording):
-                    if not recover(directory, recording, self.report):
-                        return None
-                    described = describe_now(directory, catalog, recording)
-                    catalog.put(described)
-                    return described
             is_open = directory.is_recorded(recording)
-            described = describe_now(directory, catalog, recording, is_open=is_open)
+            inventory = steady_inventory(directory, recording)
+            described = describe(catalog, inventory, is_open=is_open)
         except RecordingGoneError:
+            self._left.add(recording)  # its removal was interrupted
             return None
         except StoreError:
             if directory.has(recording):
                 raise
             return None  # another process has just removed it
-        catalog.put(described)
+        noted, manifest = described, inventory.manifest
+        if not is_open and manifest and _has_left(directory.listing(recording), manifest):
+            self._left.add(recording)  # each process sees it, as long as the row has no look
+            noted = replaced(described, summary=described.summary._replace(look=""))
+        catalog.put(noted)
         return described
+
+    def recover(self, died: Collection[str]) -> set[str]:
+        """Finish what was interrupted, and seal what recorders that `died` have left.
+
+        Returns the ids of the recordings that have changed. What another process holds stays, and
+        so does what needs more room than the disk has.
+        """
+        directory, done = self.directory, set[str]()
+        if self.catalog.is_in_memory:
+            return done
+        if not self._is_swept:
+            self._sweep()
+        for recording in sorted(self._left | {*died}):
+            with suppress(StoreError, TopicError, DiskFullError), directory.writing(recording):
+                recover(directory, recording, self.report)
+                done.add(recording)
+        self._left -= done
+        return done
+
+    def _sweep(self) -> None:
+        """Remove what killed processes have left outside of recordings."""
+        directory, catalog = self.directory, self.catalog
+        directory.manifests.clear()
+        known = {*directory.ids(), *directory.manifests.without()}
+        gone = self._gone - known
+        tables.clear(directory, gone, known)
+        for recording in gone:
+            catalog.remove(recording)
+        self._is_swept = True
+
+
+def _has_left(listing: Listing, manifest: Manifest) -> bool:
+    """True if a recorder or a change that was interrupted has left something, unless it goes on."""
+    unlisted_logs = listing.sealed.keys() - manifest.logs.keys()
+    return not manifest.is_ended or bool(
+        unlisted_logs or listing.open or listing.left_over(manifest)
+    )
 
 
 def _lost(directory: StoreDirectory, name: str) -> str:
@@ -241,14 +241,14 @@ def _lost(directory: StoreDirectory, name: str) -> str:
     return "it has neither a manifest nor a segment, but other files"
 
 
-def recover(directory: StoreDirectory, recording: str, report: RepairReport) -> bool:
-    """Finish the interrupted work on a recording that this process has locked; False if gone."""
+def recover(directory: StoreDirectory, recording: str, report: RepairReport) -> None:
+    """Finish the interrupted work on a recording that this process has locked."""
     try:
         manifest = directory.manifests.read(recording)
     except RecordingGoneError:
         removed = directory.manifests.remove(recording)  # finishes it, or says that there is none
         report.removed.append(removed.name)
-        return False
+        return
     listing = directory.listing(recording)
     directory.drop(recording, listing.left_over(manifest))
     recovered = recover_segments(directory, recording, listing, manifest)
@@ -257,7 +257,7 @@ def recover(directory: StoreDirectory, recording: str, report: RepairReport) -> 
     if is_empty and not manifest.is_ended:
         directory.manifests.remove(recording)
         report.recovered[inventory.name] = recovered
-        return False
+        return
     if recovered:
         report.recovered[inventory.name] = recovered
     adopt = unlisted(inventory)
@@ -267,7 +267,6 @@ def recover(directory: StoreDirectory, recording: str, report: RepairReport) -> 
         return now if now.is_ended else ended({"status": "recovered"})(now)
 
     directory.manifests.change(recording, change)
-    return True
 
 
 def recover_segments(

@@ -6,8 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from hybridlog_storage.errors import DiskFullError
-
 if TYPE_CHECKING:
     from hybridlog_storage.segments.recovery import Recovered
 
@@ -47,9 +45,6 @@ class RepairReport:
         removed: Recordings whose removal was finished, or whose files are gone.
         unreadable: Ids of recordings that could not be repaired, and the reason.
         damage: Reasons why data files of the embedded MongoDB were replaced by empty ones.
-        tables: Recording and topic of tables that were missing or damaged, and made again.
-        disk_full: The error if the disk had no room for repairs, else None.
-        noted_tables: Recording's id and topic of tables that a question met missing or damaged.
     """
 
     recovered: dict[str, list[Recovered]] = field(default_factory=dict)
@@ -57,9 +52,6 @@ class RepairReport:
     removed: list[str] = field(default_factory=list)
     unreadable: dict[str, str] = field(default_factory=dict)
     damage: list[str] = field(default_factory=list)
-    tables: list[tuple[str, str]] = field(default_factory=list)
-    disk_full: DiskFullError | None = None
-    noted_tables: set[tuple[str, str]] = field(default_factory=set)
 
 
 @dataclass(slots=True)

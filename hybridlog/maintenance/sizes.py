@@ -1,8 +1,8 @@
 """Bytes that recordings and topics take on the disk, by tier.
 
-The catalog, the sizes of files and one command for each collection of MongoDB suffice: the
-cost does not depend on the number of messages. Chunks and files that topics share are
-divided by payload and by number of messages.
+Manifests, the sizes of files and one command for each collection of MongoDB suffice: the cost
+does not depend on the number of messages. Files that topics share are divided by payload and
+by number of messages.
 """
 
 from __future__ import annotations
@@ -17,20 +17,15 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from hybridlog.columns.layout import type_prefix
-from hybridlog.entries import read_again
-from hybridlog_storage.errors import CatalogError
 from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD
 from hybridlog_storage.mongo.collection_names import collection_of
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
-    from hybridlog_storage.catalog import Catalog, RecordingEntry
+    from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.mongo.database import Database
-    from hybridlog_storage.segments.chunk_table import ChunkTable
 
 
 _Key = TypeVar("_Key")
@@ -42,8 +37,8 @@ class Size:
 
     Attributes:
         recording: Name of the recording; empty for several.
-        topic: Full name; empty for several, and for what belongs to no topic: definitions,
-            checksums, attachments.
+        topic: Full name; empty for several, and for what belongs to no topic: files without
+            messages, and those that are being written.
         messages: Number of messages.
         payload_bytes: Their payloads, uncompressed.
         segment_bytes: Their share of the segments.
@@ -99,7 +94,6 @@ class Sizes:
 
 def sizes_of(
     directory: StoreDirectory,
-    catalog: Catalog,
     entries: Sequence[RecordingEntry],
     database: Database | None,
 ) -> Sizes:
@@ -110,7 +104,7 @@ def sizes_of(
     rows: list[Size] = []
     tables = table_bytes(directory.path, entries)
     for entry in entries:
-        segments = _segment_bytes(directory, catalog, entry)
+        segments = _segment_bytes(directory, entry)
         columns: Counter[str] = Counter()
         for _, topic, size in entry.rows:
             columns[topic] += size
@@ -165,41 +159,20 @@ def _largest_first(rows: Iterable[Size]) -> list[Size]:
     return sorted(rows, key=lambda row: (-row.total_bytes, row.recording, row.topic))
 
 
-def _segment_bytes(
-    directory: StoreDirectory, catalog: Catalog, entry: RecordingEntry
-) -> Counter[str]:
+def _segment_bytes(directory: StoreDirectory, entry: RecordingEntry) -> Counter[str]:
     """Bytes of the segments by topic; the rest under the empty name."""
-    by_channel = np.zeros(max((c.id for c in entry.channels), default=0) + 1)
-    for number, _, _ in entry.spans:
-        if str(number) in entry.files:  # it is gone
-            continue
-        try:
-            table = catalog.table(entry, number)
-        except CatalogError:
-            read_again(directory, catalog, entry)
-            table = catalog.table(entry, number)
-        found = _chunk_shares(table)
-        by_channel[: len(found)] += found[: len(by_channel)]
-    whole: Counter[str] = Counter()
-    for channel in entry.channels:
-        whole[channel.topic] += round(float(by_channel[channel.id]))
+    manifest, whole = directory.manifests.read(entry.id), Counter[str]()
+    for number, log in manifest.logs.items():
+        if log.is_here and log.parts and str(number) in entry.digests:
+            weights = Counter[str]()
+            for channel, part in log.parts.items():
+                weights[manifest.channels[channel].topic] += (
+                    part.bytes + part.messages * MESSAGE_HEAD.itemsize
+                )
+            whole.update(_divided(log.bytes, weights))
     columns = sum(size for _, _, size in entry.rows)
     whole[""] += max(0, entry.stored_bytes - columns - whole.total())
     return whole
-
-
-def _chunk_shares(table: ChunkTable) -> NDArray[np.float64]:
-    """Bytes of the chunks by channel id, divided by the bytes of the messages in each."""
-    if not len(table.chunks):
-        return np.zeros(0)
-    stored = (table.chunks["length"] + table.chunks["trailer"]).astype(np.float64)
-    chunk = np.repeat(np.arange(len(table.chunks)), table.chunks["parts"])
-    parts = table.parts
-    weight = parts["payload_bytes"].astype(np.float64)
-    weight += parts["messages"] * float(MESSAGE_HEAD.itemsize)
-    in_chunk = np.bincount(chunk, weight)
-    shares = stored[chunk] * weight / in_chunk[chunk]
-    return np.bincount(parts["channel"], shares).astype(np.float64)
 
 
 def table_bytes(root: Path, entries: Sequence[RecordingEntry]) -> Mapping[tuple[str, str], int]:

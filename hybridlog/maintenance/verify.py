@@ -6,8 +6,8 @@ Repairs lose no data; what is left is found.
 from __future__ import annotations
 
 import secrets
-from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from shlex import quote
@@ -45,7 +45,6 @@ from hybridlog_storage.errors import (
 )
 from hybridlog_storage.manifest import encode, replace
 from hybridlog_storage.mongo.collection_names import collection_of
-from hybridlog_storage.mongo.index_documents import between
 from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.segments.gone_log import open_log
 from hybridlog_storage.segments.recovery import rebuild_summary
@@ -59,6 +58,7 @@ if TYPE_CHECKING:
 
     from hybridlog.entries import Inventory
     from hybridlog.maintenance.report import Progress, RepairReport
+    from hybridlog.opened import OpenStore
     from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.manifest import Manifest
@@ -114,24 +114,27 @@ class Verification:
 
 
 def verify(
-    directory: StoreDirectory,
-    catalog: Catalog,
-    database: Database | None,
-    *,
-    recordings: Iterable[str] | None,
+    shared: OpenStore,
+    names: Mapping[str, str] | None,
     progress: Progress | None = None,
+    *,
+    repairs: bool = False,
 ) -> Verification:
     """Check every byte of segments, manifests and tables, and count the documents of the index.
 
-    Without a database, only files are checked.
+    `names` are those of recordings by id, None for all; `repairs` makes the repairs first. Without
+    MongoDB, only files are checked.
     """
-    result = Verification(index=database is not None)
-    chosen = None if recordings is None else [*recordings]
-    index = None if database is None else _Index(database, count_all=chosen is None)
+    directory, catalog, left = shared.directory, shared.catalog, list[Finding]()
+    result = Verification()
+    if repairs:
+        left = _repair(shared, names, result.repaired, progress)
+        shared.invalidate()
+    database = shared.index.database
+    result.index = database is not None
+    index = None if database is None else _Index(database)
     checker = tables.TableChecker(directory)
-    if chosen is None:
-        chosen = [*directory.ids(), *directory.manifests.without()]
-    for recording in chosen:
+    for recording in _all(directory) if names is None else names:
         result.recordings += 1
         try:
             check = _Check(directory, catalog, index, recording, result, checker=checker)
@@ -143,41 +146,31 @@ def verify(
         except StoreError as error:
             cure = "restore its files"
             result.findings.append(Finding(recording, "recording", str(error), cure))
+    told = {(one.recording, one.place) for one in left}
+    left += [one for one in result.findings if (one.recording, one.place) not in told]
+    result.findings = left
     return result
 
 
+def _all(directory: StoreDirectory) -> list[str]:
+    return [*directory.ids(), *directory.manifests.without()]
+
+
 class _Index:
-    """Counts the documents of recordings.
+    """Counts the documents of recordings; each collection is read once."""
 
-    With `count_all` each collection is read once, and documents at any time are found. Otherwise
-    only those of the topics and the times of a recording are counted.
-    """
-
-    def __init__(self, database: Database, *, count_all: bool) -> None:
+    def __init__(self, database: Database) -> None:
         self.database = database
-        self.count_all = count_all
-        self._counts: dict[str, Counter[str]] = defaultdict(Counter)
-        if count_all:
-            collections = IndexState(database).document_collections()
-            counted = database.count_each([(name, {}) for name in collections])
-            for collection, counts in zip(collections, counted, strict=True):
-                for key, count in counts:
-                    if isinstance(key, str):
-                        self._counts[key][collection] = count
+        self._counts: dict[str, dict[str, int]] = {}
 
     def documents_of(self, entry: RecordingEntry) -> Counter[str]:
         """Numbers of documents of a recording, by collection."""
-        if self.count_all:
-            return self._counts[entry.key]
-        if entry.span is None:
-            return Counter()
-        first, last = entry.span
         names = {collection_of(channel.topic) for channel in entry.channels}
-        within = {**between(first, last + 1), "_meta.rec": entry.key}
-        counted = self.database.count_each([(name, within) for name in names])
-        return Counter(
-            {name: n for name, counts in zip(names, counted, strict=True) for _, n in counts}
-        )
+        new = sorted(names - self._counts.keys())
+        counted = self.database.count_each([(name, {}) for name in new])
+        for name, counts in zip(new, counted, strict=True):
+            self._counts[name] = {key: count for key, count in counts if isinstance(key, str)}
+        return Counter({name: self._counts[name].get(entry.key, 0) for name in names})
 
 
 class _Check:
@@ -261,7 +254,7 @@ class _Check:
             self.found(place, misfit.reason, RESTORE if is_rows(misfit.file) else cure)
         for name in inventory.listing.open.values():
             if not is_held:
-                self.found(name, "a crash has left it open", "open the store with write permission")
+                self.found(name, "a crash has left it open", _REPAIR)
         for name in sorted({*inventory.listing.others} - {*left, *_KNOWN}):
             self.found(name, "it is not a file of a recording", "move it out of the store")
         for name in () if is_held else left:
@@ -334,7 +327,7 @@ class _Check:
         for channel in entry.channels:
             if channel.is_indexed:
                 expected[collection_of(channel.topic)] += channel.stats.messages
-        if self._indexed.count_all and +have != +expected:
+        if +have != +expected:
             # The recording may have ended since all documents were counted.
             count, of = self._indexed.database.count, {"_meta.rec": entry.key}
             have = Counter({name: count(name, of) for name in have.keys() | expected.keys()})
@@ -351,28 +344,31 @@ class _Check:
             self.found(f"table of {topic}", problem, _REPAIR)
 
 
-def repair(
-    directory: StoreDirectory,
-    catalog: Catalog,
-    repairs: RepairReport,
+def _repair(
+    shared: OpenStore,
     names: Mapping[str, str] | None,
-) -> tuple[list[Repaired], list[Finding]]:
-    """Repair files, manifests and the catalog; returns what was repaired, and what was not.
-
-    `repairs` says which recordings cannot be read; `names` are those of recordings by id, None for
-    all.
-    """
+    done: list[Repaired],
+    progress: Progress | None,
+) -> list[Finding]:
+    """Repair files, manifests, the catalog, tables and index; returns what was not repaired."""
+    directory, catalog, repairs = shared.directory, shared.catalog, shared.repairs
     directory.check_writable()
-    done: list[Repaired] = []
+    database = shared.index.writable_database
     left: list[Finding] = []
     checker = tables.TableChecker(directory)
-    all_ids = (*directory.ids(), *directory.manifests.without())
-    for recording, name in ({one: one for one in all_ids} if names is None else names).items():
+    chosen = {one: one for one in _all(directory)} if names is None else names
+    for recording, name in chosen.items():
         try:
             with directory.writing(recording, name, wait_s=LOCK_WAIT_S):
                 done += _repair_one(directory, repairs, recording)
                 entry = put_entry(directory, catalog, recording)
-            if entry.status in {"damaged", "open"}:
+            if entry.status == "open":
+                continue
+            if database is not None and _is_restored(directory, catalog, entry):
+                bring(directory, catalog, entry, database, anew=True, progress=progress)
+                done.append(Repaired(entry.name, "index", "damaged chunks are readable again"))
+                entry = put_entry(directory, catalog, recording)
+            if entry.status == "damaged":
                 continue  # tables of lost data are valid again after its restoration
             for topic, why in _tables(directory, catalog, checker, entry).items():
                 place = f"table of {topic}"
@@ -387,7 +383,7 @@ def repair(
                 left.append(Finding(name, "recording", str(error), AGAIN))
         except (StoreError, TopicError) as error:
             left.append(Finding(name, "recording", str(error), AGAIN))
-    return done, left
+    return left
 
 
 def _tables(
@@ -419,49 +415,22 @@ def _repair_one(directory: StoreDirectory, report: RepairReport, recording: str)
 
 
 def _manifest(directory: StoreDirectory, report: RepairReport, recording: str) -> list[Repaired]:
-    manifests, manifest = directory.manifests, None
+    manifests, is_lost = directory.manifests, True
     with suppress(ManifestError):
-        manifest = manifests.find(recording)
-    if manifest is None:
-        recover_segments(directory, recording, directory.listing(recording), None)
-
-        def make(old: Manifest | None) -> Manifest:
-            inventory = inventory_of(directory, recording, directory.listing(recording), None)
-            made = made_again(inventory, old)
-            others = manifests.each(directory.ids())
-            return replace(made, name=free_name_in(others, made.name))
-
-        made = manifests.restore(recording, make)
-        return [Repaired(made.name, "manifest", "made again")]
-    left = directory.listing(recording).left_over(manifest)
-    misfits = take_inventory(directory, recording).misfits
-    done = [Repaired(manifest.name, file, "left over, and removed") for file in left]
-    done += [
-        Repaired(manifest.name, misfit.file, "listed in the manifest")
-        for misfit in misfits
-        if misfit.is_unlisted
-    ]
-    if done:
+        is_lost = manifests.find(recording) is None
+    if not is_lost:
         recover(directory, recording, report)
-    return done
+        return []
+    recover_segments(directory, recording, directory.listing(recording), None)
 
+    def make(old: Manifest | None) -> Manifest:
+        inventory = inventory_of(directory, recording, directory.listing(recording), None)
+        made = made_again(inventory, old)
+        others = manifests.each(directory.ids())
+        return replace(made, name=free_name_in(others, made.name))
 
-def repair_index(
-    directory: StoreDirectory,
-    catalog: Catalog,
-    database: Database,
-    entries: Sequence[RecordingEntry],
-    *,
-    progress: Progress | None = None,
-) -> list[Repaired]:
-    """Index recordings anew whose damaged chunks are readable again."""
-    done = []
-    for entry in entries:
-        if entry.status != "open" and _is_restored(directory, catalog, entry):
-            with suppress(HeldError, TopicError):
-                bring(directory, catalog, entry, database, anew=True, progress=progress)
-                done.append(Repaired(entry.name, "index", "damaged chunks are readable again"))
-    return done
+    made = manifests.restore(recording, make)
+    return [Repaired(made.name, "manifest", "made again")]
 
 
 def _is_restored(directory: StoreDirectory, catalog: Catalog, entry: RecordingEntry) -> bool:

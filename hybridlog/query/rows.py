@@ -385,7 +385,7 @@ class Rows:
                 raise
             self._tabled[part] = None
             if not isinstance(error, _UndecidedError):
-                self.session.reject_table(part.recording, part.topic)
+                self.session.tables.reject(part.recording, part.topic)
             raise ChangedError(f"The table of {part.topic} is left. Ask again.") from error
 
     # Chunks.

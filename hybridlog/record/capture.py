@@ -190,7 +190,7 @@ class Capture:
             if not self.writer.written.total():
                 self.rollback()
                 raise
-            if not self.writer.has_extras:  # or else the next opening reads them in the segment
+            if not self.writer.has_extras:  # or else the next look reads them in the segment
                 rows = tuple(map(loss_of, lost))
                 with suppress(DiskFullError):
                     self._change(lambda now: replaced(now, losses=(*now.losses, *rows)))
@@ -224,13 +224,13 @@ class Capture:
         return self.follower.state.failure
 
     def abort(self) -> None:
-        """Stop at once; flushed messages stay, and the next opening of the store seals them."""
+        """Stop at once; flushed messages stay, and are sealed by the next change of the store."""
         self.writer.abort()
         self.follower.abandon()
         self._held.close()
 
     def rollback(self) -> None:
-        """Remove the whole recording; the next opening finishes a removal that fails."""
+        """Remove the whole recording; what fails is finished by the next change of the store."""
         entry, manifests = self.entry, self._directory.manifests
         with suppress(HybridlogError):  # or else the files go first
             manifests.change(entry.id, lambda now: replaced(now, status="removed"))

@@ -1,8 +1,8 @@
 """Rows of a topic in one recording for a query: from its table, or from its chunks.
 
-A topic of an ended recording has a table, which is made again if it is missing. Where it can
-have none, and for what a running recording has flushed, chunks are decoded instead, into the
-same columns. Arrays that a table only summarises come from the chunks of the rows that need them.
+A topic of an ended recording has a table. Where that is missing or damaged, or there can be none,
+and for what a running recording has flushed, chunks are decoded instead, into the same columns.
+Arrays that a table only summarises come from the chunks of the rows that need them.
 """
 
 from __future__ import annotations
@@ -208,8 +208,8 @@ class TopicOfRecording:
             raise self._damaged(error) from error
 
     def _damaged(self, error: StoreError) -> StoreError:
-        self.session.reject_table(self.entry, self.topic)
-        return ChangedError(f"{error} It is made again when you ask again.")
+        self.session.tables.reject(self.entry, self.topic)
+        return ChangedError(f"{error} Ask again: messages answer then.")
 
     def in_table(
         self, table: TopicTable, part: TablePart, leaves: Sequence[ViewColumn], own: Collection[str]

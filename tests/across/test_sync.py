@@ -158,7 +158,7 @@ def sets_of(
 def test_messages_of_sets(logs: Logs, clock: str, topics: list[str]) -> None:
     synced = logs.store.sync(topics, tolerance="20ms", clock=clock)
     want = [
-        (logs.store.select([label])[0].id, one)
+        (logs.store.entry(label).id, one)
         for label in logs.said
         if all(logs.of(label, topic) for topic in topics)
         for one in sets_of(logs, label, topics, 20 * MS, clock)

@@ -136,45 +136,20 @@ def named(row: str, cell: int) -> set[str]:
     return {*re.findall(r"`(\w+)`", row.split("|")[cell])}
 
 
-RECOVERS_WHEN_TOLD = """
-import sys, threading, time
-from importlib import import_module
-from pathlib import Path
-from hybridlog.maintenance import opening
-
-told = Path(sys.argv.pop(1))
-
-def blocked(work):
-    def wait(*args, **options):
-        assert told.exists() or threading.current_thread() is not threading.main_thread()
-        while not told.exists():
-            time.sleep(0.01)
-        return work(*args, **options)
-    return wait
-
-opening.recover = blocked(opening.recover)
-import_module("hybridlog.cli.main").main()
-"""
-
-
 def test_what_a_power_cut_left_is_recovered_behind_the_new_recording(
     logs: Path, tmp_path: Path
 ) -> None:
-    store, told = tmp_path / "store", tmp_path / "told"
+    store = tmp_path / "store"
     replay = ("--replay", logs / "robot.bag", "--flush-interval", "100ms")
     with recorder(store, *replay) as process:
         until_it_speaks(process)
         with hl.open(store, read_only=True) as seen:
             wait_for(lambda: seen.recordings()[0].messages)  # it may speak before it has written
         process.kill()
-    program = (sys.executable, "-c", RECOVERS_WHEN_TOLD, str(told))
-    with recorder(store, *replay, "--speed", 0.1, program=program) as process:
+    assert {one.suffix for one in places.folder(store, "robot").glob("0*")} == {".open"}
+    with recorder(store, *replay, "--speed", 0.1) as process:
         assert until_it_speaks(process)["name"] == "robot-2"
-        assert {one.suffix for one in places.folder(store, "robot").glob("0*")} == {".open"}
-        told.touch()
-        assert process.stderr is not None
-        kept = re.search(r"robot was cut short by a crash: (\d+) mes", process.stderr.readline())
-        report, _ = end_and_hear(process)
+        report, said = end_and_hear(process)
     (recording,) = report["recordings"]
     assert recording["messages"] == report["messages_received"] > 0
     found = {one["name"]: one for one in run("ls", "--json", store=store).json}
@@ -182,6 +157,7 @@ def test_what_a_power_cut_left_is_recovered_behind_the_new_recording(
         "robot": "recovered",
         "robot-2": "complete",
     }
+    kept = re.search(r"robot was cut short by a crash: (\d+) mes", said)
     assert kept is not None
     assert found["robot"]["messages"] == int(kept[1]) > 0
     assert "all is well" in run("verify", store=store).out

@@ -61,10 +61,11 @@ def test_what_a_kill_leaves_is_recovered_and_told(logs: Path, fresh: Path, tmp_p
         wait_for(lambda: process.poll() is not None or open_bytes(fresh) > 200_000)
         process.kill()
         assert process.wait(60) == -signal.SIGKILL
-    done = run("ls", store=fresh)
+    done = run("edit", "robot", "--note", "found", store=fresh)
     assert "Recording robot was cut short by a crash:" in done.err
+    done = run("ls", store=fresh)
     assert "cut short by a crash" in next(line for line in done.lines if line.startswith("robot"))
-    assert run("ls", store=fresh).err == ""
+    assert done.err == ""
     (found,) = run("info", "robot", "--json", store=fresh).json
     assert 0 < found["messages"] < len(read_bag(logs / "robot.bag"))
     # Chunks of large messages are written first.

@@ -61,7 +61,7 @@ def disk(tmp_path: Path) -> Iterator[Path]:
 def drive(path: str, log: str, name: str, pause: str) -> None:
     """Record until nobody wants more; each message is written down before it is sent."""
     sent = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
-    with hl.open(path, mongo="none", recover=False) as store:
+    with hl.open(path, mongo="none") as store:
         options = RecorderOptions(name, reserve_bytes=RESERVE, flush_interval_s=FLUSH_S)
         options = replace(options, settings=replace(options.settings, segment_size=4 << 20))
         make_room(store, options.reserve_bytes)
@@ -124,7 +124,7 @@ def test_a_recorder_outlives_a_disk_that_is_filled(disk: Path, tmp_path: Path) -
         process = begin(store, log, name)
         time.sleep(12 if number == 0 else 2)
         if number == 0:
-            with hl.open(store, mongo="none", recover=False) as opened:
+            with hl.open(store, mongo="none") as opened:
                 opened.pin(name, "+1s", "+3s", ["/camera"])
         fill(filler)  # before the next one starts, too
         time.sleep(4)

@@ -398,6 +398,7 @@ def test_a_crash_loses_no_more_rows_than_messages(store: hl.Store, tmp_path: Pat
     shutil.copytree(store.directory.path, tmp_path / "left", ignore=left)
     robot.rows()
     with hl.open(tmp_path / "left") as crashed:
+        crashed.shared.recover()
         (recording,) = crashed.recordings()
         assert recording.status == "recovered"
         # 0.2 s are ten messages and ten rows; the machine may be slow.

@@ -200,6 +200,7 @@ def test_a_full_disk(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
         recording.write(own, b"")
     with hl.open(store.directory.path) as again:
         assert [m.raw for m in again.topic("/talk")] == [text(b"kept")]
+        again.shared.recover()
         (entry,) = again.recordings()
         assert entry.status == "recovered"
         assert sum(row["count"] for row in entry.end["losses"]) == taken - 1

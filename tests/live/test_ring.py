@@ -216,5 +216,5 @@ def test_a_file_that_was_let_go_and_not_deleted_is_deleted_later(plain: hl.Store
         from hybridlog.maintenance.opening import recover
         from hybridlog.maintenance.report import RepairReport
 
-        assert recover(plain.directory, entry.id, RepairReport())
+        recover(plain.directory, entry.id, RepairReport())
     assert not (robot.folder / name).exists()

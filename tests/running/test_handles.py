@@ -45,7 +45,7 @@ def test_a_recording_that_comes_while_another_thread_looks_is_seen(
                     may_end.wait(30)
                 return found
 
-            calls.change(StoreFiles, "look_at_all", slow)
+            calls.change(StoreFiles, "look", slow)
             first = threading.Thread(target=lambda: store.topic("said").count(), name="slow")
             first.start()
             assert has_looked.wait(30)

@@ -149,7 +149,7 @@ def test_a_killed_recorder(kind: str, tmp_path: Path, monkeypatch: pytest.Monkey
                     assert (found.has_losses, found.is_exact) == (True, False)
                     assert list(places.folder(path, LABEL).glob("*.open"))
             with hl.open(path, mongo=NO_MONGODB) as store:
-                entry = store.entry(LABEL)
+                entry = store.edit(LABEL, note="found")
                 assert entry.status == "recovered"
                 assert dict(entry.messages_by_topic()) == counts
                 check(store, Known(everything, counts))

@@ -94,7 +94,7 @@ ASKED: dict[str, Work] = {
     "chosen by content": lambda store: [
         *store.recordings(during=(day(3)[0], day(4)[1]), where="pose: data > 4.5")
     ],
-    "info of one": lambda store: store.select(["day00004"]),
+    "info of one": lambda store: store.entry("day00004"),
 }
 """Questions about little."""
 

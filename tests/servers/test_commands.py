@@ -12,7 +12,7 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.query.choice import Choice
-from tests.faults import logs
+from tests import logs
 from tests.servers.commands import Sent, commands
 
 pytestmark = pytest.mark.mongo("embedded")

@@ -12,8 +12,8 @@ import pytest
 import hybridlog as hl
 from hybridlog_storage.mongo.database import Database
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests import logs
 from tests.calls import Calls
-from tests.faults import logs
 from tests.limits import Limit
 from tests.servers.commands import commands
 from tests.servers.mongods import Mongod, ReplicaSet, eventually, replica_set

@@ -10,7 +10,7 @@ import pytest
 
 import hybridlog as hl
 from hybridlog_storage.errors import DatabaseError
-from tests.faults import logs
+from tests import logs
 from tests.servers.mongods import Mongod
 from tests.servers.proxy import Proxy
 

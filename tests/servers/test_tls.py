@@ -17,8 +17,8 @@ from pymongo import MongoClient
 
 import hybridlog as hl
 from hybridlog_storage.messages import Channel, Schema
+from tests import logs
 from tests.cli.running import COMMAND, environment, run
-from tests.faults import logs
 from tests.servers.mongods import Mongod, eventually, free_port
 
 pytestmark = pytest.mark.mongo("embedded")

@@ -16,9 +16,8 @@ from pymongo import MongoClient
 import hybridlog as hl
 from hybridlog.session import Session
 from hybridlog_storage.mongo.index_state import IndexState
-from tests import places
+from tests import logs, places
 from tests.cli.running import COMMAND, environment
-from tests.faults import logs
 from tests.servers.mongods import Mongod, eventually
 
 pytestmark = pytest.mark.mongo("embedded")

@@ -155,7 +155,7 @@ _DECODED: dict[tuple[str, str], list[Decoded]] = {}
 
 def decoded(store: hl.Store, recording: str, topic: str) -> list[Decoded]:
     """All messages of a topic, in order, decoded one by one; each only once."""
-    (entry,) = store.select([recording])
+    entry = store.entry(recording)
     key = entry.id, topic
     if key not in _DECODED:
         if len(_DECODED) > 50:

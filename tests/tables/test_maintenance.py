@@ -58,7 +58,6 @@ def test_a_mark_changes_no_table(few: hl.Store) -> None:
     few.mark("few", BASE + 6, "and here")
     assert len(few.topic(MARKS).to_arrow()) == 2
     few.connect()
-    assert not few.repairs.tables
     assert not few.repairs.indexed
     assert contents(few) == before
     assert few.verify().findings == []

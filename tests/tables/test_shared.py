@@ -206,7 +206,7 @@ def test_rows_of_a_topic_with_two_definitions_are_made_again(
     assert store.topic("/two").where("i8 > 0").count() == 2
     assert store.topic("/a").where("i8 > 0").count() == 6
     assert store.topic("/b").where("i8 > 0").count() == 6
-    store.mend()
+    store.verify(repair=True)
     assert {path: pq.read_metadata(path).num_rows for path in files_of(store)} == rows
     inodes = [path.stat().st_ino for path in files_of(store)]
     store.refresh()

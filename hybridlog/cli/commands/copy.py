@@ -128,8 +128,7 @@ def _copied(
 
 def _look(store: Store, given: _Copy, how: CopyOptions, done: set[str]) -> Iterator[StoreError]:
     """Copy what has ended and is not `done`; yields why something was not copied."""
-    store.mend()
-    store.summaries()  # as they are now
+    store.shared.recover()
     chosen = store.choose(given.choice).summaries
     new = [one.id for one in chosen if one.id not in done and one.status not in _RUNNING]
     if not new:

@@ -202,8 +202,8 @@ def watch_command(given: _Watch) -> None:
 
 def _look(store: Store) -> Iterator[StoreError]:
     """Index what has come since the last look, and print it; yields what cannot be read."""
-    if store.session.snapshot().unfinished or store.shared.has_changed():
-        store.refresh()
+    store.shared.newest()
+    store.shared.recover()
     repairs = store.repairs
     try:
         store.connect()

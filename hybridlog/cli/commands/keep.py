@@ -131,7 +131,7 @@ def _pin(store: Store, given: _Given) -> list[str]:
 
 def _spans(store: Store, given: _Given) -> Iterator[tuple[str, int | None, int | None]]:
     """Id of a recording, begin and end of what is to be pinned of it; None for all."""
-    from hybridlog.maintenance.keep import may_hold
+    from hybridlog.maintenance.edit import may_hold
     from hybridlog.query.answers.marks import mark_topics
     from hybridlog.query.times import parse_duration, parse_time
     from hybridlog.query.topics import split_topic

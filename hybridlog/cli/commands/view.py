@@ -44,7 +44,7 @@ def view_command(given: _Given) -> None:
         url = server.url
         name = ""
         if given.recording is not None:
-            (entry,) = store.select([given.recording])
+            entry = store.entry(given.recording)
             name = quote(entry.name, safe="")
             url += f"#recording={name}"
         shown: dict[str, object] = {"url": url, "port": server.port}
