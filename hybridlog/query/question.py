@@ -6,6 +6,7 @@ import time
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -104,8 +105,7 @@ class RecordedChannel:
 
     def arrow_type(self, fields: Collection[str] | None = None) -> Any:
         """Arrow type of its messages, or of some fields, as far as a definition fixes it."""
-        none = np.empty(0, np.int64)
-        return self.codec.columns(b"", none, none, fields).arrow().type
+        return _arrow_type(self.codec, None if fields is None else frozenset(fields))
 
     @property
     def is_reduced(self) -> bool:
@@ -320,6 +320,12 @@ class Counters:
             yield
         finally:
             self.elapsed_s = time.monotonic() - started
+
+
+@lru_cache(maxsize=256)
+def _arrow_type(codec: Codec, fields: frozenset[str] | None) -> Any:
+    none = np.empty(0, np.int64)
+    return codec.columns(b"", none, none, fields).arrow().type
 
 
 def windows_in(windows: NDArray[np.int64] | None, bounds: Span | None) -> NDArray[np.int64]:
