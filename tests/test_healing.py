@@ -25,7 +25,7 @@ from benchmarks.simulator.write import write_bag
 from benchmarks.usage import working_below
 from hybridlog.columns.topic_table import TableRows, TopicTable
 from hybridlog.index import access
-from hybridlog.query.index_reader import IndexReader
+from hybridlog.query import index_reader
 from hybridlog.query.planner import Planner
 from hybridlog_storage.catalog import CATALOG
 from hybridlog_storage.errors import (
@@ -267,7 +267,7 @@ def test_what_only_mongodb_knows_is_asked_once_more(store: Path, calls: Calls) -
         asked = opened.topic(IMU).where({"header.seq": {"$mod": [7, 0]}})
         want = [(m.recording, m.seq) for m in asked]
         assert len(want) > 20
-        read = calls(IndexReader, "_numbers", breaking)
+        read = calls(index_reader, "_numbers", breaking)
         assert [(m.recording, m.seq) for m in asked] == want
         assert len(read) == 3  # two groups of recordings, one of them twice
 

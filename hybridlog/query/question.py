@@ -161,11 +161,6 @@ class Part:
         return sum(stats.messages for stats in self.stats)
 
     @property
-    def is_indexed(self) -> bool:
-        """True if all of its messages have documents in MongoDB."""
-        return all(c.channel.is_indexed for c in self.channels if c.stats.messages)
-
-    @property
     def needs_index(self) -> bool:
         """True if the predicate has MongoDB filters."""
         return self.predicate is not None and bool(self.predicate.filters)
@@ -174,14 +169,6 @@ class Part:
     def has_fields(self) -> bool:
         """True if all of its channels have fields: not without a definition, for example."""
         return all(channel.codec.indexed for channel in self.channels)
-
-    @property
-    def lacks_fields(self) -> bool:
-        """True if the predicate asks fields that documents may lack: those of unreadable ones."""
-        if self.predicate is None or not self.predicate.asks_fields:
-            return False
-        is_open = self.recording.status == "open"
-        return is_open or not self.has_fields or any(stats.unreadable for stats in self.stats)
 
     @lazy
     def field_types(self) -> Mapping[str, str] | None:

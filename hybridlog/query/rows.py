@@ -226,20 +226,17 @@ class Rows:
         total = 0
         left: list[Part] = []
         for part in parts:
-            found = self.tabled(part)
-            if part.predicate is None and part.is_unbounded:
-                total += part.messages
-            elif part.predicate is None and part.is_by_log_time:
-                total += self._count_by_time(part)
-            elif found is None:
-                left.append(part)
+            if part.predicate is None and part.is_by_log_time:
+                total += part.messages if part.is_unbounded else self._count_by_time(part)
             elif part in self._counts:
                 matched, unreadable = self._counts[part]
                 total += matched
                 self.counters.unreadable += unreadable
-            else:
+            elif (found := self.tabled(part)) is not None:
                 total += sum(int(holds.sum()) for _, holds in self._answers(found))
                 left += [] if found.rest is None else [found.rest]
+            else:
+                left.append(part)
         return total + (self.count_in_chunks(left) if left else 0)
 
     def _outcomes(self, part: Part) -> Iterator[RowBatch]:
