@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hybridlog.frames import columns as columns_module
+from hybridlog.frames import answer
 from hybridlog.frames.answer import Block, table_of
 from hybridlog.frames.frame import frame_of
 from hybridlog.schema.arrow_columns import records_array, values_array
@@ -162,7 +162,7 @@ def test_sorted_by_log_time_then_arrival(chunks: list[list[tuple[int, int]]], li
     if not chunks:
         wanted = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(columns_module, "OFFSET_LIMIT", limit)
+        patch.setattr(answer, "OFFSET_LIMIT", limit)
         table = fill()
         frame = frame_of(fill())
     table.validate(full=True)

@@ -23,9 +23,11 @@ from benchmarks.simulator.write import write_bag
 from benchmarks.usage import working_below
 from hybridlog.columns.topic_table import TableRows, TopicTable
 from hybridlog.index import access
+from hybridlog.query import index_reader
 from hybridlog.query.planner import Planner
 from hybridlog_storage.catalog import CATALOG
 from hybridlog_storage.errors import (
+    ConnectionLostError,
     DatabaseError,
     ResourceError,
     StoreError,
@@ -252,6 +254,20 @@ def test_chunks_go_on_where_a_table_fails(store: Path, monkeypatch: pytest.Monke
         got = [row for found in planner.outcomes(part) for row in zip(*found[:3], strict=True)]
         assert got == want
         assert len(want) > 100
+
+
+def test_what_only_mongodb_knows_is_asked_once_more(store: Path, calls: Calls) -> None:
+    def breaking(*_: object) -> None:
+        if len(read) == 1:
+            raise ConnectionLostError("gone")
+
+    with hl.open(store, require_database=True) as opened:
+        asked = opened.topic(IMU).where({"header.seq": {"$mod": [7, 0]}})
+        want = [(m.recording, m.seq) for m in asked]
+        assert len(want) > 20
+        read = calls(index_reader, "_numbers", breaking)
+        assert [(m.recording, m.seq) for m in asked] == want
+        assert len(read) == 3  # two groups of recordings, one of them twice
 
 
 @pytest.mark.parametrize("name", ["mongod", "mongod/data"])

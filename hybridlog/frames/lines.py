@@ -9,8 +9,7 @@ import pyarrow as pa
 
 from hybridlog.formats.answer import Line
 from hybridlog.formats.jsonl import json_line, json_rows
-from hybridlog.frames.answer import Decoder, text_column
-from hybridlog.frames.columns import leaves_of, summary_array
+from hybridlog.frames.answer import Decoder, leaves_of, summary_array, text_column
 from hybridlog.frames.names import arranged, free_name, summary_of
 from hybridlog.index.indexing import rows_by_channel
 from hybridlog.schema.arrow_columns import below, structs, values_array

@@ -44,78 +44,80 @@ Query = tuple[str, Filter]
 """A collection and a filter."""
 
 
-class IndexReader:
-    """Asks MongoDB about parts of one question. It never writes to the index."""
+@again_if_lost
+def decided(
+    session: Session, parts: Sequence[Part], counters: Counters
+) -> tuple[list[Part], dict[Part, int]]:
+    """The parts with arrival numbers in place of filters, and documents as of `documents`.
 
-    def __init__(self, session: Session, counters: Counters) -> None:
-        self._session = session
-        self._counters = counters
+    Messages that the filters cannot test, since their documents have no fields, are counted.
+    """
+    database, predicate = _database(session, parts), _predicate(parts[0])
+    asks_fields = any(node.asks_fields for node in predicate.filters)
+    own: list[Filter] = [node.to_filter() for node in predicate.filters]
+    _check_arrays(database, parts, predicate.filters)
+    everything: Filter = {"$and": [*own, _READABLE] if asks_fields else own}
+    numbers = _numbers(database, parts, everything, counters)
+    found = [
+        replace(part, predicate=_decided(predicate, numbers[part.recording.key])) for part in parts
+    ]
+    if asks_fields:
+        lacking = [part for part in parts if _lacks_fields(part)]
+        # What is read for the rest of the predicate is counted there.
+        unknown = _TOO_LARGE if _predicate(found[0]).asks_fields else _WITHOUT_FIELDS
+        counters.unreadable += sum(_counts(database, lacking, unknown).values())
+    # Counted last: what another process has removed meanwhile is told as lacking.
+    return found, _documents(database, parts)
 
-    @again_if_lost
-    def found(self, parts: Sequence[Part]) -> tuple[list[Part], dict[Part, int]]:
-        """The parts with arrival numbers in place of filters, and `documents`.
 
-        Messages that the filters cannot test, since their documents have no fields, are counted.
-        """
-        database, predicate = self._database(parts), _predicate(parts[0])
-        asks_fields = any(node.asks_fields for node in predicate.filters)
-        own: list[Filter] = [node.to_filter() for node in predicate.filters]
-        _check_arrays(database, parts, predicate.filters)
-        everything: Filter = {"$and": [*own, _READABLE] if asks_fields else own}
-        numbers = self._numbers(database, parts, everything)
-        decided = [
-            replace(part, predicate=_decided(predicate, numbers[part.recording.key]))
-            for part in parts
-        ]
-        if asks_fields:
-            lacking = [part for part in parts if part.lacks_fields]
-            # What is read for the rest of the predicate is counted there.
-            is_read = _predicate(decided[0]).asks_fields
-            unknown = _TOO_LARGE if is_read else _WITHOUT_FIELDS
-            self._counters.unreadable += sum(_counts(database, lacking, unknown).values())
-        # Counted last: what another process has removed meanwhile is told as lacking.
-        return decided, _documents(database, parts)
+@again_if_lost
+def documents(session: Session, parts: Sequence[Part]) -> dict[Part, int]:
+    """Number of documents of those parts of which the index may lack some."""
+    return _documents(_database(session, parts), parts)
 
-    @again_if_lost
-    def documents(self, parts: Sequence[Part]) -> dict[Part, int]:
-        """Number of documents of those parts of which the index may lack some."""
-        return _documents(self._database(parts), parts)
 
-    def _numbers(
-        self, database: Database, parts: Sequence[Part], own: Filter
-    ) -> dict[str, NDArray[np.int64]]:
-        """Arrival numbers of the documents that a filter finds, by key of the recording.
+def _lacks_fields(part: Part) -> bool:
+    """True if documents may lack the fields: those of unreadable messages."""
+    is_open = part.recording.status == "open"
+    return is_open or not part.has_fields or any(stats.unreadable for stats in part.stats)
 
-        A recording has each number once, whatever the topic.
-        """
-        found: dict[str, list[NDArray[np.int64]]] = defaultdict(list)
-        for raw in database.each(_queries(parts, own), lambda _: {"$project": {"_id": 1}}):
-            check_wanted()
-            _, recordings, seqs = keys_of(raw).T
-            self._counters.documents_read += len(seqs)
-            for recording in np.unique(recordings).tolist():
-                found[f"{recording:016x}"].append(seqs[recordings == recording].astype(np.int64))
-        none = np.empty(0, np.int64)
-        return {
-            part.recording.key: np.unique(np.concatenate([none, *found[part.recording.key]]))
-            for part in parts
-        }
 
-    def _database(self, parts: Sequence[Part]) -> Database:
-        """The database; refuses parts without documents."""
-        for part in parts:
-            if not part.is_indexed:
-                why = "it was recorded with --no-index"
-                if part.topic == MARKS:
-                    why = "marks that somebody set are not in MongoDB"
-                raise TopicError(
-                    f"{part.topic} has no index documents: {why}. Write a predicate, such as "
-                    "'x > 1', instead of a MongoDB filter."
-                )
-        database: Database = self._session.shared.index.database_for(
-            "A MongoDB filter (a predicate needs none)", brings=False
-        )
-        return database
+def _numbers(
+    database: Database, parts: Sequence[Part], own: Filter, counters: Counters
+) -> dict[str, NDArray[np.int64]]:
+    """Arrival numbers of the documents that a filter finds, by key of the recording.
+
+    A recording has each number once, whatever the topic.
+    """
+    found: dict[str, list[NDArray[np.int64]]] = defaultdict(list)
+    for raw in database.each(_queries(parts, own), lambda _: {"$project": {"_id": 1}}):
+        check_wanted()
+        _, recordings, seqs = keys_of(raw).T
+        counters.documents_read += len(seqs)
+        for recording in np.unique(recordings).tolist():
+            found[f"{recording:016x}"].append(seqs[recordings == recording].astype(np.int64))
+    none = np.empty(0, np.int64)
+    return {
+        part.recording.key: np.unique(np.concatenate([none, *found[part.recording.key]]))
+        for part in parts
+    }
+
+
+def _database(session: Session, parts: Sequence[Part]) -> Database:
+    """The database; refuses parts without documents."""
+    for part in parts:
+        if not all(c.channel.is_indexed for c in part.channels if c.stats.messages):
+            why = "it was recorded with --no-index"
+            if part.topic == MARKS:
+                why = "marks that somebody set are not in MongoDB"
+            raise TopicError(
+                f"{part.topic} has no index documents: {why}. Write a predicate, such as "
+                "'x > 1', instead of a MongoDB filter."
+            )
+    database: Database = session.shared.index.database_for(
+        "A MongoDB filter (a predicate needs none)", brings=False
+    )
+    return database
 
 
 def _documents(database: Database, parts: Sequence[Part]) -> dict[Part, int]:

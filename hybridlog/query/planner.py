@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.query.chunk_scan import ScanPlan
-    from hybridlog.query.index_reader import IndexReader
     from hybridlog.query.question import Question, RecordedChannel, Span
     from hybridlog.schema.states import State
     from hybridlog.session import Session
@@ -48,13 +47,6 @@ class Planner(Rows):
         super().__init__(session, Counters() if counters is None else counters)
         self.question = question
         self._ranges = RangeResolver(session, question)
-
-    @lazy
-    def _index(self) -> IndexReader:
-        """The index documents in MongoDB."""
-        from hybridlog.query.index_reader import IndexReader
-
-        return IndexReader(self.session, self.counters)
 
     def parts(self) -> list[Part]:
         """The question, split by recording and topic, where it may have an answer.
@@ -135,7 +127,9 @@ class Planner(Rows):
         wanted = [part for part in parts if part.needs_index]
         if not wanted:
             return [*parts]
-        found, documents = self._index.found(wanted)
+        from hybridlog.query import index_reader
+
+        found, documents = index_reader.decided(self.session, wanted, self.counters)
         self.counters.not_indexed += self._lacking(documents)
         decidable = dict(zip(wanted, found, strict=True))
         return [decidable.get(part, part) for part in parts]
@@ -204,8 +198,10 @@ class Planner(Rows):
 
     def not_indexed(self) -> tuple[tuple[str, int], ...]:
         """Number of messages, in the range, that the index lacks, by name of their recording."""
+        from hybridlog.query import index_reader
+
         parts = self.split()
-        return self._lacking(self._index.documents(parts)) if parts else ()
+        return self._lacking(index_reader.documents(self.session, parts)) if parts else ()
 
     def _lacking(self, documents: Mapping[Part, int]) -> tuple[tuple[str, int], ...]:
         """Messages that the index lacks, from the documents that it has of some parts."""

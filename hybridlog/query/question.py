@@ -6,6 +6,7 @@ import time
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -104,8 +105,7 @@ class RecordedChannel:
 
     def arrow_type(self, fields: Collection[str] | None = None) -> Any:
         """Arrow type of its messages, or of some fields, as far as a definition fixes it."""
-        none = np.empty(0, np.int64)
-        return self.codec.columns(b"", none, none, fields).arrow().type
+        return _arrow_type(self.codec, None if fields is None else frozenset(fields))
 
     @property
     def is_reduced(self) -> bool:
@@ -161,11 +161,6 @@ class Part:
         return sum(stats.messages for stats in self.stats)
 
     @property
-    def is_indexed(self) -> bool:
-        """True if all of its messages have documents in MongoDB."""
-        return all(c.channel.is_indexed for c in self.channels if c.stats.messages)
-
-    @property
     def needs_index(self) -> bool:
         """True if the predicate has MongoDB filters."""
         return self.predicate is not None and bool(self.predicate.filters)
@@ -174,14 +169,6 @@ class Part:
     def has_fields(self) -> bool:
         """True if all of its channels have fields: not without a definition, for example."""
         return all(channel.codec.indexed for channel in self.channels)
-
-    @property
-    def lacks_fields(self) -> bool:
-        """True if the predicate asks fields that documents may lack: those of unreadable ones."""
-        if self.predicate is None or not self.predicate.asks_fields:
-            return False
-        is_open = self.recording.status == "open"
-        return is_open or not self.has_fields or any(stats.unreadable for stats in self.stats)
 
     @lazy
     def field_types(self) -> Mapping[str, str] | None:
@@ -320,6 +307,12 @@ class Counters:
             yield
         finally:
             self.elapsed_s = time.monotonic() - started
+
+
+@lru_cache(maxsize=256)
+def _arrow_type(codec: Codec, fields: frozenset[str] | None) -> Any:
+    none = np.empty(0, np.int64)
+    return codec.columns(b"", none, none, fields).arrow().type
 
 
 def windows_in(windows: NDArray[np.int64] | None, bounds: Span | None) -> NDArray[np.int64]:

@@ -24,14 +24,12 @@ from hybridlog_storage.errors import ChangedError, SegmentError, StoreError
 from hybridlog_storage.times import inside, placed
 
 if TYPE_CHECKING:
-    import pyarrow as pa
     from numpy.typing import NDArray
 
     from hybridlog.columns.topic_table import TableRows, TopicTable
     from hybridlog.query.chunk_scan import MessageRun
     from hybridlog.query.message_filter import MessageFilter
     from hybridlog.query.question import Counters, Part, RecordedChannel
-    from hybridlog.schema.left import LeftFields
     from hybridlog.session import Session
 
 _RENEWALS = 50  # of a question, while a ring lets files go
@@ -46,12 +44,14 @@ class RowBatch(NamedTuple):
         seq: int64[n], arrival numbers; 0 where only times are read.
         holds: bool[n], true where the message matches.
         records: n rows, their fields; None where only times are asked for.
+        summaries: n rows each, those that are asked for of arrays that are gone, by path.
     """
 
     log_time: NDArray[np.int64]
     seq: NDArray[np.int64]
     holds: NDArray[np.bool_]
     records: Any = None
+    summaries: Mapping[str, Any] = MappingProxyType({})
 
     def after(self, last: tuple[int, int]) -> RowBatch:
         """Those behind a log time and an arrival number."""
@@ -59,7 +59,9 @@ class RowBatch(NamedTuple):
         is_before = (self.log_time < time) | ((self.log_time == time) & (self.seq <= seq))
         begin = int(np.count_nonzero(is_before))
         records = None if self.records is None else self.records[begin:]
-        return RowBatch(self.log_time[begin:], self.seq[begin:], self.holds[begin:], records)
+        summaries = {path: array[begin:] for path, array in self.summaries.items()}
+        times = self.log_time[begin:], self.seq[begin:]
+        return RowBatch(*times, self.holds[begin:], records, summaries)
 
 
 class _UndecidedError(StoreError):
@@ -165,16 +167,12 @@ class Rows:
         found = [one.log_time[one.holds] for one in self.outcomes(part)]
         return np.concatenate([np.empty(0, np.int64), *found])
 
-    def values(self, part: Part, fields: Collection[str] | None) -> Iterator[RowBatch]:
-        """The matching messages with some fields, nested as these are."""
-        return self._lasting(part, lambda own: self._values(own, fields, flattens=False))
-
-    def columns(
+    def values(
         self, part: Part, fields: Collection[str] | None, *, partial: bool = False
     ) -> Iterator[RowBatch]:
-        """The same by dotted path, as tables have them; also summaries of arrays.
+        """The matching messages with some fields, nested as these are, and summaries of arrays.
 
-        With `partial`, also messages that have lost arrays with their payloads: null there.
+        With `partial`, also those that have lost arrays with their payloads: null there.
         """
         return self._lasting(part, lambda own: self._values(own, fields, partial=partial))
 
@@ -225,24 +223,20 @@ class Rows:
     # Rows of tables, then those of chunks.
 
     def _count(self, parts: Sequence[Part]) -> int:
-        self._count_by_file(parts)
         total = 0
         left: list[Part] = []
         for part in parts:
-            found = self.tabled(part)
-            if part.predicate is None and part.is_unbounded:
-                total += part.messages
-            elif part.predicate is None and part.is_by_log_time:
-                total += self._count_by_time(part)
-            elif found is None:
-                left.append(part)
+            if part.predicate is None and part.is_by_log_time:
+                total += part.messages if part.is_unbounded else self._count_by_time(part)
             elif part in self._counts:
                 matched, unreadable = self._counts[part]
                 total += matched
                 self.counters.unreadable += unreadable
-            else:
+            elif (found := self.tabled(part)) is not None:
                 total += sum(int(holds.sum()) for _, holds in self._answers(found))
                 left += [] if found.rest is None else [found.rest]
+            else:
+                left.append(part)
         return total + (self.count_in_chunks(left) if left else 0)
 
     def _outcomes(self, part: Part) -> Iterator[RowBatch]:
@@ -263,16 +257,11 @@ class Rows:
             yield RowBatch(run.batch.log_time, run.seq, holds)
 
     def _values(
-        self,
-        part: Part,
-        fields: Collection[str] | None,
-        *,
-        partial: bool = False,
-        flattens: bool = True,
+        self, part: Part, fields: Collection[str] | None, *, partial: bool
     ) -> Iterator[RowBatch]:
         from hybridlog.schema.arrow_types import converted
 
-        summaries = summaries_in(fields, part.field_types) if flattens else set()
+        summaries = summaries_in(fields, part.field_types)
         wanted = None if fields is None else {*fields} - summaries
         found = self.tabled(part, wanted)
         rest: Part | None = part
@@ -284,15 +273,13 @@ class Rows:
                 # Without the columns that only the predicate needs.
                 records = chosen.records
                 records = records if kind is None else converted(records, kind, drops=True)
-                records = _flattened(records, fields) if flattens else records
                 yield RowBatch(chosen.t, chosen.seq, holds[holds], records)
         arrays = {path.rpartition(".")[0] for path in summaries}
         wanted = None if wanted is None else wanted | arrays
         for channel, run in self._by_channel(rest) if rest is not None else ():
             own = run.take(self._decided(part, channel, run))
-            decoded = channel.codec.columns_of(own.batch, wanted)
+            decoded, made = channel.codec.columns_of(own.batch, wanted), {}
             self.counters.unreadable += len(own.batch) - len(decoded.rows)
-            left: LeftFields | None = None
             if channel.is_reduced:
                 from hybridlog.schema.left import LeftFields, without_lacking
 
@@ -302,14 +289,11 @@ class Rows:
                 else:
                     decoded = whole
                     self.counters.leave_out(lacking, channel.state)
-                left = decoded.records if isinstance(decoded.records, LeftFields) else None
-            records = decoded.arrow()
-            if flattens:
-                made = {} if left is None else left.statistics(summaries)
-                records = _flattened(records, fields, made)
+                if isinstance(decoded.records, LeftFields):
+                    made = decoded.records.statistics(summaries)
             good = decoded.rows
-            holds = np.ones(len(good), np.bool_)
-            yield RowBatch(own.batch.log_time[good], own.seq[good], holds, records)
+            times = own.batch.log_time[good], own.seq[good]
+            yield RowBatch(*times, np.ones(len(good), np.bool_), decoded.arrow(), made)
 
     # Tables.
 
@@ -539,18 +523,6 @@ def _decided(part: Part, rows: TableRows) -> NDArray[np.bool_]:
     if found is None:
         raise _UndecidedError
     return found
-
-
-def _flattened(
-    records: pa.StructArray,
-    fields: Collection[str] | None,
-    summaries: Mapping[str, pa.Array[Any]] = MappingProxyType({}),
-) -> pa.StructArray:
-    """Fields by dotted path, with the summaries of arrays that are asked for."""
-    from hybridlog.frames.columns import leaves_of
-    from hybridlog.schema.arrow_columns import structs
-
-    return structs(leaves_of(records, fields, summaries), len(records))
 
 
 def _plain(path: str) -> str:

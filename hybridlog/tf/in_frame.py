@@ -19,7 +19,6 @@ from hybridlog.arrays.message_arrays import attributes, plain_type
 from hybridlog.arrays.point_arrays import POINT_MAKERS, point_columns, positions
 from hybridlog.formats.places import POSITIONS, poses_among
 from hybridlog.frames import answer
-from hybridlog.frames.columns import flat
 from hybridlog.message import messages_in
 from hybridlog.query.planner import Planner
 from hybridlog.query.times import decoded_time
@@ -345,7 +344,7 @@ def _list_in_frame(
 ) -> Any:
     """A list of structures with poses, in frames of their own or that of their messages."""
     values, rows = column.flatten(), pc.list_parent_indices(column).to_pylist()
-    columns = flat(values)
+    columns = answer.flat(values)
     frame = next((name for name in _FRAMES if name in columns), None)
     own = columns[frame].to_pylist() if frame else [None] * len(rows)
     pairs = [(row, one or frames[row]) for row, one in zip(rows, own, strict=True)]

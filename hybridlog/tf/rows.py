@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from hybridlog.frames.columns import flat
+from hybridlog.frames.answer import flat
 from hybridlog.wording import listed
 from hybridlog_storage.errors import TopicError
 

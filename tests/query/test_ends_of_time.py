@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
-from mcap.reader import make_reader
 from rosbags.typesys import Stores, get_typestore
 
 import hybridlog as hl
-from hybridlog.formats.slices import payload_bytes
 from hybridlog.query.query import Query
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.times import END, span_of
-from tests.cli.within import answer
 from tests.odd_messages import ros_channel
 from tests.query.test_engines import WAYS, only
 
@@ -139,19 +135,3 @@ def test_header_stamps_before_1970(store: hl.Store, way: str) -> None:
         assert query.where('header.stamp < t"1970-01-01"').count() == 3
         assert query.where('header.stamp >= t"1969-12-31T23:59:58Z"').count() == 4
         assert query.where("header.stamp < -1").count() == 2
-
-
-def test_exports_by_stamps_before_1970(store: hl.Store, tmp_path: Path) -> None:
-    query = store.topic("/point").in_recording("stamps").clock("header")
-    query = query.between("1969-12-31", "1970-01-02")
-    assert payload_bytes(query) > 0
-    assert query.to_arrow().column("header.stamp").cast("int64").to_pylist() == [
-        -SECOND - 1,
-        -1,
-        SECOND,
-    ]
-    asked = ("fetch", "-t", "/point", "-r", "stamps", "--clock", "header")
-    between = ("--between", "1969-12-31", "1970-01-02")
-    answer(*asked, *between, "-o", tmp_path / "some.mcap", store=store.directory.path)
-    with (tmp_path / "some.mcap").open("rb") as file:
-        assert len(list(make_reader(file).iter_messages())) == 3

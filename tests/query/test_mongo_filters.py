@@ -122,21 +122,15 @@ def nested(operator: str) -> dict[str, object]:
     [
         *map(nested, ("$and", "$or", "$nor")),
         {"x": 5},
-        {"x": {"$gt": 4, "$lte": 9}},
         {"x": {"$in": [1, 4.0, 77]}, "s": "even"},
         {"$and": [{"x": {"$gte": 3}}, {"$or": [{"s": "odd 5"}, {"two.1": {"$lt": 6}}]}]},
         {"$nor": [{"x": {"$lt": 18}}, {"s": "even"}]},
-        {"x": {"$not": {"$gt": 1}}},
-        {"nothing": 1, "x": 2},
         {"s": {"$regex": "ODD 1.?$", "$options": "i"}},
         {"s": re.compile("^e")},
         {"s": {"$not": re.compile("^e")}},
-        {"u": 2**63 - 1},
         {"u": {"$gt": 2.0**63}},
         {"ranges.min": {"$lt": 2}},
-        {"ranges": {"$exists": True}},
         {"two": {"$size": 2}, "x": {"$mod": [5, 0]}},
-        {"two": [3, 4]},
         {"two": {"$elemMatch": {"$gt": 3, "$lt": 5}}},
         {"parts": {"$elemMatch": {"n": 4, "v": {"$type": "int"}}}},
         {"parts.v": {"$all": [40]}},
@@ -147,11 +141,8 @@ def nested(operator: str) -> dict[str, object]:
         {"at": {"$gt": 1_748_937_620 * SECOND}, "odd": {"$ne": True}},
         {"at": {"$ne": None}, "x": {"$in": [None, 3]}, "s": {"$gt": MinKey()}},
         {"x": Decimal128("3")},
-        {"_meta.seq": {"$lt": 9}},
         {"_meta.ref.len": {"$gt": 10}, "_meta.error": {"$exists": False}, "x": 3},
-        {"$expr": {"$eq": ["$s", {"$literal": "even"}]}},
         {"$expr": {"$gt": [{"$size": {"$filter": {"input": ["$x", 2], "cond": True}}}, 1]}},
-        {"$expr": {"$gt": [{"$size": {"$ifNull": ["$two", []]}}, 1]}},
         {"x": {"$nin": [1, math.inf]}, "s": {"$not": {"$regex": "a"}}},
         {"_id": b"12345678901234567890"},
         {},
@@ -159,10 +150,6 @@ def nested(operator: str) -> dict[str, object]:
     ids=lambda own: str(own)[:60],
 )
 def test_mongodb_answers_as_it_does_by_itself(store: hl.Store, own: dict[str, object]) -> None:
-    if "nothing" in own:
-        with pytest.raises(WhereError, match="there is no field nothing"):
-            store.topic("/t").where(own)
-        return
     query = store.topic("/t").where(own)
     assert pickle.loads(pickle.dumps(query.question)) == query.question
     found = seqs(query)
@@ -288,15 +275,12 @@ def test_what_mongodb_does_not_understand(store: hl.Store, own: dict[str, object
     ("text", "says"),
     [
         ("{x: 1}", "is JSON, such as"),
-        ("{'x': 1}", "is JSON, such as"),
         ('{"x": 1} and x > 2', "is JSON, such as"),
         ('{"xx": 1}', "no field xx"),
         ('{"x":' * 50_000 + "1" + "}" * 50_000, "deeply"),
         ('{"x": {"$not":' * 101 + '{"$gt": 1}' + "}}" * 101, "not allowed"),
-        ('{"x": [' + "1," * 200_000 + "1]}", "too large"),
         ('{"s": "' + "x" * 2_000_000 + '"}', "too large"),
         ('{"x": 99999999999999999999}', "64 bits"),
-        ('{"x": ' + "9" * 5000 + "}", "is JSON, such as|64 bits"),
     ],
 )
 def test_text_that_is_refused(store: hl.Store, text: str, says: str) -> None:

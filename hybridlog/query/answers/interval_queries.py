@@ -187,7 +187,9 @@ class IntervalQueries:
         self, part: Part, span: Span, paths: Collection[str], tolerance: float
     ) -> NDArray[np.int64]:
         """Log times of the messages in a span that differ from the one before."""
-        ask = partial(self._planner.columns, fields=paths)
+        from hybridlog.frames.answer import columns
+
+        ask = partial(columns, self._planner, fields=paths)
         before = self._last_before(part, span, ask)
         carried = None if before is None else before.records[-1:]
         found = [_NONE]

@@ -113,6 +113,8 @@ class _Running:
 
 def statistics(session: Session, question: Question, counters: Counters) -> list[FieldStatistics]:
     """Statistics of numeric fields; see `Query.stats`."""
+    from hybridlog.frames.answer import columns
+
     _check_all(question)
     planner = Planner(session, question, counters)
     found: dict[str, dict[str, _Running]] = {topic: {} for topic in question.topics}
@@ -130,7 +132,7 @@ def statistics(session: Session, question: Question, counters: Counters) -> list
         fields = _numbers(part.field_types) if question.fields is None else question.fields
         if fields == []:
             continue
-        for rows in planner.columns(part, fields, partial=True):
+        for rows in columns(planner, part, fields, partial=True):
             counters.messages += len(rows.log_time)
             _add(found[part.topic], question, rows.records)
     if question.fields is not None and not any(found.values()):
@@ -153,7 +155,7 @@ def _columns_of(channel: RecordedChannel, question: Question) -> pa.StructArray:
     """The columns of a channel, without rows."""
     import pyarrow as pa
 
-    from hybridlog.frames.columns import leaves_of
+    from hybridlog.frames.answer import leaves_of
     from hybridlog.schema.arrow_columns import structs
 
     types = field_types((channel,))
