@@ -831,6 +831,7 @@ class Store:
         from hybridlog.maintenance.keep import Keeper, KeepReport
         from hybridlog.maintenance.retention import Rules
 
+        self.shared.check_process()
         wanted = Rules.of(self.directory.settings.retention if rules is None else rules)
         wanted.check_place(is_remote=self.directory.is_remote)
         keeper = Keeper(self.directory, partial(remove_if, self.shared))

@@ -225,13 +225,13 @@ class _Beside:
 
     def _recover(self) -> None:
         """Seal what crashes have left of earlier recordings, and make their documents."""
-        task = self._task
-        with hybridlog.open(task.store, mongo=task.mongo, cache_mb=task.cache_mb) as store:
+        with hybridlog.open(self._task.store, mongo="none") as store:
             store.shared.recover()
             for name, segments in store.repairs.recovered.items():
                 kept = sum(one.messages for one in segments)
                 self.tell("say", f"{name} was cut short by a crash: {kept} messages are recovered")
-            store.database  # noqa: B018 - brings the index up to date
+        self._store.shared.invalidate()
+        self._store.shared.index.database  # noqa: B018 - brings the index up to date
 
 
 def _takes(trigger: Trigger, topic: str) -> bool:

@@ -13,7 +13,7 @@ import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
@@ -225,10 +225,8 @@ class Keeper:
             self._remove(step.id, check)
             return step.bytes, {}
         is_own = step.id == self._own
-        with ExitStack() as held:
-            if not is_own:
-                lock = self._directory.writing(step.id, step.recording, wait_s=LOCK_WAIT_S)
-                held.enter_context(lock)
+        lock = self._directory.writing(step.id, step.recording, wait_s=LOCK_WAIT_S)
+        with nullcontext() if is_own else lock:
             if step.groups:
                 let_go(
                     self._directory,
@@ -236,18 +234,16 @@ class Keeper:
                     lambda now: [file for file in now.files if file.group in step.groups],
                     check,
                 )
-                done = step.bytes, dict[int, str]()
-            else:
-                done = expire(
-                    self._directory,
-                    step.id,
-                    step.segments,
-                    check=check,
-                    make_room=partial(use_spare, self._directory),
-                    is_followed=is_own,
-                    **how,
-                )
-        return done
+                return step.bytes, {}
+            return expire(
+                self._directory,
+                step.id,
+                step.segments,
+                check=check,
+                make_room=partial(use_spare, self._directory),
+                is_followed=is_own,
+                **how,
+            )
 
 
 def _check(step: Step, rules: Rules, manifest: Manifest) -> None:
