@@ -376,16 +376,10 @@ class BucketStore(Source):
                 raise RefusedError(f"{where} is damaged: it has not {size} bytes.") from error
 
 
-_mounting = threading.Lock()
-
-
 def mount(address: str) -> BucketStore:
     """The store in a bucket."""
-    path = Path(address)
-    with _mounting:
-        if path not in files.mounted:
-            files.mounted[path] = BucketStore(Bucket(address))
-        return cast("BucketStore", files.mounted[path])
+    found = files.mounted.get(Path(address)) or BucketStore(Bucket(address))
+    return cast("BucketStore", files.mounted.setdefault(Path(address), found))
 
 
 def objects_of(manifest: Manifest) -> Iterator[Object]:
