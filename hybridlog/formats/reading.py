@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING, NamedTuple, Self
 
 import numpy as np
 
-from hybridlog_storage.disk.copying import joined
 from hybridlog_storage.errors import SourceError
-from hybridlog_storage.messages import MAX_CHANNELS
+from hybridlog_storage.messages import MAX_CHANNELS, joined
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hybridlog.query.question import Counters
-from hybridlog_storage.disk.copying import interleave
 from hybridlog_storage.errors import StoreError
+from hybridlog_storage.messages import interleave
 from hybridlog_storage.ordering import distinct, order_of
 from hybridlog_storage.stopping import check_wanted
 from hybridlog_storage.times import inside, placed, touches

@@ -31,8 +31,6 @@ NUMBERS: Final = FLOATS | INTEGERS
 TIMES: Final = frozenset({"time", "duration"})
 NUMERIC: Final = NUMBERS | TIMES | {"bool"}
 """Types whose values can be drawn as numbers."""
-SINGLE: Final = NUMERIC | {"string"}
-"""Types of fields without parts."""
 
 _ARRAY = re.compile(r"(?P<element>.*)\[(?P<bound><=)?(?P<width>\d*)\]", re.DOTALL)
 

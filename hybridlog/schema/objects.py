@@ -22,7 +22,7 @@ from hybridlog.schema.text import nearest, repaired_text
 from hybridlog_storage.errors import PayloadError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator
+    from collections.abc import Collection, Iterator
 
     import pyarrow as pa
 
@@ -33,18 +33,6 @@ MAX_DEPTH = 100
 """Deepest nesting that MongoDB surely accepts."""
 
 _INT64_MIN, _INT64_MAX = -(1 << 63), (1 << 63) - 1
-
-
-class Nanoseconds(Int64):
-    """A time or a duration."""
-
-    kind: str = "time"
-
-
-class Duration(Nanoseconds):
-    """A duration."""
-
-    kind = "duration"
 
 
 _LONG = frozenset(("int64", "uint32", "uint64"))
@@ -58,18 +46,16 @@ def document_cells(array: pa.Array[Any], *, typed: bool, whole: bool) -> list[An
     """
     from hybridlog.schema.arrow_types import is_bytes, is_time, lengths_of
 
-    kind = str(array.type)
     if is_bytes(array.type) and not whole:
         counted = zip(lengths_of(array).tolist(), array.is_valid().to_pylist(), strict=True)
         return [{"n": Int64(n)} if there else None for n, there in counted]
-    made: Callable[[Any], Any] = bytes
+    if is_bytes(array.type):
+        return cast("list[Any]", array.to_pylist())
     if is_time(array.type):
-        made, array = Duration if kind.startswith("duration") else Nanoseconds, array.view("int64")
-    elif typed and kind in _LONG:
-        made = Int64
-    elif not is_bytes(array.type):
+        array = array.view("int64")
+    elif not (typed and str(array.type) in _LONG):
         return None
-    return [None if value is None else made(value) for value in array.to_pylist()]
+    return [None if value is None else Int64(value) for value in array.to_pylist()]
 
 
 @dataclass(slots=True)

@@ -1,7 +1,9 @@
 """Copies a recording from a store to another one: its files, then its manifest.
 
-What is there already is not sent. Into a manifest that is there go files, channels, losses and
-the status; what people said of the recording there stays (`merging`).
+What is there already is not sent. Into a manifest that is there go files, channels, losses and the
+status; who copies from an older one takes nothing back. All that people said of the recording there
+stays, and so do its logs, which are compared by number: one that has expired there is not brought
+again, one that was left elsewhere is.
 """
 
 from __future__ import annotations
@@ -12,19 +14,16 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from hybridlog_storage.copy_places import RefusedError, Sending
-from hybridlog_storage.disk.directory import ListedFile, listed_files
 from hybridlog_storage.errors import RecordingExistsError, StoreError
-from hybridlog_storage.manifest import Manifest, replace
+from hybridlog_storage.manifest import File, Manifest, replace
 from hybridlog_storage.manifests import MANIFEST_LOCK, RECORDINGS, WRITER_LOCK
-from hybridlog_storage.merging import check_origin, merged, wanted
 from hybridlog_storage.stopping import pause, safe_point
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Collection, Mapping
     from contextlib import AbstractContextManager
 
     from hybridlog_storage.copy_places import Place, Source
-    from hybridlog_storage.manifest import File
 
 _TRIES: Final = 3  # of a recording whose files expire meanwhile
 Prepared = tuple[Manifest, "Source"]
@@ -99,7 +98,7 @@ class _Copy:
 
     def __init__(self, source: Source, target: Place, here: Manifest, how: How) -> None:
         self._source, self._target, self._here, self._how = source, target, here, how
-        self._own = {one.path for one in listed_files(here)}
+        self._own = {*here.present}
         self._others = source  # has the files that are not in `_own`
         self._must_prove = how.check or how.proved is not None
         self._done = self._total = 0
@@ -120,7 +119,7 @@ class _Copy:
             return None
         if target.mends:
             sizes = target.sizes(here.id)
-            if any(sizes.get(one.path) != one.bytes for one in listed_files(there)):
+            if any(sizes.get(name) != one.bytes for name, one in there.present.items()):
                 return None
         return Copied(there, lacking=_lacking(here, there))
 
@@ -150,9 +149,9 @@ class _Copy:
     def _wanted(self, there: Manifest | None) -> list[File]:
         return wanted(self._here, there, awaited=self._how.prepare is None)
 
-    def _is_whole(self, file: ListedFile, sizes: Mapping[str, int]) -> bool:
-        reads = file.path not in self._new
-        is_there = sizes.get(file.path) == file.bytes
+    def _is_whole(self, file: File, sizes: Mapping[str, int]) -> bool:
+        reads = file.name not in self._new
+        is_there = sizes.get(file.name) == file.bytes
         return is_there and self._target.is_whole(self._sending(file), reads=reads)
 
     def _find(self, sizes: Mapping[str, int]) -> Manifest | None:
@@ -189,32 +188,32 @@ class _Copy:
     ) -> None:
         """Send what is lacking, or lost, and prove what has to be."""
         target = self._target
-        ours = {one.path: one for one in listed_files(here)}
-        listed = {one.path: one for one in ([] if there is None else listed_files(there))}
+        ours = here.present
+        listed = {} if there is None else there.present
         numbers = {log.number for log in logs}
-        names = (f.name for f in here.files if f.is_here and f.number in numbers)
-        new = [ours[name] for name in names]
+        new = [one for one in ours.values() if one.number in numbers]
         kept = merged(here, there, numbers)
-        old = [listed[one.path] for one in listed_files(kept) if one.path in listed]
-        self._new = {one.path for one in new}
-        doubtful = [one for one in old if self._must_prove or sizes.get(one.path) != one.bytes]
+        old = [listed[name] for name in kept.present if name in listed]
+        self._new = {one.name for one in new}
+        doubtful = [one for one in old if self._must_prove or sizes.get(one.name) != one.bytes]
         self._total = sum(one.bytes for one in (*new, *doubtful))
         for one in (*new, *doubtful):
             if self._is_whole(one, sizes):
                 self._count(one.bytes, False)
-            elif ours.get(one.path) == one:
+            elif one.name in ours and ours[one.name].digest == one.digest:
                 target.send(self._sending(one))
-                copied.sent.append(one.path)
+                copied.sent.append(one.name)
             else:
-                copied.lost.append(one.path)
+                copied.lost.append(one.name)
                 continue
-            self._proved[one.path] = one.digest
+            self._proved[one.name] = one.digest
         copied.bytes, copied.sent_bytes = self._total, self._sent_bytes
 
-    def _sending(self, file: ListedFile) -> Sending:
-        source = self._source if file.path in self._own else self._others
+    def _sending(self, file: File) -> Sending:
+        source = self._source if file.name in self._own else self._others
         rate = self._how.limit_rate
-        return Sending(source, self._here.id, *file, self._count, rate)
+        about = file.name, file.bytes, file.digest
+        return Sending(source, self._here.id, *about, self._count, rate)
 
     def _count(self, size: int, is_sent: bool) -> None:  # noqa: FBT001 - as of Sending
         """Note bytes that were sent, or were there; wait as long as the limit of the rate asks."""
@@ -250,9 +249,8 @@ class _Copy:
 
     def _clear(self, there: Manifest | None, now: Manifest, sizes: Mapping[str, int]) -> None:
         """Delete files that others have replaced, and what has arrived of those not to come."""
-        before = [] if there is None else listed_files(there)
-        listed = {one.path for one in listed_files(now)}
-        left = {one.path for one in before} - listed
+        listed = now.present.keys()
+        left = set() if there is None else there.present.keys() - listed
         if self._how.prepare is None:  # or else the next copy goes on with them
             arrived = {path for path in sizes if path.endswith(".part")}
             all_else = sizes.keys() - {MANIFEST_LOCK, WRITER_LOCK} - listed
@@ -280,3 +278,74 @@ def _lacking(here: Manifest, there: Manifest | None) -> list[int]:
         for number, log in here.logs.items()
         if log.is_here and number in known and known[number].gone == "expired"
     ]
+
+
+def wanted(here: Manifest, there: Manifest | None, *, awaited: bool = True) -> list[File]:
+    """The logs that a copy lacks; of those that are gone here, the rows are sent.
+
+    `there` is the manifest of the copy so far, None if it is new; `awaited` adds those that were
+    left for later.
+    """
+    known = {} if there is None else there.logs
+    return [
+        log
+        for number, log in here.logs.items()
+        if number not in known
+        or (awaited and known[number].gone == "elsewhere" and log.gone != "elsewhere")
+    ]
+
+
+def merged(here: Manifest, there: Manifest | None, brought: Collection[int]) -> Manifest:
+    """The manifest of a copy; `there` is the one so far, None if it is new.
+
+    `brought` has the numbers of the logs that are there now, whole, or with their rows.
+    """
+    if there is None:
+        return here
+    check_origin(here, there)
+    new = {log.number: log for log in wanted(here, there) if log.number in brought}
+    rows = [f for f in there.files if f.kind == "rows" and f.number not in new]
+    rows += [f for f in here.files if f.kind == "rows" and f.number in new]
+    channels = {
+        number: channel
+        for number, channel in here.channels.items()
+        if number not in there.channels or channel.messages >= there.channels[number].messages
+    }
+    is_newer = _messages(here) >= _messages(there)
+    has_status = is_newer and (here.status != "open" or there.status == "open")
+    return replace(
+        there,
+        files=(*{**there.logs, **new}.values(), *rows),
+        channels={**there.channels, **channels},
+        losses=here.losses if is_newer else there.losses,
+        status=here.status if has_status else there.status,
+    )
+
+
+def _messages(manifest: Manifest) -> int:
+    """Messages that a recording has had; with a ring, those that went, too."""
+    gone = 0 if manifest.let_go is None else manifest.let_go.messages
+    return gone + sum(channel.messages for channel in manifest.channels.values())
+
+
+def check_origin(here: Manifest, there: Manifest | None) -> None:
+    """Raise `RefusedError` if two manifests of one id are not of one recording."""
+    if there is None:
+        return
+    logs, channels = there.logs, there.channels
+    is_one = (
+        here.created == there.created
+        and all(
+            channels[number].topic == one.topic
+            for number, one in here.channels.items()
+            if number in channels
+        )
+        and all(
+            logs[number].parts == log.parts for number, log in here.logs.items() if number in logs
+        )
+    )
+    if not is_one:
+        raise RefusedError(
+            f"{here.name} is not copied: another recording, {there.name}, has its id {here.id} "
+            "there."
+        )

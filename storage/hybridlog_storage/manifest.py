@@ -263,6 +263,11 @@ class Manifest(Record, frozen=True):
         return found
 
     @property
+    def present(self) -> dict[str, File]:
+        """Its files that are not gone, by name."""
+        return {file.name: file for file in self.files if file.is_here}
+
+    @property
     def is_ended(self) -> bool:
         """True once nobody records it any more."""
         return self.status != "open"

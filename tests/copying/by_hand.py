@@ -13,7 +13,6 @@ import pytest
 from blake3 import blake3
 
 from hybridlog_storage.copy_places import Directory, Place, Source
-from hybridlog_storage.disk.directory import listed_files
 from hybridlog_storage.manifest import (
     Channel,
     File,
@@ -131,8 +130,8 @@ class Store:
 
     def begin(self, manifest: Manifest) -> None:
         """Make a recording with all its files."""
-        for file in listed_files(manifest):
-            self.write(f"recordings/{manifest.id}/{file.path}", bytes_of(file.path))
+        for name in manifest.present:
+            self.write(f"recordings/{manifest.id}/{name}", bytes_of(name))
         begin(self.place.manifests, manifest)
 
     def write(self, name: str, content: bytes) -> None:
@@ -175,8 +174,8 @@ class Store:
         """The recording, whose files are there whole, and nothing else if it is as wanted."""
         found = self.manifests().read(RECORDING)
         paths = set()
-        for file in listed_files(found):
-            path = f"recordings/{RECORDING}/{file.path}"
+        for file in found.present.values():
+            path = f"recordings/{RECORDING}/{file.name}"
             assert blake3(self.read(path)).hexdigest() == file.digest, path
             paths.add(path)
         if wanted is not None:

@@ -25,8 +25,6 @@ class _Given(Choosing, InStore, AsJson):
 def ls_command(given: _Given) -> None:
     """List the recordings."""
     with given.opened() as store:
-        if store.directory.look_closely():
-            store.refresh()
         recordings = given.recordings_in(store.snapshot()).summaries
     found = [*recordings]
     without = "" if store.repairs.unreadable else store.directory.when_empty

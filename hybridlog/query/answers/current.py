@@ -32,8 +32,8 @@ from hybridlog.query.planner import Planner
 from hybridlog.query.question import Counters, Question
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import TimeLike, parse_time
-from hybridlog_storage.disk.copying import interleave
 from hybridlog_storage.errors import ResourceError, SegmentError
+from hybridlog_storage.messages import interleave
 from hybridlog_storage.times import BEGIN, END, earlier, span_of
 
 if TYPE_CHECKING:

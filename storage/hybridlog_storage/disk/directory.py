@@ -25,7 +25,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, Final, NamedTuple
+from typing import Any, ClassVar, Final
 
 from msgspec import structs
 
@@ -56,26 +56,11 @@ LOCK: Final = WRITER_LOCK
 LOCK_WAIT_S: Final = 10.0
 """Seconds that a command waits for another one that holds its recording."""
 _OF_MANIFEST: Final = frozenset({MANIFEST_LOCK, MANIFEST_OLD, f".{MANIFEST_OLD}"})
-_FOLDER: Final = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW
 _BESIDE: Final = _OF_MANIFEST | {WRITER_LOCK}
 _TICK_NS: Final = 50_000_000
 _POLL_S = 0.02
 _RECORDER_WAIT_S = 0.5  # a reader's look at a lock must not pass for a recorder
 _HOLDER = 32  # bytes of the line in a lock
-
-
-class ListedFile(NamedTuple):
-    """A file of a recording: its path below the recording, its size and its digest."""
-
-    path: str
-    bytes: int
-    digest: str
-
-
-def listed_files(manifest: Manifest) -> list[ListedFile]:
-    """All files that a manifest lists, without those that are gone."""
-    here = (one for one in manifest.files if one.is_here)
-    return [ListedFile(one.name, one.bytes, one.digest) for one in here]
 
 
 @dataclass(frozen=True, slots=True)
@@ -313,12 +298,8 @@ class StoreDirectory:
             return True
         return False
 
-    def look_closely(self, recording: str | None = None) -> bool:
-        """Look whether files are there; True if some are not. Here each question does.
-
-        All of a single recording is read anew from then on; None is for all recordings.
-        """
-        return False
+    def look_closely(self, recording: str) -> None:
+        """Look which files of a recording are there, and read all anew. Here each question does."""
 
     def listing(self, recording: str) -> Listing:
         """Read the content of a recording's directory."""
@@ -326,15 +307,14 @@ class StoreDirectory:
         look = self._look_of(recording)
         found = {}
         try:
-            found = files.names(path)
-        except FileNotFoundError:
-            pass
+            with suppress(FileNotFoundError):
+                found = files.names(path)
         except OSError as error:
             raise unreadable(error, path) from error
-        opened: dict[int, str] = {}
-        others = []
         sealed: dict[int, str] = {}
+        opened: dict[int, str] = {}
         rows: dict[str, int] = {}
+        others = []
         looks = hashlib.blake2b(digest_size=16)
         for name, about in sorted(found.items()):
             number, kind = _numbered(name)
@@ -349,29 +329,20 @@ class StoreDirectory:
                 others.append(name)
             if kind == SEALED_SUFFIX or name in rows:
                 looks.update(f"{name} {_file_look(about)}\n".encode())
-        return Listing(
-            dict(sorted(sealed.items())),
-            dict(sorted(opened.items())),
-            tuple(sorted(others)),
-            rows,
-            look,
-            looks.hexdigest(),
-        )
+        return Listing(sealed, opened, tuple(others), rows, look, looks.hexdigest())
 
     def whole(self, ids: Iterable[str]) -> Iterator[Manifest]:
         """Manifests of those recordings, by id, all of whose files are there.
 
         Nothing else is there to be read or mended. No log is opened.
         """
-        try:
-            with files.folder(self.recordings) as inside:
-                for manifest in self.manifests.each(ids):
-                    if _is_whole(manifest, inside):
-                        yield manifest
-        except FileNotFoundError:  # a copy by hand may lack it
-            return
-        except OSError as error:
-            raise unreadable(error, self.path, f"The store {self.path}") from error
+        for manifest in self.manifests.each(ids):
+            listed = {name: one.bytes for name, one in manifest.present.items()}
+            with suppress(OSError):  # copies of a store leave out what is empty
+                found = files.names(self.recording(manifest.id)).items()
+                there = {name: _size(about) for name, about in found if name not in _BESIDE}
+                if there == listed:
+                    yield manifest
 
     @contextmanager
     def retaining(self) -> Iterator[bool]:
@@ -491,26 +462,9 @@ def _folder_look(recording: str, folders: int) -> str:
     return f"{about.st_ino} {about.st_mtime_ns} {about.st_ctime_ns}"
 
 
-def _is_whole(manifest: Manifest, folders: int) -> bool:
-    """True if a recording's folder holds what its manifest lists, and nothing unknown."""
-    listed = listed_files(manifest)
-    try:
-        fd = os.open(manifest.id, _FOLDER, dir_fd=folders)
-    except OSError:  # copies of a store leave out what is empty
-        return False
-    try:
-        if {*os.listdir(fd)} - _BESIDE != {one.path for one in listed}:  # noqa: PTH208
-            return False
-        return all(_has_size(fd, one.path, one.bytes) for one in listed)
-    except OSError:  # one goes at this moment
-        return False
-    finally:
-        os.close(fd)
-
-
-def _has_size(folder: int, name: str, size: int) -> bool:
-    about = os.stat(name, dir_fd=folder, follow_symlinks=False)
-    return about.st_size == size and stat.S_ISREG(about.st_mode)
+def _size(about: os.stat_result) -> int:
+    """Bytes of an ordinary file; -1 of all else."""
+    return about.st_size if stat.S_ISREG(about.st_mode) else -1
 
 
 def _file_look(about: os.stat_result) -> str:

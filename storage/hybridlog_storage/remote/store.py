@@ -41,7 +41,6 @@ from hybridlog_storage.disk.directory import (
     Listing,
     StoreDirectory,
     gone,
-    listed_files,
 )
 from hybridlog_storage.errors import (
     BucketError,
@@ -377,22 +376,16 @@ class BucketStore(Source):
                 raise RefusedError(f"{where} is damaged: it has not {size} bytes.") from error
 
 
-_mounting = threading.Lock()
-
-
 def mount(address: str) -> BucketStore:
     """The store in a bucket."""
-    path = Path(address)
-    with _mounting:
-        if path not in files.mounted:
-            files.mounted[path] = BucketStore(Bucket(address))
-        return cast("BucketStore", files.mounted[path])
+    found = files.mounted.get(Path(address)) or BucketStore(Bucket(address))
+    return cast("BucketStore", files.mounted.setdefault(Path(address), found))
 
 
 def objects_of(manifest: Manifest) -> Iterator[Object]:
     """The objects of the files that a manifest lists."""
     place = f"{RECORDINGS}/{manifest.id}"
-    return (Object(f"{place}/{o.path}", o.bytes, o.digest) for o in listed_files(manifest))
+    return (Object(f"{place}/{o.name}", o.bytes, o.digest) for o in manifest.present.values())
 
 
 class RemoteDirectory(StoreDirectory):
@@ -483,24 +476,17 @@ class RemoteDirectory(StoreDirectory):
         """True if there is a manifest of a recording."""
         return recording in self.manifests.objects
 
-    def look_closely(self, recording: str | None = None) -> bool:
-        """Compare files with their objects; True if some are missing.
-
-        Those of a single recording are from then on read from the server again; None is for all.
-        """
-        place = f"{RECORDINGS}/{recording}/" if recording else f"{RECORDINGS}/"
+    def look_closely(self, recording: str) -> None:
+        """Look which objects of a recording are lost; the others are read from the server again."""
+        place = f"{RECORDINGS}/{recording}/"
         there = {one.name: one.size for one in self.bucket.objects(place)}
         lost = {one for one in self.bucket.lost if not one.startswith(place)}
-        for one in self.ids() if recording is None else [recording]:
-            with suppress(StoreError):  # it is named where it is asked about
-                for about in objects_of(self.manifests.read(one)):
-                    is_lost = there.get(about.name) != about.size
-                    if is_lost:
-                        lost.add(about.name)
-                    if is_lost or recording is not None:  # others are to notice it, too
-                        self.source.cache.forget(self.bucket, about)
+        with suppress(StoreError):  # it is named where it is asked about
+            for about in objects_of(self.manifests.read(recording)):
+                if there.get(about.name) != about.size:
+                    lost.add(about.name)
+                self.source.cache.forget(self.bucket, about)
         self.bucket.lost = lost
-        return bool(lost)
 
     def listing(self, recording: str) -> Listing:
         """As of a directory: what the manifest lists, without what was lost."""
@@ -525,7 +511,7 @@ class RemoteDirectory(StoreDirectory):
         """Bytes of all files that manifests list, and of tables."""
         tables = sum(o.size for own in self.source.cells.tables().values() for o in own.values())
         manifests = self.manifests.each(self.ids())
-        return tables + sum(one.bytes for now in manifests for one in listed_files(now))
+        return tables + sum(one.bytes for now in manifests for one in now.present.values())
 
     @contextmanager
     def retaining(self) -> Iterator[bool]:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from hybridlog_storage.checksum import crc32
-from hybridlog_storage.disk.copying import joined
 from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD
+from hybridlog_storage.messages import joined
 from hybridlog_storage.segments.chunk_table import parts_of
 from hybridlog_storage.segments.segment_format import (
     chunk_head,
