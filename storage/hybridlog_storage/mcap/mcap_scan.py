@@ -16,6 +16,7 @@ from hybridlog_storage.checksum import crc32
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.lazy import lazy
 from hybridlog_storage.mcap.mcap_content import (
+    HEAD,
     LAST_KNOWN,
     MAGIC,
     MAX_CHUNK_HEAD,
@@ -25,6 +26,7 @@ from hybridlog_storage.mcap.mcap_content import (
     ChunkContent,
     ChunkHead,
     Damage,
+    RecordFile,
     chunk_head_of,
     footer_of,
     is_in_summary,
@@ -33,7 +35,6 @@ from hybridlog_storage.mcap.mcap_content import (
     parse_summary,
     read_record,
 )
-from hybridlog_storage.mcap.record_file import HEAD, RecordFile
 from hybridlog_storage.messages import MAX_PAYLOAD
 from hybridlog_storage.segments.attachments import MAX_HEAD, Attachment, parse_attachment
 from hybridlog_storage.segments.compression import (

@@ -21,14 +21,15 @@ from hybridlog_storage.checksum import crc32
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.mcap.mcap_content import (
     CHUNK_HEAD,
+    HEAD,
     MAX_CHUNK_HEAD,
     RECORD_HEAD,
     ChunkHead,
     Damage,
+    RecordFile,
     chunk_head_of,
     parse_content,
 )
-from hybridlog_storage.mcap.record_file import HEAD, RecordFile
 from hybridlog_storage.segments.chunk_table import ChunkTable, TableBuilder, check_parts
 from hybridlog_storage.segments.segment_file import OPEN_SUFFIX, sealed_name
 from hybridlog_storage.segments.segment_format import (
