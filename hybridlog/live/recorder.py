@@ -171,7 +171,8 @@ class Recorder:
         self._ended_at: int | None = None
         self._simulated: SimulatedTime | None = None
         if options.use_sim_time:
-            self._simulated = SimulatedTime(self, options.budget_bytes // _HELD_SHARE)
+            held = options.budget_bytes // _HELD_SHARE
+            self._simulated = SimulatedTime(self, self.drop, held)
         self._sink: Sink = self._simulated or self
         self._target = LiveRecording(
             store.directory,
@@ -552,7 +553,7 @@ class Recorder:
         """See `Sink.clock`; `SimulatedTime` uses it."""
 
     def drop(self, channel: Channel, size: int, cause: Cause, detail: str, at: int) -> None:
-        """See `clocks.Recording.drop`."""
+        """See `SimulatedTime`."""
         recorded = self._recorded.get(channel) or self._meet(channel, None)
         recorded.tally.add(size, at)
         self._lose(recorded, cause, detail, at)
