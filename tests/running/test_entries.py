@@ -122,7 +122,7 @@ def test_a_segment_that_is_about_to_be_noted_is_no_problem(running: Running) -> 
     with hl.open(running.path.parent / "store", mongo=NO_MONGODB) as reader:
         catalog, directory = reader.catalog, reader.directory
         catalog.remove(running.entry.id)
-        assert not verify(directory, catalog, None, recordings=[running.entry.id]).findings
+        assert not verify(reader.shared, {running.entry.id: "live"}).findings
         put_entry(directory, catalog, running.entry.id, is_open=True)
 
 
