@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.messages import Channel
     from hybridlog_storage.segments.attachments import Attachment
-    from hybridlog_storage.segments.open_segment import Flushed
     from hybridlog_storage.segments.segment_reader import SegmentSummary
+    from hybridlog_storage.segments.walk import Flushed
 
 
 @dataclass(frozen=True, slots=True)

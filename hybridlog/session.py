@@ -33,7 +33,7 @@ from hybridlog_storage.errors import (
     TopicError,
 )
 from hybridlog_storage.messages import Channel, schema_hash
-from hybridlog_storage.segments.segment_reader import place_of
+from hybridlog_storage.segments.chunk_table import place_of
 from hybridlog_storage.times import BEGIN, END, placed
 
 if TYPE_CHECKING:
@@ -48,8 +48,8 @@ if TYPE_CHECKING:
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.segments.chunk import StoredChunk
-    from hybridlog_storage.segments.chunk_table import ChunkTable
-    from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentReader
+    from hybridlog_storage.segments.chunk_table import ChunkPlace, ChunkTable
+    from hybridlog_storage.segments.segment_reader import SegmentReader
     from hybridlog_storage.summary import RecordingSummary
 
 _MAX_NAMES = 5  # recordings in a message

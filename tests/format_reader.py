@@ -302,7 +302,12 @@ class Segment:
         _, head, crc = struct.unpack_from("<QII", arrivals)
         demand(zlib.crc32(record[: self._head(record)]) == head, "the head of a chunk")
         is_indexed = zlib.crc32(trailer[:at]) == crc
-        steps = struct.unpack(f"<{len(messages)}q", unpacked(arrivals[16:], 8 * len(messages)))
+        count, sizes = struct.unpack_from("<II", arrivals, 16), (48, 8)
+        demand(count[1] == len(messages), "the number of arrival numbers")
+        raw = unpacked(arrivals[24:], sum(n * size for n, size in zip(count, sizes, strict=True)))
+        said = [Part(*row) for row in struct.iter_unpack("<IIQqqqq", raw[: 48 * count[0]])]
+        demand(said == self.parts_of(number), "the parts in an arrival record")
+        steps = struct.unpack(f"<{count[1]}q", raw[48 * count[0] :])
         seq = 0
         heads = []
         for step, (start, opcode, message) in zip(steps, messages, strict=True):

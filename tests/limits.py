@@ -69,7 +69,6 @@ PLACES = {
     "segment_chunks": "hybridlog_storage.segments.segment_group._MAX_CHUNKS",
     "segment_parts": "hybridlog_storage.segments.segment_group._MAX_PARTS",
     "sync_stride_bytes": "hybridlog_storage.segments.segment_writer._SYNC_STRIDE",
-    "foxglove_tick_s": "hybridlog.live.sources.foxglove.connection._TICK_S",
     "bucket_whole_bytes": "hybridlog_storage.remote.bucket.PART_BYTES",
     "bucket_part_bytes": "hybridlog_storage.remote.bucket._PART",
     "bucket_retry_s": "hybridlog_storage.remote.bucket._RETRY_S",

@@ -925,7 +925,7 @@ def test_a_damaged_chunk_is_the_same_loss_for_both(recorded: hl.Store, tmp_path:
     assert sorted(second.damage) == [(1, 0), (1, 2)]
     assert second.status == "damaged"
     with hl.open(tmp_path / "store") as store:
-        found = verify(store.directory, store.catalog, None, recordings=[store.entry("robot").id])
+        found = verify(store.shared, {store.entry("robot").id: "robot"})
     assert {f.place.split(" byte ")[0] for f in found.findings} == {"000001.mcap"}
     assert len(found.findings) == 2
     with hl.open(tmp_path / "store", require_database=True) as store:

@@ -39,9 +39,9 @@ from hybridlog_storage.errors import (
 )
 from hybridlog_storage.mongo.collection_names import collection_of
 from hybridlog_storage.mongo.index_state import IndexState
+from hybridlog_storage.segments.chunk_table import places_of
 from hybridlog_storage.segments.gone_log import open_log
-from hybridlog_storage.segments.open_segment import OpenSegment
-from hybridlog_storage.segments.segment_reader import places_of
+from hybridlog_storage.segments.walk import OpenSegment
 from hybridlog_storage.settings import read_settings
 from hybridlog_storage.threads import Threads
 
@@ -56,7 +56,8 @@ if TYPE_CHECKING:
     from hybridlog_storage.messages import Channel
     from hybridlog_storage.mongo.database import Database
     from hybridlog_storage.segments.chunk import StoredChunk
-    from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentReader
+    from hybridlog_storage.segments.chunk_table import ChunkPlace
+    from hybridlog_storage.segments.segment_reader import SegmentReader
 
 _SEND_BYTES: Final = 8 << 20  # documents that are sent together, at most
 _GROUP_BYTES: Final = 8 << 20  # content of chunks that are decoded together
@@ -378,7 +379,7 @@ class Follower:
             if self.is_stopped or time.monotonic() > self._until:
                 raise TimeoutError
             self._take(self._segments[number], group, channels)
-            report(group[-1].offset)
+            report(group[-1].place.offset)
 
     def _groups(
         self, number: int, reader: SegmentReader, places: Iterable[ChunkPlace]

@@ -18,7 +18,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from hybridlog.live.sources.base import Sink
 from hybridlog.record.losses import Cause, Loss
@@ -38,31 +38,24 @@ _ROS1 = struct.Struct("<II")
 _CDR = {0: struct.Struct(">4xiI"), 1: struct.Struct("<4xiI")}
 
 
-class Recording(Sink, Protocol):
-    """A sink that also counts messages that cannot be given a time."""
-
-    def drop(self, channel: Channel, size: int, cause: Cause, detail: str, at: int) -> None:
-        """Count a message as received and lost.
-
-        Args:
-            channel: Its channel.
-            size: Bytes of its payload.
-            cause: Cause of the loss.
-            detail: Text for the user.
-            at: Time of the loss, ns.
-        """
-
-
 class SimulatedTime(Sink):
     """Passes messages on to a recorder, with the time of `/clock` as their receive time.
 
     Args:
         recorder: Takes them.
+        drop: Counts a message as received and lost; called with its channel, the bytes of its
+            payload, the cause, a text for the user and the time of the loss, ns.
         max_bytes: Memory for messages that come before the clock.
     """
 
-    def __init__(self, recorder: Recording, max_bytes: int) -> None:
+    def __init__(
+        self,
+        recorder: Sink,
+        drop: Callable[[Channel, int, Cause, str, int], None],
+        max_bytes: int,
+    ) -> None:
         self._recorder = recorder
+        self._drop = drop
         self._max_bytes = max_bytes
         self._is_clock_recorded = True
         self._lock = threading.Lock()
@@ -160,7 +153,7 @@ class SimulatedTime(Sink):
 
         def drop() -> None:
             detail = f"it came before the first time of {CLOCK}"
-            self._recorder.drop(channel, len(payload), Cause.CLOCK, detail, received)
+            self._drop(channel, len(payload), Cause.CLOCK, detail, received)
 
         if self._held is None or not self._hold(len(payload), record, drop):
             record(self.at(received))

@@ -171,7 +171,8 @@ class Recorder:
         self._ended_at: int | None = None
         self._simulated: SimulatedTime | None = None
         if options.use_sim_time:
-            self._simulated = SimulatedTime(self, options.budget_bytes // _HELD_SHARE)
+            held = options.budget_bytes // _HELD_SHARE
+            self._simulated = SimulatedTime(self, self.drop, held)
         self._sink: Sink = self._simulated or self
         self._target = LiveRecording(
             store.directory,
@@ -202,7 +203,7 @@ class Recorder:
                 store.directory,
                 partial(remove_if, store.shared),
                 self._target.id,
-                sealed=lambda: self._target.sealed,
+                sealed=lambda: self._target.capture.writer.totals.segments,
                 reserve=options.reserve_bytes,
                 say=self.say,
                 window=round((options.before_s or ring_s or 0) * 1e9),
@@ -364,20 +365,20 @@ class Recorder:
                 lost.update({cause.value: count for cause, count in one.lost.items()})
             shown = [one for one in self._topics.values() if one.tallies or one.is_present]
         topics = [one.look(elapsed, now_steady) for one in sorted(shown, key=attrgetter("topic"))]
-        stored, stored_bytes = self._target.stored
+        totals = self._target.capture.writer.totals
         failure = self._target.index_failure
         state = RecorderState(
             self.name,
             now - self._started,
             topics,
             sum(topic.messages for topic in topics),
-            stored,
+            totals.messages,
             dict(lost),
             self._target.filled,
-            self._target.lag,
+            self._target.capture.lag,
             "" if failure is None else str(failure),
             shutil.disk_usage(self._directory.path).free,
-            stored_bytes,
+            totals.payload_bytes,
             self._stalled_s(now),
             incidents=self._incidents.count,
             let_go=None if self._ring is None else self._ring.messages,
@@ -393,8 +394,8 @@ class Recorder:
         return state
 
     def _stalled_s(self, now: float) -> float:
-        taken, written = self._target.progress
-        if taken <= written or written != self._written:
+        written = self._target.capture.writer.written.total()
+        if self._target.taken.total() <= written or written != self._written:
             self._written, self._written_at = written, now
         waited = now - self._written_at - self._options.flush_interval_s
         return waited if waited > _SLOW_WRITE_S else 0.0
@@ -519,20 +520,25 @@ class Recorder:
         whole = size <= SMALL_BYTES or self._target.filled < recorded.whole_below
         number = 0 if sequence is None else sequence % _SEQUENCES
         try:
-            if whole and self._target.write(
+            is_stored = whole and self._target.write(
                 recorded.channel,
                 payload,
                 log_time=received,
                 publish_time=sent,
                 sequence=number,
                 wait=False,
-            ):
-                self._silence.take(recorded.channel.topic, steady)
-            elif size > SMALL_BYTES:
+            )
+            if not is_stored and size > SMALL_BYTES:
                 # Its fields may fit where its payload does not.
-                self._store_fields(recorded, payload, received, sent, number)
+                is_stored = self._store_fields(recorded, payload, received, sent, number)
+            if is_stored:
+                self._silence.take(recorded.channel.topic, steady)
             else:
-                self._lose_for_room(recorded, received)
+                self.say(
+                    f"{recorded.channel.topic}: the memory budget is used up and messages are lost "
+                    "(see the loss ledger); raise it with --budget"
+                )
+                self._lose(recorded, Cause.QUEUE, "the memory budget was used up", received)
         except HybridlogError as error:
             cause = Cause.DISK if isinstance(error, DiskFullError) else Cause.QUEUE
             self._refuse(cause, str(error))
@@ -547,7 +553,7 @@ class Recorder:
         """See `Sink.clock`; `SimulatedTime` uses it."""
 
     def drop(self, channel: Channel, size: int, cause: Cause, detail: str, at: int) -> None:
-        """See `clocks.Recording.drop`."""
+        """See `SimulatedTime`."""
         recorded = self._recorded.get(channel) or self._meet(channel, None)
         recorded.tally.add(size, at)
         self._lose(recorded, cause, detail, at)
@@ -646,35 +652,27 @@ class Recorder:
         received: int,
         sent: int | None,
         number: int,
-    ) -> None:
-        """Store the fields of a message without its payload."""
+    ) -> bool:
+        """Store the fields of a message without its payload; False if they do not fit either."""
         from hybridlog.columns.left_rows import reduced  # loads pyarrow
 
         if recorded.reduced is None:
             recorded.reduced = left_channel(recorded.channel, REDUCED)
-        if self._target.write(
+        is_stored = self._target.write(
             recorded.reduced,
             reduced(codec_for(recorded.channel), payload),
             log_time=received,
             publish_time=sent,
             sequence=number,
             wait=False,
-        ):
-            self._silence.take(recorded.channel.topic, self._steady(received))
+        )
+        if is_stored:
             self.say(
                 f"{recorded.channel.topic}: messages come faster than the disk writes; of some "
                 "only the fields are stored (see the loss ledger)"
             )
             self._lose(recorded, Cause.DEGRADE, "payload dropped, fields stored", received)
-        else:
-            self._lose_for_room(recorded, received)
-
-    def _lose_for_room(self, recorded: _RecordedChannel, received: int) -> None:
-        self.say(
-            f"{recorded.channel.topic}: the memory budget is used up and messages are lost "
-            "(see the loss ledger); raise it with --budget"
-        )
-        self._lose(recorded, Cause.QUEUE, "the memory budget was used up", received)
+        return is_stored
 
     def _lose(self, recorded: _RecordedChannel, cause: Cause, detail: str, received: int) -> None:
         self.lost(Loss(recorded.channel.topic, cause, 1, received, received, detail))

@@ -10,15 +10,14 @@ import numpy as np
 
 from hybridlog_storage.lazy import lazy
 from hybridlog_storage.ordering import run_starts
-from hybridlog_storage.segments.segment_reader import place_of
+from hybridlog_storage.segments.chunk_table import place_of
 from hybridlog_storage.times import BEGIN, END, placed
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog_storage.catalog import ChannelStats
-    from hybridlog_storage.segments.chunk_table import ChunkTable
-    from hybridlog_storage.segments.segment_reader import ChunkPlace
+    from hybridlog_storage.segments.chunk_table import ChunkPlace, ChunkTable
 
 
 class Chunk(NamedTuple):
@@ -100,8 +99,7 @@ class ChunkColumns:
         No bounds are all times. Header stamps are unknown here, so every chunk may hold any;
         channels in `timed` have publish times.
         """
-        is_unknown = clock == "header" or (clock == "publish" and self._table.is_flushed)
-        if bounds is None or is_unknown or not len(self.number):
+        if bounds is None or clock == "header" or not len(self.number):
             return np.ones(len(self.number), np.bool_)
         begin, end = (max(min(bound, END), BEGIN) for bound in bounds)
         own = self._table.parts[self._rows]

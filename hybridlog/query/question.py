@@ -285,7 +285,7 @@ class Counters:
     def add_chunk(self, chunk: StoredChunk) -> None:
         """Count a chunk that was read."""
         self.chunks_read += 1
-        self.bytes_read += chunk.length + chunk.trailer
+        self.bytes_read += chunk.place.length + chunk.place.trailer
 
     def add_messages(self, batch: Batch) -> None:
         """Count messages of the answer."""

@@ -142,7 +142,7 @@ class RangeResolver:
         """
         recording, stats = channel.recording, channel.stats
         is_publish = self._question.clock == "publish"
-        if recording.is_decoded if not is_publish else not recording.flushed:
+        if recording.is_decoded or is_publish:
             known = stats.first_stamp, stats.last_stamp
             if is_publish:
                 known = stats.first_publish, stats.last_publish
@@ -154,7 +154,7 @@ class RangeResolver:
 
             batch = self._session.read_chunk(recording.id, chunk.segment, chunk.place).batch
             batch = batch.take(np.flatnonzero(batch.channel == number))
-            times = batch.publish_time if is_publish else stamps_of(channel.codec, batch)[1]
+            times = stamps_of(channel.codec, batch)[1]
             yield from (int(times.min()), int(times.max())) if len(times) else ()
 
     def _is_outside(self, bounds: Span, recording: RecordingSummary) -> bool:

@@ -21,8 +21,8 @@ from hybridlog_storage.manifest import hasher
 from hybridlog_storage.messages import MARKS_CHANNEL, Batch
 from hybridlog_storage.segments.chunk import StoredChunk
 from hybridlog_storage.segments.chunk_table import CHUNK, PART, ChunkTable
-from hybridlog_storage.segments.open_segment import Flushed
 from hybridlog_storage.segments.segment_reader import SegmentReader
+from hybridlog_storage.segments.walk import Flushed
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog_storage.catalog import RecordingEntry
-    from hybridlog_storage.segments.segment_reader import ChunkPlace
+    from hybridlog_storage.segments.chunk_table import ChunkPlace
 
 _ARRIVALS: Final = 1 << 52  # the first arrival number, behind those of all messages
 _CHUNK: Final = 1000  # marks
@@ -61,10 +61,11 @@ class _MarksLog(SegmentReader):
             parts["payload_bytes"][row] = sum(map(len, _payloads(own)))
             for edge, choose in (("first", min), ("last", max)):
                 parts[edge][row] = chunks[edge][row] = choose(one["time"] for one in own)
+                parts[f"{edge}_publish"][row] = chunks[edge][row]
         chunks["parts"] = 1
         parts["channel"] = MARKS_CHANNEL
         parts["messages"] = [*map(len, self._chunks)]
-        table = ChunkTable(chunks, parts, is_flushed=True)
+        table = ChunkTable(chunks, parts)
         self.flushed = Flushed(table, (), (), self)
 
     def read_chunk(self, place: ChunkPlace) -> StoredChunk:
@@ -89,7 +90,7 @@ class _MarksLog(SegmentReader):
             np.zeros(len(own), np.uint32),
         )
         seq = _ARRIVALS + place.number * _CHUNK + np.arange(len(own))
-        return place.stored(MARKS_SEGMENT, batch, seq)
+        return StoredChunk(MARKS_SEGMENT, place, batch, seq)
 
     def read_times(self, place: ChunkPlace) -> dict[int, NDArray[np.int64]]:
         """Their log times, as of a segment."""

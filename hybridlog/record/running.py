@@ -18,8 +18,8 @@ from hybridlog.snapshot import UNFINISHED
 from hybridlog_storage.catalog import ChannelEntry, channel_entry, channel_totals
 from hybridlog_storage.disk.directory import is_stable
 from hybridlog_storage.errors import SegmentError
-from hybridlog_storage.segments.open_segment import OpenSegment
 from hybridlog_storage.segments.segment_file import OPEN_SUFFIX
+from hybridlog_storage.segments.walk import OpenSegment
 
 if TYPE_CHECKING:
     from hybridlog_storage.catalog import RecordingEntry

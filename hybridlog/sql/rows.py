@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from hybridlog.query.question import Span
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
-    from hybridlog_storage.segments.segment_reader import ChunkPlace
+    from hybridlog_storage.segments.chunk_table import ChunkPlace
 
 _FIXED: Final = frozenset({"ros1", "cdr"})
 """Encodings whose definition fixes the fields."""

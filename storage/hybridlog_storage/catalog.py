@@ -38,7 +38,7 @@ from hybridlog_storage.summary import (
 )
 
 if TYPE_CHECKING:
-    from hybridlog_storage.segments.open_segment import Flushed
+    from hybridlog_storage.segments.walk import Flushed
 else:
     Flushed = Any  # in no file
 
@@ -246,7 +246,7 @@ def channel_totals(
         stats = found[channel] = ChannelStats(
             messages=messages, payload_bytes=payload_bytes, first=first, last=last
         )
-        if channel not in silent and not table.is_flushed:
+        if channel not in silent:
             stats.first_publish, stats.last_publish = published
         if decoded is not None and channel % EXPIRED_IDS in decoded:
             stats.add(decoded[channel % EXPIRED_IDS])

@@ -130,15 +130,6 @@ def test_predicates_on_elements(stores: tuple[hl.Store, hl.Store], predicate: st
     assert query.counters.chunks_read == 0
 
 
-def test_only_columns_that_are_asked_for_are_read(stores: tuple[hl.Store, hl.Store]) -> None:
-    read = []
-    for predicate in ("ranges.min < 1.5", "ranges[3] < 1.5"):
-        query = stores[1].topic("scan").where(predicate)
-        query.count()
-        read.append(query.counters.bytes_read)
-    assert 5 * read[0] < read[1]
-
-
 @pytest.mark.parametrize(
     ("query", "from_chunks"),
     [
@@ -248,21 +239,6 @@ def answers_of(path: Path) -> list[Any]:
         found += [scans.fields("ranges").to_arrow().to_pylist()]
         found += [store.sql("select ranges[350], ranges_summary from scan order by t").rows()]
         return found
-
-
-def test_deleted_tables_change_no_answer(copy: Path) -> None:
-    right = answers_of(copy)
-    with hl.open(copy, mongo="none") as store:
-        store.index.arrays(*TOPICS)
-    assert answers_of(copy) == right
-    shutil.rmtree(copy / "tables")
-    assert answers_of(copy) == right  # and tables with arrays were made again
-    (file,) = (copy / "tables").glob("sensor_msgs_msg_LaserScan~*/*.parquet")
-    assert pq.read_table(file)["ranges"].null_count == 0
-    flip(file, 1 / 3)
-    assert answers_of(copy) == right
-    (copy / "tables").chmod(0o500)
-    assert answers_of(copy) == right
 
 
 def test_arrays_expire_with_their_payloads(copy: Path) -> None:

@@ -11,10 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from blake3 import blake3
 
 import hybridlog as hl
-from hybridlog.entries import put_entry, topic_of
+from hybridlog.entries import put_entry
 from hybridlog.maintenance import expiry
 from hybridlog_storage.errors import IncompleteError
 from hybridlog_storage.manifest import replace, with_rows
@@ -79,26 +78,6 @@ def row_files(store: Path) -> list[Path]:
 def logs(store: Path) -> dict[str, bytes]:
     """The segments that are there, with their content."""
     return {path.name: path.read_bytes() for path in recording_of(store).glob("*.mcap")}
-
-
-def test_a_file_never_changes(copy: Path) -> None:
-    """What derives from a log stays valid when it goes."""
-    with hl.open(copy, mongo="none") as store:
-        digests = store.recordings()[0].digests
-    whole, lines = logs(copy), places.manifest(copy, "log").logs
-    expire(copy, [0])
-    assert logs(copy) == {name: data for name, data in whole.items() if name != "000001.mcap"}
-    listed = places.manifest(copy, "log")
-    assert listed.logs == {**lines, 1: replace(lines[1], gone="expired")}
-    for file in listed.rows[1]:
-        data = (recording_of(copy) / file.name).read_bytes()
-        assert (len(data), blake3(data).hexdigest()) == (file.bytes, file.digest)
-    numbers = {file.name: topic_of(file, listed) for file in listed.rows[1]}
-    assert [*numbers] == ["000001.rows.parquet", "000001.1.rows.parquet"]
-    assert {*numbers.values()} == {"/scan", "/cloud"}
-    with hl.open(copy, mongo="none") as store:
-        (entry,) = store.recordings()
-        assert (entry.digests, entry.files) == (digests, {"1": "000001.rows.parquet"})
 
 
 def test_what_an_expiry_left_is_removed_by_the_next_writer(copy: Path) -> None:

@@ -13,12 +13,12 @@ import pytest
 import hybridlog as hl
 from hybridlog_storage.errors import HybridlogError, SegmentError
 from hybridlog_storage.mcap.mcap_content import MAGIC, RECORD_HEAD
-from hybridlog_storage.segments.open_segment import OpenSegment
 from hybridlog_storage.segments.segment_format import (
     ARRIVAL_OPCODE,
     ARRIVALS,
     arrival_record,
 )
+from hybridlog_storage.segments.walk import OpenSegment
 from tests.running.methods import LABEL, rows, sent
 from tests.running.running import Running, begun
 from tests.running.sequence import Known

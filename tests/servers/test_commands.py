@@ -102,20 +102,6 @@ def test_no_question_asks_once_a_recording(tmp_path: Path) -> None:
     assert "create" not in {one.name for one in few["record"]}, "once a topic, though it exists"
 
 
-def test_some_of_many_recordings(tmp_path: Path) -> None:
-    path = tmp_path / "store"
-    add(path, range(7))
-    with hl.open(path, require_database=True) as store:
-        for chosen in ([0, 1, 2, 4, 6], [6], range(7)):
-            query = store.topic("/number").in_recording(*(f"log {n}" for n in chosen))
-            there = [n * GAP + k for n in chosen for k in range(MESSAGES)]
-            assert query.where({"n": {"$gte": 5}}).count() == sum(n >= 5 for n in there)
-            asked = query.where(RAW).between("+0.025s", "+0.075s")
-            wanted = [n for n in there if 3 <= n % GAP < 8]
-            assert asked.count() == len(wanted)
-            assert [m.fields["n"] for m in asked] == wanted
-
-
 def test_what_columns_answer_asks_mongodb_nothing(tmp_path: Path) -> None:
     path = tmp_path / "store"
     add(path, range(4))
@@ -126,13 +112,3 @@ def test_what_columns_answer_asks_mongodb_nothing(tmp_path: Path) -> None:
         with hl.open(path, require_database=True) as store, commands() as sent:
             assert ask(store) == want
             assert not sent, name
-
-
-def test_the_states_of_the_index_are_read_before_and_after_a_question(tmp_path: Path) -> None:
-    """Once each, for all recordings together."""
-    path = tmp_path / "store"
-    add(path, range(4))
-    with hl.open(path, require_database=True) as store, commands() as sent:
-        assert len(store.topic("/number").where(RAW).windows(0, "1ms"))
-        asked = [one.collection for one in sent if not one.collection.isdigit()]
-        assert asked == ["hybridlog.recordings", "number", "hybridlog.recordings"]

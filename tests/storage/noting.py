@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from hybridlog_storage.segments.chunk import PackedChunk, StoredChunk
-from hybridlog_storage.segments.open_chunk import OpenChunk
+from hybridlog_storage.segments.chunk import OpenChunk, PackedChunk, StoredChunk
+from hybridlog_storage.segments.chunk_table import places_of
 from hybridlog_storage.segments.segment_file import SegmentFile
 from hybridlog_storage.segments.segment_writer import RecordingWriter
 
@@ -37,12 +37,9 @@ class NotingWriter(RecordingWriter):
 
         def noted(packed: PackedChunk) -> None:
             SegmentFile.append_chunk(segment, packed)
-            rows = segment.table.build().chunks[["offset", "length", "trailer"]].tolist()
-            offset, length, trailer = rows[-1]
+            place = places_of(segment.table.build())[-1]
             batch, seq = self._held.pop(id(packed))[1].laid_out()
-            place = {"offset": offset, "length": length, "trailer": trailer}
-            about = {"segment": segment.number, "number": len(rows) - 1}
-            self.chunks.append(StoredChunk(**about, **place, batch=batch, seq=seq))
+            self.chunks.append(StoredChunk(segment.number, place, batch, seq))
 
         segment.append_chunk = noted  # type: ignore[method-assign]
         return segment

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from hybridlog_storage.messages import Batch, Channel
 from hybridlog_storage.mongo.index_documents import DocumentAssembler
 from hybridlog_storage.segments.chunk import Placed, StoredChunk
+from hybridlog_storage.segments.chunk_table import ChunkPlace
 
 KEY = "fedcba9876543210"
 CHANNEL = Channel("/a topic/ä", "x", None)
@@ -22,9 +23,10 @@ def chunk_of(count: int) -> StoredChunk:
     numbers = np.arange(count)
     none = np.zeros(count, np.int32)
     batch = Batch(b"", numbers * 34, np.full(count, 3), none, numbers, numbers, none)
-    return StoredChunk(
-        segment=7, number=5, offset=2**41, length=100, trailer=50, batch=batch, seq=numbers
+    place = ChunkPlace(
+        number=5, offset=2**41, length=100, trailer=50, first=0, last=0, channels=(1,)
     )
+    return StoredChunk(7, place, batch, numbers)
 
 
 def documents(data: NDArray[np.uint8]) -> list[dict[str, Any]]:

@@ -299,7 +299,7 @@ def test_a_record_that_claims_too_much_costs_no_chunk_behind_it() -> None:
     struct.pack_into("<Q", data, place + 1, length + 7)
     items = items_of(bytes(data[: parts_of(data)[1]]))
     assert payloads(items) == ALL
-    assert damages(items)[0].offset == place + 9 + length
+    assert damages(items)[0].offset == place
 
 
 def test_a_log_behind_the_end_of_another_one_is_told() -> None:

@@ -9,20 +9,17 @@ from types import SimpleNamespace
 import pytest
 from mcap.records import Metadata
 
-from hybridlog_storage.segments import open_segment
+from hybridlog_storage.segments import walk
 from hybridlog_storage.segments.attachments import Attachment
 from hybridlog_storage.segments.compression import FilePart
-from hybridlog_storage.segments.open_segment import OpenSegment
 from hybridlog_storage.segments.segment_format import (
     LOSSES_METADATA,
     json_metadata,
 )
 from hybridlog_storage.segments.segment_reader import SegmentReader, SegmentSummary
 from hybridlog_storage.segments.segment_writer import RecordingWriter, SegmentSettings
+from hybridlog_storage.segments.walk import OpenSegment
 from tests.storage.test_segments import CHANNELS, LOSS, RECORDING, Row, batch_of
-
-PLACE = ("offset", "length", "trailer", "first", "last", "parts")
-PART = ("channel", "messages", "payload_bytes", "first", "last")
 
 
 class Written:
@@ -65,11 +62,8 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Written:
 def check(segment: OpenSegment, summary: SegmentSummary) -> None:
     """Compare what was read with what the summary says."""
     table, attachments, metadata, _ = segment.flushed
-    assert table.is_flushed
-    for name in PLACE:
-        assert (table.chunks[name] == summary.table.chunks[name]).all(), name
-    for name in PART:
-        assert (table.parts[name] == summary.table.parts[name]).all(), name
+    assert table.chunks.tolist() == summary.table.chunks.tolist()
+    assert table.parts.tolist() == summary.table.parts.tolist()
     for found, wanted in ((attachments, summary.attachments), (metadata, summary.metadata)):
         assert [(one.offset, one.length, one.name) for one in found] == [
             (one.offset, one.length, one.name) for one in wanted
@@ -92,7 +86,7 @@ def test_a_part_of_a_write_is_no_damage(
         waits.append(seconds)
         path.write_bytes(written.data)
 
-    monkeypatch.setattr(open_segment, "time", SimpleNamespace(sleep=sleep))
+    monkeypatch.setattr(walk, "time", SimpleNamespace(sleep=sleep))
     for seen in range(8, len(written.data), step):
         path.write_bytes(written.data[:seen].ljust(len(written.data), b"\0"))
         segment = OpenSegment(tmp_path, 0)

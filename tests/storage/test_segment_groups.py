@@ -219,7 +219,7 @@ def test_killed_with_several_open_segments(tmp_path: Path) -> None:
     # The last chunks of two segments lose what lies behind them.
     torn = {chunk.segment: chunk for chunk in made.chunks if chunk.segment in {0, 2}}
     for number, chunk in torn.items():
-        os.truncate(opened[number], chunk.offset + chunk.length + 5)
+        os.truncate(opened[number], chunk.place.offset + chunk.place.length + 5)
     told: list[Sealed] = []
     cut = [
         recover_segment(path, lambda sealed, _: told.append(sealed)).cut_bytes for path in opened

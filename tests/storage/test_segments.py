@@ -28,22 +28,22 @@ from hybridlog_storage.disk.append_file import BLOCK
 from hybridlog_storage.errors import DiskFullError, SegmentError, StoreError, UsageError
 from hybridlog_storage.manifest import replace
 from hybridlog_storage.messages import Batch, Channel, LooseBatch, Schema
-from hybridlog_storage.segments import open_chunk, segment_writer
+from hybridlog_storage.segments import chunk as chunk_module
+from hybridlog_storage.segments import segment_writer
 from hybridlog_storage.segments.attachments import Attachment
-from hybridlog_storage.segments.chunk import PackedChunk, StoredChunk, pack
+from hybridlog_storage.segments.chunk import StoredChunk
+from hybridlog_storage.segments.chunk_table import ChunkPlace
 from hybridlog_storage.segments.compression import FilePart
 from hybridlog_storage.segments.recovery import Recovered, recover_segment
 from hybridlog_storage.segments.segment_check import damage_of
 from hybridlog_storage.segments.segment_file import Sealed, SegmentFile
 from hybridlog_storage.segments.segment_format import (
-    CHUNK_TABLE_OPCODE,
     LOSSES_METADATA,
     RECORDING_METADATA,
-    arrival_record,
     json_metadata,
     trailer_of,
 )
-from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentReader, SegmentSummary
+from hybridlog_storage.segments.segment_reader import SegmentReader, SegmentSummary
 from hybridlog_storage.segments.segment_writer import AT_WORK, RecordingWriter, SegmentSettings
 from tests.calls import Calls
 from tests.limits import Limit
@@ -199,31 +199,6 @@ def test_chunks_are_as_large_as_their_bound_however_messages_come(
             assert size + 31 + len(payloads[int(chunks[number + 1].seq[0])]) > bound
 
 
-@pytest.mark.parametrize(("has", "side_by_side"), [(1, 1), (2, 1), (3, 2), (16, 2)])
-def test_a_processor_is_left_to_who_brings_messages(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has: int, side_by_side: int
-) -> None:
-    lock, at_work, seen = threading.Lock(), 0, []
-
-    def slowly(*arguments: Any, **options: Any) -> PackedChunk:
-        nonlocal at_work
-        with lock:
-            at_work += 1
-            seen.append(at_work)
-        time.sleep(0.05)
-        with lock:
-            at_work -= 1
-        return pack(*arguments, **options)
-
-    monkeypatch.setattr(segment_writer, "pack", slowly)
-    monkeypatch.setattr(segment_writer, "processors", lambda: has)
-    writer = recorder(tmp_path, setup=SegmentSettings(chunk_size=1 << 10), on_written=done)
-    for n in range(10):
-        writer.append(loose([(0, bytes([n]) * 1024, n, n, n)]), CHANNELS)
-    writer.close()
-    assert (len(seen), max(seen)) == (10, side_by_side)
-
-
 @pytest.mark.parametrize("noise", [0.3, 0.1])
 def test_chunks_that_wait_are_stored_as_they_are_once_there_is_a_hurry(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, noise: float
@@ -256,7 +231,7 @@ def test_chunks_that_wait_are_stored_as_they_are_once_there_is_a_hurry(
     hurried = True
     go_on.set()
     (path,) = writer.close()
-    shrunk = [chunk.length < size / 2 for chunk in chunks]
+    shrunk = [chunk.place.length < size / 2 for chunk in chunks]
     assert shrunk == [True] * 4 + [noise < 0.2] * 4
     assert [data for _, _, data in messages_in(path)] == payloads
 
@@ -342,19 +317,17 @@ def test_a_chunk_that_holds_little_spans_more(tmp_path: Path, at_once: int) -> N
 def test_every_cut_of_a_small_segment_recovers(tmp_path: Path) -> None:
     (path,), chunks = write(tmp_path / "a", [many(30)], SegmentSettings(chunk_size=1024))
     data = path.read_bytes()
-    end = chunks[-1].offset + chunks[-1].length + chunks[-1].trailer
+    end = chunks[-1].place.end
     for cut in range(0, end, 13):
         recovered = recovered_of(tmp_path, data[:cut])
-        whole = [
-            seq for c in chunks if c.offset + c.length + c.trailer <= cut for seq in c.seq.tolist()
-        ]
+        whole = [seq for c in chunks if c.place.end <= cut for seq in c.seq.tolist()]
         assert recovered.messages == len(whole), cut
         assert not (tmp_path / "000000.mcap.open").exists()
         if recovered.path is None:
             assert (whole, recovered.cut_bytes) == ([], cut)
             continue
-        if cut >= chunks[0].offset:  # what was cut are records that were begun
-            ends = [at for c in chunks for at in (c.offset, c.offset + c.length + c.trailer)]
+        if cut >= chunks[0].place.offset:  # what was cut are records that were begun
+            ends = [at for c in chunks for at in (c.place.offset, c.place.end)]
             assert recovered.cut_bytes == cut - max(at for at in ends if at <= cut), cut
         with SegmentReader(recovered.path, 0) as reader:
             places = reader.summary().chunks
@@ -432,7 +405,7 @@ def test_old_chunks_are_flushed_and_young_ones_are_not(
 ) -> None:
     chunks: list[StoredChunk] = []
     now = 100.0
-    for module in (open_chunk, segment_writer):
+    for module in (chunk_module, segment_writer):
         monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: now))
     writer = recorder(tmp_path, chunks)
     writer.append(batch_of([(0, b"old", 1, 1, 1)]), CHANNELS)
@@ -497,7 +470,7 @@ def content_of(chunk: StoredChunk) -> tuple[Any, ...]:
     columns = (batch.channel, batch.log_time, batch.publish_time, batch.sequence, chunk.seq)
     rows = zip(*(column.tolist() for column in columns), strict=True)
     payloads = [bytes(batch.payload(row)) for row in range(len(batch))]
-    sizes = chunk.length, chunk.trailer
+    sizes = chunk.place.length, chunk.place.trailer
     return chunk.number, list(rows), payloads, sizes
 
 
@@ -553,19 +526,6 @@ def test_the_summary_tells_what_the_chunks_hold(tmp_path: Path) -> None:
     assert struct.unpack_from("<Q", whole, len(whole) - 28)[0] == summary.start
 
 
-def test_the_summary_says_where_the_chunk_table_is(tmp_path: Path) -> None:
-    whole, _ = sample(tmp_path / "a")
-    offsets = struct.unpack_from("<Q", whole, len(whole) - 20)[0]
-    found = {}
-    while whole[offsets] == Opcode.SUMMARY_OFFSET:
-        group, start, length = struct.unpack_from("<BQQ", whole, offsets + 9)
-        found[group] = start, length
-        offsets += 9 + 17
-    start, length = found[CHUNK_TABLE_OPCODE]
-    assert whole[start] == CHUNK_TABLE_OPCODE
-    assert int.from_bytes(whole[start + 1 : start + 9], "little") + 9 == length
-
-
 def test_a_table_that_does_not_end_before_the_summary_is_refused(tmp_path: Path) -> None:
     chunks: list[StoredChunk] = []
     writer = recorder(tmp_path, chunks, SegmentSettings(chunk_size=1024))
@@ -573,7 +533,7 @@ def test_a_table_that_does_not_end_before_the_summary_is_refused(tmp_path: Path)
     (path,) = writer.close()  # nothing follows the last chunk
     whole = path.read_bytes()
     start, offsets = struct.unpack_from("<QQ", whole, len(whole) - 28)
-    gone = start - chunks[-1].offset
+    gone = start - chunks[-1].place.offset
     tail = bytearray(whole[start:-8])
     struct.pack_into("<QQ", tail, len(tail) - 20, start - gone, offsets - gone)
     struct.pack_into("<I", tail, len(tail) - 4, crc32(tail[:-4]))
@@ -600,29 +560,6 @@ def test_a_segment_of_another_format_is_refused(
     with pytest.raises(SegmentError, match=message):
         recover_segment(opened)
     assert opened.read_bytes() == whole
-
-
-def test_arrival_numbers_of_another_chunk_are_refused(tmp_path: Path) -> None:
-    whole, chunks = sample(tmp_path / "a")
-    path = tmp_path / "000000.mcap"
-    chunk = chunks[1]
-    behind = chunk.offset + chunk.length
-    trailer = trailer_of(whole[behind:], chunk.offset)
-    end = behind + trailer.length
-    right = whole[end - 9 - 16 - len(trailer.packed) : end]
-    fields = struct.unpack_from("<QII", right, 9)
-    assert right == arrival_record(*fields, trailer.packed)
-    other = arrival_record(chunk.offset + 1, *fields[1:], trailer.packed)
-    damaged = whole.replace(right, other)
-    path.write_bytes(damaged)
-    with SegmentReader(path, 0) as reader:
-        place = reader.summary().chunks[1]
-        with pytest.raises(SegmentError, match="arrival numbers are missing"):
-            reader.read_chunk(place)
-    path.unlink()
-    recovered = recovered_of(tmp_path, damaged)
-    assert any("arrival numbers are missing" in text for text in recovered.damage)
-    assert recovered.messages == sum(len(c.batch) for c in chunks) - len(chunk.batch)
 
 
 # What a crash leaves
@@ -671,9 +608,9 @@ def test_a_damaged_message_index_costs_no_message(tmp_path: Path) -> None:
     whole, chunks = sample(tmp_path / "a")
     chunk = chunks[1]
     torn = len(whole) - 9
-    indexes = chunk.offset + chunk.length
-    packed = trailer_of(whole[indexes:], chunk.offset).packed
-    for at in range(indexes, indexes + chunk.trailer - 9 - 16 - len(packed)):
+    indexes = chunk.place.offset + chunk.place.length
+    packed = trailer_of(whole[indexes:], chunk.place.offset).packed
+    for at in range(indexes, indexes + chunk.place.trailer - 9 - 16 - len(packed)):
         damaged = bytearray(whole[:torn])
         damaged[at] ^= 1 << at % 8
         recovered = recovered_of(tmp_path, damaged)
@@ -697,9 +634,9 @@ def test_an_index_that_claims_the_next_chunk_hides_no_chunk(tmp_path: Path) -> N
     (path,), chunks = write(tmp_path / "a", [many(60)], SegmentSettings(chunk_size=1024))
     assert len(chunks) > 4
     whole = bytearray(path.read_bytes()[:-9])
-    index = chunks[1].offset + chunks[1].length
+    index = chunks[1].place.offset + chunks[1].place.length
     assert whole[index] == Opcode.MESSAGE_INDEX
-    struct.pack_into("<Q", whole, index + 1, chunks[3].offset - index - 9)
+    struct.pack_into("<Q", whole, index + 1, chunks[3].place.offset - index - 9)
     recovered = recovered_of(tmp_path, whole)
     assert recovered.messages == 60
     assert len(recovered.damage) == 1
@@ -711,7 +648,7 @@ def test_damage_inside_an_open_segment_costs_no_other_chunk(tmp_path: Path, seed
     """A few bytes anywhere: chunks that they do not touch are kept, and all is told."""
     rng = random.Random(seed)
     whole, chunks = sample(tmp_path / "a")
-    first = chunks[0].offset
+    first = chunks[0].place.offset
     for _ in range(60):
         length = rng.choice([1, 8, 200])
         at = rng.randrange(first, len(whole) - length)
@@ -724,14 +661,14 @@ def test_damage_inside_an_open_segment_costs_no_other_chunk(tmp_path: Path, seed
         with SegmentReader(recovered.path, 0) as reader:
             summary = reader.summary()
             found = [reader.read_chunk(place) for place in summary.chunks]
-        kept = {chunk.offset: content_of(chunk)[1:] for chunk in found}
-        want = {chunk.offset: content_of(chunk)[1:] for chunk in chunks}
+        kept = {chunk.place.offset: content_of(chunk)[1:] for chunk in found}
+        want = {chunk.place.offset: content_of(chunk)[1:] for chunk in chunks}
         for chunk in chunks:
-            end = chunk.offset + chunk.length + chunk.trailer
-            if whole[chunk.offset : end] == damaged[chunk.offset : end]:
+            end = chunk.place.end
+            if whole[chunk.place.offset : end] == damaged[chunk.place.offset : end]:
                 # Where it is lost all the same, what defines its channels is.
                 lost = any("is lost" in text for text in recovered.damage)
-                assert kept.get(chunk.offset) == want[chunk.offset] or lost
+                assert kept.get(chunk.place.offset) == want[chunk.place.offset] or lost
         assert all(content == want[offset] for offset, content in kept.items())
         if len(kept) < len(chunks):
             assert recovered.damage or recovered.cut_bytes
@@ -831,20 +768,20 @@ def test_all_that_is_wrong_is_told_at_once(tmp_path: Path) -> None:
     whole, chunks = sample(tmp_path / "a")
     path = tmp_path / "000000.mcap"
     damaged = bytearray(whole)
-    places = [12, chunks[0].offset + 60, chunks[1].offset + chunks[1].length + 30]
+    places = [12, chunks[0].place.offset + 60, chunks[1].place.offset + chunks[1].place.length + 30]
     for at in places:
         damaged[at] ^= 1
     path.write_bytes(damaged)
     read: list[int] = []
     found, has_summary = damage_of(path, progress=read.append)
-    assert [(one.offset, one.chunk) for one in found] == [(chunks[0].offset, 0)]
+    assert [(one.offset, one.chunk) for one in found] == [(chunks[0].place.offset, 0)]
     assert found[0].problem.startswith("chunk 0 is lost (messages: /large 1): ")
     assert read == sorted(read)
     assert has_summary
     # Without its summary, what has a checksum of its own is still looked at.
     damaged[-3] ^= 1
-    damaged[chunks[0].offset + 30] ^= 1
+    damaged[chunks[0].place.offset + 30] ^= 1
     path.write_bytes(damaged)
     found, has_summary = damage_of(path)
     assert not has_summary
-    assert chunks[0].offset in [one.offset for one in found]
+    assert chunks[0].place.offset in [one.offset for one in found]

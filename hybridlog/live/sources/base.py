@@ -131,6 +131,7 @@ class ThreadedSource(LiveSource):
 
     def __init__(self) -> None:
         self._stopping = threading.Event()
+        self._lock = threading.Lock()
         self._thread: threading.Thread | None = None
 
     def _begin(self, sink: Sink, run: Callable[[], None]) -> None:

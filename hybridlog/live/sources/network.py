@@ -1,4 +1,4 @@
-"""Addresses of peers, and connections that never block the event loop."""
+"""Sources with an event loop, addresses of their peers, connections that never block the loop."""
 
 from __future__ import annotations
 
@@ -7,13 +7,16 @@ import os
 import socket
 import threading
 from concurrent.futures import Future
+from contextlib import suppress
 from typing import TYPE_CHECKING, Final, NamedTuple
 from urllib.parse import urlsplit
 
-from hybridlog.live.sources.base import PeerError, one_line
+from hybridlog.live.sources.base import PeerError, ThreadedSource, one_line
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Coroutine, Sequence
+
+    from hybridlog.live.sources.base import Sink
 
     Addresses = Sequence[tuple[int, tuple[object, ...]]]
 
@@ -21,6 +24,44 @@ PATIENCE_S: Final = 5.0
 """Time limit for a look-up, a connection or an answer."""
 
 _MAX_ADDRESSES = 8
+
+
+class LoopSource(ThreadedSource):
+    """A source whose thread runs an event loop."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._cancel: Callable[[], object] = lambda: None
+
+    def _begin_loop(self, sink: Sink, work: Callable[[], Coroutine[None, None, None]]) -> None:
+        """Run a coroutine, which is cancelled when the source stops."""
+
+        async def follow() -> None:
+            loop, task = asyncio.get_running_loop(), asyncio.current_task()
+            assert task is not None
+            with self._lock:
+                if self._stopping.is_set():
+                    return
+                self._cancel = lambda: loop.call_soon_threadsafe(task.cancel)
+            try:
+                await work()
+            finally:
+                with self._lock:
+                    self._cancel = lambda: None
+
+        def run() -> None:
+            with suppress(asyncio.CancelledError):
+                asyncio.run(follow())
+
+        self._begin(sink, run)
+
+    def stop(self) -> None:
+        """Stop, after the messages that are under way, and wait some seconds at most."""
+        with self._lock:
+            self._stopping.set()
+            self._cancel()
+            self._cancel = lambda: None
+        super().stop()
 
 
 class UnreachedError(PeerError):

@@ -1,6 +1,7 @@
 """Reads an MCAP file forward, also a damaged one.
 
-Behind damage it goes on where plausible records follow one another again.
+A record ends where its length says, or where its fields end if nothing goes on there. Behind damage
+reading goes on at the next chunk of the summary, or where plausible records follow one another.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from hybridlog_storage.checksum import crc32
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.lazy import lazy
 from hybridlog_storage.mcap.mcap_content import (
+    HEAD,
     LAST_KNOWN,
     MAGIC,
     MAX_CHUNK_HEAD,
@@ -24,6 +26,7 @@ from hybridlog_storage.mcap.mcap_content import (
     ChunkContent,
     ChunkHead,
     Damage,
+    RecordFile,
     chunk_head_of,
     footer_of,
     is_in_summary,
@@ -32,7 +35,6 @@ from hybridlog_storage.mcap.mcap_content import (
     parse_summary,
     read_record,
 )
-from hybridlog_storage.mcap.record_file import HEAD, RecordFile
 from hybridlog_storage.messages import MAX_PAYLOAD
 from hybridlog_storage.segments.attachments import MAX_HEAD, Attachment, parse_attachment
 from hybridlog_storage.segments.compression import (
@@ -65,7 +67,6 @@ _BETWEEN_CHUNKS: Final = {
 }
 _IN_DATA: Final = _BETWEEN_CHUNKS | {Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE}
 _MESSAGE_SIZE: Final = 22  # bytes of its fields before the payload
-_FIRST_PRIVATE: Final = 0x80
 
 Item: TypeAlias = McapRecord | Attachment | ChunkContent | Damage
 """An item of a scan."""
@@ -83,40 +84,33 @@ class Scan:
         self._limit = limit
         self._bytes = RecordFile(self._read, size, _WINDOW)
         self.summary: Summary | None = None
-        self._stop: int | None = None  # end of the data by the summary
-        self._read_summary()
+        self._stop = self._read_summary()  # end of the data by the summary
         self._chunked = self.summary is not None and bool(self.summary.chunk_indexes)
         self._at = len(MAGIC)
-        # End of the fields of the last record. If its length was wrong, the search for the next
-        # one starts here.
-        self._behind = self._at
-        self._last = self._at  # start of the last record
-        self._has_ended = False  # the data, and the summary follows
         self._needs_crc = False  # messages have no checksum of their own
-        self._is_damaged = self._is_closed = False
-        self._is_torn = False  # the file ends in damage
+        self._is_damaged = False
+        self._is_closed = False  # or damage tells that it is not
 
     def _read(self, offset: int, length: int) -> memoryview:
         self._file.seek(offset)
         return memoryview(self._file.read(length))
 
-    def _read_summary(self) -> None:
+    def _read_summary(self) -> int | None:
         end = self._bytes.size - TAIL
         tail = self._read(end, TAIL) if end >= len(MAGIC) else b""
         footer = footer_of(tail) if len(tail) == TAIL else None
         if footer is None or footer[0] < len(MAGIC) + HEAD + 4:
-            return
+            return None
         start, _, crc = footer
         is_there = self._bytes.at(start - HEAD - 4, HEAD) == _DATA_END
         if self._parse_summary(start, end, crc) or is_there:
-            self._stop = start
-            return
+            return start
         # Where bytes of the data are missing, the summary begins before that place.
         first = max(len(MAGIC), end - _MAX_MOVED)
         found = bytes(self._read(first, end - first)).rfind(_DATA_END)
         moved = first + found + HEAD + 4
-        if found >= 0 and moved < start and self._parse_summary(moved, end, crc):
-            self._stop = moved
+        is_moved = found >= 0 and moved < start and self._parse_summary(moved, end, crc)
+        return moved if is_moved else None
 
     def _parse_summary(self, start: int, end: int, crc: int) -> bool:
         """Read the summary, if it starts there."""
@@ -128,53 +122,50 @@ class Scan:
                 self.summary = parse_summary(data[: end - start])[0]
         return self.summary is not None
 
+    @property
+    def _end_of_data(self) -> int:
+        """End of the data by the summary, or of the file."""
+        return self._bytes.size if self._stop is None else self._stop
+
     def items(self) -> Iterator[tuple[int, Item]]:
         """Each byte of the file where an item starts, and the item, in file order.
 
         Items are messages with the definitions between them, other records, and damage.
         """
         while self._at < self._bytes.size:
-            for at, item in self._step():
+            for at, item in self._step(self._at):
                 self._is_damaged |= isinstance(item, Damage)
                 yield at, item
-            if self._has_ended:
-                yield from self._end()
-        if not (self._is_closed or self._is_torn):
+        if not self._is_closed:
             why = "the file was not closed: its end is missing; all before it was read"
             yield _damage(self._bytes.size, 0, why, 0)
 
-    def _step(self) -> Iterator[tuple[int, Item]]:
+    def _step(self, at: int) -> Iterator[tuple[int, Item]]:
         """Read one record, one run of messages, or one place of damage."""
-        at = self._at
         head = self._bytes.at(at, HEAD, move=True)
         if at == self._stop:
-            self._has_ended = True
             yield _damage(at, 0, "the record that ends the data is damaged", 0)
-        elif len(head) < HEAD:
+            yield from self._end()
+            return
+        if len(head) < HEAD:
             yield self._torn(at, "the file ends in the middle of a record")
-        else:
-            opcode, length = RECORD_HEAD.unpack(head)
-            yield from self._record(at, opcode, at + HEAD + length)
-            self._last = at
-
-    def _record(self, at: int, opcode: int, end: int) -> Iterator[tuple[int, Item]]:
+            return
+        opcode, length = RECORD_HEAD.unpack(head)
+        end = at + HEAD + length
         chunk = self._chunk_head(at)
-        if chunk is not None and chunk.end == end:
-            if opcode != Opcode.CHUNK:
-                yield _damage(
-                    at, HEAD, "the head of a chunk is damaged; it is read all the same", 0
-                )
-            yield from self._chunk(at, chunk)
-        elif opcode == Opcode.CHUNK:
-            yield from self._damaged_chunk(at, end, chunk)
+        if opcode == Opcode.CHUNK or (chunk is not None and chunk.end == end):
+            yield from self._chunk(at, opcode, end, chunk)
         elif end > self._end_of_data or not (opcode in _IN_DATA or opcode > LAST_KNOWN):
-            what = f"a record of kind {opcode} claims {end - at - HEAD} bytes"
+            what = f"a record of kind {opcode} claims {length} bytes"
             yield self._lost(at, what if opcode else "no record starts here")
         elif opcode == Opcode.MESSAGE:
             yield from self._loose(at, end)
         else:
-            self._at, self._behind = end, at + HEAD
-            yield from self._plain(at, opcode, end)
+            self._at = end
+            if opcode == Opcode.DATA_END:
+                yield from self._data_end(at, end)
+            else:
+                yield from self._plain(at, opcode, end)
 
     # Chunks
 
@@ -185,34 +176,51 @@ class Scan:
             return None
         return head._replace(start=at + head.start, end=at + head.end)
 
-    def _chunk(self, at: int, chunk: ChunkHead) -> Iterator[tuple[int, Item]]:
-        """The messages of a chunk, of its beginning if the file ends in it."""
+    def _chunk(
+        self, at: int, opcode: int, end: int, chunk: ChunkHead | None
+    ) -> Iterator[tuple[int, Item]]:
+        """A chunk, also with a wrong length or kind."""
+        is_right = chunk is not None and chunk.end == end
+        ends = [end] if chunk is None else [one for one in (chunk.end, end) if one >= chunk.start]
+        right = end if is_right else next((one for one in ends if self._goes_on(one)), None)
+        if right is None:
+            yield self._lost(at, f"a chunk record claims {end - at - HEAD} bytes")
+            return
         self._chunked = True
+        if chunk is None:
+            self._at = right
+            yield _damage(at, right - at, "the fields of a chunk are damaged")
+            return
+        if not (is_right and opcode == Opcode.CHUNK):
+            yield _damage(at, HEAD, "the head of a chunk is damaged; it is read all the same", 0)
+        yield from self._content(at, chunk._replace(end=right))
+
+    def _content(self, at: int, chunk: ChunkHead) -> Iterator[tuple[int, Item]]:
+        """The messages of a chunk, of its beginning if the file ends in it."""
         self._needs_crc |= not chunk.crc
-        end = min(chunk.end, self._bytes.size)
-        self._at = self._behind = end
-        self._is_torn = end < chunk.end
+        self._at = end = min(chunk.end, self._bytes.size)
         found = 0
-        reason = "the file ends in the middle of a chunk" if self._is_torn else ""
+        reason = "the file ends in the middle of a chunk" if end < chunk.end else ""
+        self._is_closed |= end < chunk.end
         try:
             for content in self._contents(chunk, end):
                 found += len(content.batch)
                 yield from self._given(at, content)
         except SegmentError as error:
             reason = reason or f"a chunk is damaged: {error}"
-        if reason:
+        if reason or not self._goes_on(end):
             another = self._chunk_before(end, chunk.start)
             if another is not None:
-                self._at = self._behind = end = another
-                reason, self._is_torn = "bytes of a chunk are missing", False
+                self._at = end = another
+                reason, self._is_closed = "bytes of a chunk are missing", False
+        if reason:
             before = f"; {found} messages of its beginning were read" if found else ""
             yield _damage(at, end - at, reason + before)
 
     def _chunk_before(self, end: int, start: int) -> int | None:
-        """The next chunk, if it begins before the end that the last record claims.
+        """The next chunk, if it begins before the end that a record claims, which lacks bytes then.
 
-        That record lacks bytes then. Only a chunk of the summary counts: one in the payload of a
-        message is none of this file.
+        Only a chunk of the summary counts: one in the payload of a message is none of this file.
         """
         return self._bytes.search(start, end + HEAD - 1, {Opcode.CHUNK}, self._is_listed)
 
@@ -274,22 +282,6 @@ class Scan:
             yield _damage(at, 0, reason, lost)
         yield at, content
 
-    def _damaged_chunk(
-        self, at: int, end: int, chunk: ChunkHead | None
-    ) -> Iterator[tuple[int, Item]]:
-        """A chunk whose lengths contradict each other."""
-        ends = [end] if chunk is None else [one for one in (chunk.end, end) if one >= chunk.start]
-        right = next((one for one in ends if self._goes_on(one)), None)
-        if right is None:
-            yield self._lost(at, f"a chunk record claims {end - at - HEAD} bytes")
-        elif chunk is None:
-            self._chunked = True
-            self._at = self._behind = right
-            yield _damage(at, right - at, "the fields of a chunk are damaged")
-        else:
-            yield _damage(at, HEAD, "a length of a chunk record is wrong", 0)
-            yield from self._chunk(at, chunk._replace(end=right))
-
     # Other records
 
     def _loose(self, at: int, end: int) -> Iterator[tuple[int, Item]]:
@@ -298,62 +290,66 @@ class Scan:
         if not _MESSAGE_SIZE <= size <= MAX_PAYLOAD:
             yield self._lost(at, f"a message record claims {size} bytes")
             return
-        record = self._bytes.at(at, end - at, move=True)
-        if self._chunked and _is_other_record(record[HEAD:]):
-            self._at = self._behind = end
+        self._bytes.at(at, size + HEAD, move=True)
+        if self._chunked and self._is_other_record(at, end):
+            self._at = end
             yield _damage(at, end - at, "a record is marked as a message but is none", 0)
             return
         self._needs_crc = True
         run = self._bytes.rest(at)[: self._end_of_data - at]
         found = parse_content(run, loose=True)
-        self._at = self._behind = at + found.end
+        self._at = at + found.end
         yield from self._given(at, found)
 
-    def _plain(self, at: int, opcode: int, end: int) -> Iterator[tuple[int, Item]]:
+    def _is_other_record(self, at: int, end: int) -> bool:
+        """True if the content of a message record is exactly that of another kind.
+
+        In files with chunks, messages outside of them are rare. But one wrong byte can turn
+        any record between two chunks into a message, and no checksum covers those.
+        """
+        for opcode in (Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT, Opcode.METADATA):
+            with suppress(SegmentError):
+                if self._parsed(at, opcode, end)[1] == end:
+                    return True
+        return False
+
+    def _parsed(self, at: int, opcode: int, end: int) -> tuple[Item | None, int]:
+        """A record that is neither chunk nor message, and where its known fields end."""
         start, size = at + HEAD, end - at - HEAD
         if opcode > LAST_KNOWN:
-            return
-        if opcode == Opcode.DATA_END:
-            yield from self._data_end(at, end)
-        elif opcode == Opcode.MESSAGE_INDEX:
+            return None, start
+        if opcode == Opcode.MESSAGE_INDEX:
             entries = int.from_bytes(self._bytes.at(start + 2, min(size, 4)), "little")
-            if start + 6 + entries == end:
-                self._behind = end
-        elif size > _MAX_PLAIN and opcode != Opcode.ATTACHMENT:
-            reason = f"a record of {size} bytes is above the limit of {_MAX_PLAIN}"
-            yield _damage(at, end - at, reason, 0)
-        else:
-            try:
-                head = self._bytes.at(
-                    start, min(size, MAX_HEAD if opcode == Opcode.ATTACHMENT else size)
-                )
-                found: tuple[Item | None, int] = (
-                    parse_attachment(head, FilePart(self._read, start, size))
-                    if opcode == Opcode.ATTACHMENT
-                    else read_record(opcode, head)
-                )
-            except SegmentError as error:
-                is_placed = self._goes_on(end)
-                yield (
-                    _damage(at, end - at, str(error), 0)
-                    if is_placed
-                    else self._lost(at, str(error))
-                )
-                return
-            self._behind = start + found[1]
-            if found[0] is not None:
-                yield at, found[0]
+            return None, start + 6 + entries
+        if opcode == Opcode.ATTACHMENT:
+            head = self._bytes.at(start, min(size, MAX_HEAD))
+            item, used = parse_attachment(head, FilePart(self._read, start, size))
+            return item, start + used
+        if size > _MAX_PLAIN:
+            raise SegmentError(f"a record of {size} bytes is above the limit of {_MAX_PLAIN}")
+        record, used = read_record(opcode, self._bytes.at(start, size))
+        return record, start + used
+
+    def _plain(self, at: int, opcode: int, end: int) -> Iterator[tuple[int, Item]]:
+        """A record that is neither chunk nor message."""
+        is_placed = self._goes_on(end)
+        try:
+            item, fields_end = self._parsed(at, opcode, end)
+        except SegmentError as error:
+            reason = str(error)
+            yield _damage(at, end - at, reason, 0) if is_placed else self._lost(at, reason)
+            return
+        if not is_placed:
+            self._at = self._chunk_before(end, at + 1) or min(fields_end, end)
+        if self._at != end:
+            yield _damage(at, HEAD, "the length of a record is wrong", 0)
+        if item is not None:
+            yield at, item
 
     # The end of the data
 
-    @property
-    def _end_of_data(self) -> int:
-        """End of the data by the summary, or of the file."""
-        return self._bytes.size if self._stop is None else self._stop
-
     def _data_end(self, at: int, end: int) -> Iterator[tuple[int, Item]]:
-        self._has_ended = end == self._stop if self._stop is not None else self._ends_data(end)
-        if not self._has_ended:
+        if not (end == self._stop if self._stop is not None else self._ends_data(end)):
             yield _damage(at, end - at, "an end of data stands in the middle of the data")
             return
         crc = int.from_bytes(self._bytes.at(at + HEAD, 4), "little")
@@ -365,6 +361,7 @@ class Scan:
             if found != crc:
                 why = "the checksum of all data differs: some bytes before this one have changed"
                 yield _damage(0, at, why)
+        yield from self._end()
 
     def _ends_data(self, end: int) -> bool:
         """True if the summary, or the end of the file, follows."""
@@ -380,37 +377,29 @@ class Scan:
         at, size = self._at, self._bytes.size
         rest = self._bytes.at(at, TAIL + 1)
         is_footer = len(rest) == TAIL and footer_of(rest) is not None
-        self._is_closed = self.summary is not None or is_footer
         found: int | None = None
-        if not self._is_closed and at < size:
+        if self.summary is None and not is_footer and at < size:
             found = self._bytes.search(at, size, {Opcode.CHUNK}, self._is_start)
             why = "the summary is damaged, or bytes follow it"
             why = why if found is None else "bytes follow the end of the log"
             yield _damage(at, (found or size) - at, why, 0)
-            self._is_closed = True  # the damage tells it
-        self._at = self._behind = found or size
-        self._has_ended, self._stop = found is None, None
+        self._is_closed |= self.summary is not None or is_footer or at < size
+        self._at, self._stop = found or size, None
 
     # Behind damage
 
     def _torn(self, at: int, reason: str) -> tuple[int, Item]:
-        self._at, self._is_torn = self._bytes.size, True
+        self._at, self._is_closed = self._bytes.size, True
         return _damage(at, self._bytes.size - at, reason)
 
     def _lost(self, at: int, reason: str) -> tuple[int, Item]:
         """Skip to the next records that are whole."""
-        start = self._behind if self._behind < at else at + 1
         kinds = _BETWEEN_CHUNKS if self._chunked else _IN_DATA
-        found = (
-            self._chunk_before(at, self._last + 1)
-            or self._bytes.search(start, self._end_of_data, kinds, self._is_start)
-            or self._stop
-        )
+        found = self._bytes.search(at + 1, self._end_of_data, kinds, self._is_start) or self._stop
         if found is None:
             return self._torn(at, f"the file ends in the middle of a record: {reason}")
-        where = min(at, self._behind, found)
-        self._at = self._behind = found
-        return _damage(where, found - where, f"{reason}; reading goes on at byte {found}")
+        self._at = found
+        return _damage(at, found - at, f"{reason}; reading goes on at byte {found}")
 
     def _is_start(self, at: int) -> bool:
         """True for a record that nothing else looks like, or for three in a row."""
@@ -434,7 +423,7 @@ class Scan:
         if opcode == Opcode.CHUNK:  # it alone may run over the end: nothing else looks like it
             chunk = self._chunk_head(at)
             return None if chunk is None or chunk.end > end else end
-        if end > self._bytes.size or not (opcode in _IN_DATA or opcode >= _FIRST_PRIVATE):
+        if end > self._bytes.size or not (opcode in _IN_DATA or opcode > LAST_KNOWN):
             return None
         if opcode == Opcode.MESSAGE_INDEX:
             entries = int.from_bytes(raw[HEAD + 2 :], "little")
@@ -448,24 +437,3 @@ class Scan:
 
 def _damage(at: int, length: int, reason: str, messages: int | None = None) -> tuple[int, Item]:
     return at, Damage(at, length, reason, messages)
-
-
-def _is_other_record(content: memoryview) -> bool:
-    """True if the content of a message record is exactly that of another kind.
-
-    In files with chunks, messages outside of them are rare. But one wrong byte can turn
-    any record between two chunks into a message, and no checksum covers those.
-    """
-    size = int.from_bytes(content[2:6], "little")
-    first = int.from_bytes(content[14:22], "little")  # of a message, the publish time
-    if len(content) == 6 + size and size % 16 == 0 and first < MAX_UNCOMPRESSED:
-        return True  # a message index
-    part = FilePart(lambda at, size: content[at : at + size], 0, len(content))
-    for parse in (
-        lambda: parse_attachment(content, part),
-        lambda: read_record(Opcode.METADATA, content),
-    ):
-        with suppress(SegmentError):
-            if parse()[1] == len(content):
-                return True
-    return False

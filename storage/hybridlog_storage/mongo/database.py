@@ -69,7 +69,6 @@ _WRONG_QUESTION = frozenset(
 _UNNAMED_CODE = "Location"
 """Prefix of the server's unnamed error codes: thousands of checks on the arguments of
 operators and expressions. Failures of the server itself have names."""
-_WRITES = frozenset({"insert", "remove", "update"})
 _UNAUTHORIZED = 13
 _LOGIN_FAILED = 18
 _RESERVED_NAMES = frozenset({"admin", "local", "config"})
@@ -178,24 +177,22 @@ class Database:
 
     def may_write(self) -> bool:
         """False if the user of this connection may not change the database."""
+        from pymongo import WriteConcern
         from pymongo.errors import OperationFailure
 
-        def ask() -> Document:
-            try:
-                return self._client.admin.command("connectionStatus", showPrivileges=True)
-            except OperationFailure:  # not MongoDB's own server
-                return {}
+        # Without a majority of a replica set, there is nothing to wait for.
+        of = self._database["hybridlog.store"].with_options(write_concern=WriteConcern(1))
 
-        user = self._again(ask).get("authInfo", {})
-        if not user.get("authenticatedUsers"):
+        def is_allowed() -> bool:
+            try:
+                of.delete_one({"_id": ""})  # which is never there
+            except OperationFailure as error:
+                if error.code != _UNAUTHORIZED:
+                    raise
+                return False
             return True
-        allowed: set[str] = set()
-        for privilege in user.get("authenticatedUserPrivileges", ()):
-            resource = privilege["resource"]
-            names = resource.get("db"), resource.get("collection")
-            if resource.get("anyResource") or names in {("", ""), (self.name, "")}:
-                allowed.update(privilege["actions"])
-        return allowed >= _WRITES
+
+        return self._again(is_allowed)
 
     def ensure_collection(self, name: str) -> None:
         """Create a clustered collection (`_id` is its only key) unless it exists."""

@@ -14,7 +14,7 @@ import numpy as np
 
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.lazy import RowType
-from hybridlog_storage.messages import EXPIRED_IDS
+from hybridlog_storage.messages import EXPIRED_IDS, MARKS_CHANNEL
 from hybridlog_storage.ordering import run_starts
 from hybridlog_storage.segments.compression import checked_frame, decompress
 
@@ -59,12 +59,10 @@ class ChunkTable:
     Attributes:
         chunks: `CHUNK`[n], in file order; the row is the chunk's number.
         parts: `PART`[m], chunk by chunk, by channel id within one.
-        is_flushed: The segment is not sealed yet: publish times are unknown.
     """
 
     chunks: NDArray[np.void]
     parts: NDArray[np.void]
-    is_flushed: bool = False
 
     @property
     def end(self) -> int:
@@ -148,6 +146,60 @@ class ChunkTable:
         return table
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChunkPlace:
+    """Position of a chunk in its segment.
+
+    Attributes:
+        number: Number of the chunk in its segment, from 0, in file order.
+        offset: Byte of the chunk record.
+        length: Bytes of the chunk record.
+        trailer: Bytes of message indexes and arrival numbers behind it.
+        first: Smallest log time in it, ns.
+        last: Largest log time in it, ns.
+        channels: Ids of the channels in it.
+    """
+
+    number: int
+    offset: int
+    length: int
+    trailer: int
+    first: int
+    last: int
+    channels: tuple[int, ...]
+
+    @property
+    def end(self) -> int:
+        """Byte behind what belongs to it."""
+        return self.offset + self.length + self.trailer
+
+    @property
+    def is_expired(self) -> bool:
+        """True if its payloads were deleted, or are to be copied later."""
+        return EXPIRED_IDS <= self.channels[0] < MARKS_CHANNEL
+
+
+def places_of(table: ChunkTable) -> list[ChunkPlace]:
+    """Position of each chunk of a table, in file order."""
+    bounds = table.part_bounds()
+    return [place_of(table, number, bounds) for number in range(len(table.chunks))]
+
+
+def place_of(table: ChunkTable, number: int, bounds: NDArray[np.int64] | None = None) -> ChunkPlace:
+    """Position of a chunk of a table; `bounds` are its `part_bounds`, if they are at hand."""
+    bounds = table.part_bounds() if bounds is None else bounds
+    offset, length, trailer, first, last, _ = table.chunks[number].item()
+    return ChunkPlace(
+        number=number,
+        offset=offset,
+        length=length,
+        trailer=trailer,
+        first=first,
+        last=last,
+        channels=tuple(table.parts["channel"][bounds[number] : bounds[number + 1]].tolist()),
+    )
+
+
 def _problem(table: ChunkTable) -> str | None:
     """The contradiction in a table, None if it is consistent."""
     chunks = table.chunks
@@ -179,6 +231,15 @@ def _part_problem(table: ChunkTable, parts: NDArray[np.void]) -> str | None:
     if not same or not parts["messages"].all() or (parts["first"] > parts["last"]).any():
         return "the times of its chunks and its parts differ"
     return None
+
+
+def check_parts(
+    place: tuple[int, int, int], span: tuple[int, int], parts: NDArray[np.void], messages: int
+) -> None:
+    """Raise `SegmentError` unless parts fit their chunk; place and span as for `TableBuilder`."""
+    table = ChunkTable(np.array([(*place, *span, len(parts))], CHUNK), parts)
+    if _problem(table) or int(parts["messages"].sum()) != messages:
+        raise SegmentError("what is said of its messages does not fit it")
 
 
 def parts_of(batch: Batch, order: NDArray[np.intp]) -> tuple[NDArray[np.void], int, int]:
@@ -226,7 +287,7 @@ class TableBuilder:
         self.chunks += 1
         self.parts += len(parts)
 
-    def build(self, *, is_flushed: bool = False) -> ChunkTable:
+    def build(self) -> ChunkTable:
         """The table of all added chunks; see `ChunkTable`."""
         chunks, parts = bytes(self._chunks), bytes(self._parts)
-        return ChunkTable(np.frombuffer(chunks, CHUNK), np.frombuffer(parts, PART), is_flushed)
+        return ChunkTable(np.frombuffer(chunks, CHUNK), np.frombuffer(parts, PART))

@@ -16,6 +16,7 @@ from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.manifest import decode_file, encode_file
 from hybridlog_storage.messages import EXPIRED_IDS
 from hybridlog_storage.ordering import distinct
+from hybridlog_storage.segments.chunk import StoredChunk
 from hybridlog_storage.segments.segment_reader import SegmentReader
 from hybridlog_storage.stopping import check_wanted
 
@@ -27,8 +28,8 @@ if TYPE_CHECKING:
 
     from hybridlog_storage.manifest import File
     from hybridlog_storage.messages import Batch, Buffer
-    from hybridlog_storage.segments.chunk import StoredChunk
-    from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentSummary
+    from hybridlog_storage.segments.chunk_table import ChunkPlace
+    from hybridlog_storage.segments.segment_reader import SegmentSummary
 
 _HEAD = struct.Struct("<4s8sIIQ")  # magics, bytes of the line, CRC-32 and bytes of all behind
 _MAGIC = b"PAR1", b"hbl-rows"
@@ -140,7 +141,7 @@ class GoneLog(SegmentReader):
                 f"Chunk {place.number} of log {self.number}, which is gone, is damaged: {error}"
             ) from error
         batch.channel = batch.channel + np.int32(self._added)
-        return place.stored(self.number, batch, seq)
+        return StoredChunk(self.number, place, batch, seq)
 
 
 def open_log(path: Path, number: int, rows: Rows | None = None) -> SegmentReader:

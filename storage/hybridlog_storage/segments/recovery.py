@@ -110,11 +110,12 @@ class _Rest:
         self._damage = walk.damaged
         for number, one in walk.schemas.items():
             segment.schemas[number] = Schema(one.name, one.encoding, bytes(one.data))
-        segment.channels |= walk.channels
+        segment.channels |= {n: (walk.schema_ids[n], one) for n, one in walk.channels.items()}
         segment.note_extras(walk.metadata, walk.attachments)
+        segment.table = walk.table
         for chunk in walk.chunks:
-            segment.note_chunk(chunk.offset, chunk.trailer, chunk.head, chunk.indexes, chunk.parts)
-        self.messages = sum(int(chunk.parts["messages"].sum()) for chunk in walk.chunks)
+            segment.note_index(chunk.offset, chunk.head, chunk.indexes)
+        self.messages = sum(walk.table.build().counts().values())
         self.cut_bytes = self._torn()
 
     @classmethod

@@ -50,9 +50,6 @@ from hybridlog_storage.segments.segment_format import (
 )
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from hybridlog_storage.messages import Buffer, Channel, Schema
 
 OPEN_SUFFIX = ".mcap.open"
@@ -264,23 +261,15 @@ class SegmentFile:
         self._append([chunk.head, chunk.data, indexes, arrivals])
         head = chunk_head_of(chunk.head)
         assert head is not None
-        sizes = {channel: len(data) for channel, data in chunk.indexes.items()}
-        self.note_chunk(offset, len(indexes) + len(arrivals), head, sizes, chunk.parts)
+        place = offset, head.length, len(indexes) + len(arrivals)
+        self.table.chunk(place, (head.first, head.last), chunk.parts)
+        self.note_index(offset, head, {number: len(data) for number, data in chunk.indexes.items()})
 
-    def note_chunk(
-        self,
-        offset: int,
-        trailer: int,
-        head: ChunkHead,
-        indexes: Mapping[int, int],
-        parts: NDArray[np.void],
-    ) -> None:
-        """Note a chunk that is in the file already, with its `PART`[c].
+    def note_index(self, offset: int, head: ChunkHead, indexes: Mapping[int, int]) -> None:
+        """Note the chunk index of a chunk that is in the file and the table already.
 
-        `trailer` is the bytes of message indexes and arrival record behind it, `indexes` those of
-        the message index of each channel, by channel id.
+        `indexes` is the bytes of the message index of each channel, by channel id.
         """
-        self.table.chunk((offset, head.length, trailer), (head.first, head.last), parts)
         self._chunk_indexes += record_bytes(
             ChunkIndex(
                 message_start_time=head.first,

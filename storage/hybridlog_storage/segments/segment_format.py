@@ -36,6 +36,7 @@ from hybridlog_storage.mcap.mcap_content import (
 )
 from hybridlog_storage.messages import Batch, Buffer, Channel, Schema
 from hybridlog_storage.ordering import run_starts
+from hybridlog_storage.segments.chunk_table import PART
 from hybridlog_storage.segments.compression import checked_frame, decompress
 
 if TYPE_CHECKING:
@@ -53,7 +54,8 @@ NO_PUBLISH_TIME: Final = "hybridlog.no_publish_time"
 NO_INDEX: Final = "hybridlog.no_index"
 
 ARRIVAL_OPCODE: Final = 0x90
-"""Record of the application range of opcodes: the arrival numbers of the chunk before it."""
+"""Record of the application range of opcodes: the arrival numbers of the chunk before it, and
+the rows that the chunk table will have of it."""
 CHUNK_TABLE_OPCODE: Final = 0x92
 """Record of the summary: the chunk table, see `chunk_table`."""
 DAMAGED_OPCODE: Final = 0x93
@@ -68,7 +70,7 @@ ARRIVAL_HEAD: Final = RECORD_HEAD.size + ARRIVALS.size
 """Bytes of an arrival record without its numbers."""
 
 _INDEX_ENTRY = RowType(("log_time", "<u8"), ("offset", "<u8"))
-_MAX_ARRIVALS = 1 << 27
+_COUNTS = struct.Struct("<II")  # parts and messages of a chunk
 
 
 def record_bytes(record: McapRecord) -> bytes:
@@ -242,19 +244,20 @@ def definitions_chunk(content: bytes, offset: int) -> bytes:
         compression="zstd",
         compressed_size=len(packed),
     )
-    arrivals = arrival_record(offset, crc32(head), 0, pack_arrivals(np.empty(0, np.int64)))
+    nothing = pack_arrivals(np.empty(0, PART), np.empty(0, np.int64))
+    arrivals = arrival_record(offset, crc32(head), 0, nothing)
     return b"".join((head, packed, arrivals))
 
 
-def pack_arrivals(seq: NDArray[np.int64]) -> bytes:
-    """Pack the arrival numbers of a chunk's messages, in chunk order, with a checksum."""
+def pack_arrivals(parts: NDArray[np.void], seq: NDArray[np.int64]) -> bytes:
+    """Pack `PART`[c] of a chunk, and its arrival numbers in chunk order, with a checksum."""
     steps = seq.astype("<i8")
     steps[1:] -= seq[:-1]
-    return checked_frame(steps.tobytes())
+    return _COUNTS.pack(len(parts), len(steps)) + checked_frame(parts.tobytes() + steps.tobytes())
 
 
 def arrival_record(chunk: int, head_crc: int, indexes_crc: int, packed: Buffer) -> bytes:
-    """The record with the packed arrival numbers of the chunk that starts at a byte of the file.
+    """The record behind a chunk that starts at a byte of the file, from `pack_arrivals`.
 
     Checksums are CRC-32: of the chunk record before its content, and of its message indexes.
     """
@@ -272,7 +275,8 @@ class Trailer(NamedTuple):
     """The records behind a chunk, `length` bytes.
 
     `head_crc` is the CRC-32 of the chunk record before its content. `indexes` are channel id and
-    entries (`log_time`, `offset`) of each message index; None if they have changed.
+    entries (`log_time`, `offset`) of each message index; None if they have changed. `packed` is
+    from `pack_arrivals`.
     """
 
     length: int
@@ -280,15 +284,18 @@ class Trailer(NamedTuple):
     indexes: list[tuple[int, NDArray[np.void]]] | None
     packed: memoryview
 
-    def arrivals(self, count: int) -> NDArray[np.int64]:
-        """The arrival numbers of messages in chunk order; `SegmentError` if not `count` of them."""
+    def arrivals(self) -> tuple[NDArray[np.void], NDArray[np.int64]]:
+        """`PART`[c] of the chunk, and its arrival numbers in chunk order."""
         try:
-            if count > _MAX_ARRIVALS:
-                raise SegmentError("there are too many")
-            raw = decompress("zstd", self.packed, count * 8)
+            if len(self.packed) < _COUNTS.size:
+                raise SegmentError("they are too short")
+            parts, messages = _COUNTS.unpack_from(self.packed)
+            size = parts * PART.itemsize
+            raw = decompress("zstd", self.packed[_COUNTS.size :], size + messages * 8)
         except SegmentError as error:
             raise SegmentError(f"its arrival numbers are damaged: {error}") from error
-        return np.cumsum(np.frombuffer(raw, "<i8"), dtype=np.int64)
+        steps = np.frombuffer(raw, "<i8", messages, size)
+        return np.frombuffer(raw, PART, parts), np.cumsum(steps, dtype=np.int64)
 
     def starts(self) -> NDArray[np.int64] | None:
         """Start of each message record in the chunk, ascending; None if the indexes changed."""

@@ -6,22 +6,24 @@ share a reader.
 
 from __future__ import annotations
 
+import json
 import os
 import stat
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, TypedDict, cast
 
 import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, Metadata, MetadataIndex
+from msgspec import convert
 
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import SegmentError, exhausted
-from hybridlog_storage.manifest import hasher
+from hybridlog_storage.manifest import Count, Nanoseconds, Text, Topic, hasher
 from hybridlog_storage.mcap.mcap_content import (
     MAGIC,
     MAX_CHUNK_HEAD,
@@ -33,7 +35,7 @@ from hybridlog_storage.mcap.mcap_content import (
     parse_content,
     parse_summary,
 )
-from hybridlog_storage.messages import EXPIRED_IDS, MARKS_CHANNEL, Buffer, Channel, with_expired
+from hybridlog_storage.messages import Buffer, Channel, with_expired
 from hybridlog_storage.ordering import distinct
 from hybridlog_storage.segments.attachments import (
     MAX_HEAD,
@@ -42,7 +44,7 @@ from hybridlog_storage.segments.attachments import (
     reader_of,
 )
 from hybridlog_storage.segments.chunk import StoredChunk
-from hybridlog_storage.segments.chunk_table import ChunkTable
+from hybridlog_storage.segments.chunk_table import ChunkPlace, ChunkTable, places_of
 from hybridlog_storage.segments.compression import FilePart, decompress
 from hybridlog_storage.segments.segment_format import (
     CHUNK_TABLE_OPCODE,
@@ -56,58 +58,15 @@ from hybridlog_storage.segments.segment_format import (
     metadata_of,
     trailer_of,
 )
-from hybridlog_storage.segments.statements import loss_rows
 from hybridlog_storage.stopping import check_wanted
 
 if TYPE_CHECKING:
     from mcap.summary import Summary
     from numpy.typing import NDArray
 
-    from hybridlog_storage.messages import Batch
-
 _MAX_SUMMARY = 1 << 30
 _PIECE = 4 << 20  # bytes read at once for a checksum
 _AHEAD = 64 << 20  # bytes that are announced at once; a multiple of the former
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ChunkPlace:
-    """Position of a chunk in its segment.
-
-    Attributes:
-        number: Number of the chunk in its segment, from 0, in file order.
-        offset: Byte of the chunk record.
-        length: Bytes of the chunk record.
-        trailer: Bytes of message indexes and arrival numbers behind it.
-        first: Smallest log time in it, ns.
-        last: Largest log time in it, ns.
-        channels: Ids of the channels in it.
-    """
-
-    number: int
-    offset: int
-    length: int
-    trailer: int
-    first: int
-    last: int
-    channels: tuple[int, ...]
-
-    @property
-    def is_expired(self) -> bool:
-        """True if its payloads were deleted, or are to be copied later."""
-        return EXPIRED_IDS <= self.channels[0] < MARKS_CHANNEL
-
-    def stored(self, segment: int, batch: Batch, seq: NDArray[np.int64]) -> StoredChunk:
-        """The chunk of a segment with its content; see `StoredChunk`."""
-        return StoredChunk(
-            segment=segment,
-            number=self.number,
-            offset=self.offset,
-            length=self.length,
-            trailer=self.trailer,
-            batch=batch,
-            seq=seq,
-        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -311,10 +270,12 @@ class SegmentReader:
             starts = trailer.starts()
             batch = None if starts is None else messages_at(content, starts)
             batch = parse_content(content).batch if batch is None else batch
-            seq = trailer.arrivals(len(batch))
+            seq = trailer.arrivals()[1]
+            if len(seq) != len(batch):
+                raise SegmentError(f"it has {len(seq)} arrival numbers for {len(batch)} messages")
         except SegmentError as error:
             raise self._damaged(place, error) from error
-        return place.stored(self.number, batch, seq)
+        return StoredChunk(self.number, place, batch, seq)
 
     def _damaged(self, place: ChunkPlace, error: SegmentError) -> SegmentError:
         return SegmentError(f"Chunk at byte {place.offset} of {self.path} is damaged: {error}")
@@ -349,9 +310,7 @@ class SegmentReader:
     def fetch(self, places: Iterable[ChunkPlace]) -> None:
         """Announce chunks that will be read, so that a bucket is asked once for all of them."""
         with suppress(OSError):  # what is missing is told when it is read
-            files.fetch(
-                self._fd, ((at.offset, at.offset + at.length + at.trailer) for at in places)
-            )
+            files.fetch(self._fd, ((at.offset, at.end) for at in places))
 
     def read(self, offset: int, length: int) -> memoryview:
         """Unchecked bytes of the file; `SegmentError` if it is too short."""
@@ -371,27 +330,6 @@ class SegmentReader:
         return buffer
 
 
-def places_of(table: ChunkTable) -> list[ChunkPlace]:
-    """Position of each chunk of a table, in file order."""
-    bounds = table.part_bounds()
-    return [place_of(table, number, bounds) for number in range(len(table.chunks))]
-
-
-def place_of(table: ChunkTable, number: int, bounds: NDArray[np.int64] | None = None) -> ChunkPlace:
-    """Position of a chunk of a table; `bounds` are its `part_bounds`, if they are at hand."""
-    bounds = table.part_bounds() if bounds is None else bounds
-    offset, length, trailer, first, last, _ = table.chunks[number].item()
-    return ChunkPlace(
-        number=number,
-        offset=offset,
-        length=length,
-        trailer=trailer,
-        first=first,
-        last=last,
-        channels=tuple(table.parts["channel"][bounds[number] : bounds[number + 1]].tolist()),
-    )
-
-
 def check_format(recording: Mapping[str, object], path: Path) -> None:
     """Raise `SegmentError` if a segment has another format."""
     version = recording.get("format")
@@ -400,6 +338,38 @@ def check_format(recording: Mapping[str, object], path: Path) -> None:
             f"{path} is of format {version}, and this hybridlog knows format {FORMAT_VERSION}. "
             "Use the hybridlog that wrote it."
         )
+
+
+LossRow = TypedDict(
+    "LossRow",
+    {
+        "cause": Text,
+        "reason": Text,
+        "file": Text | None,
+        "topic": Topic | None,
+        "count": Count | None,
+        "offset": Count | None,
+        "length": Count | None,
+        "from": Nanoseconds | None,
+        "to": Nanoseconds | None,
+    },
+)
+"""A row of the loss ledger: `from` and `to` are log times, ns; None for what is unknown."""
+
+
+def loss_rows(value: Mapping[str, object]) -> list[dict[str, Any]]:
+    """Rows of the loss ledger, from the value of its metadata record, see `LossRow`."""
+    found = value.get("rows")
+    try:
+        json.dumps(found, ensure_ascii=False).encode()  # fails for halves of surrogate pairs
+        rows = cast("list[dict[str, Any]]", convert(found, list[LossRow]))
+    except (ValueError, RecursionError) as error:
+        raise SegmentError(f"a metadata record is damaged: {error!r}") from error
+    for row in rows:
+        begin, end = row["from"], row["to"]
+        if (begin is None) != (end is None) or (begin is not None and begin > end):
+            raise SegmentError("a metadata record is damaged: a loss ends before it begins")
+    return rows
 
 
 def open_chunk(record: memoryview) -> tuple[Buffer, ChunkHead]:

@@ -25,9 +25,8 @@ from hybridlog_storage.errors import DiskFullError, StoreError, UsageError
 from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD
 from hybridlog_storage.messages import MAX_CHANNELS, Batch, Channel, LooseBatch, Schema
 from hybridlog_storage.segments.attachments import Attachment
-from hybridlog_storage.segments.chunk import PackedChunk, pack
+from hybridlog_storage.segments.chunk import OpenChunk, PackedChunk, pack
 from hybridlog_storage.segments.compression import Compressor
-from hybridlog_storage.segments.open_chunk import OpenChunk
 from hybridlog_storage.segments.segment_file import Sealed, SegmentFile
 from hybridlog_storage.segments.segment_group import FIRST, LATCHED, Division, Key, SegmentGroup
 from hybridlog_storage.stopping import safe_point

@@ -1,11 +1,15 @@
 """Walks over the records of a segment without a summary: one being written, or left by a crash.
 
 Each record has a checksum of its own, so what is whole is known at once. Behind damage the walk
-goes on at the next record that proves itself.
+goes on at the next record that proves itself. Of a segment that is being written, what the writer
+has not finished yet is left out.
 """
 
 from __future__ import annotations
 
+import time
+from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
@@ -16,44 +20,41 @@ from mcap.records import Schema as SchemaRecord
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.mcap.mcap_content import (
+    CHUNK_HEAD,
+    HEAD,
     MAX_CHUNK_HEAD,
-    MESSAGE_HEAD,
     RECORD_HEAD,
     ChunkHead,
     Damage,
+    RecordFile,
     chunk_head_of,
     parse_content,
 )
-from hybridlog_storage.mcap.record_file import HEAD, RecordFile
-from hybridlog_storage.segments.chunk_table import PART, parts_of
+from hybridlog_storage.segments.chunk_table import ChunkTable, TableBuilder, check_parts
+from hybridlog_storage.segments.segment_file import OPEN_SUFFIX, sealed_name
 from hybridlog_storage.segments.segment_format import (
     ARRIVAL_HEAD,
     ARRIVAL_OPCODE,
     DAMAGED_OPCODE,
     INDEX_HEAD,
     LOSSES_METADATA,
+    OUR_NAMES,
     RECORDING_METADATA,
     START,
     Trailer,
     channel_of,
-    index_order,
     json_of,
     metadata_of,
     trailer_of,
 )
-from hybridlog_storage.segments.segment_reader import open_chunk
-from hybridlog_storage.segments.statements import loss_rows
+from hybridlog_storage.segments.segment_reader import SegmentReader, loss_rows, open_chunk
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from hybridlog_storage.messages import Buffer, Channel
-    from hybridlog_storage.segments.segment_reader import SegmentReader
 
 _WINDOW: Final = 4096  # bytes read at once around the heads of records
 _SEARCHED: Final = 1 << 20  # bytes searched at once for the next record
 _MAX_RECORD: Final = 1 << 28  # bytes of what is read into memory as a whole
-_UNKNOWN: Final = np.iinfo(np.int64)  # publish times stand in the messages only
 
 
 class WalkedChunk(NamedTuple):
@@ -61,14 +62,12 @@ class WalkedChunk(NamedTuple):
 
     `offset` is of the chunk record; `trailer` is the bytes of message indexes and arrival numbers
     behind it; `indexes` is the bytes of each message index by channel id, none if they are damaged.
-    `parts` is `PART`[c]; publish times are unknown if its content was not read.
     """
 
     offset: int
     head: ChunkHead
     trailer: int
     indexes: dict[int, int]
-    parts: NDArray[np.void]
 
 
 class _TornError(SegmentError):
@@ -83,21 +82,29 @@ class Walk:
         reads: Whether the content of all chunks is read, too.
 
     Attributes:
+        reader: As above.
         recording: What it says of its recording; None without.
-        channels: Id of the schema, and channel, by id of the channel.
+        channels: Channels by id, as far as they are defined.
+        schema_ids: Id of the schema of each, by id of the channel.
         schemas: Schemas by id, also of channels that are not defined.
+        table: The chunk table so far.
         is_complete: Whether the end of the data was reached: the writer had begun the summary.
         end: Where the last whole record ends, or damage before a later one.
     """
 
     def __init__(self, reader: SegmentReader, *, reads: bool = False) -> None:
-        self._reader = reader
+        self.reader = reader
         self._reads = reads
         self._bytes = RecordFile(reader.read, reader.size, _WINDOW)
+        self._begin()
+
+    def _begin(self) -> None:
         self.recording: dict[str, Any] | None = None
-        self.channels: dict[int, tuple[int, Channel]] = {}
+        self.channels: dict[int, Channel] = {}
+        self.schema_ids: dict[int, int] = {}
         self.schemas: dict[int, SchemaRecord] = {}
         self.chunks: list[WalkedChunk] = []
+        self.table = TableBuilder()
         self.losses: list[dict[str, Any]] = []
         self.attachments: list[AttachmentIndex] = []
         self.metadata: list[MetadataIndex] = []
@@ -114,14 +121,14 @@ class Walk:
     def go_on(self) -> None:
         """Read what follows the last whole record."""
         self._stopped, self.is_complete = None, False
-        self._bytes.size = self._reader.size
+        self._bytes.size = self.reader.size
         self._bytes.forget()
-        while not self.is_complete and self.end < self._reader.size:
+        while not self.is_complete and self.end < self.reader.size:
             at = self.end
             try:
                 self.end = self._record(at)
             except SegmentError as error:
-                size = self._reader.size
+                size = self.reader.size
                 behind = self._bytes.search(at + 1, size, _PROVABLE, self._proves_itself)
                 if behind is None:
                     if not isinstance(error, _TornError):
@@ -149,12 +156,12 @@ class Walk:
         if opcode in {Opcode.METADATA, Opcode.ATTACHMENT, DAMAGED_OPCODE}:
             if opcode == Opcode.METADATA and end - at > _MAX_RECORD:
                 raise SegmentError("the record is too large")
-            if end > self._reader.size:
+            if end > self.reader.size:
                 raise _TornError("the file ends in the middle of a record")
             if opcode == Opcode.METADATA:
                 self._take_metadata(at, end)
             elif opcode == Opcode.ATTACHMENT:
-                found = self._reader.attachment_at(at, end - at)
+                found = self.reader.attachment_at(at, end - at)
                 self.attachments.append(found.index(at, end - at))
             else:
                 why = "it was damaged when the recording was recovered"
@@ -167,7 +174,7 @@ class Walk:
 
     def _take_metadata(self, at: int, end: int) -> None:
         try:
-            record = metadata_of(self._reader.read(at, end - at), at)
+            record = metadata_of(self.reader.read(at, end - at), at)
         except SegmentError as error:
             raise SegmentError(f"a metadata record is damaged: {error}") from error
         if record.name == LOSSES_METADATA:
@@ -184,11 +191,15 @@ class Walk:
         if crc32(self._bytes.at(at, head.start, move=True)) != trailer.head_crc:
             raise SegmentError("the head of a chunk changed: its checksum differs")
         behind = end + trailer.length
-        if trailer.indexes == []:
-            self._define(at, end)
-            return behind
         try:
-            parts = self._parts(at, head, trailer)
+            parts, seq = trailer.arrivals()
+            if not len(seq):
+                self._define(at, end)
+                return behind
+            place, span = (at, head.length, trailer.length), (head.first, head.last)
+            check_parts(place, span, parts, len(seq))
+            if self._reads:
+                self._content(at, end)
         except SegmentError as error:
             self._damaged.append(Damage(at, behind - at, f"a chunk is damaged: {error}"))
             return behind
@@ -200,15 +211,16 @@ class Walk:
         if self._reads and not indexes:
             size = trailer.length - ARRIVAL_HEAD - len(trailer.packed)
             self._damaged.append(Damage(end, size, "message indexes are damaged"))
-        self.chunks.append(WalkedChunk(at, head, trailer.length, indexes, parts))
+        self.chunks.append(WalkedChunk(at, head, trailer.length, indexes))
+        self.table.chunk(place, span, parts)
         return behind
 
     def _chunk_head(self, at: int, end: int) -> ChunkHead:
         """A chunk record before its content; `SegmentError` if the file ends in the chunk."""
         head = chunk_head_of(self._bytes.at(at, MAX_CHUNK_HEAD, move=True))
-        if head is not None and at + head.end == end <= self._reader.size:
+        if head is not None and at + head.end == end <= self.reader.size:
             return head
-        if end > self._reader.size and (head is None or at + head.end == end):
+        if end > self.reader.size and (head is None or at + head.end == end):
             raise _TornError("the file ends in the middle of a chunk")
         raise SegmentError("the lengths of a chunk contradict each other")
 
@@ -219,17 +231,18 @@ class Walk:
             if isinstance(record, SchemaRecord):
                 self.schemas[record.id] = record
             else:
-                self.channels[record.id] = record.schema_id, channel_of(record, self.schemas)
+                self.channels[record.id] = channel_of(record, self.schemas)
+                self.schema_ids[record.id] = record.schema_id
 
     def _content(self, at: int, end: int) -> Buffer:
         if end - at > _MAX_RECORD:
             raise SegmentError("a chunk is too large")
-        return open_chunk(self._reader.read(at, end - at))[0]
+        return open_chunk(self.reader.read(at, end - at))[0]
 
     def _trailer(self, at: int, end: int, content: int) -> Trailer:
         """The records behind a chunk, also if its message indexes are damaged."""
         behind, opcode = end, int(Opcode.MESSAGE_INDEX)
-        size = self._reader.size
+        size = self.reader.size
         while opcode in {Opcode.MESSAGE_INDEX, DAMAGED_OPCODE} and behind + HEAD <= size:
             opcode, behind = self._head(behind)
         is_whole = opcode == ARRIVAL_OPCODE and behind <= size
@@ -239,24 +252,11 @@ class Walk:
         try:
             if behind - end > _MAX_RECORD:
                 raise SegmentError("its message indexes are too large")
-            return trailer_of(self._reader.read(end, behind - end), at)
+            return trailer_of(self.reader.read(end, behind - end), at)
         except SegmentError as error:
             if behind == size and not is_whole:
                 raise _TornError(str(error)) from error
             raise
-
-    def _parts(self, at: int, head: ChunkHead, trailer: Trailer) -> NDArray[np.void]:
-        """Statistics of each channel in a chunk; by its messages if its indexes are damaged."""
-        if trailer.indexes and not self._reads:
-            return _parts_by_index(trailer.indexes, head.size)
-        batch = parse_content(self._content(at, at + head.length)).batch
-        if not len(batch):
-            raise SegmentError("it has no messages")
-        trailer.arrivals(len(batch))
-        parts, *span = parts_of(batch, index_order(batch.channel, batch.log_time))
-        if span != [head.first, head.last]:
-            raise SegmentError("its times are not those of its messages")
-        return parts
 
     # Behind damage
 
@@ -264,16 +264,16 @@ class Walk:
         """True if zeros follow, as a writer leaves behind its last block."""
         if any(self._bytes.at(at, HEAD, move=True)):
             return False
-        rest = self._reader.read(at, min(self._reader.size - at, _SEARCHED))
+        rest = self.reader.read(at, min(self.reader.size - at, _SEARCHED))
         return not np.frombuffer(rest, np.uint8).any()
 
     def _proves_itself(self, at: int) -> bool:
         try:
             opcode, end = self._head(at)
-            if end > self._reader.size or end - at > _MAX_RECORD:
+            if end > self.reader.size or end - at > _MAX_RECORD:
                 return False
             if opcode == Opcode.METADATA:
-                metadata_of(self._reader.read(at, end - at), at)
+                metadata_of(self.reader.read(at, end - at), at)
                 return True
             head = self._chunk_head(at, end)
             trailer = self._trailer(at, end, head.size)
@@ -285,17 +285,91 @@ class Walk:
 _PROVABLE: Final = frozenset({Opcode.CHUNK, Opcode.METADATA})
 
 
-def _parts_by_index(indexes: list[tuple[int, NDArray[np.void]]], size: int) -> NDArray[np.void]:
-    """Statistics, `PART`[c] by channel id, of a chunk of `size` bytes, from its checked indexes."""
-    times = [rows["log_time"].astype(np.int64) for _, rows in indexes]
-    starts = np.concatenate([rows["offset"] for _, rows in indexes]).astype(np.int64)
-    counts = np.array([len(rows) for _, rows in indexes])
-    order = np.argsort(starts, kind="stable")
-    sizes = np.empty(len(starts), np.int64)
-    sizes[order] = np.diff(starts[order], append=size) - MESSAGE_HEAD.itemsize
-    parts = np.empty(len(indexes), PART)
-    parts["channel"], parts["messages"] = [channel for channel, _ in indexes], counts
-    parts["payload_bytes"] = np.add.reduceat(sizes, np.cumsum(counts) - counts)
-    parts["first"], parts["last"] = [t[0] for t in times], [t[-1] for t in times]
-    parts["first_publish"], parts["last_publish"] = _UNKNOWN.min, _UNKNOWN.max
-    return parts
+_WRITING_S: Final = 0.02  # the time that a writer may take for the rest of a record
+_LOOKS: Final = 5  # at what seems damaged, before it counts as damaged
+
+
+class Flushed(NamedTuple):
+    """Content of a segment at one moment, as the summary of a sealed one says it.
+
+    Attachments and metadata are those of the source, in file order.
+    """
+
+    table: ChunkTable
+    attachments: Sequence[AttachmentIndex]
+    metadata: Sequence[MetadataIndex]
+    reader: SegmentReader
+
+
+class OpenSegment(Walk):
+    """The content that a segment has at this moment; it may be sealed meanwhile."""
+
+    def __init__(self, recording: Path, number: int) -> None:
+        try:
+            reader = SegmentReader(recording / f"{number:06d}{OPEN_SUFFIX}", number)
+        except SegmentError:  # it may have been sealed just now
+            reader = SegmentReader(recording / sealed_name(number), number)
+        super().__init__(reader)
+
+    def _begin(self) -> None:
+        super()._begin()
+        self._last = b""  # head of the last chunk
+        self._flushed: Flushed | None = None
+
+    @property
+    def flushed(self) -> Flushed:
+        """Its content so far."""
+        if self._flushed is None:
+            metadata = [one for one in self.metadata if not one.name.startswith(OUR_NAMES)]
+            self._flushed = Flushed(
+                self.table.build(), tuple(self.attachments), metadata, self.reader
+            )
+        return self._flushed
+
+    def follow(self) -> bool:
+        """Read what was flushed since, also if it was sealed meanwhile; True if there is anything.
+
+        A read beside a write may see a part of it, and zeros in place of the rest. So what seems
+        damaged is looked at again, and counts only if it is still the same.
+        """
+        is_cut = self.is_cut()
+        if is_cut:
+            self._begin()
+        before = self.end, self.damaged
+        known = self.damaged
+        self._read_on()
+        for _ in range(_LOOKS):
+            seen = self.damaged
+            if seen == known:
+                break
+            time.sleep(_WRITING_S)
+            self._begin()
+            self._read_on()
+            if self.damaged == seen:
+                break
+        return is_cut or (self.end, self.damaged) != before
+
+    def is_cut(self) -> bool:
+        """True if the writer took chunks back that were read, on a full disk."""
+        self.reader.grow()
+        if self.reader.size < self.end:
+            return self.end > len(START)
+        return bool(self.chunks) and self._head_of_last() != self._last
+
+    def _head_of_last(self) -> bytes:
+        return bytes(self.reader.read(self.chunks[-1].offset, CHUNK_HEAD.size))
+
+    def _read_on(self) -> None:
+        self.reader.grow()
+        size, end, known = self.reader.size, self.end, len(self.chunks)
+        try:
+            self.go_on()
+        except SegmentError:  # the writer has just cut the padding behind its last block
+            self.reader.grow()
+            if self.reader.size >= size:
+                raise
+            self.go_on()
+        if self.end != end:
+            self._flushed = None
+        if len(self.chunks) > known:
+            self._last = self._head_of_last()

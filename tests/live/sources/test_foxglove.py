@@ -186,8 +186,8 @@ def saying(payload: bytes, time: int = 0, number: int = 1) -> Script:
 
 @pytest.fixture(autouse=True)
 def _quick(limit: Limit) -> Iterator[None]:
-    """Look more often and try again sooner; and nothing is left behind."""
-    limit(foxglove_tick_s=0.02, foxglove_pauses_s=(0.02, 0.05))
+    """Try again sooner; and nothing is left behind."""
+    limit(foxglove_pauses_s=(0.02, 0.05))
     yield
     assert [t.name for t in threading.enumerate() if t.name == "hybridlog-foxglove"] == []
 

@@ -8,16 +8,14 @@ import logging
 import re
 import socket
 import ssl
-import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
-from math import inf
 from operator import attrgetter
 from struct import Struct
-from typing import Any, Final
+from typing import Final
 
 from picows import (
     WSCloseCode,
@@ -49,7 +47,6 @@ from hybridlog.live.sources.sequence_gaps import (
 )
 from hybridlog_storage.messages import Channel
 
-_TICK_S: Final = 0.25  # interval at which a silent connection checks whether to stop
 _OPEN_S: Final = 10.0
 _CLOSE_S: Final = 1.0
 _PING_S: Final = 10.0  # silence after which a ping is sent, and then until the end
@@ -59,67 +56,62 @@ _SILENT: Final = logging.Logger("picows", logging.CRITICAL + 1)  # the user is t
 
 
 class Client:
-    """The client, which runs in the thread of a Foxglove source."""
+    """The client, which runs in the event loop of a Foxglove source."""
 
-    def __init__(
-        self,
-        sink: Sink,
-        address: Address,
-        stop: threading.Event,
-        reached: Callable[[], None],
-    ) -> None:
+    def __init__(self, sink: Sink, address: Address, reached: Callable[[], None]) -> None:
         self._sink = sink
         self._address = address
-        self._stop = stop
         self._reached = reached
         self._missed: dict[str, int] = {}
 
-    def run(self) -> None:
-        """Connect, read and reconnect until stopped."""
+    async def run(self) -> None:
+        """Connect, read and reconnect until cancelled."""
         failures = 0
-        while not self._stop.is_set():
+        while True:
             began = time.monotonic()
             try:
-                reason = asyncio.run(self._connect())
+                reason = await self._connect()
             except PeerError as error:
                 reason = str(error)
-            if self._stop.is_set():
-                return
             self._sink.say(f"{self._address.shown}: {one_line(reason)}; trying again")
             if time.monotonic() - began > _STABLE_S:
                 failures = 0
-            self._stop.wait(_PAUSES_S[min(failures, len(_PAUSES_S) - 1)])
+            await asyncio.sleep(_PAUSES_S[min(failures, len(_PAUSES_S) - 1)])
             failures += 1
 
     async def _connect(self) -> str:
         """Make one connection, and read it to its end; returns the reason, for the user."""
-        session = Session(self._sink, self._address.shown, self._missed)
+        session = Session(self._sink, self._address.shown, self._missed, self._reached)
         opening = asyncio.ensure_future(self._open(session))
-        if not await self._has_ended(opening, _OPEN_S):
+        is_stopped = True
+        try:
+            opened, _ = await asyncio.wait({opening}, timeout=_OPEN_S)
+            if not opened:
+                raise PeerError(f"does not answer within {_OPEN_S:g} s; check host and port")
+            transport = opening.result()
+            ended = asyncio.ensure_future(transport.wait_disconnected())
+            await asyncio.wait({ended})
+            is_stopped = False
+        finally:
+            await self._leave(session, opening)
+            session.end(is_stopped=is_stopped)
+        return self._reason(transport, session.problem or ended.exception())
+
+    async def _leave(self, session: Session, opening: asyncio.Future[WSTransport]) -> None:
+        """Close a connection, if there is one: first messages that are under way still come."""
+        if not session.is_connected:
             opening.cancel()
-            await asyncio.wait({opening})
-            raise PeerError(f"does not answer within {_OPEN_S:g} s; check host and port")
+        await asyncio.wait({opening})
+        if opening.cancelled() or opening.exception() is not None:
+            return
         transport = opening.result()
         ended = asyncio.ensure_future(transport.wait_disconnected())
-        try:
-            if session.problem is None:
-                self._reached()
-            if not await self._has_ended(ended, inf):
-                transport.send_close(WSCloseCode.OK)  # messages under way still come
-                await asyncio.wait({ended}, timeout=_CLOSE_S)
-        finally:
+        if not (await asyncio.wait({ended}, timeout=0))[0]:
+            transport.send_close(WSCloseCode.OK)
+            await asyncio.wait({ended}, timeout=_CLOSE_S)
             transport.disconnect(graceful=False)
             await asyncio.wait({ended})
-            session.end(is_stopped=self._stop.is_set())
-        error = ended.exception()
-        return self._reason(transport, session.problem or error)
-
-    async def _has_ended(self, work: asyncio.Future[Any], seconds: float) -> bool:
-        """Wait for work to end, at most some seconds and until the source is stopped."""
-        deadline = time.monotonic() + seconds
-        while not (work.done() or self._stop.is_set() or time.monotonic() > deadline):
-            await asyncio.wait({work}, timeout=_TICK_S)
-        return work.done()
+        ended.exception()
 
     def _reason(self, transport: WSTransport, problem: BaseException | None) -> str:
         if isinstance(problem, WSProtocolError):
@@ -133,7 +125,7 @@ class Client:
         if problem is not None:
             raise problem
         closing = transport.close_handshake
-        if closing is not None and closing.sent is not None and not self._stop.is_set():
+        if closing is not None and closing.sent is not None:
             return f"has been silent for {2 * _PING_S:g} s"
         return "the connection broke"
 
@@ -256,12 +248,16 @@ class Session(WSListener):
 
     max_bytes: Final = 1 << 30  # of a message
 
-    def __init__(self, sink: Sink, name: str, missed: dict[str, int]) -> None:
+    def __init__(
+        self, sink: Sink, name: str, missed: dict[str, int], reached: Callable[[], None]
+    ) -> None:
         self.problem: Exception | None = None  # why the session ended the connection
+        self.is_connected = False
         self._sink = sink
         self._take = sink.take
         self._name = name
         self._missed = missed
+        self._reached = reached
         self._next = 0
         self._routes: dict[int, tuple[Channel, SequenceGapDetector | None]] = {}
         self._subscriptions: dict[int, _Subscription] = {}
@@ -281,9 +277,11 @@ class Session(WSListener):
 
     def on_ws_connected(self, transport: WSTransport) -> None:
         """Check the protocol."""
-        self._transport = transport
+        self._transport, self.is_connected = transport, True
         transport.underlying_transport.set_write_buffer_limits(1)
-        if transport.response.headers.get("Sec-WebSocket-Protocol") not in SUBPROTOCOLS:
+        if transport.response.headers.get("Sec-WebSocket-Protocol") in SUBPROTOCOLS:
+            self._reached()
+        else:
             self._fail(
                 PeerError(
                     "a websocket server that does not speak Foxglove; start foxglove_bridge or "

@@ -18,12 +18,13 @@ in another century.
 
 from __future__ import annotations
 
-from hybridlog.live.sources.base import Sink, ThreadedSource
+from hybridlog.live.sources.base import Sink
 from hybridlog.live.sources.foxglove.protocol import parse_address, without_user
+from hybridlog.live.sources.network import LoopSource
 from hybridlog_storage.errors import MissingDependencyError
 
 
-class FoxgloveSource(ThreadedSource):
+class FoxgloveSource(LoopSource):
     """A client of one Foxglove WebSocket server. TLS certificates are checked.
 
     It reconnects with growing pauses. After that the server's channels may have other
@@ -55,4 +56,4 @@ class FoxgloveSource(ThreadedSource):
             raise MissingDependencyError(
                 "recording from Foxglove needs picows: pip install 'hybridlog[foxglove]'"
             ) from error
-        self._begin(sink, Client(sink, address, self._stopping, self._reached).run)
+        self._begin_loop(sink, Client(sink, address, self._reached).run)

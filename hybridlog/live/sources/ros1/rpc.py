@@ -12,7 +12,6 @@ import contextlib
 import os
 import socket
 import xmlrpc.client
-from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import urlsplit
 from xml.parsers.expat import ExpatError
@@ -41,11 +40,8 @@ class RefusedError(PeerError):
 
 _MAX_ANSWER: Final = 32 << 20
 _MAX_REQUEST: Final = 4 << 20
-_MAX_HTTP_HEADER: Final = 64 << 10
 _MAX_CLIENTS: Final = 64
-
-
-# Calling.
+_END: Final = b"\r\n\r\n"
 
 
 async def call(network: Network, uri: str, method: str, *arguments: Any) -> object:
@@ -59,45 +55,38 @@ async def call(network: Network, uri: str, method: str, *arguments: Any) -> obje
     )
     try:
         async with asyncio.timeout(2 * PATIENCE_S):
-            with await network.connect(endpoint) as connected:
-                answer = await _exchange(connected, head.encode("ascii") + body)
+            reader, writer = await asyncio.open_connection(sock=await network.connect(endpoint))
+            with contextlib.closing(writer):
+                writer.write(head.encode("ascii") + body)
+                words, length = await _head(reader)
+                if len(words) < 2 or not words[0].startswith(b"HTTP/"):
+                    raise PeerError("it does not speak HTTP")
+                if words[1] != b"200":
+                    raise PeerError(f"it answers {one_line(b' '.join(words[1:]))}")
+                answer = await _body(reader, length, _MAX_ANSWER)
     except OSError as error:
         raise UnreachedError(reason_of(error)) from error
     values, _ = _parsed(answer)
     return _value_of(values[0] if values else None)
 
 
-async def _exchange(connected: socket.socket, request: bytes) -> bytes:
-    """Sends a request, and returns the body of the answer."""
-    await asyncio.get_running_loop().sock_sendall(connected, request)
-    words, length, begun = await _head(connected)
-    if len(words) < 2 or not words[0].startswith(b"HTTP/"):
-        raise PeerError("it does not speak HTTP")
-    if words[1] != b"200":
-        raise PeerError(f"it answers {one_line(b' '.join(words[1:]))}")
-    return await _body(connected, begun, length, _MAX_ANSWER)
+async def _head(reader: asyncio.StreamReader) -> tuple[list[bytes], int | None]:
+    """The words of the first line of a call or answer, and the length of its body."""
+    try:
+        got = await reader.readuntil(_END)
+    except (asyncio.IncompleteReadError, asyncio.LimitOverrunError) as error:
+        raise PeerError("it does not speak HTTP") from error
+    first, *fields = got.removesuffix(_END).split(b"\r\n")
+    return first.split(None, 2), _content_length(fields)
 
 
-async def _head(connected: socket.socket) -> tuple[list[bytes], int | None, bytearray]:
-    """The words of the first line of a call or answer, the length of its body, and its begin."""
-    loop = asyncio.get_running_loop()
-    got = bytearray()
-    while (end := got.find(b"\r\n\r\n")) < 0:
-        data = await loop.sock_recv(connected, 64 << 10)
-        if not data or len(got) > _MAX_HTTP_HEADER:
-            raise PeerError("it does not speak HTTP")
-        got += data
-    first, *fields = bytes(got[:end]).split(b"\r\n")
-    return first.split(None, 2), _content_length(fields), got[end + 4 :]
-
-
-async def _body(connected: socket.socket, got: bytearray, length: int | None, most: int) -> bytes:
+async def _body(reader: asyncio.StreamReader, length: int | None, most: int) -> bytes:
     """The body of a call or answer; without a length, all that comes."""
-    loop = asyncio.get_running_loop()
+    got = bytearray()
     while length is None or len(got) < length:
         if max(length or 0, len(got)) > most:
             raise PeerError(f"its answer is longer than {most >> 20} MiB")
-        data = await loop.sock_recv(connected, 64 << 10)
+        data = await reader.read(64 << 10)
         if not data:
             if length is None:
                 break
@@ -152,72 +141,37 @@ def _value_of(answer: object) -> object:
     raise PeerError("its answer is not that of a ROS node")
 
 
-# Being called.
-
-
 class RpcServer:
-    """Answers calls on one socket, which it owns."""
+    """Answers calls; `start` gives it a socket, which it owns."""
 
-    def __init__(self, listening: socket.socket, methods: Mapping[str, Method]) -> None:
-        self._socket = listening
+    def __init__(self, methods: Mapping[str, Method]) -> None:
         self._methods = methods
-        self._clients: set[asyncio.Task[None]] = set()
+        self._clients = 0
 
-    async def serve(self) -> None:
-        """Answers calls until cancelled; then closes all sockets."""
-        loop = asyncio.get_running_loop()
-        try:
-            while True:
-                while len(self._clients) >= _MAX_CLIENTS:
-                    await asyncio.wait(self._clients, return_when=asyncio.FIRST_COMPLETED)
-                await self._wait_for_call()
-                try:
-                    # The loop's `sock_accept` loses an accepted client if it is cancelled
-                    # at that moment. Here nothing waits after `accept`.
-                    client, _ = self._socket.accept()
-                except BlockingIOError:
-                    continue
-                except OSError:
-                    # The client is gone already, or no descriptors are left.
-                    await asyncio.sleep(0.1)
-                    continue
-                client.setblocking(False)
-                task = loop.create_task(self._answer(client))
-                self._clients.add(task)
-                task.add_done_callback(self._clients.discard)
-                # Closes it even if the task is cancelled before it begins.
-                task.add_done_callback(partial(_close, client))
-        finally:
-            self._socket.close()
-            for task in tuple(self._clients):
-                task.cancel()
-            await asyncio.gather(*self._clients, return_exceptions=True)
+    async def start(self, listening: socket.socket) -> asyncio.Server:
+        """Answers calls until the returned server is closed, and the loop has ended."""
+        return await asyncio.start_server(self._answer, sock=listening)
 
-    async def _wait_for_call(self) -> None:
-        """Waits for a client."""
-        loop = asyncio.get_running_loop()
-        called = asyncio.Event()
-        loop.add_reader(self._socket, called.set)
-        try:
-            await called.wait()
-        finally:
-            loop.remove_reader(self._socket)
+    async def _answer(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Answers one call; malformed calls, and too many at once, close the connection."""
+        self._clients += 1
+        with contextlib.suppress(OSError, PeerError), contextlib.closing(writer):
+            try:
+                if self._clients <= _MAX_CLIENTS:
+                    async with asyncio.timeout(PATIENCE_S):
+                        await self._answer_one(reader, writer)
+            finally:
+                self._clients -= 1
 
-    async def _answer(self, client: socket.socket) -> None:
-        """Answers one call; malformed calls close the connection."""
-        loop = asyncio.get_running_loop()
-        with contextlib.suppress(OSError, PeerError):
-            async with asyncio.timeout(PATIENCE_S):
-                words, length, begun = await _head(client)
-                if words[:1] != [b"POST"] or length is None:
-                    return
-                values, method = _parsed(await _body(client, begun, length, _MAX_REQUEST))
-                body = self._result(method, values).encode()
-                head = (
-                    "HTTP/1.0 200 OK\r\nContent-Type: text/xml\r\n"
-                    f"Content-Length: {len(body)}\r\n\r\n"
-                )
-                await loop.sock_sendall(client, head.encode() + body)
+    async def _answer_one(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        words, length = await _head(reader)
+        if words[:1] != [b"POST"] or length is None:
+            return
+        values, method = _parsed(await _body(reader, length, _MAX_REQUEST))
+        body = self._result(method, values).encode()
+        head = f"HTTP/1.0 200 OK\r\nContent-Type: text/xml\r\nContent-Length: {len(body)}\r\n\r\n"
+        writer.write(head.encode() + body)
+        await writer.drain()
 
     def _result(self, method: str | None, values: tuple[object, ...]) -> str:
         known = self._methods.get(method or "")
@@ -225,10 +179,6 @@ class RpcServer:
             fault = xmlrpc.client.Fault(1, f"unknown method {one_line(method or '')}")
             return xmlrpc.client.dumps(fault, methodresponse=True)
         return xmlrpc.client.dumps((known(values),), methodresponse=True)
-
-
-def _close(client: socket.socket, _: asyncio.Task[None]) -> None:
-    client.close()
 
 
 _BACKLOG: Final = 64

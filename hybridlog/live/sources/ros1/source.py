@@ -14,14 +14,13 @@ import asyncio
 import contextlib
 import os
 import secrets
-import threading
 from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 import msgspec
 
-from hybridlog.live.sources.base import PeerError, ThreadedSource, one_line
-from hybridlog.live.sources.network import Endpoint, Network, endpoint_of
+from hybridlog.live.sources.base import PeerError, one_line
+from hybridlog.live.sources.network import Endpoint, LoopSource, Network, endpoint_of
 from hybridlog.live.sources.ros1.rpc import RefusedError, RpcServer, call, listen, methods, uri_of
 from hybridlog.live.sources.ros1.stream import Reader
 from hybridlog.live.sources.ros1.subscription import ANY, Context, Subscription
@@ -36,7 +35,7 @@ _DEFAULT_URI: Final = "http://localhost:11311"
 _DEFAULT_PORT: Final = 11311
 
 
-class Ros1Source(ThreadedSource):
+class Ros1Source(LoopSource):
     """Subscribes to topics of a ROS 1 system, whatever their type.
 
     Each connection to a publisher is a channel with the fields of its header, as in a bag.
@@ -70,8 +69,6 @@ class Ros1Source(ThreadedSource):
         self.caller = f"/hybridlog_{os.getpid()}_{secrets.token_hex(4)}"
         self._max_message_bytes = max_message_bytes
         self._poll_s = poll_s
-        self._lock = threading.Lock()
-        self._end: Callable[[BaseException | None], None] | None = None
 
     def check(self) -> None:
         """Checks the address."""
@@ -80,15 +77,7 @@ class Ros1Source(ThreadedSource):
     def start(self, sink: Sink) -> None:
         """Begins to poll the master, which need not be up yet."""
         uri = f"http://{self._endpoint()}/"
-        self._begin(sink, lambda: asyncio.run(self._follow(sink, uri)))
-
-    def stop(self) -> None:
-        """Passes on the messages received so far, and takes back all registrations."""
-        with self._lock:
-            self._stopping.set()
-            if self._end is not None:
-                self._end(None)
-        self._join()
+        self._begin_loop(sink, lambda: self._follow(sink, uri))
 
     def _endpoint(self) -> Endpoint:
         try:
@@ -101,61 +90,35 @@ class Ros1Source(ThreadedSource):
     async def _follow(self, sink: Sink, uri: str) -> None:
         """Runs all tasks until the source is stopped or one of them fails."""
         loop = asyncio.get_running_loop()
-        over: asyncio.Future[None] = loop.create_future()
-        tasks: set[asyncio.Task[None]] = set()
+        failed: asyncio.Future[None] = loop.create_future()
+        network = Network()
+        listening, host = await listen(network, os.environ, sink.say)
 
-        def settle(error: BaseException | None) -> None:
-            if over.done():
-                return
-            if error is None:
-                over.set_result(None)
-            else:
-                over.set_exception(error)
+        def fail(error: BaseException) -> None:
+            if not failed.done():
+                failed.set_exception(error)
 
-        def end(error: BaseException | None) -> None:
-            loop.call_soon_threadsafe(settle, error)
-
-        def finished(task: asyncio.Task[None]) -> None:
-            tasks.discard(task)
-            if not task.cancelled() and (error := task.exception()) is not None:
-                end(error)
-
-        def spawn(work: Coroutine[None, None, None]) -> None:
-            task = loop.create_task(work)
-            tasks.add(task)
-            task.add_done_callback(finished)
-
-        with self._lock:
-            if self._stopping.is_set():
-                return
-            self._end = end
-        try:
-            network = Network()
-            listening, host = await listen(network, os.environ, sink.say)
+        with listening:
             master = Master(network, uri, self.caller, uri_of(host, listening))
             graph = Graph(master, uri, self._poll_s, self._reached)
-            server = RpcServer(listening, methods(uri, graph.topics, graph.hint, sink.say))
-            reader = Reader(end)
-            context = Context(
-                *(network, self.caller, sink, reader, self._max_message_bytes),
-                *(spawn, graph.hint),
-            )
+            server = RpcServer(methods(uri, graph.topics, graph.hint, sink.say))
+            serving = await server.start(listening)
+            reader = Reader(lambda error: loop.call_soon_threadsafe(fail, error))
             reader.start()
             try:
-                spawn(server.serve())
-                spawn(graph.watch(context))
-                await over
+                async with asyncio.TaskGroup() as tasks:
+                    context = Context(
+                        *(network, self.caller, sink, reader, self._max_message_bytes),
+                        *(tasks.create_task, graph.hint),
+                    )
+                    tasks.create_task(graph.watch(context))
+                    await failed
+            except BaseExceptionGroup as group:
+                raise group.exceptions[0] from None
             finally:
-                while tasks:
-                    for task in tuple(tasks):
-                        task.cancel()
-                    await asyncio.wait(tuple(tasks), timeout=1)
-                listening.close()
+                serving.close()
                 reader.stop()
                 await graph.farewell()
-        finally:
-            with self._lock:
-                self._end = None
 
 
 _Item = TypeVar("_Item")

@@ -265,7 +265,7 @@ class Reader:
     error before it ends.
     """
 
-    def __init__(self, failed: Callable[[BaseException], None]) -> None:
+    def __init__(self, failed: Callable[[BaseException], object]) -> None:
         self._failed = failed
         self._selector = selectors.DefaultSelector()
         self._wake, self._woken = socket.socketpair()

@@ -44,7 +44,7 @@ class Context:
     sink: Sink
     reader: Reader
     max_message_bytes: int
-    spawn: Callable[[Coroutine[None, None, None]], None]
+    spawn: Callable[[Coroutine[None, None, None]], object]
     look_again: Callable[[str], None]
 
 

@@ -17,7 +17,7 @@ from collections import deque
 from contextlib import suppress
 from json import dumps
 from pathlib import Path
-from threading import Event, Lock, Thread
+from threading import Event, Thread
 from typing import TYPE_CHECKING, Any, Final
 
 from hybridlog.formats.yaml_values import YamlError, parse_yaml, read_yaml
@@ -64,7 +64,6 @@ class Ros2Source(ThreadedSource):
         self.address = f"domain {os.environ.get('ROS_DOMAIN_ID') or '0'}"
         self._python = python
         self._overrides = qos_overrides
-        self._lock = Lock()
         self._child: Process | None = None
         self._settings: dict[str, object] = {}
         self._outages: dict[str, int] = {}
