@@ -264,10 +264,6 @@ class Follower:
         missed = 0 if failure is None else read - indexed
         return Followed(self._target.is_wanted, read, indexed, missed, failure)
 
-    def make_rows(self) -> None:
-        """See `make_rows_ahead`."""
-        make_rows_ahead(self._directory, self._entry.id, lambda: not self.is_stopped)
-
     def forget(self) -> None:
         """Remove the documents of a recording that is removed.
 
@@ -514,69 +510,68 @@ def make_rows_ahead(
         make_rows(directory, recording, is_wanted)
 
 
-class FollowerThread:
-    """Runs a follower in this process, which waits for it at the end only.
+class FollowerThread(Follower):
+    """Follows on a thread of this process, which waits for it at the end only.
 
-    Args:
-        follower: The follower.
-        interval_s: Time between two looks, seconds; None to do everything at the end.
+    `interval_s` lies between two looks, seconds; with None it does everything at the end.
     """
 
-    def __init__(self, follower: Follower, interval_s: float | None) -> None:
+    def __init__(
+        self,
+        directory: StoreDirectory,
+        catalog: Catalog,
+        entry: RecordingEntry,
+        target: IndexTarget,
+        interval_s: float | None,
+    ) -> None:
         load()
-        self.follower = follower
-        self.forget = follower.forget
+        super().__init__(directory, catalog, entry, target)
         self._interval_s = interval_s
-        self._entry: RecordingEntry | None = None
+        self._ended_as: RecordingEntry | None = None
         self._crash: BaseException | None = None
         # No event: a thread that is interrupted in `set` may leave it locked forever.
         self._calls: SimpleQueue[None] = SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="hybridlog-index", daemon=True)
         self._thread.start()
 
-    @property
-    def state(self) -> Followed:
-        """How far it is."""
-        return self.follower.state
-
     def finish(self, entry: RecordingEntry) -> RecordingEntry:
-        """Finish the follower, and raise its errors other than those of the database."""
-        self._entry = entry
+        """As of `Follower`; errors of the thread are raised, too."""
+        self._ended_as = entry
         self.abandon()
         if self._crash is not None:
             raise self._crash
-        return self._entry
+        return self._ended_as
 
     def abandon(self) -> None:
         """Stop it."""
-        self.follower.is_stopped = True
+        self.is_stopped = True
         self._calls.put(None)
         self._thread.join()
 
     def _run(self) -> None:
         try:
-            while not self.follower.is_stopped:
+            while not self.is_stopped:
                 try:
                     self._calls.get(timeout=self._interval_s)
                 except Empty:
                     with suppress(StoreError):  # the next look or `finish` sees it
-                        self.follower.follow()
-            if self._entry is not None:
-                self.follower.is_stopped = False
+                        self.follow()
+            if self._ended_as is not None:
+                self.is_stopped = False
                 with suppress(StoreError, DiskFullError):  # or else they are written when logs go
-                    self.follower.make_rows()
-                self._entry = self.follower.finish(self._entry)
+                    make_rows_ahead(self._directory, self._entry.id, lambda: not self.is_stopped)
+                self._ended_as = super().finish(self._ended_as)
         except BaseException as error:
             self._crash = error
         finally:
-            self.follower.discard()
+            self.discard()
 
 
 def in_thread(
     directory: StoreDirectory, catalog: Catalog, target: IndexTarget, interval_s: float | None
 ) -> Callable[[RecordingEntry], FollowerThread]:
     """A function that begins to follow a new recording, on a thread of this process."""
-    return lambda entry: FollowerThread(Follower(directory, catalog, entry, target), interval_s)
+    return lambda entry: FollowerThread(directory, catalog, entry, target, interval_s)
 
 
 def bring(
