@@ -10,20 +10,18 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
-
 from hybridlog.columns.recording_logs import RecordingRows
 from hybridlog.columns.table_writer import TableWriter, load
 from hybridlog.entries import put_entry
 from hybridlog.follow.child import Followed
 from hybridlog.index.indexing import ChunkIndexer
+from hybridlog.index.sending import IndexTarget, Sender
 from hybridlog.maintenance.expiry import make_rows
 from hybridlog.maintenance.report import reporter
 from hybridlog.maintenance.retention import Rules
@@ -37,19 +35,13 @@ from hybridlog_storage.errors import (
     StoreError,
     TopicError,
 )
-from hybridlog_storage.mongo.collection_names import collection_of
 from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.segments.gone_log import open_log
 from hybridlog_storage.segments.open_segment import OpenSegment
 from hybridlog_storage.segments.segment_reader import places_of
 from hybridlog_storage.settings import read_settings
-from hybridlog_storage.threads import Threads
 
 if TYPE_CHECKING:
-    from concurrent.futures import Future
-
-    from numpy.typing import NDArray
-
     from hybridlog.maintenance.report import Progress
     from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
@@ -58,110 +50,9 @@ if TYPE_CHECKING:
     from hybridlog_storage.segments.chunk import StoredChunk
     from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentReader
 
-_SEND_BYTES: Final = 8 << 20  # documents that are sent together, at most
 _GROUP_BYTES: Final = 8 << 20  # content of chunks that are decoded together
 _GROUP_ROWS: Final = 1 << 17  # messages that are decoded together
 _RETRY_S: Final = 2.0  # between attempts after the database has failed
-
-
-@dataclass(frozen=True, slots=True)
-class IndexTarget:
-    """The database for the index documents of a recording.
-
-    Attributes:
-        database: The index; None if it is unavailable now, or the recording gets none.
-        failure: Why it is unavailable now; None if it is not, or the recording gets none.
-        renew: Returns the index, connected again if that was lost; starts the embedded MongoDB
-            again if that has ended. Raises `DatabaseError`.
-    """
-
-    database: Database | None = None
-    failure: DatabaseError | None = None
-    renew: Callable[[], Database] | None = None
-
-    @property
-    def is_wanted(self) -> bool:
-        """True if the recording gets documents, now or later."""
-        return self.database is not None or self.failure is not None
-
-    @property
-    def without(self) -> str:
-        """The end of a sentence about a MongoDB that is unavailable."""
-        return "so the index is made later" if self.is_wanted else "so there is no index"
-
-
-class _Sender:
-    """Sends documents to the index on a thread of its own, while more are made.
-
-    Attributes:
-        database: The index.
-        messages: Number of those whose documents it has sent.
-        ended: Digests of segments all of whose documents were added, by number as text.
-    """
-
-    def __init__(self, key: str, database: Database) -> None:
-        self.database = database
-        self.messages = 0
-        self._key = key
-        self._collections: set[str] = set()  # that exist
-        self._thread = Threads(1, "hybridlog-send")
-        self._sending: Future[None] | None = None
-        self._begin()
-
-    def _begin(self) -> None:
-        self._documents: defaultdict[str, list[NDArray[np.uint8]]] = defaultdict(list)
-        self._size = self._added = 0
-        self.ended: dict[str, str] = {}
-
-    def add(self, documents: Iterable[tuple[str, NDArray[np.uint8]]], messages: int) -> None:
-        """Add the documents of some messages, in tables of their topics.
-
-        Raises:
-            HybridlogError: An earlier sending has failed.
-        """
-        for topic, table in documents:
-            self._documents[topic].append(table)
-            self._size += table.size
-        self._added += messages
-        if self._size >= _SEND_BYTES:
-            self.send()
-
-    def send(self, *, wait: bool = False) -> None:
-        """Send what was added; `wait` until the index has it.
-
-        Raises:
-            HybridlogError: This sending has failed, or an earlier one.
-        """
-        if self._sending is not None:
-            self._sending.result()
-        sent = self._documents, self._added, self.ended
-        self._begin()
-        self._sending = self._thread.submit(self._send, *sent)
-        if wait:
-            self._sending.result()
-
-    def close(self) -> None:
-        """Stop sending."""
-        self._thread.shutdown(wait=True, cancel_futures=True)
-
-    def _send(
-        self,
-        documents: Mapping[str, list[NDArray[np.uint8]]],
-        messages: int,
-        segments: Mapping[str, str],
-    ) -> None:
-        if documents and not self._collections:
-            # One command, where creating each would be one for each topic.
-            self._collections.update(self.database.list_collections())
-        for topic, tables in documents.items():
-            name = collection_of(topic)
-            if name not in self._collections:
-                self.database.ensure_collection(name)
-                self._collections.add(name)
-            self.database.insert_raw(name, [row.tobytes() for table in tables for row in table])
-        if segments:
-            IndexState(self.database).put_segments(self._key, segments)
-        self.messages += messages
 
 
 @dataclass(slots=True)
@@ -178,7 +69,7 @@ class _Segment:
     """
 
     is_wanted: bool
-    sender: _Sender | None
+    sender: Sender | None
     opened: OpenSegment | None = None
     chunks: int = 0
     decoded: dict[int, ChannelStats] = field(default_factory=dict)
@@ -234,7 +125,7 @@ class Follower:
         self._until = until
         self._progress = progress
         self._indexer = ChunkIndexer(entry.id)
-        self._sender: _Sender | None = None
+        self._sender: Sender | None = None
         self._retry_at = 0.0
         self._indexed = 0
         self._gap: DatabaseError | None = None  # why the index has missed something
@@ -472,7 +363,7 @@ class Follower:
             if state.one(self._entry.key) is None:
                 state.begin(self._entry)
             self.failure = None
-            self._sender = _Sender(self._entry.key, database)
+            self._sender = Sender(self._entry.key, database)
 
     def _send(self, *, wait: bool = False) -> None:
         if self._sender is not None:

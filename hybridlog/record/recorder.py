@@ -39,8 +39,8 @@ from hybridlog_storage.times import placed
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.follow.follower import IndexTarget
     from hybridlog.formats.reading import Damage, Fingerprint, Source
+    from hybridlog.index.sending import IndexTarget
     from hybridlog.query.topics import TopicMatcher
     from hybridlog.snapshot import Snapshot
     from hybridlog_storage.catalog import Catalog
