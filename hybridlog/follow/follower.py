@@ -411,9 +411,9 @@ class FollowerThread(Follower):
         self,
         directory: StoreDirectory,
         catalog: Catalog,
-        entry: RecordingEntry,
         target: IndexTarget,
         interval_s: float | None,
+        entry: RecordingEntry,
     ) -> None:
         load()
         super().__init__(directory, catalog, entry, target)
@@ -456,13 +456,6 @@ class FollowerThread(Follower):
             self._crash = error
         finally:
             self.discard()
-
-
-def in_thread(
-    directory: StoreDirectory, catalog: Catalog, target: IndexTarget, interval_s: float | None
-) -> Callable[[RecordingEntry], FollowerThread]:
-    """A function that begins to follow a new recording, on a thread of this process."""
-    return lambda entry: FollowerThread(directory, catalog, entry, target, interval_s)
 
 
 def bring(

@@ -137,13 +137,13 @@ def record(
         SourceError: nothing could be read.
         DiskFullError: no space; nothing is stored.
     """
-    from hybridlog.follow.follower import in_thread  # a live recorder loads none of it
+    from hybridlog.follow.follower import FollowerThread  # a live recorder loads none of it
 
     started = time.monotonic()
     capture = Capture(
         directory,
         catalog,
-        in_thread(directory, catalog, target, _FOLLOW_S),
+        partial(FollowerThread, directory, catalog, target, _FOLLOW_S),
         known,
         name=options.name or name_of(source.path),
         tags=options.tags,
