@@ -7,7 +7,6 @@ ends at any point costs nothing but the work of the next one.
 
 from __future__ import annotations
 
-import math
 import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -89,7 +88,6 @@ class Follower:
         target: Where documents go.
         topics: Topics whose tables are made; None for all of a new recording.
         done: Numbers of the segments that have all their documents, as text.
-        until: When `finish` is given up, by `time.monotonic`.
         progress: Called after each chunk of `finish`.
 
     Attributes:
@@ -109,7 +107,6 @@ class Follower:
         *,
         topics: Collection[str] | None = None,
         done: Collection[str] = (),
-        until: float = math.inf,
         progress: Progress | None = None,
     ) -> None:
         self._target = target or IndexTarget()
@@ -122,7 +119,6 @@ class Follower:
         self._entry = entry
         self._topics = topics
         self._done = done
-        self._until = until
         self._progress = progress
         self._indexer = ChunkIndexer(entry.id)
         self._sender: Sender | None = None
@@ -174,7 +170,7 @@ class Follower:
         self._check_cut()
         manifest = self._directory.manifests.read(self._entry.id)
         listing = self._directory.listing(self._entry.id).choosing(manifest)
-        with suppress(TimeoutError):
+        with suppress(InterruptedError):
             for number in sorted({*listing.open, *listing.sealed} - self._ended):
                 if number in listing.sealed and number in manifest.logs:
                     digest = manifest.logs[number].digest
@@ -194,7 +190,6 @@ class Follower:
 
         Raises:
             SegmentError: A segment cannot be read.
-            TimeoutError: Time was short.
         """
         try:
             self._retry_at = 0.0
@@ -260,10 +255,10 @@ class Follower:
         channels: Mapping[int, Channel],
         report: Callable[[int], None] = lambda _: None,
     ) -> None:
-        """Read those chunks of a segment that were not; TimeoutError if it is to stop."""
+        """Read those chunks of a segment that were not; InterruptedError if it is to stop."""
         for group in self._groups(number, reader, places):
-            if self.is_stopped or time.monotonic() > self._until:
-                raise TimeoutError
+            if self.is_stopped:
+                raise InterruptedError
             self._take(self._segments[number], group, channels)
             report(group[-1].offset)
 
@@ -466,7 +461,6 @@ def bring(
     *,
     anew: bool = False,
     topics: Collection[str] = (),
-    until: float = math.inf,
     wait_s: float = 0.0,
     progress: Progress | None = None,
 ) -> Follower | None:
@@ -479,7 +473,6 @@ def bring(
         database: The index; None to make no documents.
         anew: Whether documents that are there are made again.
         topics: Topics whose tables are made again.
-        until: When this is given up, by `time.monotonic`.
         wait_s: Seconds to wait for another process that holds the recording.
         progress: Called after each chunk.
 
@@ -487,7 +480,6 @@ def bring(
         DatabaseError: MongoDB fails.
         HeldError: Another process holds the recording.
         SegmentError: A segment cannot be read.
-        TimeoutError: It was given up.
         TopicError: The recording is gone.
     """
     with directory.writing(known.id, known.name, wait_s=wait_s):
@@ -506,7 +498,6 @@ def bring(
             IndexTarget(database),
             topics=wanted,
             done=done,
-            until=until,
             progress=progress,
         )
         follower.finish(entry)
