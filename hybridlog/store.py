@@ -739,16 +739,16 @@ class Store:
             options: Options of the recording.
             choices: Fields of `LiveOptions`, instead of `options`.
         """
-        from hybridlog.follow.follower import in_thread
+        from hybridlog.follow.follower import FollowerThread
         from hybridlog.live import LiveOptions, LiveRecording
         from hybridlog.live.recording import follow_interval_s
 
         chosen, shared = options or LiveOptions(**choices), self._to_change()
+        about = self.directory, self.catalog
         target = shared.index.index_to_record("Starting a recording")
         return LiveRecording(
-            self.directory,
-            self.catalog,
-            in_thread(self.directory, self.catalog, target, follow_interval_s(chosen)),
+            *about,
+            partial(FollowerThread, *about, target, follow_interval_s(chosen)),
             name,
             chosen,
             known=shared.newest,

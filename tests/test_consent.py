@@ -106,17 +106,12 @@ def foreign(tmp_path: Path, listener: Listener) -> Path:
 @pytest.mark.parametrize(
     "command",
     [
-        ("ls",),
         ("info",),
         ("fetch", "-t", "x"),
         ("verify",),
         ("index", "rebuild"),
-        ("rm", "-y", "x"),
         ("index", "list"),
-        ("info", "-t", "x"),
         ("record", __file__),
-        ("export", "/nonexistent/x.mcap"),
-        ("info", "--losses"),
     ],
     ids=" ".join,
 )

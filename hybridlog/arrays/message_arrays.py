@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from hybridlog.arrays import VIDEOS
-from hybridlog.arrays.array_views import MAX_EMPTY, byte_array, check_rows, view_of
-from hybridlog.arrays.point_arrays import POINT_MAKERS
+from hybridlog.arrays.point_arrays import MAX_EMPTY, POINT_MAKERS, byte_array, check_rows, view_of
 from hybridlog_storage.errors import MissingDependencyError, PayloadError
 
 if TYPE_CHECKING:

@@ -108,9 +108,11 @@ class TableFolders:
         place = self._root / TABLES / folder
         names = [n for n in files.names(place) if n.endswith(SUFFIX)]
         shared = [*shared_for(shared_times(names), self._created)]
-        waiting, old = addition, []
+        waiting, old = addition, list[Path]()
         if goes is not None:
-            old = self._own_files(place, names, goes)
+            own = [name for name in sorted(names) if name.startswith(f"{self._recording}-")]
+            readers = [reader for name in own if (reader := _reader(place / name)) is not None]
+            old = [one.path for one in readers if all(goes(s.topic) for s in one.about.sections)]
             for name in shared:
                 reader = _reader(place / name)
                 if reader is not None and reader.about.has(self._recording):
@@ -119,26 +121,9 @@ class TableFolders:
                     break
         if waiting.pieces:
             self._merge(place, shared, waiting)
-        self._publish(place, addition.files, names, old)
+        self._publish(place, addition.files, old)
         with suppress(OSError), files.folder(place.parent) as fd:
             files.system.rmdir(folder, dir_fd=fd)
-
-    def _own_files(
-        self, place: Path, names: Iterable[str], goes: Callable[[str], bool]
-    ) -> list[str]:
-        """Files of long topics that are to go; damaged ones are among them."""
-        found = []
-        for name in sorted(names):
-            if name.startswith(f"{self._recording}-"):
-                try:
-                    about = ColumnFile(place / name).about
-                    topics = [one.topic for one in about.sections]
-                except (OSError, StoreError):
-                    found.append(name)
-                    continue
-                if all(map(goes, topics)):
-                    found.append(name)
-        return found
 
     def _merge(self, place: Path, shared: Sequence[str], addition: Addition) -> None:
         """Add rows to the shared file that may have them, or to a new one."""
@@ -164,22 +149,18 @@ class TableFolders:
         goes: Callable[[str], bool],
     ) -> None:
         """Replace a shared file by one with other rows of the recording."""
+        pieces = [*addition.pieces]
+        new = {section.topic for section, _ in pieces}
         try:
             table = reader.table()
+            for before, section in reader.sections():
+                is_fresh = section.segments.items() <= self._digests.items()
+                stays = is_fresh and section.topic not in new and not goes(section.topic)
+                if section.id != self._recording or stays:
+                    pieces.append((section, table.slice(before, section.rows)))
         except StoreError as error:
             # Its other recordings get their tables again when they are asked about.
             _log.info("%s", error)
-            files.unlink(path)
-            if addition.pieces:
-                self._write(path, addition.pieces)
-            return
-        pieces = [*addition.pieces]
-        new = {section.topic for section, _ in pieces}
-        for before, section in reader.sections():
-            is_fresh = section.segments.items() <= self._digests.items()
-            stays = is_fresh and section.topic not in new and not goes(section.topic)
-            if section.id != self._recording or stays:
-                pieces.append((section, table.slice(before, section.rows)))
         if pieces:
             self._write(path, pieces)
         else:
@@ -208,16 +189,15 @@ class TableFolders:
             raise
         files.rename(part, path)
 
-    def _publish(
-        self, place: Path, parts: Sequence[Path], names: Collection[str], old: Sequence[str]
-    ) -> None:
+    def _publish(self, place: Path, parts: Sequence[Path], old: Sequence[Path]) -> None:
         """Give finished files free names: first those of the old files, which they replace."""
+        names = files.names(place)
         numbered = (f"{self._recording}-{number}{SUFFIX}" for number in count())
-        free = (name for name in numbered if name not in names)
-        for part, name in zip(parts, chain(old, free), strict=False):
-            files.rename(part, place / name)
-        for name in old[len(parts) :]:
-            files.remove_tree(place / name)
+        free = (place / name for name in numbered if name not in names)
+        for part, path in zip(parts, chain(old, free), strict=False):
+            files.rename(part, path)
+        for path in old[len(parts) :]:
+            files.remove_tree(path)
 
 
 def _folders(root: Path) -> list[str]:

@@ -335,7 +335,7 @@ class TableWriter:
                 files.remove_tree(self._parts)  # left from a crash
             files.make_folders(self._parts)
         self._numbers += 1
-        return self._parts / f"{self._numbers}{SUFFIX}"
+        return self._parts / f"{self._recording}-{self._numbers}{SUFFIX}"
 
     def _check_room(self) -> None:
         if shutil.disk_usage(self._root).free < _RESERVE:

@@ -15,7 +15,6 @@ import threading
 from collections import OrderedDict, defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
-from itertools import chain
 from pathlib import Path
 from stat import S_ISDIR
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -72,18 +71,16 @@ class _Folder(Listing):
         """Files that were looked at and cannot be read."""
         return [str(self._path / name) for name, (_, file) in self._files.items() if file is None]
 
-    def look(self, recording: RecordingEntry | None) -> None:
-        """Open files that may have rows of a recording, or all, if they are new or replaced."""
+    def look(self, recording: RecordingEntry) -> None:
+        """Open files that may have rows of a recording, if they are new or replaced."""
         if self.read():
             self._drop_replaced()
-        tables = [*self._own.values()] if recording is None else [self._own.get(recording.id, [])]
-        for name in chain.from_iterable(tables):
+        for name in self._own.get(recording.id, []):
             self._open(name)
-        if recording is not None:
-            for name in shared_for(self._shared, recording.created):
-                file = self._open(name)
-                if file is not None and file.about.has(recording.id):
-                    break
+        for name in shared_for(self._shared, recording.created):
+            file = self._open(name)
+            if file is not None and file.about.has(recording.id):
+                break
 
     def _drop_replaced(self) -> None:
         before, self._files, self.rows = self._files, {}, {}
@@ -255,7 +252,7 @@ class Tables:
             known = self._sealed.setdefault(recording.id, _Folders(place, self.opened))
             known.look()
             for folder in known.of(self._types_of(recording, topic)):
-                folder.look(None)
+                folder.look(recording)
             rows = self._rows_in(known, recording, topic)
             while len(self._sealed) > _MAX_RUNNING:
                 self._sealed.popitem(last=False)

@@ -7,23 +7,20 @@ ends at any point costs nothing but the work of the next one.
 
 from __future__ import annotations
 
-import math
 import threading
 import time
-from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
-
 from hybridlog.columns.recording_logs import RecordingRows
 from hybridlog.columns.table_writer import TableWriter, load
 from hybridlog.entries import put_entry
 from hybridlog.follow.child import Followed
 from hybridlog.index.indexing import ChunkIndexer
+from hybridlog.index.sending import IndexTarget, Sender
 from hybridlog.maintenance.expiry import make_rows
 from hybridlog.maintenance.report import reporter
 from hybridlog.maintenance.retention import Rules
@@ -37,19 +34,13 @@ from hybridlog_storage.errors import (
     StoreError,
     TopicError,
 )
-from hybridlog_storage.mongo.collection_names import collection_of
 from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.segments.chunk_table import places_of
 from hybridlog_storage.segments.gone_log import open_log
 from hybridlog_storage.segments.walk import OpenSegment
 from hybridlog_storage.settings import read_settings
-from hybridlog_storage.threads import Threads
 
 if TYPE_CHECKING:
-    from concurrent.futures import Future
-
-    from numpy.typing import NDArray
-
     from hybridlog.maintenance.report import Progress
     from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
@@ -59,110 +50,9 @@ if TYPE_CHECKING:
     from hybridlog_storage.segments.chunk_table import ChunkPlace
     from hybridlog_storage.segments.segment_reader import SegmentReader
 
-_SEND_BYTES: Final = 8 << 20  # documents that are sent together, at most
 _GROUP_BYTES: Final = 8 << 20  # content of chunks that are decoded together
 _GROUP_ROWS: Final = 1 << 17  # messages that are decoded together
 _RETRY_S: Final = 2.0  # between attempts after the database has failed
-
-
-@dataclass(frozen=True, slots=True)
-class IndexTarget:
-    """The database for the index documents of a recording.
-
-    Attributes:
-        database: The index; None if it is unavailable now, or the recording gets none.
-        failure: Why it is unavailable now; None if it is not, or the recording gets none.
-        renew: Returns the index, connected again if that was lost; starts the embedded MongoDB
-            again if that has ended. Raises `DatabaseError`.
-    """
-
-    database: Database | None = None
-    failure: DatabaseError | None = None
-    renew: Callable[[], Database] | None = None
-
-    @property
-    def is_wanted(self) -> bool:
-        """True if the recording gets documents, now or later."""
-        return self.database is not None or self.failure is not None
-
-    @property
-    def without(self) -> str:
-        """The end of a sentence about a MongoDB that is unavailable."""
-        return "so the index is made later" if self.is_wanted else "so there is no index"
-
-
-class _Sender:
-    """Sends documents to the index on a thread of its own, while more are made.
-
-    Attributes:
-        database: The index.
-        messages: Number of those whose documents it has sent.
-        ended: Digests of segments all of whose documents were added, by number as text.
-    """
-
-    def __init__(self, key: str, database: Database) -> None:
-        self.database = database
-        self.messages = 0
-        self._key = key
-        self._collections: set[str] = set()  # that exist
-        self._thread = Threads(1, "hybridlog-send")
-        self._sending: Future[None] | None = None
-        self._begin()
-
-    def _begin(self) -> None:
-        self._documents: defaultdict[str, list[NDArray[np.uint8]]] = defaultdict(list)
-        self._size = self._added = 0
-        self.ended: dict[str, str] = {}
-
-    def add(self, documents: Iterable[tuple[str, NDArray[np.uint8]]], messages: int) -> None:
-        """Add the documents of some messages, in tables of their topics.
-
-        Raises:
-            HybridlogError: An earlier sending has failed.
-        """
-        for topic, table in documents:
-            self._documents[topic].append(table)
-            self._size += table.size
-        self._added += messages
-        if self._size >= _SEND_BYTES:
-            self.send()
-
-    def send(self, *, wait: bool = False) -> None:
-        """Send what was added; `wait` until the index has it.
-
-        Raises:
-            HybridlogError: This sending has failed, or an earlier one.
-        """
-        if self._sending is not None:
-            self._sending.result()
-        sent = self._documents, self._added, self.ended
-        self._begin()
-        self._sending = self._thread.submit(self._send, *sent)
-        if wait:
-            self._sending.result()
-
-    def close(self) -> None:
-        """Stop sending."""
-        self._thread.shutdown(wait=True, cancel_futures=True)
-
-    def _send(
-        self,
-        documents: Mapping[str, list[NDArray[np.uint8]]],
-        messages: int,
-        segments: Mapping[str, str],
-    ) -> None:
-        if documents and not self._collections:
-            # One command, where creating each would be one for each topic.
-            self._collections.update(self.database.list_collections())
-        for topic, tables in documents.items():
-            name = collection_of(topic)
-            if name not in self._collections:
-                self.database.ensure_collection(name)
-                self._collections.add(name)
-            self.database.insert_raw(name, [row.tobytes() for table in tables for row in table])
-        if segments:
-            IndexState(self.database).put_segments(self._key, segments)
-        self.messages += messages
 
 
 @dataclass(slots=True)
@@ -179,7 +69,7 @@ class _Segment:
     """
 
     is_wanted: bool
-    sender: _Sender | None
+    sender: Sender | None
     opened: OpenSegment | None = None
     chunks: int = 0
     decoded: dict[int, ChannelStats] = field(default_factory=dict)
@@ -199,7 +89,6 @@ class Follower:
         target: Where documents go.
         topics: Topics whose tables are made; None for all of a new recording.
         done: Numbers of the segments that have all their documents, as text.
-        until: When `finish` is given up, by `time.monotonic`.
         progress: Called after each chunk of `finish`.
 
     Attributes:
@@ -219,7 +108,6 @@ class Follower:
         *,
         topics: Collection[str] | None = None,
         done: Collection[str] = (),
-        until: float = math.inf,
         progress: Progress | None = None,
     ) -> None:
         self._target = target or IndexTarget()
@@ -232,10 +120,9 @@ class Follower:
         self._entry = entry
         self._topics = topics
         self._done = done
-        self._until = until
         self._progress = progress
         self._indexer = ChunkIndexer(entry.id)
-        self._sender: _Sender | None = None
+        self._sender: Sender | None = None
         self._retry_at = 0.0
         self._indexed = 0
         self._gap: DatabaseError | None = None  # why the index has missed something
@@ -265,10 +152,6 @@ class Follower:
         missed = 0 if failure is None else read - indexed
         return Followed(self._target.is_wanted, read, indexed, missed, failure)
 
-    def make_rows(self) -> None:
-        """See `make_rows_ahead`."""
-        make_rows_ahead(self._directory, self._entry.id, lambda: not self.is_stopped)
-
     def forget(self) -> None:
         """Remove the documents of a recording that is removed.
 
@@ -288,7 +171,7 @@ class Follower:
         self._check_cut()
         manifest = self._directory.manifests.read(self._entry.id)
         listing = self._directory.listing(self._entry.id).choosing(manifest)
-        with suppress(TimeoutError):
+        with suppress(InterruptedError):
             for number in sorted({*listing.open, *listing.sealed} - self._ended):
                 if number in listing.sealed and number in manifest.logs:
                     digest = manifest.logs[number].digest
@@ -308,7 +191,6 @@ class Follower:
 
         Raises:
             SegmentError: A segment cannot be read.
-            TimeoutError: Time was short.
         """
         try:
             self._retry_at = 0.0
@@ -374,10 +256,10 @@ class Follower:
         channels: Mapping[int, Channel],
         report: Callable[[int], None] = lambda _: None,
     ) -> None:
-        """Read those chunks of a segment that were not; TimeoutError if it is to stop."""
+        """Read those chunks of a segment that were not; InterruptedError if it is to stop."""
         for group in self._groups(number, reader, places):
-            if self.is_stopped or time.monotonic() > self._until:
-                raise TimeoutError
+            if self.is_stopped:
+                raise InterruptedError
             self._take(self._segments[number], group, channels)
             report(group[-1].place.offset)
 
@@ -477,7 +359,7 @@ class Follower:
             if state.one(self._entry.key) is None:
                 state.begin(self._entry)
             self.failure = None
-            self._sender = _Sender(self._entry.key, database)
+            self._sender = Sender(self._entry.key, database)
 
     def _send(self, *, wait: bool = False) -> None:
         if self._sender is not None:
@@ -515,69 +397,61 @@ def make_rows_ahead(
         make_rows(directory, recording, is_wanted)
 
 
-class FollowerThread:
-    """Runs a follower in this process, which waits for it at the end only.
+class FollowerThread(Follower):
+    """Follows on a thread of this process, which waits for it at the end only.
 
-    Args:
-        follower: The follower.
-        interval_s: Time between two looks, seconds; None to do everything at the end.
+    `interval_s` lies between two looks, seconds; with None it does everything at the end.
     """
 
-    def __init__(self, follower: Follower, interval_s: float | None) -> None:
+    def __init__(
+        self,
+        directory: StoreDirectory,
+        catalog: Catalog,
+        target: IndexTarget,
+        interval_s: float | None,
+        entry: RecordingEntry,
+    ) -> None:
         load()
-        self.follower = follower
-        self.forget = follower.forget
+        super().__init__(directory, catalog, entry, target)
         self._interval_s = interval_s
-        self._entry: RecordingEntry | None = None
+        self._ended_as: RecordingEntry | None = None
         self._crash: BaseException | None = None
         # No event: a thread that is interrupted in `set` may leave it locked forever.
         self._calls: SimpleQueue[None] = SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="hybridlog-index", daemon=True)
         self._thread.start()
 
-    @property
-    def state(self) -> Followed:
-        """How far it is."""
-        return self.follower.state
-
     def finish(self, entry: RecordingEntry) -> RecordingEntry:
-        """Finish the follower, and raise its errors other than those of the database."""
-        self._entry = entry
+        """As of `Follower`; errors of the thread are raised, too."""
+        self._ended_as = entry
         self.abandon()
         if self._crash is not None:
             raise self._crash
-        return self._entry
+        return self._ended_as
 
     def abandon(self) -> None:
         """Stop it."""
-        self.follower.is_stopped = True
+        self.is_stopped = True
         self._calls.put(None)
         self._thread.join()
 
     def _run(self) -> None:
         try:
-            while not self.follower.is_stopped:
+            while not self.is_stopped:
                 try:
                     self._calls.get(timeout=self._interval_s)
                 except Empty:
                     with suppress(StoreError):  # the next look or `finish` sees it
-                        self.follower.follow()
-            if self._entry is not None:
-                self.follower.is_stopped = False
+                        self.follow()
+            if self._ended_as is not None:
+                self.is_stopped = False
                 with suppress(StoreError, DiskFullError):  # or else they are written when logs go
-                    self.follower.make_rows()
-                self._entry = self.follower.finish(self._entry)
+                    make_rows_ahead(self._directory, self._entry.id, lambda: not self.is_stopped)
+                self._ended_as = super().finish(self._ended_as)
         except BaseException as error:
             self._crash = error
         finally:
-            self.follower.discard()
-
-
-def in_thread(
-    directory: StoreDirectory, catalog: Catalog, target: IndexTarget, interval_s: float | None
-) -> Callable[[RecordingEntry], FollowerThread]:
-    """A function that begins to follow a new recording, on a thread of this process."""
-    return lambda entry: FollowerThread(Follower(directory, catalog, entry, target), interval_s)
+            self.discard()
 
 
 def bring(
@@ -588,7 +462,6 @@ def bring(
     *,
     anew: bool = False,
     topics: Collection[str] = (),
-    until: float = math.inf,
     wait_s: float = 0.0,
     progress: Progress | None = None,
 ) -> Follower | None:
@@ -601,7 +474,6 @@ def bring(
         database: The index; None to make no documents.
         anew: Whether documents that are there are made again.
         topics: Topics whose tables are made again.
-        until: When this is given up, by `time.monotonic`.
         wait_s: Seconds to wait for another process that holds the recording.
         progress: Called after each chunk.
 
@@ -609,7 +481,6 @@ def bring(
         DatabaseError: MongoDB fails.
         HeldError: Another process holds the recording.
         SegmentError: A segment cannot be read.
-        TimeoutError: It was given up.
         TopicError: The recording is gone.
     """
     with directory.writing(known.id, known.name, wait_s=wait_s):
@@ -628,7 +499,6 @@ def bring(
             IndexTarget(database),
             topics=wanted,
             done=done,
-            until=until,
             progress=progress,
         )
         follower.finish(entry)

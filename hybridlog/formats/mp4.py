@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from hybridlog.arrays import is_video_type
-from hybridlog.arrays.bitstream import frame_of, is_key_frame
-from hybridlog.arrays.video import VideoDecoder, pyav
+from hybridlog.arrays.video import VideoDecoder, frame_of, is_key_frame, pyav
 from hybridlog.drawing.images import shown_pixels
 from hybridlog.formats.answer import Answer
 from hybridlog.formats.writing import Sink, Target, Whole, failures, path_of

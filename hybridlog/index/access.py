@@ -29,7 +29,7 @@ from hybridlog_storage.settings import (
 )
 
 if TYPE_CHECKING:
-    from hybridlog.follow.follower import IndexTarget
+    from hybridlog.index.sending import IndexTarget
     from hybridlog.maintenance.report import Progress
     from hybridlog.shared import Shared
     from hybridlog_storage.mongo.database import Database
@@ -151,7 +151,7 @@ class IndexAccess:
 
     def index_to_record(self, purpose: str, *, brings: bool = True) -> IndexTarget:
         """The index, for a new recording; it may be unavailable, or without `brings` be behind."""
-        from hybridlog.follow.follower import IndexTarget
+        from hybridlog.index.sending import IndexTarget
 
         renew = partial(self.connect, brings=False)
         try:

@@ -18,21 +18,12 @@ if TYPE_CHECKING:
 
 
 def missing(
-    directory: StoreDirectory,
-    entry: RecordingEntry,
-    tables: Tables | None = None,
+    directory: StoreDirectory, entry: RecordingEntry, tables: Tables | None = None
 ) -> set[str]:
-    """Topics whose tables are missing, or differ from the catalog."""
+    """Topics of which tables lack rows, or have others than the catalog."""
     from hybridlog.columns.tables import Tables
 
-    tables = tables or Tables(directory.path)
-    topics = topics_of(entry)
-    lacking = tables.lacking(entry, topics)
-    return lacking | {
-        topic
-        for topic in topics - lacking
-        if tables.can_have(entry, topic) and tables.of(entry, topic) is None
-    }
+    return (tables or Tables(directory.path)).lacking(entry, topics_of(entry))
 
 
 class TableChecker:

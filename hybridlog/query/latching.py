@@ -55,14 +55,14 @@ def is_video(channel: Channel) -> bool:
 
 def is_key_frame(channel: Channel, payload: Buffer) -> bool:
     """True if a message of a video channel is a key frame."""
-    from hybridlog.arrays import bitstream
+    from hybridlog.arrays import video
     from hybridlog.schema.codecs import codec_for
 
     try:
-        form, data = bitstream.frame_of(codec_for(channel).decode(memoryview(payload)))
+        form, data = video.frame_of(codec_for(channel).decode(memoryview(payload)))
     except (PayloadError, DefinitionError):
         return False
-    return bitstream.is_key_frame(form, data)
+    return video.is_key_frame(form, data)
 
 
 def publisher_of(channel: Channel) -> Hashable:

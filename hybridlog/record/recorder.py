@@ -39,8 +39,8 @@ from hybridlog_storage.times import placed
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.follow.follower import IndexTarget
     from hybridlog.formats.reading import Damage, Fingerprint, Source
+    from hybridlog.index.sending import IndexTarget
     from hybridlog.query.topics import TopicMatcher
     from hybridlog.snapshot import Snapshot
     from hybridlog_storage.catalog import Catalog
@@ -137,13 +137,13 @@ def record(
         SourceError: nothing could be read.
         DiskFullError: no space; nothing is stored.
     """
-    from hybridlog.follow.follower import in_thread  # a live recorder loads none of it
+    from hybridlog.follow.follower import FollowerThread  # a live recorder loads none of it
 
     started = time.monotonic()
     capture = Capture(
         directory,
         catalog,
-        in_thread(directory, catalog, target, _FOLLOW_S),
+        partial(FollowerThread, directory, catalog, target, _FOLLOW_S),
         known,
         name=options.name or name_of(source.path),
         tags=options.tags,

@@ -20,8 +20,7 @@ import pytest
 from numpy.typing import NDArray
 
 import hybridlog as hl
-from hybridlog.arrays.bitstream import FrameOrder, frame_of, is_key_frame
-from hybridlog.arrays.video import VideoDecoder
+from hybridlog.arrays.video import FrameOrder, VideoDecoder, frame_of, is_key_frame
 from hybridlog_storage.errors import MissingDependencyError, PayloadError, TopicError
 from hybridlog_storage.messages import Channel, Schema
 from tests.cli.within import answer

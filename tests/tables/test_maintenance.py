@@ -74,12 +74,12 @@ def test_what_is_left_of_recordings_that_are_gone(few: hl.Store, tmp_path: Path)
     assert contents(few) != before
     places.lose(root, "more")
     with hl.open(root, mongo="none") as again:
-        again.recordings()
+        again.shared.recover()
     assert contents(few) == before
     # What was not finished.
     (root / PARTS / f"r{gone}").mkdir(parents=True)
     with hl.open(root, mongo="none") as again:
-        again.recordings()
+        again.shared.recover()
     assert not unfinished(few)
     few.refresh()
     assert compare(few) == 90

@@ -9,8 +9,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.arrays import is_video_type
-from hybridlog.arrays.bitstream import frame_of, is_key_frame
-from hybridlog.arrays.video import VideoDecoder
+from hybridlog.arrays.video import VideoDecoder, frame_of, is_key_frame
 from hybridlog.message import messages_in
 from hybridlog.query.answers.lost import lost_times
 from hybridlog.query.planner import Planner
