@@ -21,6 +21,7 @@ from hybridlog.query.question import Counters
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import DurationLike, parse_duration
 from hybridlog.schema.arrow_types import common_schema
+from hybridlog.snapshot import UNFINISHED
 from hybridlog.wording import counted, listed
 from hybridlog_storage.errors import UsageError
 
@@ -129,11 +130,14 @@ class Aligned:
         base, beside = self._base, [self._beside(reader) for reader in self._others]
         several = len(self._session.chosen(base.question)) > 1
         chosen = RangeResolver(self._session, base.question).resolve()
-        for resolved in chosen if limit != 0 else ():
+        for summary, bounds, _ in chosen if limit != 0 else ():
+            span = None if summary.status in UNFINISHED else summary.extent
+            if bounds is not None and base.question.clock == "log":
+                span = bounds
             for one in beside:
-                one.enter(resolved.summary.id)
-            name = resolved.summary.name if several else None
-            for times, table in base.rows(resolved.summary.id):
+                one.enter(summary.id, span)
+            name = summary.name if several else None
+            for times, table in base.rows(summary.id):
                 matched = [one.match(times) for one in beside]
                 begin = 0
                 while begin < len(times):

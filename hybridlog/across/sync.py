@@ -22,6 +22,7 @@ from hybridlog.query.answers.video import picture_of
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.planner import Planner
 from hybridlog.query.question import Counters
+from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import DurationLike, parse_duration
 from hybridlog.wording import counted
 from hybridlog_storage.errors import StoreError, TimeError, UsageError
@@ -76,20 +77,23 @@ class Synced(Sequence[tuple["Message", ...]]):
         limit = None if tolerance is None else parse_duration(tolerance)
         chosen = [set(session.chosen(question).tolist()) for question in questions]
         places = set.intersection(*chosen)
-        readers = [TopicReader(session, question, clock) for question in questions]
+        summaries = session.snapshot().summaries
+        in_range = set.union(*(_in_range(session, question) for question in questions))
+        near = [one for place in sorted(places) if (one := summaries[place].id) in in_range]
+        asked = (replace(question, recordings=tuple(near)) for question in questions)
+        readers = [TopicReader(session, question, clock) for question in asked]
         ids: list[str] = []
         # By topic int64[4, n] of each recording, as of `_Times`.
         found = [[np.empty((4, 0), np.int64)] for _ in questions]
         timed = np.zeros(len(questions), np.int64)  # messages with a time
-        for place in sorted(places):
-            recording = session.snapshot().summaries[place].id
+        for recording in near:
             read = [reader.moments(recording) for reader in readers]
             timed += [len(one.time) for one in read]
             if not all(len(one.time) for one in read):
                 continue
             epochs = readers[0].epochs(recording)
-            near = min((one for one in (limit, epochs.apart) if one is not None), default=None)
-            rows = approximate_sets([one.time for one in read], near)
+            longest = min((one for one in (limit, epochs.apart) if one is not None), default=None)
+            rows = approximate_sets([one.time for one in read], longest)
             ids += [recording] * len(rows)
             for n, one in enumerate(read):
                 message = one.place[rows[:, n]]
@@ -183,6 +187,13 @@ class Synced(Sequence[tuple["Message", ...]]):
                 "sets again."
             )
         return messages[number]
+
+
+def _in_range(session: Session, question: Question) -> set[str]:
+    """Ids of the recordings that a question's range touches."""
+    with suppress(TimeError):
+        return {one.summary.id for one in RangeResolver(session, question).resolve()}
+    return set()
 
 
 def _left_out(

@@ -98,6 +98,7 @@ class TopicReader:
         self.is_apart = is_apart
         self.counters = Counters()
         self._epochs: dict[str, Epochs] = {}
+        self._of_all: Moments | None = None  # of all recordings, if these are apart
         self._session = session
         self._time = {"log": TIME, "publish": "publish_time", "header": STAMP}[clock]
         self._hidden = {TIME} if is_apart else {TIME, RECORDING}
@@ -147,17 +148,32 @@ class TopicReader:
 
     def values(self, recording: str, span: Span) -> Iterator[pa.Table]:
         """The messages beside a recording in a span of log time, ns, in order."""
-        question = self._beside(recording)
+        yield from self._stream(self._during(self._beside(recording), span), is_decided=True)
+
+    def _during(self, question: Question, span: Span) -> Question:
         row = np.array([[*span, 1]], np.int64)
         ids = [one.id for one in self._session.summaries_of(question)]
-        yield from self._stream(replace(question, during=Intervals((i, row) for i in ids)))
+        return replace(question, during=Intervals((one, row) for one in ids))
 
-    def moments(self, recording: str) -> Moments:
-        """The times of all messages beside a recording; no payload is read for log times."""
+    def moments(self, recording: str, span: Span | None = None) -> Moments:
+        """The times of all messages beside a recording; no payload is read for log times.
+
+        If these are compared, at least of those in a span, ns.
+        """
+        if self._time != TIME or not self.question.is_unbounded:
+            span = None
+        if not self.is_apart or span is not None:
+            return self._moments(recording, span)
+        self._of_all = self._of_all or self._moments(recording, None)
+        return self._of_all
+
+    def _moments(self, recording: str, span: Span | None) -> Moments:
         none = np.empty(0, np.int64)
         if self.elsewhere(recording) is not None:
             return Moments(none, none, none)
         counters, question = Counters(), replace(self._beside(recording), frame=None)
+        if span is not None:
+            question = self._during(question, span)
         log_time, time = none, none
         with suppress(TimeError):  # the range does not touch the recording
             if self._time == TIME:
@@ -178,8 +194,11 @@ class TopicReader:
         order = order[time[order] != UNKNOWN]
         return Moments(log_time, time[order], order)
 
-    def _stream(self, question: Question) -> Iterator[pa.Table]:
-        """The tables with rows of an answer, whose cost counts."""
+    def _stream(self, question: Question, *, is_decided: bool = False) -> Iterator[pa.Table]:
+        """The tables with rows of an answer, whose cost counts.
+
+        If a predicate is decided, `moments` has counted what it cannot decide.
+        """
         counters = Counters()
         try:
             with suppress(TimeError):  # the range does not touch the recording
@@ -187,8 +206,8 @@ class TopicReader:
                     if table.num_rows:
                         yield table
         finally:
-            if question.during is not None and question.predicate is not None:
-                counters.unreadable = counters.without_arrays = 0  # `moments` has counted these
+            if is_decided and question.predicate is not None:
+                counters.unreadable = counters.without_arrays = 0
                 counters.not_indexed = ()
             self.counters.add(counters)
 
@@ -286,12 +305,15 @@ class Beside:
         why = _WHY if tolerance is None else _WHY_NEAR
         self._why = why.get(how, "").format(format_duration(tolerance or 0))
 
-    def enter(self, recording: str) -> None:
-        """Go on with the rows of another recording."""
+    def enter(self, recording: str, span: Span | None) -> None:
+        """Go on with the rows of another recording, in a span of log time, ns; None: any."""
+        near = self._tolerance
+        if span is not None:
+            span = None if near is None else (max(span[0] - near, BEGIN), min(span[1] + near, END))
         self._recording = recording
         self._reason = self._reader.elsewhere(recording) or self._why
         self._lost = self._reader.lost(recording)
-        self._moments = self._reader.moments(recording)
+        self._moments = self._reader.moments(recording, span)
         self._most = max(_PIECE_BYTES // self._reader.message_bytes(recording), 1)
         self._held, self._first, self._last = self._reader.empty, END, BEGIN
 

@@ -133,7 +133,7 @@ def test_errors_say_what_to_do(store: hl.Store, tmp_path: Path) -> None:
         store.sql(f"copy (select 1) to '{tmp_path / 'x'}'").rows()
     with pytest.raises(TopicError, match=r"There is no view 'scn'; did you mean scan"):
         store.sql("select * from scn")
-    with pytest.raises(TopicError, match="There is no view 'xyzzy'; there are Large_2, "):
+    with pytest.raises(TopicError, match="There is no view 'xyzzy'; there are Large_2"):
         store.sql("select * from xyzzy")
     with pytest.raises(UsageError, match='syntax error at or near "selec"'):
         store.sql("selec 1")

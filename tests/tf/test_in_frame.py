@@ -231,7 +231,7 @@ def test_formats_and_refusals(demo: Path, store: hl.Store) -> None:
         store.recordings("robot").topic("odom", "scan").in_frame("map").to_arrow()
     odom = store.topic("odom").in_frame("map")
     for ask in (
-        lambda: store.sync([odom, "scan"]),
+        lambda: store.sync([odom, "/base/scan"]),
         lambda: next(iter(odom)),
         lambda: odom.at("+1s"),
         lambda: odom.changes("pose.pose.position.x"),
