@@ -257,8 +257,8 @@ class Shell:
         assert process.stderr is not None
         complaints = process.stderr.read()
         process.stderr.close()
-        code = process.wait(120)
-        listener.join(10)
+        code = process.wait()
+        listener.join()
         os.close(ours)
         said = (bytes(heard) + complaints).decode("utf-8", "replace")
         return code, re.sub(r"\x1b\[[0-9;]*m", "", said.replace("\r\n", "\n"))
@@ -321,7 +321,7 @@ class Python:
 
     def close(self) -> None:
         """End it."""
-        self._process.communicate(timeout=30)
+        self._process.communicate()
 
 
 @contextlib.contextmanager
@@ -390,6 +390,7 @@ def troubles(
     return found
 
 
+@pytest.mark.timeout(1800)  # for all pages, also on a machine that has other things to do
 @pytest.mark.parametrize("page", RUN, ids=lambda page: page.name)
 def test_what_is_shown_runs(page: Path, troubles: dict[Path, Future[str]]) -> None:
     found = troubles[page].result()

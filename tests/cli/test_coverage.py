@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
+from hybridlog_storage.manifests import MANIFEST_OLD
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
@@ -65,6 +66,28 @@ def test_what_was_lost_is_not_called_a_damaged_source(damaged: Path) -> None:
     rows = {line.split()[0]: line for line in run("ls", store=damaged).lines[1:]}
     assert rows["part"].endswith("stored data lost")
     assert rows["gone"].endswith("stored data lost")
+
+
+@pytest.mark.parametrize("has_old", [True, False])
+def test_a_lost_manifest_is_said_with_answers(damaged: Path, has_old: bool) -> None:
+    recording = places.id_of(damaged, "part")
+    (places.manifest_of(places.folder(damaged, "part"))).unlink()
+    if not has_old:
+        (places.folder(damaged, "part") / MANIFEST_OLD).unlink()
+    done = run("fetch", "-t", "/kept", "--count", store=damaged, code=None)
+    assert done.out == "0\n"
+    assert f"Recording {recording} cannot be read: {recording} has no manifest" in done.err
+    assert "1 recording cannot be read and is left out" in done.err
+    run("fetch", "-t", "/kept", "--count", "--strict", store=damaged, code=11)
+    run("verify", "--repair", store=damaged, code=None)
+    done = run("fetch", "-t", "/kept", "-r", "part", "--count", store=damaged)
+    assert done.out == "3\n"
+    assert "part has lost its manifest once, so this answer may not be complete." in done.err
+    info = run("info", "part", store=damaged).out
+    why = "not known: its manifest was lost, so a segment may be missing"
+    assert ("1 message lost in 1 place" if has_old else why) in info
+    done = run("fetch", "-t", "/kept", "-r", "part", "--count", store=damaged)
+    assert "part has lost its manifest once" in done.err
 
 
 def test_info_shows_notes_and_marks(damaged: Path) -> None:

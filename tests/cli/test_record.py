@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -136,3 +138,14 @@ def test_a_damaged_log_says_where(logs: Path, tmp_path: Path) -> None:
     assert damage["file"].endswith("torn.bag")
     assert 0 < damage["offset"] <= (logs / "torn.bag").stat().st_size
     run("verify", store=tmp_path / "s")
+
+
+def test_names_that_are_no_utf_8(logs: Path, tmp_path: Path) -> None:
+    odd = Path(os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9.mcap"))
+    shutil.copy(logs / "odd.mcap", odd)
+    tag = os.fsdecode(b"who=Ren\xe9")
+    run("record", odd, "--set-tag", tag, "-q", store=tmp_path / "s")
+    (found,) = run("ls", "--json", store=tmp_path / "s").json
+    assert found["name"] == "caf\\xe9"
+    assert found["tags"] == {"who": "Ren\\xe9"}
+    assert "all is well" in run("verify", store=tmp_path / "s").out

@@ -224,6 +224,21 @@ def test_compressed_images_as_they_came(
         assert picture(compressed(said, data), raw=False, form="jpg").suffix == ".jpg"
 
 
+@pytest.mark.parametrize(
+    ("start", "suffix"),
+    [
+        (b"MM\0*rest", ".tif"),
+        (b"\0\0\0\x1cftypavif", ".avif"),
+        (b"\0\0\0\x0cjP  \r\n\x87\n", ".jp2"),
+        (b"\0\0\0\x0cJXL \r\n\x87\n", ".jxl"),
+        (b"\xff\x0a\0", ".jxl"),
+    ],
+)
+def test_formats_by_their_first_bytes(start: bytes, suffix: str) -> None:
+    assert picture(compressed("", start)).suffix == suffix
+    assert picture(compressed("", start)).data == start
+
+
 @pytest.mark.parametrize("data", [b"\0\0\0\x01\x67\x42", b"BMx", b"RIFF1234WAVE", b"x" * 30])
 @pytest.mark.parametrize("raw_form", [True, False])
 def test_no_known_format(data: bytes, *, raw_form: bool) -> None:
@@ -247,6 +262,13 @@ def test_compressed_depth() -> None:
         assert seen(found).tolist() == [[0, 95, 255, 0]]
     with pytest.raises(PayloadError, match="only PNG"):
         picture(compressed("16UC1; compressedDepth rvl", bytes(99)))
+
+
+def test_foxglove_images() -> None:
+    message = Sent(
+        "foxglove.RawImage", encoding="mono8", height=5, width=7, step=7, data=GREY.tobytes()
+    )
+    assert np.array_equal(seen(picture(message)), GREY)
 
 
 def test_jpeg() -> None:

@@ -23,6 +23,7 @@ from hybridlog.maintenance.expiry import expire
 from hybridlog.message import Message
 from hybridlog.query.query import Query
 from hybridlog_storage.errors import DiskFullError, PayloadError, TimeError, UsageError
+from hybridlog_storage.messages import Channel, Schema
 from tests.calls import Calls
 from tests.cli.running import run
 from tests.cli.within import answer
@@ -35,12 +36,14 @@ from .test_video import (
     DECODERS,
     ENCODERS,
     GROUP,
+    JSON,
     MS,
     STEP,
     decoded,
     drawn,
     encode,
     encoded,
+    payload,
     psnr,
     write,
 )
@@ -244,6 +247,18 @@ def test_what_is_no_video(store: hl.Store, tmp_path: Path) -> None:
         OUTPUTS["mp4"].write(Answer(), io.BytesIO())
     to_mp4(images.every(2), tmp_path / "out.mp4")
     assert len(read(tmp_path / "out.mp4")[1]) == 3
+
+
+def test_frames_of_another_size_or_format(tmp_path: Path) -> None:
+    video = Channel("/cam", "json", Schema("foxglove.CompressedVideo", "jsonschema", JSON))
+    with hl.open(tmp_path / "store", create=True, mongo="none") as store:
+        with store.start("cam") as recording:
+            for n, form in enumerate(("h264", "h265")):
+                frame = payload("json", form, encoded(form)[0])
+                recording.write(video, frame, log_time=BASE + n * STEP)
+        with pytest.raises(UsageError, match="/cam has h264, then other frames, at 2025-"):
+            to_mp4(store.topic("/cam"), tmp_path / "out.mp4")
+        assert [one.name for one in tmp_path.iterdir()] == ["store"]
 
 
 def test_files_that_are_not_completed(

@@ -125,6 +125,22 @@ def test_what_is_refused(
     assert [*tmp_path.iterdir()] == []
 
 
+def curves_of(found: list[Line]) -> str:
+    return figure(found, size=(500, 300), form="svg").decode()
+
+
+def test_names_are_no_formulas_and_letters_may_lack() -> None:
+    names = ["$x", "_hidden", "a$b^$\\frac", "\x1b[31m", "日本 \U0001f916"]
+    found = [made([0, 1], [0, 1], name, "$\\topic$") for name in names]
+    text = curves_of(found)
+    assert "$\\topic$" in text
+    for name in names:
+        want = name.replace("\x1b", "\N{REPLACEMENT CHARACTER}")
+        assert f">{want}<" in text.replace("&amp;", "&")
+    assert "$x" in curves_of(found[:1])
+    assert figure(found, size=(500, 300), form="png").startswith(b"\x89PNG")
+
+
 def test_without_matplotlib(drive: Drive, tmp_path: Path, calls: Calls) -> None:
     calls.missing("matplotlib")
     ask = ("-t", "drive", "--fields", "y")

@@ -186,6 +186,14 @@ def test_far_from_the_origin_keeps_millimetres() -> None:
     assert np.abs(times - [1_700_000_000 + at / 1000 for at in range(10)]).max() < 1e-6
 
 
+def test_values_that_float32_cannot_hold_are_not_finite() -> None:
+    rows = [struct.pack("<3d", x, 1, 2) for x in (1e300, 5, -1e39)]
+    described = [(name, 8 * at, 8, 1) for at, name in enumerate("xyz")]
+    got = points_of("sensor_msgs/PointCloud2", cloud(described, [rows], step=24))
+    assert got["dropped"] == {"not finite": 2}
+    assert got["xyz"].tolist() == [[5, 1, 2]]
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

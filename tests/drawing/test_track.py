@@ -11,9 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from rosbags.highlevel import AnyReader
 
 import hybridlog as hl
-from hybridlog.drawing.track import Grid, Position, fix_of, position_of, track
+from benchmarks.simulator.write import write_bag
+from hybridlog.drawing.track import Grid, Position, fix_of, pose_of, position_of, track
 from hybridlog.query.query import field_types
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.messages import Channel, Schema
@@ -147,6 +149,23 @@ def test_a_span(store: hl.Store) -> None:
     assert len(track(store.topic("fix"), pixels=10, span=(end, begin))["times"]) == 0
 
 
+def test_the_short_way_round(store: hl.Store) -> None:
+    got = track(store.topic("other"), pixels=10)
+    assert np.allclose(got["xy"][:3, 0], [0, 222.64, 222.64], atol=0.01)
+    assert np.isnan(got["xy"][3:]).all()
+    assert (got["messages"], got["fixes"]) == (5, 3)
+
+
+def test_messages_that_arrive_in_pairs_have_no_gaps(tmp_path: Path) -> None:
+    with hl.open(tmp_path / "store", create=True) as store:
+        with store.start("pairs") as recorder:
+            for at in range(40):
+                time = BASE + (at // 2) * 100 * MS + at % 2 + (5000 * MS if at >= 20 else 0)
+                recorder.write(channel("/fix"), payload(48.0, 11.0), log_time=time)
+        got = track(store.topic("fix"), pixels=100)
+    assert np.flatnonzero(np.isnan(got["xy"][:, 0])).tolist() == [20]
+
+
 def test_the_grid_is_on_the_ellipsoid() -> None:
     # Lengths of a degree, from the tables of the ellipsoid.
     for latitude, east, north in (
@@ -200,3 +219,43 @@ def test_topics_without_positions(store: hl.Store) -> None:
         track(store.topic("fix").reverse(), pixels=10)
     with pytest.raises(UsageError, match="at least one pixel"):
         track(store.topic("fix"), pixels=0)
+
+
+def test_poses_of_a_robot(tmp_path: Path) -> None:
+    """Against the messages as rosbags reads them."""
+    bag = tmp_path / "robot.bag"
+    write_bag(bag, duration_s=8, topics=["/odom", "/r_cart/command_pose"])
+    with AnyReader([bag]) as reader:
+        (connection,) = (c for c in reader.connections if c.topic == "/odom")
+        read = [
+            (time, reader.deserialize(raw, connection.msgtype).pose.pose)
+            for _, time, raw in reader.messages([connection])
+        ]
+    with hl.open(tmp_path / "store", create=True) as store:
+        store.record(bag)
+        query = store.topic("odom")
+        assert position_of(field_types(query)) == Position(
+            "pose.pose.position.", is_geographic=False
+        )
+        got = track(query, pixels=len(read))
+        assert (got["is_geographic"], got["grid"], got["exact"]) == (False, None, True)
+        assert got["times"].tolist() == [time for time, _ in read]
+        assert got["xy"].tolist() == [[pose.position.x, pose.position.y] for _, pose in read]
+        thin = track(query, pixels=10)
+        assert not thin["exact"]
+        assert (thin["messages"], thin["fixes"]) == (len(read), len(read))
+        assert {tuple(place) for place in thin["xy"].tolist()} <= {
+            tuple(p) for p in got["xy"].tolist()
+        }
+        time, pose = read[200]
+        found = pose_of(query.at(time), "pose.pose.position.")
+        assert (found["time"], found["x"], found["y"]) == (time, pose.position.x, pose.position.y)
+        # The robot turns about z only.
+        turned = 2 * math.atan2(pose.orientation.z, pose.orientation.w)
+        assert found["heading"] is not None
+        assert math.cos(found["heading"] - turned) == pytest.approx(1)
+        assert position_of(field_types(store.topic("r_cart/command_pose"))) == Position(
+            "pose.position.", is_geographic=False
+        )
+        with pytest.raises(UsageError, match="has no position"):
+            pose_of(query.at(time), "pose.")

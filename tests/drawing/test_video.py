@@ -185,6 +185,18 @@ def test_pictures_at_any_time(videos: hl.Store, form: str, encoding: str) -> Non
 
 
 @pytest.mark.parametrize("form", ENCODERS)
+def test_info_counts_key_frames(videos: hl.Store, form: str) -> None:
+    encoded(form)
+    found = answer("info", form, "--json", store=videos.directory.path).json[0]["channels"]
+    about = {channel["topic"]: channel["video"] for channel in found}
+    wanted = {"formats": [form], "frames": COUNT, "key_frames": len(KEYS), "unreadable": 0}
+    for encoding in ENCODINGS:
+        assert about[f"/{encoding}"] == wanted
+    text = answer("info", form, store=videos.directory.path).out
+    assert f"{form}, {len(KEYS)} key frames" in text
+
+
+@pytest.mark.parametrize("form", ENCODERS)
 def test_a_slice_begins_with_the_key_frame(videos: hl.Store, form: str, tmp_path: Path) -> None:
     frames, right, begin = encoded(form), decoded(form), BASE + 7 * STEP
     for number, encoding in enumerate(ENCODINGS):

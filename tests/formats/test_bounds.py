@@ -18,6 +18,7 @@ import lz4.frame
 import pytest
 import zstandard
 
+from hybridlog.formats.yaml_values import YamlError, parse_yaml
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.segments.compression import Compressor, decompress
 from tests.formats import test_rosbag1 as bags
@@ -123,6 +124,27 @@ def test_missing_files_of_the_metadata_are_told(tmp_path: Path) -> None:
     )
     (folder / "metadata.yaml").write_text(f"{text}  files:\n{files}")
     assert read(folder)[2] == [["the file is missing; metadata.yaml lists it", 2]] * 1000
+
+
+def test_yaml_values() -> None:
+    text = "{a: 1, b: '1', c: ~, d: True, e: 1.5, f: &x [-2, null], g: *x, <<: {h: 1}, i: !!str 3}"
+    found = parse_yaml(text)
+    assert found == {
+        "a": 1,
+        "b": "1",
+        "c": None,
+        "d": True,
+        "e": "1.5",
+        "f": [-2, None],
+        "g": [-2, None],
+        "<<": {"h": 1},
+        "i": "3",
+    }
+    assert parse_yaml("a: 1\n---\n}") == {"a": 1}
+    assert parse_yaml("") is None
+    for wrong in ("{a: 1, a: 2}", "[", "{[a]: 1}", "\x00", "\ud800"):
+        with pytest.raises(YamlError):
+            parse_yaml(wrong)
 
 
 # Chunks of MCAP files
@@ -328,6 +350,19 @@ def test_messages_of_too_many_channels_are_counted(tmp_path: Path) -> None:
     bag = tmp_path / "a.bag"
     bag.write_bytes(bags.bag(*rows, again))
     assert read(bag) == (FULL + 1, FULL, [[reason, 100]])
+
+
+def test_definitions_without_messages(tmp_path: Path) -> None:
+    # The last definition of each id is a channel.
+    path = write(tmp_path / "a.mcap", *(channel(9, f"/t{k}") for k in range(70_000)), message())
+    assert read(path) == (1, 2, [])
+    flips = [channel(k) for k in range(1, FULL)] + [schema(1, f"a/T{k % 2}") for k in range(10_000)]
+    assert read(write(tmp_path / "b.mcap", *flips, message())) == (1, FULL - 1, [])
+    bag = tmp_path / "a.bag"
+    rows = [bags.connection(k, topic=f"/t{k}") for k in range(1, FULL + 100)]
+    bag.write_bytes(bags.bag(*rows, bags.connection(0), bags.message(0, 1, b"")))
+    reason = f"100 channels without messages are left out; a recording can have {FULL}"
+    assert read(bag) == (1, FULL, [[reason, 0]])
 
 
 def test_very_many_damaged_places_are_counted_together(tmp_path: Path) -> None:

@@ -120,6 +120,28 @@ def test_part_that_nothing_lists_is_missing(
 
 
 @pytest.mark.parametrize(
+    ("listed", "count", "damage"),
+    [
+        (["x_0.db3", "x_1.db3"], 15, []),
+        (["x_0.db3"], 20, [("x_0.db3", 5)]),
+        ([], 15, []),
+        ([], 16, [("metadata.yaml", 1)]),
+    ],
+)
+def test_files_that_got_other_names(
+    bag: Path, listed: list[str], count: int, damage: list[tuple[str, int]]
+) -> None:
+    put_metadata(bag, listed, count)
+    found = Found(bag)
+    assert (found.numbers, found.damage) == (FIFTEEN, damage)
+    found = Found(bag / "bag_1.db3")
+    assert (found.numbers, found.damage) == (FIFTEEN[5:10], [])
+    put_db3(bag / "other.db3", [99])
+    with pytest.raises(SourceError, match="none of the files"):
+        open_source(bag)
+
+
+@pytest.mark.parametrize(
     ("names", "listed", "damage"),
     [
         (["0", "9", "10"], None, {"1.db3": None}),

@@ -6,6 +6,7 @@ import bz2
 import re
 import struct
 import tempfile
+import tracemalloc
 from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
@@ -14,10 +15,10 @@ import lz4.frame
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from rosbags.rosbag1 import Writer
+from rosbags.rosbag1 import Reader, Writer
 
 from hybridlog.formats.reading import BATCH_MESSAGES, Damage, Source
-from hybridlog.formats.rosbag1.reader import Rosbag1Source
+from hybridlog.formats.rosbag1.reader import Rosbag1Source, walk
 from hybridlog_storage.errors import SourceError
 from hybridlog_storage.messages import Channel, Schema
 from tests.data import DATA, needs_data
@@ -400,6 +401,27 @@ def test_the_definition_is_found_in_the_index_when_its_chunk_is_lost(tmp_path: P
     assert [each.messages_lost for each in damage] == [total(expected) - total(found)]
 
 
+@pytest.mark.parametrize("compression", ["none", "bz2", "lz4"])
+@pytest.mark.parametrize("size", [-300, 1, 200, 20_000])
+def test_the_definition_is_found_in_an_index_that_has_moved(
+    tmp_path: Path, compression: str, size: int
+) -> None:
+    path = tmp_path / "a.bag"
+    expected = make(path, compression, chunk=700, messages=2000)
+    good = path.read_bytes()
+    with Reader(path) as reader:
+        start = reader.chunk_infos[0].pos + 60
+        whole = [chunk for chunk in reader.chunk_infos if chunk.pos > start + max(size, 0)]
+    first = min(chunk.start_time for chunk in whole)
+    added = b"\xff" * max(-size, 0)
+    path.write_bytes(good[:start] + added + good[start + max(size, 0) :])
+    found, damage = read(path)
+    for key, messages in expected.items():
+        intact = [message for message in messages if message[0] >= first]
+        assert found[key][-len(intact) :] == intact
+    assert sum(one.messages_lost or 0 for one in damage) == 2000 - total(found)
+
+
 def with_zeros(data: bytes) -> bytes:
     """A bag with zeros behind each of its index records, which states them in its chunk list."""
     parts, moved, at = [data[:13]], {}, 13
@@ -476,3 +498,19 @@ def test_a_cut_chunk_gives_what_unpacks(compression: str) -> None:
     assert times == list(range(len(times)))
     assert 5 < len(times) < 40
     assert [each.messages_lost for each in damage] == [None]
+
+
+def test_zeros_are_no_records() -> None:
+    """A small chunk may unpack to very many of them."""
+    sound = connection(0) + message(0, 1, b"a")
+    data = sound + bytes(16 << 20)
+    tracemalloc.start()
+    try:
+        run = walk(data, len(data))
+        assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    finally:
+        tracemalloc.stop()
+    assert run.end == len(sound)
+    messages, damage = read_bytes(bag(chunk(sound + bytes(1 << 20), "bz2")))
+    assert values(messages) == [b"a"]
+    assert damage

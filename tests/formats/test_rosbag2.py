@@ -10,6 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
+import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
@@ -126,6 +127,20 @@ def test_written_by_rosbags(
     if storage is StoragePlugin.SQLITE3 or mode is not CompressionMode.MESSAGE:
         assert read(file) == (expected, [])
         assert read(folder) == (expected, [])
+
+
+def test_no_room_to_unpack(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = make(tmp_path / "bag", mode=CompressionMode.FILE)
+    usage = shutil.disk_usage(tmp_path)._replace(free=(64 << 20) + 1000)
+    monkeypatch.setattr("shutil.disk_usage", lambda _: usage)
+    with pytest.raises(SourceError, match="TMPDIR"):
+        open_source(folder)
+    # A frame that does not say its size is stopped when it has filled the room.
+    file = next(folder.glob("*.zstd"))
+    raw = zstandard.ZstdDecompressor().decompressobj().decompress(file.read_bytes())
+    file.write_bytes(zstandard.ZstdCompressor(write_content_size=False).compress(raw))
+    with pytest.raises(SourceError, match="TMPDIR"):
+        open_source(folder)
 
 
 @settings(max_examples=100, deadline=None)

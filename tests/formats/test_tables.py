@@ -121,6 +121,31 @@ def test_types_that_change(writer: object, held: int, limit: Limit) -> None:
         assert [json.loads(text) for text in found] == values
 
 
+def test_parquet_has_no_statistics_of_floats() -> None:
+    import pyarrow.parquet as pq
+
+    data = written(
+        write_parquet,
+        pa.table(
+            {
+                "a.b": [1.5, math.nan],
+                "i": [1, 2],
+                "l": [[1.5], [math.nan]],
+                "o": [{"f": 1.5, "s": "x"}, {"f": math.nan, "s": "y"}],
+            }
+        ),
+    )
+    group = pq.ParquetFile(io.BytesIO(data)).metadata.row_group(0)
+    columns = [group.column(i) for i in range(group.num_columns)]
+    assert {c.path_in_schema: c.is_stats_set for c in columns} == {
+        "a.b": False,
+        "i": True,
+        "l.list.element": False,
+        "o.f": False,
+        "o.s": True,
+    }
+
+
 READS = (
     lambda data: read_parquet(data)["a"].to_pylist(),
     lambda data: read_arrow(data)["a"].to_pylist(),

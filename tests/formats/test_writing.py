@@ -22,6 +22,7 @@ from hybridlog.formats.answer import Answer
 from hybridlog.formats.writing import Sink
 from hybridlog_storage.disk import unfinished
 from hybridlog_storage.disk.unfinished import (
+    beside,
     undo_unfinished,
     undone,
 )
@@ -236,6 +237,27 @@ def contents(path: Path) -> dict[str, bytes]:
     """The bytes of a file, or of all files in a directory."""
     files = [path] if path.is_file() else [p for p in path.rglob("*") if p.is_file()]
     return {str(file.relative_to(path)): file.read_bytes() for file in files}
+
+
+def test_a_child_process_removes_nothing_of_its_parent(tmp_path: Path) -> None:
+    file, directory = beside(tmp_path / "out"), beside(tmp_path / "dir")
+    file.path.touch()
+    directory.path.mkdir()
+    (directory.path / "inner").touch()
+    child = os.fork()
+    if not child:
+        try:
+            undo_unfinished()
+            file.remove()
+        finally:
+            os._exit(0)
+    os.waitpid(child, 0)
+    assert len(list(tmp_path.iterdir())) == 2
+    undo_unfinished()
+    assert list(tmp_path.iterdir()) == []
+    file.path.touch()  # another's by now
+    file.remove()
+    assert list(tmp_path.iterdir()) == [file.path]
 
 
 def test_what_was_done_is_undone_when_the_process_is_stopped_or_the_work_fails() -> None:

@@ -664,6 +664,19 @@ def test_user_and_password_are_in_one_header_only() -> None:
     assert b"Authorization: Basic " + expected in lines
 
 
+def test_a_server_that_does_not_read_is_left(limit: Limit) -> None:
+    limit(foxglove_send_s=0.2)
+
+    def script(peer: Peer) -> None:
+        peer.offer(channel())
+        flood = frame(Opcode.PING, bytes(125)) * 1000
+        while True:
+            peer.send(flood)
+
+    heard = hear(lambda h: h.said, script, Peer.wait)
+    assert "has not read for 0.2 s" in heard.said[0]
+
+
 def test_a_server_that_comes_late_is_waited_for() -> None:
     port = free_port()
     heard = Heard()

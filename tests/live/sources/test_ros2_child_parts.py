@@ -495,6 +495,15 @@ def test_each_version_of_a_type_is_a_channel_of_its_own(tmp_path: Path) -> None:
     assert [message[:2] for message in rig.messages] == [(0, b"a"), (1, b"b"), (0, b"a")]
 
 
+def test_a_graph_that_cannot_be_asked_costs_no_message(tmp_path: Path) -> None:
+    rig = live_topic(tmp_path, offer())
+    rig.ros.offers = lambda _topic: 1 / 0
+    rig.ros.made[0].queue = [(b"b", info(1, B))]
+    rig.child._take(0.0)
+    assert [message[:2] for message in rig.messages] == [(0, b"b")]
+    assert "its publishers are unknown for now" in rig.told("say")[0]["text"]
+
+
 def test_the_child_runs_under_older_pythons_and_with_nothing_installed() -> None:
     for path in [*FOLDER.glob("*.py"), ROOT.joinpath(*GAPS.split(".")).with_suffix(".py")]:
         name = path.stem
