@@ -612,7 +612,7 @@ STORE: dict[str, Rule] = {
         lambda k: ((LABEL,), (LABEL,), (), (LABEL,), len(k.of("/arm"))),
     ),
     "select": Rule(
-        lambda s: [(e.name, e.status, e.messages, e.span) for e in s.select(None)],
+        lambda s: [(e.name, e.status, e.messages, e.span) for e in s.session.select(None)],
         lambda k: [(LABEL, "open", len(k.of()), k.span)],
     ),
     "sizes": Rule(
