@@ -215,7 +215,7 @@ class Ring:
 
     def due(self, now: float) -> set[int]:
         """The groups whose time is over."""
-        sealed = self._recording.capture.writer.totals.segments
+        sealed = self._recording.sealed
         if sealed != self._seen:
             logs = self._directory.manifests.read(self._recording.id).logs.values()
             seen = time.monotonic()

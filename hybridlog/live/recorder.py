@@ -203,7 +203,7 @@ class Recorder:
                 store.directory,
                 partial(remove_if, store.shared),
                 self._target.id,
-                sealed=lambda: self._target.capture.writer.totals.segments,
+                sealed=lambda: self._target.sealed,
                 reserve=options.reserve_bytes,
                 say=self.say,
                 window=round((options.before_s or ring_s or 0) * 1e9),
@@ -365,20 +365,20 @@ class Recorder:
                 lost.update({cause.value: count for cause, count in one.lost.items()})
             shown = [one for one in self._topics.values() if one.tallies or one.is_present]
         topics = [one.look(elapsed, now_steady) for one in sorted(shown, key=attrgetter("topic"))]
-        totals = self._target.capture.writer.totals
+        stored, stored_bytes = self._target.stored
         failure = self._target.index_failure
         state = RecorderState(
             self.name,
             now - self._started,
             topics,
             sum(topic.messages for topic in topics),
-            totals.messages,
+            stored,
             dict(lost),
             self._target.filled,
-            self._target.capture.lag,
+            self._target.lag,
             "" if failure is None else str(failure),
             shutil.disk_usage(self._directory.path).free,
-            totals.payload_bytes,
+            stored_bytes,
             self._stalled_s(now),
             incidents=self._incidents.count,
             let_go=None if self._ring is None else self._ring.messages,
@@ -394,8 +394,8 @@ class Recorder:
         return state
 
     def _stalled_s(self, now: float) -> float:
-        written = self._target.capture.writer.written.total()
-        if self._target.taken.total() <= written or written != self._written:
+        taken, written = self._target.progress
+        if taken <= written or written != self._written:
             self._written, self._written_at = written, now
         waited = now - self._written_at - self._options.flush_interval_s
         return waited if waited > _SLOW_WRITE_S else 0.0

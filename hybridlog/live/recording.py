@@ -284,6 +284,27 @@ class LiveRecording:
         return min(max(self._unwritten, 0) / self._options.budget_bytes, 1.0)
 
     @property
+    def sealed(self) -> int:
+        """Number of sealed segments."""
+        return self.capture.writer.totals.segments
+
+    @property
+    def stored(self) -> tuple[int, int]:
+        """Messages in chunks, and the bytes of their payloads."""
+        totals = self.capture.writer.totals
+        return totals.messages, totals.payload_bytes
+
+    @property
+    def progress(self) -> tuple[int, int]:
+        """Messages taken, and those of them that are written to the disk."""
+        return self.taken.total(), self.capture.writer.written.total()
+
+    @property
+    def lag(self) -> int:
+        """Messages that are not indexed yet."""
+        return self.capture.lag
+
+    @property
     def index_failure(self) -> DatabaseError | None:
         """The error that stopped the index, None while it works."""
         return self.capture.follower.state.failure
