@@ -475,38 +475,33 @@ class Query:
             self.counters.messages = found
         return found
 
-    def to_numpy(self, frame: str | None = None) -> NDArray[Any] | list[NDArray[Any]]:
+    def to_numpy(self) -> NDArray[Any] | list[NDArray[Any]]:
         """Every message as an array (`Message.to_numpy`): stacked if all are alike.
 
-        Messages that cannot be arrays are left out; `counters.unreadable` counts them.
-
-        Args:
-            frame: The frame of points; see `in_frame`. Their `x`, `y` and `z` are float64, NaN
-                without a transform, before their other fields. None for that of each message.
+        Messages that cannot be arrays are left out; `counters.unreadable` counts them. Points
+        with `in_frame` have `x`, `y` and `z` as float64, NaN without a transform, before their
+        other fields.
 
         Raises:
             PayloadError: None of the messages can be an array.
             DefinitionError: The first of them has no definition.
         """
-        frame = self.question.frame if frame is None else frame
-        if frame is not None:
+        if self.question.frame is not None:
             from hybridlog.tf.in_frame import points_of
 
             self.counters.reset()
-            framed = replace(self.question, frame=frame)
-            return _stacked([one.points for one in points_of(self.session, framed, self.counters)])
+            found = points_of(self.session, self.question, self.counters)
+            return _stacked([one.points for one in found])
         arrays: list[NDArray[Any]] = []
         refused: PayloadError | DefinitionError | None = None
-        unreadable = 0
         for message in of_now(self):
             try:
                 arrays.append(message.to_numpy())
             except (PayloadError, DefinitionError) as error:
                 refused = refused or error
-                unreadable += 1
+                self.counters.unreadable += 1
         if refused is not None and not arrays:
             raise refused
-        self.counters.unreadable += unreadable
         return _stacked(arrays)
 
     # Tables.
