@@ -8,7 +8,6 @@ r"""Predicates over message fields: `ranges.min < 0.5 and header.frame_id == "la
                 | value order field [ order value ]             0 < x < 5
                 | field [ "not" ] "in" "[" value { "," value } "]"
                 | field ("~" | "=~" | "!~") string              a regular expression
-                | field "between" value "and" value             half-open
                 | field ("exists" | "missing")
     field       = name { "." name | "[" index "]" | "[" [ begin ] ":" [ end ] "]" | "[]" | "[*]" }
     value       = integer | 0xff | 1e-3 | inf | nan | "string" | true | false | null
@@ -223,32 +222,19 @@ class _Parser:
             if token.keyword == "not" and not self._take("in"):
                 raise self._fail(self._peek(), "expected 'in' after 'not' here")
             return self._member(field, token, negated=token.keyword == "not")
-        if self._take("between"):
-            return self._between(field)
         if token.keyword == "[":
             problem = "write an element as x[3], a slice as x[3:8]; both count from 0"
             raise self._fail(token, problem)
         raise self._fail(
             token,
-            "expected an operator here: ==, !=, <, <=, >, >=, in, not in, ~, !~, between, "
-            "exists or missing (of a bool: field == true)",
+            "expected an operator here: ==, !=, <, <=, >, >=, in, not in, ~, !~, exists "
+            "or missing (of a bool: field == true)",
         )
 
     def _compare(self, field: Field, order: Order) -> Compare:
         position = self._peek().position
         value = self._value()
         return _compare(self._text, field, order, value, position)
-
-    def _between(self, field: Field) -> Node:
-        position = self._peek().position
-        low = self._compare(field, ">=")
-        if not self._take("and"):
-            raise self._fail(self._peek(), "expected 'and' here: between a and b")
-        high = self._compare(field, "<")
-        a, b = low.value, high.value
-        if isinstance(a, int | float) and isinstance(b, int | float) and not a < b:
-            raise error_at(self._text, position, "the range is empty (its end is not part of it)")
-        return And((low, high))
 
     def _member(self, field: Field, token: Token, *, negated: bool) -> Node:
         closing = {"[": "]", "(": ")"}.get(self._peek().keyword)
