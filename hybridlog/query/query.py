@@ -614,13 +614,7 @@ class Query:
 
     # Intervals.
 
-    def intervals(
-        self,
-        at_least: DurationLike | None = None,
-        length: DurationLike | None = None,
-        max_gap: DurationLike | None = None,
-        state: str | None = None,
-    ) -> Intervals:
+    def intervals(self, max_gap: DurationLike | None = None, state: str | None = None) -> Intervals:
         """The longest intervals in which the predicate of `where` holds.
 
         At any time, the last message of the topic (by log time, then arrival) determines the
@@ -630,9 +624,6 @@ class Query:
         Without `where`, any message holds: `max_gap` then finds when the topic was active.
 
         Args:
-            at_least: Only intervals of at least this length.
-            length: Each interval cut into as many pieces of exactly this length as fit,
-                one after the other from its beginning.
             max_gap: Longest time for which a message is valid; by default, until the next one.
             state: `held`, `not held` or `unknown`: three parts of the asked time, without
                 each other. Unknown is the time before the first message, after `max_gap`, and
@@ -648,10 +639,7 @@ class Query:
             TimeError: no duration, or a range outside of all recordings.
         """
         with self.counters.timed():
-            found = self._intervals().states(max_gap, state)
-        if at_least is not None:
-            found = found.at_least(at_least)
-        return found if length is None else found.cut(length)
+            return self._intervals().states(max_gap, state)
 
     def changes(
         self, *fields: str, pause: DurationLike = "1s", tolerance: float = 0.0
