@@ -53,11 +53,8 @@ from hybridlog.query.predicate.tokens import Token, error_at, is_filter, tokeniz
 from hybridlog.query.predicate.tree import (
     ALWAYS,
     And,
-    Compare,
-    Exists,
+    Condition,
     Field,
-    Match,
-    Member,
     Near,
     Node,
     Not,
@@ -217,7 +214,7 @@ class _Parser:
         if self._take("~", "=~", "!~"):
             return self._match(field, negated=token.text == "!~")
         if self._take("exists", "missing"):
-            return Exists(field, present=token.keyword == "exists")
+            return Condition(field, "exists" if token.keyword == "exists" else "missing")
         if self._take("in", "not"):
             if token.keyword == "not" and not self._take("in"):
                 raise self._fail(self._peek(), "expected 'in' after 'not' here")
@@ -231,7 +228,7 @@ class _Parser:
             "or missing (of a bool: field == true)",
         )
 
-    def _compare(self, field: Field, order: Order) -> Compare:
+    def _compare(self, field: Field, order: Order) -> Condition:
         position = self._peek().position
         value = self._value()
         return _compare(self._text, field, order, value, position)
@@ -250,7 +247,7 @@ class _Parser:
             values.append(self._value())
         if not values:
             raise self._fail(token, "the list is empty")
-        return Member(field, tuple(values), negated, token.position)
+        return Condition(field, "not in" if negated else "in", tuple(values), token.position)
 
     def _match(self, field: Field, *, negated: bool) -> Node:
         token = self._peek()
@@ -263,7 +260,7 @@ class _Parser:
             compile_regex(pattern)
         except RegexError as error:
             raise self._fail(token, f"the pattern is refused: {error}") from None
-        return Match(field, pattern, negated, token.position)
+        return Condition(field, "!~" if negated else "~", (pattern,), token.position)
 
     def _field(self) -> Field:
         token = self._peek()
@@ -318,10 +315,10 @@ class _Parser:
         return error_at(self._text, token.position, message)
 
 
-def _compare(text: str, field: Field, order: Order, value: Value, position: int) -> Compare:
+def _compare(text: str, field: Field, order: Order, value: Value, position: int) -> Condition:
     if order not in {"==", "!="}:
         if value is None or isinstance(value, bool):
             raise error_at(text, position, "only numbers, times and strings have an order")
         if isinstance(value, float) and math.isnan(value):
             raise error_at(text, position, "nothing is less or greater than nan; write == nan")
-    return Compare(field, order, value, position)
+    return Condition(field, order, (value,), position)

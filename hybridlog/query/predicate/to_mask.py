@@ -25,12 +25,10 @@ from hybridlog.query.predicate.numbers import (
     single,
 )
 from hybridlog.query.predicate.tree import (
+    NEGATED,
     And,
-    Compare,
-    Exists,
+    Condition,
     Field,
-    Match,
-    Member,
     MongoFilter,
     Near,
     Node,
@@ -133,14 +131,14 @@ def _mask(node: Node, source: _Objects | _Columns) -> Mask:
             return ~_mask(item, source)
         case MongoFilter() | Near():
             raise _UnfitError
-        case Exists(target, present):
+        case Condition(target, "exists" | "missing" as op):
             for rows in source.there(target):
                 found[rows] = True
-            return found if present else ~found
+            return found if op == "exists" else ~found
     for each in source.elements(node.field):
         found[each.rows[_tested(node, each, source.types)]] = True
-    if (isinstance(node, Compare) and node.order == "!=") or getattr(node, "negated", False):
-        return _mask(Exists(node.field, present=True), source) & ~found
+    if node.op in NEGATED:
+        return _mask(Condition(node.field, "exists"), source) & ~found
     return found
 
 
@@ -414,34 +412,22 @@ def _elements(leaves: _Leaves) -> Iterator[_Leaves]:
     yield _Leaves(values, rows, is_element=is_element)
 
 
-def _tested(node: Compare | Member | Match, leaves: _Leaves, types: FieldTypes) -> Mask:
+def _tested(node: Condition, leaves: _Leaves, types: FieldTypes) -> Mask:
     """Mask of the values that satisfy a condition, without its negation: bool[values]."""
     if types.are_singles(node.field.parts):
-        node = _of_singles(node)
+        # Decimal literals as float32 holds them, like the values.
+        node = replace(node, operands=tuple(map(single, node.operands)))
     if leaves.is_summary:
         return _of_summaries(node, leaves, types)
-    match node:
-        case Match(pattern=pattern):
-            return _matching(leaves.values, pattern)
-        case Compare(order="==" | "!=", value=value):
-            return _equal_to(leaves, (value,))
-        case Member(values=values):
-            return _equal_to(leaves, values)
-        case Compare(order=order, value=value):
-            found = _compared(leaves.values, order, value)
-            if leaves.is_element and _kind_of(leaves.values) == "f":
-                found &= np.isfinite(_numpy(leaves.values).astype(np.float64))
-            return found
-
-
-def _of_singles(node: Compare | Member | Match) -> Compare | Member | Match:
-    """The condition with its decimal literals as float32 holds them, like the values."""
-    match node:
-        case Compare(value=value):
-            return replace(node, value=single(value))
-        case Member(values=values):
-            return replace(node, values=tuple(map(single, values)))
-    return node
+    op, value = NEGATED.get(node.op, node.op), node.operands[0]
+    if op == "~":
+        return _matching(leaves.values, str(value))
+    if op in {"==", "in"}:
+        return _equal_to(leaves, node.operands)
+    found = _compared(leaves.values, op, value)
+    if leaves.is_element and _kind_of(leaves.values) == "f":
+        found &= np.isfinite(_numpy(leaves.values).astype(np.float64))
+    return found
 
 
 def _equal_to(leaves: _Leaves, values: Sequence[Value]) -> Mask:
@@ -540,17 +526,18 @@ def _floats_compared(numbers: NDArray[Any], order: str, value: float) -> Any:
 # Conditions on summaries.
 
 
-def _of_summaries(node: Compare | Member | Match, leaves: _Leaves, types: FieldTypes) -> Mask:
+def _of_summaries(node: Condition, leaves: _Leaves, types: FieldTypes) -> Mask:
     """Conditions on the elements of arrays that are present only as summaries.
 
     The ends decide what any element being greater or less is asked for; nothing else.
     """
     path, has_ends = node.field.names, leaves.values.type.get_field_index("min") >= 0
-    if not has_ends or not isinstance(node, Compare) or node.order in {"==", "!="}:
+    if not has_ends or node.op not in {"<", "<=", ">", ">="}:
         raise _UnfitError
-    end = pc.struct_field(leaves.values, "min" if node.order in {"<", "<="} else "max")
+    value = node.operands[0]
+    end = pc.struct_field(leaves.values, "min" if node.op in {"<", "<="} else "max")
     is_rounded = pa.types.is_floating(end.type) and not types.are_floats(path)
-    is_large = is_number(node.value) and abs(nearest(node.value)) >= 2**53
+    is_large = is_number(value) and abs(nearest(value)) >= 2**53
     if types.kind(path) == "bool" or (is_rounded and is_large):
         raise _UnfitError
-    return _compared(end, node.order, node.value)
+    return _compared(end, node.op, value)

@@ -10,11 +10,8 @@ from typing import Any, Literal, cast
 
 from hybridlog.query.predicate.tokens import error_at
 from hybridlog.query.predicate.tree import (
-    Compare,
-    Exists,
+    Condition,
     Field,
-    Match,
-    Member,
     Parts,
     Predicate,
 )
@@ -154,7 +151,7 @@ def check(predicate: Predicate, types: FieldTypes | Mapping[str, str] | None) ->
         target = condition.field
         for problem in _problems_of(target, known):
             raise error_at(predicate.text, target.position, problem)
-        if isinstance(condition, Exists):
+        if not condition.operands:
             continue
         if target.names in known.inner:
             below = (name for name in known.types if name.startswith(f"{target.names}."))
@@ -185,17 +182,17 @@ def _problems_of(target: Field, types: FieldTypes) -> Iterator[str]:
     yield f"there is no field {path}; {hint}"
 
 
-def _problems(node: Compare | Member | Match, types: FieldTypes, text: str) -> Iterator[str]:
+def _problems(node: Condition, types: FieldTypes, text: str) -> Iterator[str]:
     """Reasons to refuse what a field is compared with."""
     path = node.field.names
     is_statistic = types.known and path not in types.types and types.statistic(node.field.parts)
     kind = "number" if is_statistic else types.kind(path)
-    if isinstance(node, Match):
+    if node.op in {"~", "!~"}:
         if kind not in {"string", "other"}:
             yield f"the field is a {kind}, not a string"
         return
     is_moment = kind == "time" and types.base(path) != "duration"
-    for value in (node.value,) if isinstance(node, Compare) else node.values:
+    for value in node.operands:
         if kind == "other" or value is None:
             continue
         given = next(name for name, known in _VALUES.items() if isinstance(value, known))

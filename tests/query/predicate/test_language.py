@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.to_mask import mask_of_objects
-from hybridlog.query.predicate.tree import Compare, Predicate
+from hybridlog.query.predicate.tree import Condition, Predicate
 from hybridlog.query.predicate.types import check
 from hybridlog_storage.errors import WhereError
 
@@ -100,9 +100,9 @@ def test_grammar(where: str, expected: str) -> None:
 
 def test_nan() -> None:
     node = checked("x == NaN", {"x": "float64"}).root
-    assert isinstance(node, Compare)
-    assert isinstance(node.value, float)
-    assert math.isnan(node.value)
+    assert isinstance(node, Condition)
+    assert isinstance(node.operands[0], float)
+    assert math.isnan(node.operands[0])
 
 
 @pytest.mark.parametrize(

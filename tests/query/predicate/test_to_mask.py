@@ -13,7 +13,7 @@ import pytest
 from hybridlog.query.predicate.mongo_filter import mongo_filter
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.to_mask import mask_of_objects, to_mask
-from hybridlog.query.predicate.tree import Compare, Field
+from hybridlog.query.predicate.tree import Condition, Field
 
 ORDERS = {
     "==": operator.eq,
@@ -52,7 +52,7 @@ def test_numbers_are_compared_by_value(name: str, order: str) -> None:
     bounds += [2**53 - 1, 2**53 + 1, 2**63 - 1, 2**63, 2**63 + 1, 2**64 - 1, 2**64, 10**400]
     bounds += [1e300, -1e300, 2.0**63, 2.0**64, -(2**63), -(2**63) - 1, -(10**400)]
     for bound in bounds:
-        asked = Compare(Field(("x",)), order, bound)  # type: ignore[arg-type]
+        asked = Condition(Field(("x",)), order, (bound,))  # type: ignore[arg-type]
         records = pa.StructArray.from_arrays([pa.array(values)], ["x"])
         mask = to_mask(asked, {"x": name}, records)
         assert mask is not None
