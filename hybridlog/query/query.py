@@ -43,7 +43,6 @@ if TYPE_CHECKING:
     from hybridlog.query.answers.follow import Following
     from hybridlog.query.answers.interval_queries import IntervalQueries
     from hybridlog.query.answers.statistics import FieldStatistics, TopicCheck
-    from hybridlog.query.choice import During, Tags, Texts
     from hybridlog.query.intervals import Intervals
     from hybridlog.query.predicate.tree import Predicate
     from hybridlog.query.question import RecordedChannel, Span
@@ -306,33 +305,15 @@ class Query:
                 )
         return self._with(tags=tuple(dict.fromkeys(keys)))
 
-    def in_recording(
-        self,
-        *names: str,
-        tag: Tags = None,
-        has: Texts = None,
-        type: Texts = None,  # noqa: A002 - the word of the command line
-        during: During = None,
-        where: Texts = None,
-        older_than: DurationLike | None = None,
-    ) -> Query:
-        """Only these recordings: by name, id or glob, and as `Store.recordings`.
+    def in_recording(self, *names: str) -> Query:
+        """Only these recordings, by name, id or glob; `Store.recordings` chooses by more.
 
         Raises:
             TopicError: no such recording exists, or none has the topic.
         """
         from hybridlog.query.choosing import choose
 
-        choice = Choice.of(
-            names,
-            tag=tag,
-            has=has,
-            type=type,
-            during=during,
-            where=where,
-            older_than=older_than,
-        )
-        chosen = choose(self.session, choice)
+        chosen = choose(self.session, Choice.of(names))
         if chosen.problem:
             raise TopicError(chosen.problem)
         ids = [summary.id for summary in chosen.summaries]
