@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from itertools import product
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 import pyarrow as pa
@@ -33,6 +34,7 @@ from hybridlog.query.predicate.tree import (
     Near,
     Node,
     Not,
+    Op,
     Or,
     Parts,
     Predicate,
@@ -135,8 +137,14 @@ def _mask(node: Node, source: _Objects | _Columns) -> Mask:
             for rows in source.there(target):
                 found[rows] = True
             return found if op == "exists" else ~found
-    for each in source.elements(node.field):
-        found[each.rows[_tested(node, each, source.types)]] = True
+    if node.other is not None:
+        sides = [map(_numbers, source.elements(one)) for one in (node.field, node.other)]
+        for (own, left), (others, right) in product(*sides):
+            rows, one, two = np.intersect1d(own, others, return_indices=True)
+            found[rows] |= _compared_rows(left[one], NEGATED.get(node.op, node.op), right[two])
+    else:
+        for each in source.elements(node.field):
+            found[each.rows[_tested(node, each, source.types)]] = True
     if node.op in NEGATED:
         return _mask(Condition(node.field, "exists"), source) & ~found
     return found
@@ -417,6 +425,8 @@ def _tested(node: Condition, leaves: _Leaves, types: FieldTypes) -> Mask:
     if types.are_singles(node.field.parts):
         # Decimal literals as float32 holds them, like the values.
         node = replace(node, operands=tuple(map(single, node.operands)))
+    if node.field.is_absolute:
+        return _of_absolute(node, leaves, types)
     if leaves.is_summary:
         return _of_summaries(node, leaves, types)
     op, value = NEGATED.get(node.op, node.op), node.operands[0]
@@ -428,6 +438,38 @@ def _tested(node: Condition, leaves: _Leaves, types: FieldTypes) -> Mask:
     if leaves.is_element and _kind_of(leaves.values) == "f":
         found &= np.isfinite(_numpy(leaves.values).astype(np.float64))
     return found
+
+
+def _of_absolute(node: Condition, leaves: _Leaves, types: FieldTypes) -> Mask:
+    """`abs(x) < 5` is `-5 < x < 5`, of the same element of an array."""
+    is_between = node.op in {"<", "<="}
+    if is_between and leaves.is_summary:
+        raise _UnfitError
+    plain = replace(node, field=replace(node.field, is_absolute=False))
+    turned = cast(Op, {"<": ">", "<=": ">=", ">": "<", ">=": "<="}.get(node.op, node.op))
+    values = tuple(-value if is_number(value) else value for value in node.operands)
+    below = replace(plain, op=turned, operands=values)
+    join = np.logical_and if is_between else np.logical_or
+    return join(_tested(plain, leaves, types), _tested(below, leaves, types))
+
+
+def _numbers(leaves: _Leaves) -> tuple[Rows, NDArray[Any]]:
+    """The rows of single numbers and times, and these."""
+    values, rows = leaves.values, leaves.rows
+    if leaves.is_element or _kind_of(values) not in {"i", "f", "O"}:
+        return rows[:0], np.empty(0)
+    if isinstance(values, np.ndarray):
+        return rows, values
+    values, rows = _some(values, rows, _valid(values))
+    return rows, _numpy(values.cast(pa.int64()) if is_time(values.type) else values)
+
+
+def _compared_rows(left: NDArray[Any], op: str, right: NDArray[Any]) -> Mask:
+    """Compare numbers with others, exactly."""
+    if left.dtype.kind != right.dtype.kind:
+        left, right = left.astype(object), right.astype(object)
+    with np.errstate(invalid="ignore"):  # NaN
+        return _ORDERS[op](left, right).astype(np.bool_)  # type: ignore[no-any-return]
 
 
 def _equal_to(leaves: _Leaves, values: Sequence[Value]) -> Mask:

@@ -58,10 +58,12 @@ class Field(_Node):
 
     Attributes:
         parts: Names, ints for elements of arrays, slices.
+        is_absolute: Without the signs of numbers, as `abs(x)`.
         position: Its place in the text.
     """
 
     parts: Parts
+    is_absolute: bool = False
     position: int = dataclasses.field(default=0, repr=False)
 
     @property
@@ -82,12 +84,14 @@ class Condition(_Node):
     Attributes:
         operands: The value that it is compared with; of `in` several, of `exists` none; of `~` a
             pattern in RE2's syntax.
+        other: The field that it is compared with, which must exist besides; None for operands.
         position: Place of the operands in the text.
     """
 
     field: Field
     op: Op
     operands: tuple[Value, ...] = ()
+    other: Field | None = None
     position: int = dataclasses.field(default=0, repr=False)
 
 

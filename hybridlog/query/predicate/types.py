@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, Literal, cast
 
+from hybridlog.query.predicate.numbers import is_number
 from hybridlog.query.predicate.tokens import error_at
 from hybridlog.query.predicate.tree import (
     Condition,
@@ -151,7 +152,7 @@ def check(predicate: Predicate, types: FieldTypes | Mapping[str, str] | None) ->
         target = condition.field
         for problem in _problems_of(target, known):
             raise error_at(predicate.text, target.position, problem)
-        if not condition.operands:
+        if condition.op in {"exists", "missing"}:
             continue
         if target.names in known.inner:
             below = (name for name in known.types if name.startswith(f"{target.names}."))
@@ -191,6 +192,19 @@ def _problems(node: Condition, types: FieldTypes, text: str) -> Iterator[str]:
         if kind not in {"string", "other"}:
             yield f"the field is a {kind}, not a string"
         return
+    if node.field.is_absolute and kind not in {"number", "other"}:
+        yield f"the field is a {kind}, and abs() is of numbers"
+    if node.field.is_absolute and any(is_number(one) and one < 0 for one in node.operands):
+        yield "abs() is never negative"
+    if node.other is not None:
+        kinds = {kind, types.kind(node.other.names)} - {"other"}
+        if len(kinds) > 1 or not kinds <= {"number", "time"}:
+            yield "only two numbers, or two times, can be compared (strings need quotes)"
+        both = (node.field.parts, node.other.parts)
+        paths = (Field(parts[: end + 1]).names for parts in both for end in range(len(parts)))
+        is_absolute = node.field.is_absolute or node.other.is_absolute
+        if is_absolute or not types.arrays.isdisjoint(paths):
+            yield "fields that are compared are single values: no arrays, and no abs()"
     is_moment = kind == "time" and types.base(path) != "duration"
     for value in node.operands:
         if kind == "other" or value is None:

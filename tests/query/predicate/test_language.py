@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 import re
+from typing import Any
 
 import numpy as np
 import pytest
@@ -70,6 +71,8 @@ ANYTHING = dict.fromkeys(
         ("x == 1e-3", "x == 0.001"),
         ("x == .5", "x == 0.5"),
         ("x < -inf", "x < -inf"),
+        ("abs(x) < 5", "5 > abs(x)"),
+        ("x < y", "x<y"),
         ("x == 9223372036854775807", "x == 9223372036854775807"),
         ("x == -9223372036854775808", "x == -9223372036854775808"),
         ("x == 9223372036854775808", "x == 9223372036854775808"),
@@ -109,7 +112,9 @@ def test_nan() -> None:
     ("where", "message", "column"),
     [
         ("x <", "expected a value", 3),
-        ("x == base", "strings need quotes", 5),
+        ("abs(x", "expected '\\)'", 5),
+        ("abs(x) < y", "no abs", 9),
+        ("0 < x < y", "strings need quotes", 8),
         ("(x < 1", "expected '\\)'", 6),
         ("x < 1)", "expected 'and'", 5),
         ("x < nan", "nan", 4),
@@ -216,6 +221,15 @@ def test_limits() -> None:
         ("1760000000.5 < t", 't"1760000000.5" for seconds'),
         ("1760000000000 < _meta.t < 1770000000000", "nanoseconds here"),
         ("x > 1 & x < 2", "write and"),
+        ("x == s", "strings need quotes"),
+        ("x == base", "no field base"),
+        ("a > x", "no arrays"),
+        ("m.v > x", "no arrays"),
+        ("x > nine[0]", "no arrays"),
+        ("t > x", "two numbers, or two times"),
+        ("s == names", "two numbers"),
+        ("abs(x) > -5", "never negative"),
+        ("abs(t) > 5", r"abs\(\) is of numbers"),
         ("o:x > 1", "a space follows the name"),
     ],
 )
@@ -318,6 +332,8 @@ conditions = (
         st.sampled_from(["z", "a.min", "m.q.min"]),
         st.just([None, 1]) | st.just([None]),
     )
+    | comparisons(["abs(x)", "abs(i)", "abs(a)", "abs(m.v)", "abs(a.min)"], finite.map(abs))
+    | st.tuples(st.just("fields"), st.permutations(["x", "i", "z", "o.y"]), orders)
     | st.tuples(
         st.sampled_from(["exists", "missing"]),
         st.sampled_from(["x", "z", "o", "o.y", "m", "m.v", "a", "a[0]", "m[1].v", *stats]),
@@ -341,6 +357,8 @@ def write(question: Question) -> str:
     match question:
         case ("compare", path, order, value):
             return f"{path} {order} {spell(value)}"
+        case ("fields", [left, right, *_], order):
+            return f"{left} {order} {right}"
         case ("in" | "not in" as word, path, values):
             return f"{path} {word} [{', '.join(map(spell, values))}]"
         case ("exists" | "missing" as word, path):
@@ -382,6 +400,13 @@ def leaves(document: Document, path: str) -> list[object]:
     return reached(document, parts)
 
 
+def absolute(leaf: Any) -> object:
+    """Numbers without their signs; of a list, those of its elements."""
+    if isinstance(leaf, list):
+        return [absolute(value) for value in leaf]
+    return leaf if leaf is None else abs(leaf)
+
+
 def same_kind(left: object, right: object) -> bool:
     def kind(value: object) -> str:
         if isinstance(value, bool) or value is None or isinstance(value, str):
@@ -414,8 +439,18 @@ def holds(question: Question, document: Document) -> bool:
             return holds(left, document) or holds(right, document)
         case ("not", inner):
             return not holds(inner, document)
+        case ("fields", [left, right, *_], order):
+            sides = [leaves(document, path) for path in (left, right)]
+            if not all(sides):
+                return False
+            one, other = (side[0] for side in sides)
+            is_equal = one == one and compares(one, "==", other)
+            return not is_equal if order == "!=" else compares(one, str(order), other)
     word, path, *rest = question
-    found = leaves(document, str(path))
+    is_absolute = str(path).startswith("abs(")
+    found = leaves(document, str(path).removeprefix("abs(").removesuffix(")"))
+    if is_absolute:
+        found = [absolute(leaf) for leaf in found]
     values = [item for leaf in found for item in (leaf if isinstance(leaf, list) else [leaf])]
     match word, rest:
         case "exists", _:
