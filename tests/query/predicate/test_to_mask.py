@@ -147,8 +147,9 @@ def test_two_fields_are_compared_by_value(order: str) -> None:
         predicate = parse(f"{one} {order} {other}")
         pairs = zip(kinds[one], kinds[other], strict=True)  # Python compares exactly
         want = [a is not None and b is not None and compare(a, b) for a, b in pairs]
-        mask = to_mask(predicate.root.items[0], {}, records)  # type: ignore[union-attr]
-        assert (mask is None) == (order == "!=")  # of nulls, columns do not say which are missing
+        mask = to_mask(predicate, {}, records)
+        # Of nulls, columns do not say which are missing.
         assert mask is None or mask.tolist() == want
+        assert (mask is None) == (None in kinds[other] or (order == "!=" and None in kinds[one]))
         rows = [{k: v for k, v in row.items() if v is not None} for row in records.to_pylist()]
         assert mask_of_objects(predicate, {}, rows).tolist() == want
