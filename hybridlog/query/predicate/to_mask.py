@@ -429,12 +429,12 @@ def _tested(node: Condition, leaves: _Leaves, types: FieldTypes) -> Mask:
         return _of_absolute(node, leaves, types)
     if leaves.is_summary:
         return _of_summaries(node, leaves, types)
-    op, value = NEGATED.get(node.op, node.op), node.operands[0]
-    if op == "~":
-        return _matching(leaves.values, str(value))
+    op = NEGATED.get(node.op, node.op)
     if op in {"==", "in"}:
         return _equal_to(leaves, node.operands)
-    found = _compared(leaves.values, op, value)
+    if op == "~":
+        return _matching(leaves.values, str(node.operands[0]))
+    found = _compared(leaves.values, op, node.operands[0])
     if leaves.is_element and _kind_of(leaves.values) == "f":
         found &= np.isfinite(_numpy(leaves.values).astype(np.float64))
     return found

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, Literal, cast
 
-from hybridlog.query.predicate.numbers import is_number
 from hybridlog.query.predicate.tokens import error_at
 from hybridlog.query.predicate.tree import (
     Condition,
@@ -194,7 +193,9 @@ def _problems(node: Condition, types: FieldTypes, text: str) -> Iterator[str]:
         return
     if node.field.is_absolute and kind not in {"number", "other"}:
         yield f"the field is a {kind}, and abs() is of numbers"
-    if node.field.is_absolute and any(is_number(one) and one < 0 for one in node.operands):
+    if node.field.is_absolute and any(
+        isinstance(one, int | float) and one < 0 for one in node.operands
+    ):
         yield "abs() is never negative"
     if node.other is not None:
         kinds = {kind, types.kind(node.other.names)} - {"other"}
