@@ -13,7 +13,7 @@ import numpy as np
 
 from hybridlog.index.access import again_if_lost
 from hybridlog.query.predicate.mongo_filter import misjudged
-from hybridlog.query.predicate.tree import And, Field, Member, MongoFilter, Predicate
+from hybridlog.query.predicate.tree import And, Condition, Field, MongoFilter, Predicate
 from hybridlog.query.question import field_types
 from hybridlog.record.marks import MARKS
 from hybridlog.schema.column import STAMP
@@ -196,5 +196,5 @@ def _decided(predicate: Predicate, numbers: NDArray[np.int64]) -> Predicate:
     root = predicate.root
     items = root.items if isinstance(root, And) else (root,)
     rest = tuple(item for item in items if not isinstance(item, MongoFilter))
-    found = Member(_SEQ, tuple(numbers.tolist()), negated=False)
+    found = Condition(_SEQ, "in", tuple(numbers.tolist()))
     return Predicate(And((found, *rest)), predicate.text)

@@ -43,7 +43,6 @@ if TYPE_CHECKING:
     from hybridlog.query.answers.follow import Following
     from hybridlog.query.answers.interval_queries import IntervalQueries
     from hybridlog.query.answers.statistics import FieldStatistics, TopicCheck
-    from hybridlog.query.choice import During, Tags, Texts
     from hybridlog.query.intervals import Intervals
     from hybridlog.query.predicate.tree import Predicate
     from hybridlog.query.question import RecordedChannel, Span
@@ -306,33 +305,15 @@ class Query:
                 )
         return self._with(tags=tuple(dict.fromkeys(keys)))
 
-    def in_recording(
-        self,
-        *names: str,
-        tag: Tags = None,
-        has: Texts = None,
-        type: Texts = None,  # noqa: A002 - the word of the command line
-        during: During = None,
-        where: Texts = None,
-        older_than: DurationLike | None = None,
-    ) -> Query:
-        """Only these recordings: by name, id or glob, and as `Store.recordings`.
+    def in_recording(self, *names: str) -> Query:
+        """Only these recordings, by name, id or glob; `Store.recordings` chooses by more.
 
         Raises:
             TopicError: no such recording exists, or none has the topic.
         """
         from hybridlog.query.choosing import choose
 
-        choice = Choice.of(
-            names,
-            tag=tag,
-            has=has,
-            type=type,
-            during=during,
-            where=where,
-            older_than=older_than,
-        )
-        chosen = choose(self.session, choice)
+        chosen = choose(self.session, Choice.of(names))
         if chosen.problem:
             raise TopicError(chosen.problem)
         ids = [summary.id for summary in chosen.summaries]
@@ -475,38 +456,33 @@ class Query:
             self.counters.messages = found
         return found
 
-    def to_numpy(self, frame: str | None = None) -> NDArray[Any] | list[NDArray[Any]]:
+    def to_numpy(self) -> NDArray[Any] | list[NDArray[Any]]:
         """Every message as an array (`Message.to_numpy`): stacked if all are alike.
 
-        Messages that cannot be arrays are left out; `counters.unreadable` counts them.
-
-        Args:
-            frame: The frame of points; see `in_frame`. Their `x`, `y` and `z` are float64, NaN
-                without a transform, before their other fields. None for that of each message.
+        Messages that cannot be arrays are left out; `counters.unreadable` counts them. Points
+        with `in_frame` have `x`, `y` and `z` as float64, NaN without a transform, before their
+        other fields.
 
         Raises:
             PayloadError: None of the messages can be an array.
             DefinitionError: The first of them has no definition.
         """
-        frame = self.question.frame if frame is None else frame
-        if frame is not None:
+        if self.question.frame is not None:
             from hybridlog.tf.in_frame import points_of
 
             self.counters.reset()
-            framed = replace(self.question, frame=frame)
-            return _stacked([one.points for one in points_of(self.session, framed, self.counters)])
+            found = points_of(self.session, self.question, self.counters)
+            return _stacked([one.points for one in found])
         arrays: list[NDArray[Any]] = []
         refused: PayloadError | DefinitionError | None = None
-        unreadable = 0
         for message in of_now(self):
             try:
                 arrays.append(message.to_numpy())
             except (PayloadError, DefinitionError) as error:
                 refused = refused or error
-                unreadable += 1
+                self.counters.unreadable += 1
         if refused is not None and not arrays:
             raise refused
-        self.counters.unreadable += unreadable
         return _stacked(arrays)
 
     # Tables.
@@ -619,13 +595,7 @@ class Query:
 
     # Intervals.
 
-    def intervals(
-        self,
-        at_least: DurationLike | None = None,
-        length: DurationLike | None = None,
-        max_gap: DurationLike | None = None,
-        state: str | None = None,
-    ) -> Intervals:
+    def intervals(self, max_gap: DurationLike | None = None, state: str | None = None) -> Intervals:
         """The longest intervals in which the predicate of `where` holds.
 
         At any time, the last message of the topic (by log time, then arrival) determines the
@@ -635,9 +605,6 @@ class Query:
         Without `where`, any message holds: `max_gap` then finds when the topic was active.
 
         Args:
-            at_least: Only intervals of at least this length.
-            length: Each interval cut into as many pieces of exactly this length as fit,
-                one after the other from its beginning.
             max_gap: Longest time for which a message is valid; by default, until the next one.
             state: `held`, `not held` or `unknown`: three parts of the asked time, without
                 each other. Unknown is the time before the first message, after `max_gap`, and
@@ -653,10 +620,7 @@ class Query:
             TimeError: no duration, or a range outside of all recordings.
         """
         with self.counters.timed():
-            found = self._intervals().states(max_gap, state)
-        if at_least is not None:
-            found = found.at_least(at_least)
-        return found if length is None else found.cut(length)
+            return self._intervals().states(max_gap, state)
 
     def changes(
         self, *fields: str, pause: DurationLike = "1s", tolerance: float = 0.0

@@ -139,7 +139,7 @@ def ask(
     rows = []
     is_cut = False
     if where is not None and len(query.topics) == 1:
-        held = query.intervals(at_least=at_least)
+        held = query.intervals().at_least(at_least or 0)
         values["interval_count"] = len(held)
         is_cut = len(held) > MAX_ROWS
         names = {one.id: one.name for one in query.summaries()}

@@ -36,7 +36,7 @@ X = parse("x < 1").root
         ("/odom:", near("/odom", "")),
         ("/odom: v > 1 and w < 2", near("/odom", "v > 1 and w < 2")),
         ("x < 1 and /odom: v > 0.5", And((X, ODOM))),
-        ("x between 1 and 2 and /odom:", And((parse("x between 1 and 2").root, near("/odom", "")))),
+        ("1 <= x < 2 and /odom:", And((parse("1 <= x < 2").root, near("/odom", "")))),
         ("/odom: v > 0.5 and /a: b == ': c /d: e'", And((ODOM, near("/a", "b == ': c /d: e'")))),
         ("/odom: v > 0.5 or /a: b == 1 && /c:", Or((ODOM, And((A, near("/c", "")))))),
         ("/odom: v > 0.5 && !/a: b == 1", And((ODOM, Not(A)))),

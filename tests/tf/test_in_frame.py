@@ -67,8 +67,8 @@ def matrix(oracle: Oracle, message: Any, target: str) -> Any | None:
 @needs_data
 def test_scans_of_a_real_log(demo: Path, store: hl.Store, tmp_path: Path) -> None:
     """The first scan comes before the first transform; it keeps its place, and is reported."""
-    query = store.recordings("tilt").topic("scan")
-    arrays, oracle, missing = query.to_numpy("tilt_base"), Oracle(TILT), 0
+    query = store.recordings("tilt").topic("scan").in_frame("tilt_base")
+    arrays, oracle, missing = query.to_numpy(), Oracle(TILT), 0
     scans = messages(TILT, "/scan")
     run("fetch", "-r", "tilt", "-t", "scan", "--in-frame", "tilt_base", "-F", "ply", "-o",
         tmp_path / "out", store=demo / "store")  # fmt: skip

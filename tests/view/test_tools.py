@@ -85,7 +85,7 @@ def test_ten_questions_of_the_page_are_answered(demo_store: hl.Store, ask: Ask) 
     told = ask("ask", topic="scan", where=fast, within="0.1s").values
     assert told["count"] == scans.count() > 0
     assert (told["lost"], told["lacks"]) == (None, [])
-    near = demo_store.topic("scan").where("ranges.min < 0.6").intervals(at_least="1s")
+    near = demo_store.topic("scan").where("ranges.min < 0.6").intervals().at_least("1s")
     told = ask("ask", topic="scan", where="ranges.min < 0.6", at_least="1s").values
     assert told["interval_count"] == len(near) == len(told["intervals"]) > 0
     assert {one["recording"] for one in told["intervals"]} == {"robot"}

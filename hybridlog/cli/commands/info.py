@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from operator import itemgetter
 from pathlib import Path
 from shlex import quote
@@ -40,7 +40,6 @@ from hybridlog_storage.errors import SegmentError, StoreError
 
 if TYPE_CHECKING:
     from hybridlog.attachments import StoredAttachment, StoredMetadata
-    from hybridlog.query.answers.video import VideoSummary
     from hybridlog.store import Store
     from hybridlog_storage.catalog import RecordingEntry
 
@@ -146,11 +145,11 @@ def _is_segment(what: str) -> bool:
     return looks and Path(what).exists()
 
 
-def _videos(store: Store, entry: RecordingEntry) -> dict[str, VideoSummary]:
+def _videos(store: Store, entry: RecordingEntry) -> dict[str, dict[str, Any]]:
     """Codec and key frames of video topics, by topic; none of those that cannot be read."""
     from hybridlog.arrays import is_video_type
 
-    found: dict[str, VideoSummary] = {}
+    found: dict[str, dict[str, Any]] = {}
     for topic in dict.fromkeys(one.topic for one in entry.channels if is_video_type(one.type)):
         from hybridlog.query.answers.video import summary_of
 
@@ -161,9 +160,7 @@ def _videos(store: Store, entry: RecordingEntry) -> dict[str, VideoSummary]:
     return found
 
 
-def _as_dict(
-    store: Store, entry: RecordingEntry, videos: Mapping[str, VideoSummary]
-) -> dict[str, Any]:
+def _as_dict(store: Store, entry: RecordingEntry, videos: Mapping[str, Any]) -> dict[str, Any]:
     from hybridlog.entries import summary_of
     from hybridlog.query.periods import mean_rate
     from hybridlog.schema.states import shown_channels
@@ -202,7 +199,7 @@ def _as_dict(
                 "surplus": c.stats.surplus if entry.is_decoded else None,
                 "not_indexed": c.unindexed,
                 "metadata": c.metadata,
-                "video": asdict(videos[c.topic]) if c.topic in videos else None,
+                "video": videos.get(c.topic),
             }
             for c in shown_channels(entry.channels)
         ],

@@ -98,8 +98,9 @@ def _intervals(given: _Given, query: Query) -> Intervals:
         found = query.gaps(given.longer_than, given.periods)
     else:
         state = given.state and given.state.replace("-", " ")
-        return query.intervals(given.at_least, given.length, given.max_gap, state)
-    return found if given.at_least is None else found.at_least(given.at_least)
+        found = query.intervals(given.max_gap, state)
+    found = found if given.at_least is None else found.at_least(given.at_least)
+    return found if given.length is None else found.cut(given.length)
 
 
 def _duration(row: Mapping[str, int]) -> str:

@@ -9,7 +9,7 @@ from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.query.planner import Planner
-from hybridlog.query.predicate.tree import Exists, is_meta
+from hybridlog.query.predicate.tree import is_meta
 from hybridlog.query.question import Question, field_types
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import format_time
@@ -72,7 +72,7 @@ def _missing_fields(session: Session, question: Question, *, is_empty: bool) -> 
     paths = dict.fromkeys(
         condition.field.names
         for condition in question.predicate.conditions()
-        if not isinstance(condition, Exists) and not is_meta(condition.field.path)
+        if condition.operands and not is_meta(condition.field.path)
     )
     if not paths:
         return

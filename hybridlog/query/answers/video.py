@@ -32,45 +32,28 @@ _MAX_LOOKED = 600
 _SIZE = 16 << 20  # of the pictures of some topics, about
 
 
-@dataclass(frozen=True, slots=True)
-class VideoSummary:
-    """The first frames of a video topic.
-
-    Attributes:
-        formats: Their formats, such as `h264`.
-        frames: Number of frames that were looked at.
-        key_frames: Number of key frames among them.
-        unreadable: Number of those that are no video that can be read.
-    """
-
-    formats: tuple[str, ...]
-    frames: int
-    key_frames: int
-    unreadable: int
-
-
-def summary_of(session: Session, recording: str, topic: str) -> VideoSummary:
-    """Codec and key frames of the first 600 frames of a topic.
+def summary_of(session: Session, recording: str, topic: str) -> dict[str, Any]:
+    """Formats of the first 600 frames of a topic, their number, key frames and unreadable ones.
 
     Raises:
         SegmentError: A chunk is damaged.
     """
     question = Question((topic,), (recording,), limit=_MAX_LOOKED)
     formats: set[str] = set()
-    frames = keys = unreadable = 0
+    found = {"frames": 0, "key_frames": 0, "unreadable": 0}
     for run in Planner(session, question).runs():
         for message in messages_in(run):
             if message.is_reduced:
                 continue
-            frames += 1
+            found["frames"] += 1
             try:
                 form, data = frame_of(message.decode())
             except (PayloadError, DefinitionError):
-                unreadable += 1
+                found["unreadable"] += 1
                 continue
             formats.add(form)
-            keys += is_key_frame(form, data)
-    return VideoSummary(tuple(sorted(formats)), frames, keys, unreadable)
+            found["key_frames"] += is_key_frame(form, data)
+    return {"formats": sorted(formats), **found}
 
 
 def frames_in_front(session: Session, question: Question) -> list[Message]:

@@ -15,7 +15,7 @@ Kind = Literal["field", "topic", "word"]
 
 _WORD: Final = re.compile(r"""[^\s()!&|<>=~,"'{}]*\Z""")
 _COMPARISONS: Final = frozenset({"==", "=", "!=", "<", "<=", ">", ">=", "~", "=~", "!~"})
-_BEHIND: Final = ("and", "or", "between", "exists", "in", "missing", "not in")
+_BEHIND: Final = ("and", "or", "exists", "in", "missing", "not in")
 _VALUES: Final = ("false", "inf", "nan", "null", "true")
 _BEGINS: Final = frozenset({"and", "&&", "or", "||", "not", "!", "("})
 _PLAIN: Final = re.compile(r"[^\W\d]\w*")

@@ -20,7 +20,7 @@ from hybridlog.query.predicate.regex import RegexError, compile_regex
 from hybridlog.query.predicate.tree import (
     ALWAYS,
     And,
-    Exists,
+    Condition,
     Field,
     MongoFilter,
     Predicate,
@@ -123,7 +123,7 @@ def mongo_filter(
         raise _refused((), "it has a text that is not valid Unicode") from None
     except (BSONError, OverflowError, TypeError, ValueError) as error:
         raise _refused((), str(error)) from None
-    asked = (Exists(_field(path), present=True) for path in checker.paths if not _is_id(path))
+    asked = (Condition(_field(path), "exists") for path in checker.paths if not _is_id(path))
     check(Predicate(And(tuple(asked)), str(query)), types)
     root = MongoFilter(content, tuple(checker.paths.items())) if found else ALWAYS
     return Predicate(root, str(query))

@@ -4,13 +4,13 @@ r"""Predicates over message fields: `ranges.min < 0.5 and header.frame_id == "la
     term        = factor { ("and" | "&&") factor }
     factor      = ("not" | "!") factor | "(" expression ")" | condition | near
     near        = TOPIC ":" [ expression ]                  a message of another topic
-    condition   = field ("==" | "=" | "!=" | "<" | "<=" | ">" | ">=") value
+    condition   = field ("==" | "=" | "!=" | "<" | "<=" | ">" | ">=") (value | field)
                 | value order field [ order value ]             0 < x < 5
                 | field [ "not" ] "in" "[" value { "," value } "]"
                 | field ("~" | "=~" | "!~") string              a regular expression
-                | field "between" value "and" value             half-open
                 | field ("exists" | "missing")
-    field       = name { "." name | "[" index "]" | "[" [ begin ] ":" [ end ] "]" | "[]" | "[*]" }
+    field       = "abs" "(" field ")"
+                | name { "." name | "[" index "]" | "[" [ begin ] ":" [ end ] "]" | "[]" | "[*]" }
     value       = integer | 0xff | 1e-3 | inf | nan | "string" | true | false | null
                 | t"2015-03-03T18:28:33.5Z" | 5ms | 1m30s
 
@@ -20,6 +20,9 @@ backquotes: `` `a-b` ``. A path through an array (`status[].level`, `status.leve
 *any* element. Different elements may satisfy several conditions on one array:
 `0 < x < 5` means `0 < x and x < 5`. A slice `x[3:8]` is an array: the elements 3 to 7 of x,
 as far as there are any. Times and durations are integer nanoseconds, as stored.
+
+Two fields that are compared are single numbers or times of one message, and NaN equals nothing
+there.
 
 `!=`, `not in` and `!~` hold only where the field exists. For an array, they mean that no
 element equals or matches the operand. `not (...)` is plain negation: it also holds where
@@ -44,6 +47,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache
 from itertools import groupby
 from operator import itemgetter
@@ -54,11 +58,8 @@ from hybridlog.query.predicate.tokens import Token, error_at, is_filter, tokeniz
 from hybridlog.query.predicate.tree import (
     ALWAYS,
     And,
-    Compare,
-    Exists,
+    Condition,
     Field,
-    Match,
-    Member,
     Near,
     Node,
     Not,
@@ -214,41 +215,33 @@ class _Parser:
     def _of_field(self, field: Field) -> Node:
         token = self._peek()
         if (order := self._order()) is not None:
-            return self._compare(field, order)
+            behind = self._peek()
+            if behind.kind != "path" or behind.keyword in _VALUE_WORDS:
+                return self._compare(field, order)
+            other = self._field()
+            compared = Condition(field, order, other=other, position=behind.position)
+            return And((compared, Condition(other, "exists")))
         if self._take("~", "=~", "!~"):
             return self._match(field, negated=token.text == "!~")
         if self._take("exists", "missing"):
-            return Exists(field, present=token.keyword == "exists")
+            return Condition(field, "exists" if token.keyword == "exists" else "missing")
         if self._take("in", "not"):
             if token.keyword == "not" and not self._take("in"):
                 raise self._fail(self._peek(), "expected 'in' after 'not' here")
             return self._member(field, token, negated=token.keyword == "not")
-        if self._take("between"):
-            return self._between(field)
         if token.keyword == "[":
             problem = "write an element as x[3], a slice as x[3:8]; both count from 0"
             raise self._fail(token, problem)
         raise self._fail(
             token,
-            "expected an operator here: ==, !=, <, <=, >, >=, in, not in, ~, !~, between, "
-            "exists or missing (of a bool: field == true)",
+            "expected an operator here: ==, !=, <, <=, >, >=, in, not in, ~, !~, exists "
+            "or missing (of a bool: field == true)",
         )
 
-    def _compare(self, field: Field, order: Order) -> Compare:
+    def _compare(self, field: Field, order: Order) -> Condition:
         position = self._peek().position
         value = self._value()
         return _compare(self._text, field, order, value, position)
-
-    def _between(self, field: Field) -> Node:
-        position = self._peek().position
-        low = self._compare(field, ">=")
-        if not self._take("and"):
-            raise self._fail(self._peek(), "expected 'and' here: between a and b")
-        high = self._compare(field, "<")
-        a, b = low.value, high.value
-        if isinstance(a, int | float) and isinstance(b, int | float) and not a < b:
-            raise error_at(self._text, position, "the range is empty (its end is not part of it)")
-        return And((low, high))
 
     def _member(self, field: Field, token: Token, *, negated: bool) -> Node:
         closing = {"[": "]", "(": ")"}.get(self._peek().keyword)
@@ -264,7 +257,9 @@ class _Parser:
             values.append(self._value())
         if not values:
             raise self._fail(token, "the list is empty")
-        return Member(field, tuple(values), negated, token.position)
+        return Condition(
+            field, "not in" if negated else "in", tuple(values), position=token.position
+        )
 
     def _match(self, field: Field, *, negated: bool) -> Node:
         token = self._peek()
@@ -277,20 +272,25 @@ class _Parser:
             compile_regex(pattern)
         except RegexError as error:
             raise self._fail(token, f"the pattern is refused: {error}") from None
-        return Match(field, pattern, negated, token.position)
+        return Condition(field, "!~" if negated else "~", (pattern,), position=token.position)
 
     def _field(self) -> Field:
         token = self._peek()
         if token.kind != "path":
             raise self._fail(token, "expected the name of a field here")
         self._at += 1
+        if token.keyword == "abs" and self._take("("):
+            found = self._field()
+            if not self._take(")"):
+                raise self._fail(self._peek(), "expected ')' here")
+            return replace(found, is_absolute=True)
         if token.path[0] == "_meta" and not _ONLY_INDEXED.isdisjoint(token.path[1:2]):
             path = Field(token.path).path
             problem = (
                 f'only MongoDB has {path}; ask with a filter: {{"{path}": {{"$exists": true}}}}'
             )
             raise self._fail(token, problem)
-        return Field(token.path, token.position)
+        return Field(token.path, position=token.position)
 
     def _value(self) -> Value:
         sign = {"-": -1, "+": 1}.get(self._peek().keyword, 0)
@@ -310,7 +310,7 @@ class _Parser:
         if token.kind == "path":
             raise self._fail(
                 token,
-                "expected a value here (strings need quotes; two fields cannot be compared)",
+                "expected a value here (strings need quotes)",
             )
         raise self._fail(token, "expected a value here")
 
@@ -332,10 +332,10 @@ class _Parser:
         return error_at(self._text, token.position, message)
 
 
-def _compare(text: str, field: Field, order: Order, value: Value, position: int) -> Compare:
+def _compare(text: str, field: Field, order: Order, value: Value, position: int) -> Condition:
     if order not in {"==", "!="}:
         if value is None or isinstance(value, bool):
             raise error_at(text, position, "only numbers, times and strings have an order")
         if isinstance(value, float) and math.isnan(value):
             raise error_at(text, position, "nothing is less or greater than nan; write == nan")
-    return Compare(field, order, value, position)
+    return Condition(field, order, (value,), position=position)

@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from itertools import product
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 import pyarrow as pa
@@ -25,16 +26,15 @@ from hybridlog.query.predicate.numbers import (
     single,
 )
 from hybridlog.query.predicate.tree import (
+    NEGATED,
     And,
-    Compare,
-    Exists,
+    Condition,
     Field,
-    Match,
-    Member,
     MongoFilter,
     Near,
     Node,
     Not,
+    Op,
     Or,
     Parts,
     Predicate,
@@ -133,14 +133,20 @@ def _mask(node: Node, source: _Objects | _Columns) -> Mask:
             return ~_mask(item, source)
         case MongoFilter() | Near():
             raise _UnfitError
-        case Exists(target, present):
+        case Condition(target, "exists" | "missing" as op):
             for rows in source.there(target):
                 found[rows] = True
-            return found if present else ~found
-    for each in source.elements(node.field):
-        found[each.rows[_tested(node, each, source.types)]] = True
-    if (isinstance(node, Compare) and node.order == "!=") or getattr(node, "negated", False):
-        return _mask(Exists(node.field, present=True), source) & ~found
+            return found if op == "exists" else ~found
+    if node.other is not None:
+        sides = [map(_numbers, source.elements(one)) for one in (node.field, node.other)]
+        for (own, left), (others, right) in product(*sides):
+            rows, one, two = np.intersect1d(own, others, return_indices=True)
+            found[rows] |= _compared_rows(left[one], NEGATED.get(node.op, node.op), right[two])
+    else:
+        for each in source.elements(node.field):
+            found[each.rows[_tested(node, each, source.types)]] = True
+    if node.op in NEGATED:
+        return _mask(Condition(node.field, "exists"), source) & ~found
     return found
 
 
@@ -414,34 +420,56 @@ def _elements(leaves: _Leaves) -> Iterator[_Leaves]:
     yield _Leaves(values, rows, is_element=is_element)
 
 
-def _tested(node: Compare | Member | Match, leaves: _Leaves, types: FieldTypes) -> Mask:
+def _tested(node: Condition, leaves: _Leaves, types: FieldTypes) -> Mask:
     """Mask of the values that satisfy a condition, without its negation: bool[values]."""
     if types.are_singles(node.field.parts):
-        node = _of_singles(node)
+        # Decimal literals as float32 holds them, like the values.
+        node = replace(node, operands=tuple(map(single, node.operands)))
+    if node.field.is_absolute:
+        return _of_absolute(node, leaves, types)
     if leaves.is_summary:
         return _of_summaries(node, leaves, types)
-    match node:
-        case Match(pattern=pattern):
-            return _matching(leaves.values, pattern)
-        case Compare(order="==" | "!=", value=value):
-            return _equal_to(leaves, (value,))
-        case Member(values=values):
-            return _equal_to(leaves, values)
-        case Compare(order=order, value=value):
-            found = _compared(leaves.values, order, value)
-            if leaves.is_element and _kind_of(leaves.values) == "f":
-                found &= np.isfinite(_numpy(leaves.values).astype(np.float64))
-            return found
+    op = NEGATED.get(node.op, node.op)
+    if op in {"==", "in"}:
+        return _equal_to(leaves, node.operands)
+    if op == "~":
+        return _matching(leaves.values, str(node.operands[0]))
+    found = _compared(leaves.values, op, node.operands[0])
+    if leaves.is_element and _kind_of(leaves.values) == "f":
+        found &= np.isfinite(_numpy(leaves.values).astype(np.float64))
+    return found
 
 
-def _of_singles(node: Compare | Member | Match) -> Compare | Member | Match:
-    """The condition with its decimal literals as float32 holds them, like the values."""
-    match node:
-        case Compare(value=value):
-            return replace(node, value=single(value))
-        case Member(values=values):
-            return replace(node, values=tuple(map(single, values)))
-    return node
+def _of_absolute(node: Condition, leaves: _Leaves, types: FieldTypes) -> Mask:
+    """`abs(x) < 5` is `-5 < x < 5`, of the same element of an array."""
+    is_between = node.op in {"<", "<="}
+    if is_between and leaves.is_summary:
+        raise _UnfitError
+    plain = replace(node, field=replace(node.field, is_absolute=False))
+    turned = cast(Op, {"<": ">", "<=": ">=", ">": "<", ">=": "<="}.get(node.op, node.op))
+    values = tuple(-value if is_number(value) else value for value in node.operands)
+    below = replace(plain, op=turned, operands=values)
+    join = np.logical_and if is_between else np.logical_or
+    return join(_tested(plain, leaves, types), _tested(below, leaves, types))
+
+
+def _numbers(leaves: _Leaves) -> tuple[Rows, NDArray[Any]]:
+    """The rows of single numbers and times, and these."""
+    values, rows = leaves.values, leaves.rows
+    if leaves.is_element or _kind_of(values) not in {"i", "f", "O"}:
+        return rows[:0], np.empty(0)
+    if isinstance(values, np.ndarray):
+        return rows, values
+    values, rows = _some(values, rows, _valid(values))
+    return rows, _numpy(values.cast(pa.int64()) if is_time(values.type) else values)
+
+
+def _compared_rows(left: NDArray[Any], op: str, right: NDArray[Any]) -> Mask:
+    """Compare numbers with others, exactly."""
+    if left.dtype.kind != right.dtype.kind:
+        left, right = left.astype(object), right.astype(object)
+    with np.errstate(invalid="ignore"):  # NaN
+        return _ORDERS[op](left, right).astype(np.bool_)  # type: ignore[no-any-return]
 
 
 def _equal_to(leaves: _Leaves, values: Sequence[Value]) -> Mask:
@@ -540,17 +568,18 @@ def _floats_compared(numbers: NDArray[Any], order: str, value: float) -> Any:
 # Conditions on summaries.
 
 
-def _of_summaries(node: Compare | Member | Match, leaves: _Leaves, types: FieldTypes) -> Mask:
+def _of_summaries(node: Condition, leaves: _Leaves, types: FieldTypes) -> Mask:
     """Conditions on the elements of arrays that are present only as summaries.
 
     The ends decide what any element being greater or less is asked for; nothing else.
     """
     path, has_ends = node.field.names, leaves.values.type.get_field_index("min") >= 0
-    if not has_ends or not isinstance(node, Compare) or node.order in {"==", "!="}:
+    if not has_ends or node.op not in {"<", "<=", ">", ">="}:
         raise _UnfitError
-    end = pc.struct_field(leaves.values, "min" if node.order in {"<", "<="} else "max")
+    value = node.operands[0]
+    end = pc.struct_field(leaves.values, "min" if node.op in {"<", "<="} else "max")
     is_rounded = pa.types.is_floating(end.type) and not types.are_floats(path)
-    is_large = is_number(node.value) and abs(nearest(node.value)) >= 2**53
+    is_large = is_number(value) and abs(nearest(value)) >= 2**53
     if types.kind(path) == "bool" or (is_rounded and is_large):
         raise _UnfitError
-    return _compared(end, node.order, node.value)
+    return _compared(end, node.op, value)

@@ -16,6 +16,9 @@ from hybridlog_storage.lazy import lazy
 Value: TypeAlias = bool | int | float | str | None
 """The operand of a comparison; times and durations are integer nanoseconds."""
 Order = Literal["==", "!=", "<", "<=", ">", ">="]
+Op: TypeAlias = Literal[Order, "in", "not in", "~", "!~", "exists", "missing"]
+NEGATED: Final[dict[Op, Op]] = {"!=": "==", "not in": "in", "!~": "~"}
+"""Operators that hold for a field that is there and does not satisfy another one."""
 
 
 class _Node:
@@ -55,10 +58,12 @@ class Field(_Node):
 
     Attributes:
         parts: Names, ints for elements of arrays, slices.
+        is_absolute: Without the signs of numbers, as `abs(x)`.
         position: Its place in the text.
     """
 
     parts: Parts
+    is_absolute: bool = False
     position: int = dataclasses.field(default=0, repr=False)
 
     @property
@@ -73,40 +78,20 @@ class Field(_Node):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Compare(_Node):
-    """`field order value`."""
+class Condition(_Node):
+    """A condition on a field: `x < 5`, `x in [1, 2]`, `x ~ "^a"`, `x exists`.
+
+    Attributes:
+        operands: The value that it is compared with; of `in` several, of `exists` none; of `~` a
+            pattern in RE2's syntax.
+        other: The field that it is compared with, which must exist besides; None for operands.
+        position: Place of the operands in the text.
+    """
 
     field: Field
-    order: Order
-    value: Value
-    position: int = dataclasses.field(default=0, repr=False)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Member(_Node):
-    """`field in [...]`, or `not in` when negated."""
-
-    field: Field
-    values: tuple[Value, ...]
-    negated: bool
-    position: int = dataclasses.field(default=0, repr=False)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Exists(_Node):
-    """`field exists`, or `missing` when not present."""
-
-    field: Field
-    present: bool
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Match(_Node):
-    """`field ~ pattern`, or `!~` when negated; the pattern is in RE2's syntax."""
-
-    field: Field
-    pattern: str
-    negated: bool
+    op: Op
+    operands: tuple[Value, ...] = ()
+    other: Field | None = None
     position: int = dataclasses.field(default=0, repr=False)
 
 
@@ -174,7 +159,6 @@ class MongoFilter(_Node):
 
 ALWAYS: Final = And(())
 """What every message satisfies."""
-Condition: TypeAlias = Compare | Member | Exists | Match
 Node: TypeAlias = Condition | And | Or | Not | Near | MongoFilter
 
 

@@ -10,11 +10,8 @@ from typing import Any, Literal, cast
 
 from hybridlog.query.predicate.tokens import error_at
 from hybridlog.query.predicate.tree import (
-    Compare,
-    Exists,
+    Condition,
     Field,
-    Match,
-    Member,
     Parts,
     Predicate,
 )
@@ -154,7 +151,7 @@ def check(predicate: Predicate, types: FieldTypes | Mapping[str, str] | None) ->
         target = condition.field
         for problem in _problems_of(target, known):
             raise error_at(predicate.text, target.position, problem)
-        if isinstance(condition, Exists):
+        if condition.op in {"exists", "missing"}:
             continue
         if target.names in known.inner:
             below = (name for name in known.types if name.startswith(f"{target.names}."))
@@ -185,17 +182,32 @@ def _problems_of(target: Field, types: FieldTypes) -> Iterator[str]:
     yield f"there is no field {path}; {hint}"
 
 
-def _problems(node: Compare | Member | Match, types: FieldTypes, text: str) -> Iterator[str]:
+def _problems(node: Condition, types: FieldTypes, text: str) -> Iterator[str]:
     """Reasons to refuse what a field is compared with."""
     path = node.field.names
     is_statistic = types.known and path not in types.types and types.statistic(node.field.parts)
     kind = "number" if is_statistic else types.kind(path)
-    if isinstance(node, Match):
+    if node.op in {"~", "!~"}:
         if kind not in {"string", "other"}:
             yield f"the field is a {kind}, not a string"
         return
+    if node.field.is_absolute and kind not in {"number", "other"}:
+        yield f"the field is a {kind}, and abs() is of numbers"
+    if node.field.is_absolute and any(
+        isinstance(one, int | float) and one < 0 for one in node.operands
+    ):
+        yield "abs() is never negative"
+    if node.other is not None:
+        kinds = {kind, types.kind(node.other.names)} - {"other"}
+        if len(kinds) > 1 or not kinds <= {"number", "time"}:
+            yield "only two numbers, or two times, can be compared (strings need quotes)"
+        both = (node.field.parts, node.other.parts)
+        paths = (Field(parts[: end + 1]).names for parts in both for end in range(len(parts)))
+        is_absolute = node.field.is_absolute or node.other.is_absolute
+        if is_absolute or not types.arrays.isdisjoint(paths):
+            yield "fields that are compared are single values: no arrays, and no abs()"
     is_moment = kind == "time" and types.base(path) != "duration"
-    for value in (node.value,) if isinstance(node, Compare) else node.values:
+    for value in node.operands:
         if kind == "other" or value is None:
             continue
         given = next(name for name, known in _VALUES.items() if isinstance(value, known))

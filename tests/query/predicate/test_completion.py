@@ -36,7 +36,7 @@ def offered(text: str) -> list[str]:
         ("odd|", ["`odd-name`"]),
         ("quoted|", ["`quoted.name`"]),
         ("ranges.min < 0.5 a|", ["ranges.min < 0.5 and"]),
-        ("ranges.min e|", ["ranges.min exists", "ranges.min between"]),
+        ("ranges.min e|", ["ranges.min exists"]),
         ("a == t|", ["a == true"]),
         ("/o|", ["/odom: "]),
         ("range_max > 1 and im|", ["range_max > 1 and /imu: "]),

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 import re
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from hypothesis import strategies as st
 
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.to_mask import mask_of_objects
-from hybridlog.query.predicate.tree import Compare, Predicate
+from hybridlog.query.predicate.tree import Condition, Predicate
 from hybridlog.query.predicate.types import check
 from hybridlog_storage.errors import WhereError
 
@@ -54,7 +55,7 @@ ANYTHING = dict.fromkeys(
         ("5 > x", "x < 5"),
         ("5 == x", "x == 5"),
         ("0 < x < 5", "x > 0 and x < 5"),
-        ("x between 1 and 2", "x >= 1 and x < 2"),
+        ("1 <= x < 2", "x >= 1 and x < 2"),
         ("x IN [1, 2.5, -3,]", "x in [1, 2.5, -3]"),
         ("x not in ('a')", "x not in ['a']"),
         ("x not in ('a', 2)", "x not in ['a', 2]"),
@@ -70,6 +71,8 @@ ANYTHING = dict.fromkeys(
         ("x == 1e-3", "x == 0.001"),
         ("x == .5", "x == 0.5"),
         ("x < -inf", "x < -inf"),
+        ("abs(x) < 5", "5 > abs(x)"),
+        ("x < y", "x<y"),
         ("x == 9223372036854775807", "x == 9223372036854775807"),
         ("x == -9223372036854775808", "x == -9223372036854775808"),
         ("x == 9223372036854775808", "x == 9223372036854775808"),
@@ -100,16 +103,18 @@ def test_grammar(where: str, expected: str) -> None:
 
 def test_nan() -> None:
     node = checked("x == NaN", {"x": "float64"}).root
-    assert isinstance(node, Compare)
-    assert isinstance(node.value, float)
-    assert math.isnan(node.value)
+    assert isinstance(node, Condition)
+    assert isinstance(node.operands[0], float)
+    assert math.isnan(node.operands[0])
 
 
 @pytest.mark.parametrize(
     ("where", "message", "column"),
     [
         ("x <", "expected a value", 3),
-        ("x == base", "strings need quotes", 5),
+        ("abs(x", "expected '\\)'", 5),
+        ("abs(x) < y", "no abs", 9),
+        ("0 < x < y", "strings need quotes", 8),
         ("(x < 1", "expected '\\)'", 6),
         ("x < 1)", "expected 'and'", 5),
         ("x < nan", "nan", 4),
@@ -140,7 +145,7 @@ def test_nan() -> None:
         ("`` == 1", "must not", 0),
         ("x in []", "list is empty", 2),
         ("x in 5", "expected a list", 5),
-        ("x between 5 and 3", "empty", 10),
+        ("x between 5 and 3", "expected an operator", 2),
         ("x not 5", "expected 'in'", 6),
         ("x[*][0] == 1", "only of named", 4),
         ("x[].0 == 1", "only of named", 3),
@@ -214,8 +219,17 @@ def test_limits() -> None:
         ("nine[9] > 1", "nine has 9 elements"),
         ("t > 1760000000", 't"1760000000" for seconds'),
         ("1760000000.5 < t", 't"1760000000.5" for seconds'),
-        ("_meta.t between 1760000000000 and 1770000000000", "nanoseconds here"),
+        ("1760000000000 < _meta.t < 1770000000000", "nanoseconds here"),
         ("x > 1 & x < 2", "write and"),
+        ("x == s", "strings need quotes"),
+        ("x == base", "no field base"),
+        ("a > x", "no arrays"),
+        ("m.v > x", "no arrays"),
+        ("x > nine[0]", "no arrays"),
+        ("t > x", "two numbers, or two times"),
+        ("s == names", "two numbers"),
+        ("abs(x) > -5", "never negative"),
+        ("abs(t) > 5", r"abs\(\) is of numbers"),
         ("o:x > 1", "a space follows the name"),
     ],
 )
@@ -318,6 +332,8 @@ conditions = (
         st.sampled_from(["z", "a.min", "m.q.min"]),
         st.just([None, 1]) | st.just([None]),
     )
+    | comparisons(["abs(x)", "abs(i)", "abs(a)", "abs(m.v)", "abs(a.min)"], finite.map(abs))
+    | st.tuples(st.just("fields"), st.permutations(["x", "i", "z", "o.y"]), orders)
     | st.tuples(
         st.sampled_from(["exists", "missing"]),
         st.sampled_from(["x", "z", "o", "o.y", "m", "m.v", "a", "a[0]", "m[1].v", *stats]),
@@ -341,6 +357,8 @@ def write(question: Question) -> str:
     match question:
         case ("compare", path, order, value):
             return f"{path} {order} {spell(value)}"
+        case ("fields", [left, right, *_], order):
+            return f"{left} {order} {right}"
         case ("in" | "not in" as word, path, values):
             return f"{path} {word} [{', '.join(map(spell, values))}]"
         case ("exists" | "missing" as word, path):
@@ -382,6 +400,13 @@ def leaves(document: Document, path: str) -> list[object]:
     return reached(document, parts)
 
 
+def absolute(leaf: Any) -> object:
+    """Numbers without their signs; of a list, those of its elements."""
+    if isinstance(leaf, list):
+        return [absolute(value) for value in leaf]
+    return leaf if leaf is None else abs(leaf)
+
+
 def same_kind(left: object, right: object) -> bool:
     def kind(value: object) -> str:
         if isinstance(value, bool) or value is None or isinstance(value, str):
@@ -414,8 +439,18 @@ def holds(question: Question, document: Document) -> bool:
             return holds(left, document) or holds(right, document)
         case ("not", inner):
             return not holds(inner, document)
+        case ("fields", [left, right, *_], order):
+            sides = [leaves(document, path) for path in (left, right)]
+            if not all(sides):
+                return False
+            one, other = (side[0] for side in sides)
+            is_equal = one == one and compares(one, "==", other)
+            return not is_equal if order == "!=" else compares(one, str(order), other)
     word, path, *rest = question
-    found = leaves(document, str(path))
+    is_absolute = str(path).startswith("abs(")
+    found = leaves(document, str(path).removeprefix("abs(").removesuffix(")"))
+    if is_absolute:
+        found = [absolute(leaf) for leaf in found]
     values = [item for leaf in found for item in (leaf if isinstance(leaf, list) else [leaf])]
     match word, rest:
         case "exists", _:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 import operator
 import struct
 from fractions import Fraction
@@ -13,7 +15,7 @@ import pytest
 from hybridlog.query.predicate.mongo_filter import mongo_filter
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.to_mask import mask_of_objects, to_mask
-from hybridlog.query.predicate.tree import Compare, Field
+from hybridlog.query.predicate.tree import Condition, Field
 
 ORDERS = {
     "==": operator.eq,
@@ -52,7 +54,7 @@ def test_numbers_are_compared_by_value(name: str, order: str) -> None:
     bounds += [2**53 - 1, 2**53 + 1, 2**63 - 1, 2**63, 2**63 + 1, 2**64 - 1, 2**64, 10**400]
     bounds += [1e300, -1e300, 2.0**63, 2.0**64, -(2**63), -(2**63) - 1, -(10**400)]
     for bound in bounds:
-        asked = Compare(Field(("x",)), order, bound)  # type: ignore[arg-type]
+        asked = Condition(Field(("x",)), order, (bound,))  # type: ignore[arg-type]
         records = pa.StructArray.from_arrays([pa.array(values)], ["x"])
         mask = to_mask(asked, {"x": name}, records)
         assert mask is not None
@@ -127,3 +129,27 @@ def test_what_columns_cannot_tell() -> None:
     assert mask is not None
     assert mask.tolist() == [True]
     assert mask_of("x == 1", table.slice(0, 0)) == []
+
+
+@pytest.mark.parametrize("order", ["==", "!=", "<", "<=", ">", ">="])
+def test_two_fields_are_compared_by_value(order: str) -> None:
+    big = [2**53 + 1, 2**63 - 1, 0, 5]
+    kinds = {
+        "int64": [*big, -(2**63), None, 7],
+        "uint64": [2**53, 2**63, 2**64 - 1, 5, 1, 2, None],
+        "float64": [2.0**53, 2.0**63, math.nan, 5.0, -(2.0**63), 0.5, math.inf],
+    }
+    records = pa.StructArray.from_arrays(
+        [pa.array(values, kind) for kind, values in kinds.items()], [*kinds]
+    )
+    compare = operator.ne if order == "!=" else ORDERS[order]
+    for one, other in itertools.permutations(kinds, 2):
+        predicate = parse(f"{one} {order} {other}")
+        pairs = zip(kinds[one], kinds[other], strict=True)  # Python compares exactly
+        want = [a is not None and b is not None and compare(a, b) for a, b in pairs]
+        mask = to_mask(predicate, {}, records)
+        # Of nulls, columns do not say which are missing.
+        assert mask is None or mask.tolist() == want
+        assert (mask is None) == (None in kinds[other] or (order == "!=" and None in kinds[one]))
+        rows = [{k: v for k, v in row.items() if v is not None} for row in records.to_pylist()]
+        assert mask_of_objects(predicate, {}, rows).tolist() == want
