@@ -29,8 +29,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.query.chunk_columns import Chunk
-    from hybridlog.query.message_filter import MessageFilter
-    from hybridlog.query.question import Clock, RecordedChannel, Span
+    from hybridlog.query.question import Clock, Part, RecordedChannel, Span
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.messages import Batch
@@ -100,8 +99,8 @@ class ScanPlan:
     """Everything to read, in order.
 
     Attributes:
-        filters: Decides on each message of a channel, by index of the channel, but for those in
-            some segments.
+        filters: By index of a channel the part whose predicate is asked of each message, but for
+            those in some segments.
         offsets: Payload offsets of the other messages that are wanted, by chunk; int64[k].
         is_chosen: Only messages with offsets, or which a filter accepts, are wanted.
         reverse: Latest message first.
@@ -111,7 +110,7 @@ class ScanPlan:
     channels: list[RecordedChannel]
     scans: list[RecordingScan]
     clock: Clock = "log"
-    filters: Mapping[int, tuple[MessageFilter, Collection[int]]] = field(default_factory=dict)
+    filters: Mapping[int, tuple[Part, Collection[int]]] = field(default_factory=dict)
     offsets: Mapping[ChunkKey, NDArray[np.int64]] = field(default_factory=dict)
     is_chosen: bool = False
     reverse: bool = False
@@ -280,16 +279,18 @@ class ChunkScan:
 
     def _filtered(self, run: MessageRun, undecided: Sequence[int]) -> tuple[MessageRun, int, int]:
         """The messages that satisfy the predicate, and numbers as in `Matches`."""
-        filters = self._plan.filters
         if not undecided or not len(run.batch):
             return run, 0, 0
+        from hybridlog.query.message_filter import matches
+
         holds = np.ones(len(run.batch), np.bool_)
         unreadable = expired = 0
         for index in distinct(run.batch.channel).tolist():
             if index in undecided:
                 rows = np.flatnonzero(run.batch.channel == index)
                 channel = self._plan.channels[index]
-                found = filters[index][0].matches(channel, run.batch.take(rows), run.seq[rows])
+                part, _ = self._plan.filters[index]
+                found = matches(part, channel, run.batch.take(rows), run.seq[rows])
                 holds[rows] = found.holds
                 unreadable += found.unreadable
                 expired += found.expired

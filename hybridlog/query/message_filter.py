@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from numpy.typing import NDArray
 
-    from hybridlog.query.question import RecordedChannel
+    from hybridlog.query.question import Part, RecordedChannel
     from hybridlog_storage.messages import Batch
 
 
@@ -36,68 +36,55 @@ class Matches(NamedTuple):
     expired: int = 0
 
 
-class MessageFilter:
-    """Decides one predicate on decoded messages. Thread safe.
+def matches(part: Part, channel: RecordedChannel, batch: Batch, seq: NDArray[np.int64]) -> Matches:
+    """Decide the predicate of a part on messages of one of its channels; `seq` as they arrived."""
+    predicate, types = part.predicate, part.field_types
+    assert predicate is not None
+    holds = np.zeros(len(batch), np.bool_)
+    fields = {path.split(".")[0].split("[")[0] for path in predicate.fields()} - {"_meta"}
+    times = batch.log_time, seq, batch.publish_time
+    if not fields:  # what a message itself provides can be asked of any
+        mask = mask_of(part, channel, structs({}, len(batch)), *times)
+        assert mask is not None
+        return Matches(mask, 0)
+    if not channel.codec.indexed:
+        return Matches(holds, len(batch))
+    if channel.is_reduced:
+        fields = _elements_of(predicate, types or {})
+    decoded = channel.codec.columns_of(batch, fields)
+    rows = decoded.rows
+    times = batch.log_time[rows], seq[rows], batch.publish_time[rows]
+    lacking = np.zeros(len(rows), np.bool_)
+    if channel.is_reduced:
+        from hybridlog.schema.left import LeftFields
 
-    `types` are those of the fields by path; None where no definition fixes them.
-    """
-
-    def __init__(self, predicate: Predicate, types: Mapping[str, str] | None) -> None:
-        self._predicate = predicate
-        self._types = types
-        self._elements = _elements_of(predicate, types or {})
-        self._fields = {path.split(".")[0].split("[")[0] for path in predicate.fields()}
-        self._asks_meta = "_meta" in self._fields
-        self._fields -= {"_meta"}
-
-    def matches(self, channel: RecordedChannel, batch: Batch, seq: NDArray[np.int64]) -> Matches:
-        """Decide on messages of one channel; `seq` are their arrival numbers."""
-        holds = np.zeros(len(batch), np.bool_)
-        times = batch.log_time, seq, batch.publish_time
-        if not self._fields:  # what a message itself provides can be asked of any
-            mask = mask_of(self._predicate, self._types, structs({}, len(batch)), channel, *times)
-            assert mask is not None
-            return Matches(mask, 0)
-        if not channel.codec.indexed:
-            return Matches(holds, len(batch))
-        fields = self._elements if channel.is_reduced else self._fields
-        decoded = channel.codec.columns_of(batch, fields)
-        rows = decoded.rows
-        times = batch.log_time[rows], seq[rows], batch.publish_time[rows]
-        lacking = np.zeros(len(rows), np.bool_)
-        if channel.is_reduced:
-            from hybridlog.schema.left import LeftFields
-
-            assert isinstance(decoded.records, LeftFields)
-            lacking = decoded.records.lacking() if fields else lacking
-            mask = None  # of some arrays only summaries are left
-        else:
-            mask = mask_of(self._predicate, self._types, decoded.arrow(), channel, *times)
-        if mask is None:
-            plain = decoded.plain(whole=False)
-            if self._asks_meta:
-                meta = meta_array(structs({}, len(rows)), channel, *times).to_pylist()
-                plain = [{**one, **own} for one, own in zip(plain, meta, strict=True)]
-            mask = mask_of_objects(self._predicate, self._types, plain)
-        holds[rows] = mask & ~lacking
-        unread, expired = len(batch) - len(rows), int(lacking.sum())
-        return Matches(holds, unread + expired, expired)
+        assert isinstance(decoded.records, LeftFields)
+        lacking = decoded.records.lacking() if fields else lacking
+        mask = None  # of some arrays only summaries are left
+    else:
+        mask = mask_of(part, channel, decoded.arrow(), *times)
+    if mask is None:
+        plain = decoded.plain(whole=False)
+        if any(map(is_meta, predicate.fields())):
+            meta = meta_array(structs({}, len(rows)), channel, *times).to_pylist()
+            plain = [{**one, **own} for one, own in zip(plain, meta, strict=True)]
+        mask = mask_of_objects(predicate, types, plain)
+    holds[rows] = mask & ~lacking
+    unread, expired = len(batch) - len(rows), int(lacking.sum())
+    return Matches(holds, unread + expired, expired)
 
 
 def mask_of(
-    predicate: Predicate,
-    types: Mapping[str, str] | None,
-    records: pa.StructArray,
-    channel: RecordedChannel,
-    *times: Any,
+    part: Part, channel: RecordedChannel, records: pa.StructArray, *times: Any
 ) -> NDArray[np.bool_] | None:
-    """Mask of the messages for which a predicate holds; None if columns cannot decide.
+    """Mask of the messages for which a part's predicate holds; None if columns cannot decide.
 
     `times` are log times, arrival numbers and publish times, as of `meta_array`.
     """
-    if any(map(is_meta, predicate.fields())):
+    assert part.predicate is not None
+    if any(map(is_meta, part.predicate.fields())):
         records = meta_array(records, channel, *times)
-    return to_mask(predicate, types, records)
+    return to_mask(part.predicate, part.field_types, records)
 
 
 def _elements_of(predicate: Predicate, types: Mapping[str, str]) -> set[str]:

@@ -11,6 +11,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from itertools import pairwise
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
 
     from hybridlog.columns.topic_table import TableRows, TopicTable
     from hybridlog.query.chunk_scan import MessageRun
-    from hybridlog.query.message_filter import MessageFilter
     from hybridlog.query.question import Counters, Part, RecordedChannel
     from hybridlog.session import Session
 
@@ -380,20 +380,20 @@ class Rows:
         Where a table decides, it says where they are; else filters decide on what is read.
         """
         channels: list[RecordedChannel] = []
-        filters: dict[int, tuple[MessageFilter, Collection[int]]] = {}
+        filters: dict[int, tuple[Part, Collection[int]]] = {}
         offsets: dict[ChunkKey, list[NDArray[np.int64]]] = defaultdict(list)
         of_recording: dict[str, tuple[Part, dict[int, int]]] = {}
         for part in parts:
             _, indexes = of_recording.setdefault(part.recording.id, (part, {}))
-            decide = filter_of(part)
-            found = None if decide is None else self.tabled(part)
+            asks = part.predicate is not None
+            found = self.tabled(part) if asks else None
             for key, own in self._offsets(found).items() if found is not None else ():
                 offsets[key].append(own)
             for channel in part.channels:
                 indexes[channel.channel_id] = len(channels)
-                if decide is not None and (found is None or found.segments is not None):
+                if asks and (found is None or found.segments is not None):
                     covered = () if found is None or found.segments is None else found.segments
-                    filters[len(channels)] = decide, covered
+                    filters[len(channels)] = part, covered
                 channels.append(channel)
         return ScanPlan(
             channels,
@@ -435,16 +435,18 @@ class Rows:
         """The messages of a part in order, whether they match or not, of one channel at a time."""
         plan = self.chunk_plan([replace(part, predicate=None)])
         for run in ChunkScan(plan, self.session).runs():
-            changes = np.flatnonzero(np.diff(run.batch.channel)) + 1
-            for own in map(run.take, np.split(np.arange(len(run.batch)), changes)):
+            edges = [0, *(np.flatnonzero(np.diff(run.batch.channel)) + 1), len(run.batch)]
+            for begin, end in pairwise(edges):
+                own = run if len(edges) == 2 else run.take(np.arange(begin, end))
                 yield plan.channels[int(own.batch.channel[0])], own
 
     def _decided(self, part: Part, channel: RecordedChannel, run: MessageRun) -> NDArray[np.bool_]:
         """Whether messages of one channel match; those that cannot be tested are counted."""
-        decide = filter_of(part)
-        if decide is None:
+        if part.predicate is None:
             return np.ones(len(run.batch), np.bool_)
-        found = decide.matches(channel, run.batch, run.seq)
+        from hybridlog.query.message_filter import matches
+
+        found = matches(part, channel, run.batch, run.seq)
         self.counters.unreadable += found.unreadable
         self.counters.without_arrays += found.expired
         return found.holds
@@ -484,15 +486,6 @@ def summaries_in(fields: Collection[str] | None, types: Mapping[str, str] | None
     return {path for path in fields or () if is_summary(path, types or {})}
 
 
-def filter_of(part: Part) -> MessageFilter | None:
-    """Decides the predicate of a part on messages; None without one."""
-    if part.predicate is None:
-        return None
-    from hybridlog.query.message_filter import MessageFilter
-
-    return MessageFilter(part.predicate, part.field_types)
-
-
 def places_of(references: Any) -> NDArray[np.int64]:
     """Segment, chunk and payload offset of messages, int64[n, 3], from a table's column `ref`."""
     columns = [references.field(n).to_numpy(zero_copy_only=False) for n in ("seg", "chunk", "off")]
@@ -513,13 +506,12 @@ def offsets_by_chunk(
 
 
 def _decided(part: Part, rows: TableRows) -> NDArray[np.bool_]:
-    predicate = part.predicate
-    if predicate is None:
+    if part.predicate is None:
         return np.ones(len(rows), np.bool_)
     from hybridlog.query.message_filter import mask_of
 
     times = rows.t, rows.seq, rows.own.get("pub")
-    found = mask_of(predicate, part.field_types, rows.records, part.channels[0], *times)
+    found = mask_of(part, part.channels[0], rows.records, *times)
     if found is None:
         raise _UndecidedError
     return found

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
+import bson
 import numpy as np
 import pytest
 from bson import Decimal128, Int64, MinKey
@@ -19,12 +20,14 @@ import hybridlog as hl
 from hybridlog.contract import Contract
 from hybridlog.follow.child import Trigger
 from hybridlog.query.choice import Choice
+from hybridlog.query.index_reader import keys_of
 from hybridlog.query.predicate.mongo_filter import MAX_DEPTH
 from hybridlog.query.query import Query
 from hybridlog_storage.errors import (
     DatabaseError,
     HybridlogError,
     IncompleteError,
+    StoreError,
     UsageError,
     WhereError,
 )
@@ -363,3 +366,11 @@ def test_messages_without_fields_are_told(tmp_path: Path) -> None:
         both = topic.where({"x": {"$ne": 1}}).where("x < 5")
         assert (both.count(), both.counters.unreadable) == (1, 1)
         assert topic.where({"_meta.error": {"$exists": True}}).count() == 1
+
+
+@pytest.mark.parametrize(
+    "document", [{"_meta": {"seq": Int64(1)}}, {"_id": b"x" * 23}, {"_id": "x" * 24}]
+)
+def test_a_strange_document_is_refused(document: dict[str, object]) -> None:
+    with pytest.raises(StoreError, match="index rebuild"):
+        keys_of(bson.encode(document))

@@ -13,11 +13,11 @@ from hypothesis import HealthCheck, Phase, example, given, settings
 from hypothesis import strategies as st
 
 from hybridlog.columns.left_rows import reduced
-from hybridlog.query.message_filter import MessageFilter
+from hybridlog.query.message_filter import matches
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.to_mask import mask_of_objects, statistic_of, to_mask
 from hybridlog.query.predicate.tree import Predicate
-from hybridlog.query.question import RecordedChannel
+from hybridlog.query.question import Part, RecordedChannel
 from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.catalog import ChannelStats, RecordingEntry
 from hybridlog_storage.messages import REDUCED, Batch, Channel, Schema, left_channel
@@ -428,6 +428,7 @@ def test_reduced_json_has_summaries(where: str, holds: bool) -> None:
     batch = Batch(payload, zero, zero + len(payload), zero, zero, zero, zero)
     entry = RecordingEntry("0", "a", {}, {}, 0, "complete")
     recorded = RecordedChannel(entry, 0, left_channel(channel, REDUCED), ChannelStats(), None)
-    found = MessageFilter(parse(where), None).matches(recorded, batch, zero)
+    part = Part(entry, "/r", (recorded,), None, "log", None, parse(where))
+    found = matches(part, recorded, batch, zero)
     assert found.holds.tolist() == [holds]
     assert found.unreadable == found.expired == ("r." not in where)
