@@ -62,6 +62,12 @@ def test_bands_are_the_intervals_as_far_as_pixels_tell(drive: Drive) -> None:
     assert Matches(query).bands((0, BASE - 1), 7).tolist() == []
 
 
+def test_bands_last_until_the_recording_ends(drive: Drive) -> None:
+    query = drive.store.topic("loose").where("name exists")
+    end = int(drive.times[-1])
+    assert Matches(query).bands((end - 5 * MS, end + 1), 9).tolist() == [[end - 5 * MS, end + 1]]
+
+
 @pytest.mark.parametrize("count", [1, 7, 5000])
 def test_matches_step_by_step(drive: Drive, count: int) -> None:
     matches = Matches(drive.store.topic("drive").where(PREDICATE))

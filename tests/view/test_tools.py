@@ -141,6 +141,21 @@ def test_nothing_leaves_the_store(
     assert ask("sql", query="select 1").values["rows"] == [[1]]
 
 
+def test_settings_name_no_path(demo_store: hl.Store, ask: Ask) -> None:
+    for query in ("select * from duckdb_settings()", "select * from duckdb_databases()"):
+        text = json.dumps(ask("sql", query=query).values)
+        for place in (demo_store.directory.path, Path.cwd(), Path.home()):
+            assert str(place) not in text
+    assert ask("sql", query="select * from recordings").values["rows"][0][0] == "robot"
+
+
+def test_large_answers_are_cut(ask: Ask) -> None:
+    told = ask("sql", query="select range, repeat('x', 1000) from range(1000000)").values
+    assert told["more"]
+    assert 0 < len(told["rows"]) <= tools.MAX_ROWS
+    assert ask("sql", query="select msg from rosout").values["rows"]
+
+
 def test_values_that_json_lacks(ask: Ask) -> None:
     odd = "select 'nan'::double, '-infinity'::float, {'x': 'infinity'::double}"
     assert ask("sql", query=odd).values["rows"] == [["NaN", "-Infinity", {"x": "Infinity"}]]
@@ -202,3 +217,10 @@ def test_no_byte_is_written_and_losses_are_told(demo_store: hl.Store, tmp_path: 
         assert [one["topic"] for one in topics] == [text]
         assert ask("fetch", topic=text).values["messages"][0]["fields"] == {"text": text}
     assert content(path) == before
+
+
+def test_an_endless_answer_is_given_up(demo_store: hl.Store) -> None:
+    with asking(make_server(demo_store, seconds=2)) as ask:
+        endless = "select count(*) from range(100000000000) where sin(range) > 2"
+        assert re.search("stopped after|longer than", ask("sql", query=endless).error)
+        assert ask("sql", query="select 1").values["rows"] == [[1]]
