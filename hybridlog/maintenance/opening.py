@@ -136,7 +136,8 @@ class StoreFiles:
             described = self._read(recording)
             return described.summary if described is not None else None
         found = described_of(*known)
-        if found.entry.status not in UNFINISHED:
+        is_noted = self.catalog.recording(recording) == (found.files, found.entry)
+        if found.entry.status not in UNFINISHED or not is_noted:
             self.catalog.put(found)
         return found.summary
 

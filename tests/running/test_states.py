@@ -85,6 +85,7 @@ def test_all_payloads_of_a_copy_have_expired(running: Running, tmp_path: Path) -
     known = running.flushed()
     copied = copy_of(running, tmp_path / "copy")
     with hl.open(copied, mongo=NO_MONGODB) as store:
+        store.shared.recover()
         entry = store.entry(LABEL)
         with store.directory.writing(entry.id):
             expire(store.directory, entry.id, [*map(int, entry.digests)])
