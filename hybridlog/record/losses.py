@@ -160,9 +160,7 @@ def losses_of(entry: RecordingEntry) -> list[dict[str, Any]]:
     """The loss ledger of a recording, with a row for what a crash cut off."""
     losses = [dict(loss) for loss in entry.end.get("losses", [])]
     if entry.status == "unfinished":
-        losses.append(
-            _uncounted(CRASH, "its last segment is read once the store can be written again")
-        )
+        losses.append(_uncounted(CRASH, "what came after its last flushed message is lost"))
     if "recovered" in {entry.status, entry.end.get("status")}:  # a crash ended it
         losses.append(_uncounted(CRASH, "what came after its last message was not stored"))
         damage = entry.end.get("damage", [])
