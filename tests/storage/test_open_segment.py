@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import pytest
 from mcap.records import Metadata
 
+from hybridlog_storage.mcap.mcap_content import RECORD_HEAD
 from hybridlog_storage.segments import walk
 from hybridlog_storage.segments.attachments import Attachment
 from hybridlog_storage.segments.compression import FilePart
@@ -96,3 +97,27 @@ def test_a_part_of_a_write_is_no_damage(
         assert not segment.damaged, seen
         check(segment, written.summary)
     assert waits
+
+
+def test_damage_behind_a_chunk_costs_no_other(
+    written: Written, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(walk, "time", SimpleNamespace(sleep=lambda _: None))
+    chunks = written.summary.table.chunks
+    at, length, trailer, *_ = chunks[1].tolist()
+    path = tmp_path / "000000.mcap.open"
+    heads, end = [], at + length
+    while end < at + length + trailer:
+        heads.append(end)
+        end += RECORD_HEAD.size + RECORD_HEAD.unpack_from(written.data, end)[1]
+    for place in (head + n for head in heads for n in range(RECORD_HEAD.size)):
+        for bit in (1 << n for n in range(8)):
+            data = bytearray(written.data)
+            data[place] ^= bit
+            path.write_bytes(data)
+            segment = OpenSegment(tmp_path, 0)
+            segment.follow()
+            found = {row[0] for row in segment.flushed.table.chunks.tolist()}
+            lost = {row[0] for row in chunks.tolist()} - found
+            assert lost <= {at}, (place, bit)
+            assert segment.damaged or not lost

@@ -190,9 +190,12 @@ class Walk:
         trailer = self._trailer(at, end, head.size)
         if crc32(self._bytes.at(at, head.start, move=True)) != trailer.head_crc:
             raise SegmentError("the head of a chunk changed: its checksum differs")
-        behind = end + trailer.length
         try:
             parts, seq = trailer.arrivals()
+        except SegmentError as error:  # its length may be wrong: what follows is looked for
+            raise SegmentError(f"a chunk is damaged: {error}") from error
+        behind = end + trailer.length
+        try:
             if not len(seq):
                 self._define(at, end)
                 return behind
