@@ -554,6 +554,8 @@ def test_a_cut_costs_no_pinned_byte_and_no_count(
             left = payloads(found)
             assert all(left[n] == image(n) for n in range(41, 60))
             assert all(raw is None or raw == image(n) for n, raw in left.items())
+            with hl.open(found, mongo="none") as opened:
+                opened.shared.recover()
             check_answers(found)
             keep("--max-age", "0s", store=found)
         assert left[0] is None

@@ -130,7 +130,7 @@ def test_a_live_recording_while_the_server_comes(tmp_path: Path, calls: Calls) -
             if away:
                 raise ConnectionLostError("MongoDB does not answer")
 
-        calls(store.shared.index, "another", another)
+        calls(store.shared.index, "_another", another)
         with store.start("live", LiveOptions(flush_interval_s=0.1)) as recording:
             for one in messages(0, 50, 0):
                 recording.write(CHANNELS[one.topic], one.raw, log_time=one.log_time)

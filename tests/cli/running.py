@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
+from hybridlog.cli import output
 from hybridlog.cli.main import _run as run_app
 from tests import places
 from tests.cli.within import Answer
@@ -62,6 +63,7 @@ def _within(words: list[str], env: dict[str, str]) -> Answer:
         pytest.MonkeyPatch.context() as patch,
     ):
         patch.setattr(sys, "argv", ["hybridlog", *words])
+        output.begin(None)  # as in a new process
         for stream in (sys.stdout, sys.stderr):
             stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
         code = run_app()

@@ -93,6 +93,8 @@ def test_what_an_expiry_left_is_removed_by_the_next_writer(copy: Path) -> None:
             assert store.recordings()[0].status == "complete"
         assert beside.exists()
         assert answers(copy) == right
+        with hl.open(copy, mongo="none") as store:
+            store.shared.recover()
         assert (logs(copy), row_files(copy)) == (left, rows)
     # What the manifest lists in its place is gone: nothing else of it is removed.
     (recording_of(copy) / "000001.rows.parquet").unlink()
@@ -162,7 +164,8 @@ def test_a_death_at_any_step_is_finished_or_undone(copy: Path, tmp_path: Path, s
         place = tmp_path / f"at {step}"
         shutil.copytree(copy, place)
         lived = not dies(step, partial(expire, place, [0, 1]), only=CHANGES)
-        with hl.open(place, mongo="none") as store:  # finishes or undoes it
+        with hl.open(place, mongo="none") as store:
+            store.shared.recover()  # finishes or undoes it
             assert not store.verify().findings
             listed = {file.name for file in places.manifest(place, "log").files if file.is_here}
             assert logs(place).keys() | {path.name for path in row_files(place)} == listed

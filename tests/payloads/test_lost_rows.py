@@ -20,7 +20,7 @@ from tests import places
 from tests.cli.within import answer
 from tests.copies import bring
 from tests.damage import flip
-from tests.payloads.logs import COUNT, messages, recording_of
+from tests.payloads.logs import COUNT, recording_of
 from tests.payloads.test_expiry import TOPICS, answers, expire, row_files
 
 FIELDS = {"/scan": "angle_min", "/cloud": "width"}
@@ -154,32 +154,6 @@ def test_a_copy_with_the_file_brings_it_back(
         assert lab.copy(gone, None, CopyOptions(check=True)).copied == ["log"]
     assert answers(gone) == right
     with hl.open(gone, mongo="none") as store:
-        assert store.verify().findings == []
-
-
-@pytest.mark.parametrize("only_fields", [False, True])
-def test_a_copy_with_the_segment_brings_it_in_place_of_damaged_rows(
-    copy: Path, tmp_path: Path, only_fields: bool
-) -> None:
-    with hl.open(tmp_path / "lab", create=True, mongo="none") as lab:
-        bring(lab, copy)
-        whole = messages(lab)
-    expire(copy, [0, 1])
-    right = answers(copy)
-    file, _ = rows_of(copy, 1)
-    flip(recording_of(copy) / file.name, 900)
-    options = CopyOptions(check=True, only_fields=only_fields)
-    with hl.open(tmp_path / "lab", mongo="none") as lab:
-        report = lab.copy(copy, None, options)
-        assert (report.copied, report.refused) == (["log"], {})
-        again = lab.copy(copy, None, options)
-        assert (again.copied, again.refused) == ([], {})
-        assert messages(lab) == whole
-    assert answers(copy) == right
-    logs = places.manifest(copy, "log").logs
-    assert logs[1].gone == "elsewhere" if only_fields else logs[1].is_here
-    assert logs[3].gone == "expired"
-    with hl.open(copy, mongo="none") as store:
         assert store.verify().findings == []
 
 

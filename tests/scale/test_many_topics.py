@@ -97,4 +97,3 @@ def test_missing_tables_are_made_together(stores: dict[int, Path], tmp_path: Pat
             assert query.count() == count * (MESSAGES - 4)
     few, many = costs[FEW], costs[MANY]
     assert len(many.commands) == len(few.commands)
-    assert len(many.opened) <= len(few.opened) + 5  # a young manifest is read once more

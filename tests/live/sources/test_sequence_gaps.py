@@ -86,7 +86,7 @@ def heard_by_foxglove(*payloads: bytes) -> Heard:
     heard = Heard()
 
     async def hear() -> None:
-        session = Unanswered(heard, "server", {})
+        session = Unanswered(heard, "server", {}, lambda: None)
         session._advertise(
             [{"id": 1, "topic": "/a", "encoding": "ros1", "schemaName": "T", "schema": DEFINITION}]
         )
