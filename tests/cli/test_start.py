@@ -102,7 +102,7 @@ def test_version() -> None:
     assert run("--version").out == f"hybridlog {__version__}\n"
 
 
-def test_what_is_installed(tmp_path: Path) -> None:
+def test_what_is_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A package whose metadata is not there is missing, and the cure is named."""
     shown = run("--installed").out
     assert re.match(r"hybridlog \S+, Python 3\S+, ", shown)
@@ -114,14 +114,15 @@ def test_what_is_installed(tmp_path: Path) -> None:
     assert {*NEEDED_FOR} == {*project["optional-dependencies"]} - {"all", "bench", "dev"}
     (listed,) = re.findall(r"Extras: (.+), or `all`", (ROOT / "README.md").read_text())
     assert {*re.findall(r"`(\w+)`", listed)} == {*NEEDED_FOR}
-    (tmp_path / "sitecustomize.py").write_text(
-        "import importlib.metadata as m\nfound = m.version\n"
-        "def version(name):\n    if name == 'duckdb': raise m.PackageNotFoundError(name)\n"
-        "    return found(name)\nm.version = version\n"
-    )
-    shown = run(
-        "--installed", PYTHONPATH=str(tmp_path), HYBRIDLOG_MONGOD=str(tmp_path / "none")
-    ).out
+    found = metadata.version
+
+    def version(name: str) -> str:
+        if name == "duckdb":
+            raise metadata.PackageNotFoundError(name)
+        return found(name)
+
+    monkeypatch.setattr(metadata, "version", version)
+    shown = run("--installed", HYBRIDLOG_MONGOD=str(tmp_path / "none")).out
     assert re.search(r"pip install \S.*\[sql\]", shown)
     assert "which is not a program that can be run" in shown
 
