@@ -754,8 +754,9 @@ def recorded(tmp_path_factory: pytest.TempPathFactory, demo_bag: Path) -> Iterat
 
 
 def entry_of(store: Path, name: str) -> RecordingEntry:
-    """What hybridlog says of a recording when it opens a store."""
+    """What hybridlog says of a recording, once what a crash has left is finished."""
     with hl.open(store) as opened:
+        opened.shared.recover()
         return next(entry for entry in opened.recordings() if entry.name == name)
 
 

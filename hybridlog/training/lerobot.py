@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
@@ -48,6 +47,18 @@ _UNFINISHED: Final = ".episodes"
 _PLAN: Final = "plan.json"
 _DATA: Final = "data/chunk-{chunk:03d}/file-{file:03d}.parquet"
 _VIDEO: Final = "videos/{key}/chunk-{chunk:03d}/file-{file:03d}.mp4"
+_TASKS: Final = {
+    "index_columns": ["task"],
+    "column_indexes": [],
+    "columns": [
+        {"name": "task_index", "field_name": "task_index", "pandas_type": "int64",
+         "numpy_type": "int64", "metadata": None},
+        {"name": "task", "field_name": "task", "pandas_type": "unicode",
+         "numpy_type": "object", "metadata": None},
+    ],
+    "pandas_version": "2",
+}  # fmt: skip
+"""What pandas reads: the text of a task is the index of its row, as LeRobot has it."""
 _EPISODES: Final = "meta/episodes/chunk-{chunk:03d}/file-{file:03d}.parquet"
 _INDEX: Final = {"dtype": "int64", "shape": [1], "names": None}
 
@@ -199,9 +210,9 @@ class _Assembly:
             stats[f"{IMAGE_PREFIX}{name}"] = _colour_stats(counts)
         path = self._file(_EPISODES, 0)
         pq.write_table(pa.Table.from_pylist(self.rows), path, compression="snappy")
-        # The text of a task is the index, as LeRobot reads it.
-        tasks = pd.DataFrame({"task_index": self.tasks.values()}, pd.Index(self.tasks, name="task"))
-        tasks.to_parquet(self.root / "meta/tasks.parquet")
+        tasks = pa.table({"task_index": [*self.tasks.values()], "task": [*self.tasks]})
+        tasks = tasks.replace_schema_metadata({"pandas": json.dumps(_TASKS)})
+        pq.write_table(tasks, self.root / "meta/tasks.parquet", compression="snappy")
         own = {**self.plan, "episodes": [one.about for one in self.made]}
         for file, value in (("stats", stats), ("hybridlog", own), ("info", self._info())):
             write_text(self.root / f"meta/{file}.json", json.dumps(value, indent=1))
