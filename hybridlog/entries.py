@@ -159,13 +159,8 @@ class Inventory:
         return self.manifest is not None and self.manifest.status != "unproven" and not self.lost
 
 
-def state_now(directory: StoreDirectory, recording: str) -> str:
-    """The state of a recording's files, as of `Inventory`."""
-    return state_of(directory.listing(recording), directory.manifests.find(recording))
-
-
 def state_of(listing: Listing, manifest: Manifest | None) -> str:
-    """The same, by the content of its directory and its manifest."""
+    """The state of a recording's files, as of `Inventory`, by its directory and its manifest."""
     return listing.print if manifest is None else truth.state_of(manifest, listing.print)
 
 
@@ -241,7 +236,8 @@ def steady_inventory(directory: StoreDirectory, recording: str) -> Inventory:
         found = take_inventory(directory, recording)
         if not (found.misfits or found.lost):
             return found
-        if state_now(directory, recording) == found.state:
+        manifest = directory.manifests.find(recording)
+        if state_of(directory.listing(recording), manifest) == found.state:
             return found
     raise StoreError(f"The files of recording {recording!r} change while they are read. Ask again.")
 
@@ -323,18 +319,11 @@ def described_of(
     return Described(entry, summary_of(shown, look), topic_types(shown), files, channels or {})
 
 
-def describe_now(
-    directory: StoreDirectory, catalog: Catalog, recording: str, *, is_open: bool = False
-) -> Described:
-    """Read a recording from its files."""
-    return describe(catalog, steady_inventory(directory, recording), is_open=is_open)
-
-
 def put_entry(
     directory: StoreDirectory, catalog: Catalog, recording: str, *, is_open: bool = False
 ) -> RecordingEntry:
     """Read a recording's files and update its catalog row."""
-    described = describe_now(directory, catalog, recording, is_open=is_open)
+    described = describe(catalog, steady_inventory(directory, recording), is_open=is_open)
     catalog.put(described)
     return described.entry
 

@@ -76,7 +76,7 @@ ALLOWED = {
         "hybridlog_storage.summary",
     ),
     "obstore": ("hybridlog_storage.remote.bucket",),
-    "pandas": ("hybridlog.frames", "hybridlog.training.lerobot"),
+    "pandas": ("hybridlog.frames",),
     "picows": ("hybridlog.live.sources.foxglove.connection",),
     "polars": ("hybridlog.frames.frame",),
     "pyarrow": (

@@ -18,7 +18,7 @@ import pytest
 import hybridlog as hl
 from hybridlog.entries import (
     Inventory,
-    describe_now,
+    describe,
     ended,
     listed,
     loss_values,
@@ -27,6 +27,7 @@ from hybridlog.entries import (
     read_summary,
     recording_metadata,
     sealed_of,
+    steady_inventory,
     summary_by,
     take_inventory,
     unlisted,
@@ -140,7 +141,8 @@ class Made:
 
     def entry(self, *, is_open: bool = False) -> RecordingEntry:
         with closing(Catalog(Path("/nowhere"), "x", in_memory=True)) as catalog:
-            described = describe_now(self.directory, catalog, self.id, is_open=is_open)
+            found = steady_inventory(self.directory, self.id)
+            described = describe(catalog, found, is_open=is_open)
         for manifest in self.directory.whole([self.id]):
             made = summary_by(manifest, described.summary.look)
             is_seen = not described.summary.has_lost_segments or manifest.losses
@@ -433,7 +435,7 @@ def test_chunks_that_cannot_be_read_are_lost_by_topic(made: Made) -> None:
     parts = summary.table.parts[bounds[0] : bounds[1]]
     with closing(Catalog(Path("/nowhere"), "x", in_memory=True)) as catalog:
         catalog.put_damage(made.id, {(2, 0): "its checksum differs", (2, 99): "x", (9, 0): "y"})
-        entry = describe_now(made.directory, catalog, made.id).entry
+        entry = describe(catalog, steady_inventory(made.directory, made.id)).entry
     assert entry.status == "damaged"
     rows = [row for row in entry.end["losses"] if row["cause"] == "segment"]
     assert {row["file"] for row in rows} == {"000002.mcap"}
@@ -454,7 +456,7 @@ def test_nothing_says_what_recording_it_is(directory: StoreDirectory) -> None:
     places.segment(directory.path, "x").write_bytes(b"nothing")
     with closing(Catalog(Path("/nowhere"), "x", in_memory=True)) as catalog:
         with pytest.raises(ManifestError, match="x has no manifest"):
-            describe_now(directory, catalog, "x")
+            describe(catalog, steady_inventory(directory, "x"))
     with pytest.raises(SegmentError, match="neither a manifest nor a segment"):
         made_again(take_inventory(directory, "x"), None)
 

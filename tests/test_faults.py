@@ -165,18 +165,24 @@ def kill_mongod(store: Path) -> None:
     os.kill(pid, signal.SIGKILL)
 
 
+def killing(place: Path, before: Callable[[], object] = bool) -> tuple[Any, list[int]]:
+    """Progress of a log that kills mongod once, and the number of messages by then."""
+    killed: list[int] = []
+
+    def progress(_done: int, messages: int) -> None:
+        if messages > 3000 and not killed:
+            killed.append(messages)
+            before()
+            kill_mongod(place)
+
+    return progress, killed
+
+
 def test_mongod_killed_while_a_log_is_recorded(
     tmp_path: Path, robot: Path, spoken: dict[str, list[Message]]
 ) -> None:
     place = tmp_path / "store"
-    killed = False
-
-    def progress(_done: int, messages: int) -> None:
-        nonlocal killed
-        if messages > 3000 and not killed:
-            killed = True
-            kill_mongod(place)
-
+    progress, killed = killing(place)
     with hl.open(place, create=True, require_database=True) as store:
         report = store.record(robot, progress=progress)
         assert killed
@@ -485,15 +491,7 @@ def test_mongod_killed_and_not_to_be_had_again(
     tmp_path: Path, robot: Path, spoken: dict[str, list[Message]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     place = tmp_path / "store"
-    killed = False
-
-    def progress(_done: int, messages: int) -> None:
-        nonlocal killed
-        if messages > 3000 and not killed:
-            killed = True
-            monkeypatch.setenv("HYBRIDLOG_MONGOD", "/bin/false")
-            kill_mongod(place)
-
+    progress, _ = killing(place, lambda: monkeypatch.setenv("HYBRIDLOG_MONGOD", "/bin/false"))
     whole = Counter(m for part in spoken.values() for m in part)
     with hl.open(place, create=True, require_database=True) as store:
         report = store.record(robot, progress=progress)

@@ -60,7 +60,7 @@ _MAX_NAMES: Final = 3  # recordings in a message
 
 
 class Moments(NamedTuple):
-    """When the messages of a topic were.
+    """Times of the messages of a topic.
 
     Attributes:
         log_time: int64[n], ns, ascending.

@@ -1,4 +1,4 @@
-"""What is left of the logs of a recording that are gone."""
+"""Rows of the logs of a recording whose payloads are gone."""
 
 from __future__ import annotations
 

@@ -353,7 +353,7 @@ class TableWriter:
             topic.finished.append((folder, place))
 
     def _section(self, topic: _Topic, found: Piece | _File, begin: int = 0) -> Section:
-        """What a file says of rows in it."""
+        """The description of rows in their file."""
         digests = {str(number): self._cut[number] for number in sorted(found.segments)}
         counts = found.rows, found.unreadable, found.arrays
         return Section(self._recording, topic.name, begin, digests, *counts)

@@ -396,7 +396,7 @@ def _order(blocks: Sequence[Block]) -> NDArray[np.intp] | None:
 def _ordered(
     arrays: Sequence[pa.Array[Any]], kind: pa.DataType, order: NDArray[np.intp] | None
 ) -> pa.ChunkedArray[Any]:
-    column = chunked(arrays, kind)
+    column = pa.chunked_array([array for array in arrays if len(array)], type=kind)
     return column if order is None else in_order(column, order)
 
 
@@ -526,8 +526,3 @@ def _large(kind: pa.DataType) -> pa.DataType:
     if is_list(kind):
         return pa.large_list(kind.value_type)
     return pa.large_binary() if pa.types.is_binary(kind) else pa.large_string()
-
-
-def chunked(arrays: Iterable[pa.Array[Any]], kind: pa.DataType) -> pa.ChunkedArray[Any]:
-    """Arrays of one type as one column, without empty pieces."""
-    return pa.chunked_array([array for array in arrays if len(array)], type=kind)

@@ -135,16 +135,17 @@ class StoreFiles:
         if known is None:
             described = self._read(recording)
             return described.summary if described is not None else None
-        found = described_of(*known)
-        is_noted = self.catalog.recording(recording) == (found.files, found.entry)
+        entry, look, files, is_noted = known
+        found = described_of(entry, look, files)
         if found.entry.status not in UNFINISHED or not is_noted:
             self.catalog.put(found)
         return found.summary
 
-    def _known(self, recording: str) -> tuple[RecordingEntry, str, str] | None:
+    def _known(self, recording: str) -> tuple[RecordingEntry, str, str, bool] | None:
         """A recording by its catalog row, with what people say of it by now.
 
-        Its entry, its look and the state of its files; None if the row does not match them.
+        Its entry, its look, the state of its files, and True if the row has all of it already;
+        None if the row does not match the files.
         """
         directory, row = self.directory, self.catalog.recording(recording)
         if row is None:
@@ -161,7 +162,8 @@ class StoreFiles:
             holder = directory.holder(recording)
             if holder is None or not (holder.is_recording or entry.status != "open"):
                 return None
-        return with_said(entry, manifest), listing.look, files
+        said = with_said(entry, manifest)
+        return said, listing.look, files, said == entry
 
     def current_entry(self, summary: RecordingSummary) -> tuple[RecordingEntry | None, bool]:
         """The entry of a recording, None if it is gone; and whether its files were read again."""

@@ -332,7 +332,7 @@ def _ordered(rows: Rows) -> Rows:
 
 
 def _common(mine: NDArray[np.int64], theirs: NDArray[np.int64]) -> Rows:
-    """What intervals (int64[n, 2], disjoint, in order) have in common."""
+    """The common time of intervals (int64[n, 2], disjoint, in order)."""
     # Each pair that overlaps: the others that end after this one begins, and so on.
     low = np.searchsorted(theirs[:, 1], mine[:, 0], "right")
     count = np.maximum(np.searchsorted(theirs[:, 0], mine[:, 1], "left") - low, 0)

@@ -185,7 +185,7 @@ class Rows:
             try:
                 return ask(parts)
             except ChangedError:
-                self._forget(before)
+                self._set_back(before)
                 parts = [*map(self._renewed, parts)]
         return ask(parts)
 
@@ -204,11 +204,11 @@ class Rows:
             except ChangedError:
                 if turn == _RENEWALS:
                     raise
-                self._forget(before)
+                self._set_back(before)
                 part = self._renewed(part)
 
-    def _forget(self, before: Counters) -> None:
-        """What the counters said of messages that are read again."""
+    def _set_back(self, before: Counters) -> None:
+        """Count anew the messages that are read again."""
         self.counters.unreadable = before.unreadable
         self.counters.without_arrays = before.without_arrays
 
@@ -441,7 +441,7 @@ class Rows:
                 yield plan.channels[int(own.batch.channel[0])], own
 
     def _decided(self, part: Part, channel: RecordedChannel, run: MessageRun) -> NDArray[np.bool_]:
-        """Whether messages of one channel match; those that cannot be tested are counted."""
+        """bool[n], true for matching messages; those that cannot be tested are counted."""
         if part.predicate is None:
             return np.ones(len(run.batch), np.bool_)
         from hybridlog.query.message_filter import matches

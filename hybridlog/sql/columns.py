@@ -53,7 +53,7 @@ OWN: Final = pa.schema(
 _RESERVED: Final = frozenset({*OWN_COLUMNS, *OWN.names})
 _types = pa.types
 Key = tuple[tuple[str, ...], bool]
-"""Of a column that is no struct: the path of its field, and whether it is a summary."""
+"""The path of the field of a column that is no struct; True if it is a summary."""
 
 
 @dataclass(frozen=True, slots=True)

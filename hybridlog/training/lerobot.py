@@ -49,16 +49,11 @@ _DATA: Final = "data/chunk-{chunk:03d}/file-{file:03d}.parquet"
 _VIDEO: Final = "videos/{key}/chunk-{chunk:03d}/file-{file:03d}.mp4"
 _TASKS: Final = {
     "index_columns": ["task"],
-    "column_indexes": [],
     "columns": [
-        {"name": "task_index", "field_name": "task_index", "pandas_type": "int64",
-         "numpy_type": "int64", "metadata": None},
-        {"name": "task", "field_name": "task", "pandas_type": "unicode",
-         "numpy_type": "object", "metadata": None},
+        {"name": "task", "field_name": "task", "pandas_type": "unicode", "numpy_type": "object"}
     ],
-    "pandas_version": "2",
-}  # fmt: skip
-"""What pandas reads: the text of a task is the index of its row, as LeRobot has it."""
+}
+"""Metadata for pandas: the text of a task is the index of its row, as LeRobot has it."""
 _EPISODES: Final = "meta/episodes/chunk-{chunk:03d}/file-{file:03d}.parquet"
 _INDEX: Final = {"dtype": "int64", "shape": [1], "names": None}
 

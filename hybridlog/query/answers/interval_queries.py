@@ -7,11 +7,9 @@ from dataclasses import replace
 from functools import partial
 from itertools import groupby
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.compute as pc
 
 from hybridlog.query.answers.lost import lost_times
 from hybridlog.query.answers.marks import mark_topics, marks
@@ -20,8 +18,6 @@ from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import DurationLike, parse_duration
 from hybridlog.record.losses import extent_of
-from hybridlog.schema.arrow_types import is_list, lengths_of
-from hybridlog.schema.column import ranges
 from hybridlog.wording import listed
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.times import END, earlier, placed
@@ -33,8 +29,6 @@ if TYPE_CHECKING:
     from hybridlog.query.rows import RowBatch
     from hybridlog.session import Session
     from hybridlog_storage.summary import RecordingSummary
-
-    Places = NDArray[np.intp]
 
 _NONE = np.empty(0, np.int64)
 
@@ -55,7 +49,7 @@ class IntervalQueries:
         return Intervals(self.held(max_gap))
 
     def held(self, max_gap: DurationLike | None) -> Iterator[tuple[str, NDArray[np.int64]]]:
-        """The intervals in which the predicate holds, some at a time; see `Query.held`."""
+        """The intervals in which the predicate holds, some at a time; see `Query.intervals`."""
         self._check("A state")
         gap = None if max_gap is None else parse_duration(max_gap)
         if gap == 0:
@@ -188,13 +182,14 @@ class IntervalQueries:
     ) -> NDArray[np.int64]:
         """Log times of the messages in a span that differ from the one before."""
         from hybridlog.frames.answer import columns
+        from hybridlog.query.rows_differ import steps
 
         ask = partial(columns, self._planner, fields=paths)
         before = self._last_before(part, span, ask)
         carried = None if before is None else before.records[-1:]
         found = [_NONE]
         for rows in ask(_bounded(part, span)):
-            differs, carried = _steps(carried, rows.records, tolerance)
+            differs, carried = steps(carried, rows.records, tolerance)
             found.append(rows.log_time[differs])
         return np.concatenate(found)
 
@@ -219,91 +214,3 @@ def _at(times: NDArray[np.int64]) -> NDArray[np.int64]:
 
 def _bounded(part: Part, span: Span) -> Part:
     return replace(part, bounds=span, clock="log", windows=None)
-
-
-def _steps(
-    carried: pa.StructArray | None, rows: pa.StructArray, tolerance: float
-) -> tuple[NDArray[np.bool_], pa.StructArray]:
-    """Find the rows that differ from the row before them; also returns the last row."""
-    from hybridlog.columns.fields import joined
-
-    whole = rows if carried is None else joined([carried, rows])
-    numbers = np.arange(len(whole))
-    differs = rows_differ(whole, numbers, np.maximum(numbers - 1, 0), tolerance)
-    return differs[len(whole) - len(rows) :], whole[-1:]
-
-
-def rows_differ(
-    column: pa.Array[Any], one: Places, other: Places, tolerance: float = 0.0
-) -> NDArray[np.bool_]:
-    """True where rows of a column, possibly nested, differ from other rows of it.
-
-    NaN equals NaN, -0 equals 0, and null equals only null; numbers are equal if they differ by at
-    most the tolerance. Lists of different lengths differ.
-    """
-    kind = column.type
-    if isinstance(kind, pa.BaseExtensionType):  # JSON text
-        return rows_differ(column.storage, one, other)
-    if pa.types.is_null(kind):
-        return np.zeros(len(one), np.bool_)
-    valid: NDArray[np.bool_] = np.asarray(column.is_valid(), np.bool_)
-    differs: NDArray[np.bool_] = valid[one] != valid[other]
-    there = valid[one] & valid[other]
-    if pa.types.is_struct(kind):
-        for inner in column.flatten():
-            differs |= there & rows_differ(inner, one, other, tolerance)
-        return differs
-    if is_list(kind):
-        rows = np.flatnonzero(there)
-        differs[rows] = _lists(column, one[rows], other[rows], tolerance)
-        return differs
-    differs |= there & _values(column, one, other, tolerance)
-    return differs
-
-
-def _values(
-    column: pa.Array[Any], one: Places, other: Places, tolerance: float
-) -> NDArray[np.bool_]:
-    kind = column.type
-    if not (pa.types.is_primitive(kind) and not pa.types.is_decimal(kind)):
-        codes = pc.fill_null(column.dictionary_encode().indices, -1)
-        values = codes.to_numpy(zero_copy_only=False)
-    else:
-        if pa.types.is_temporal(kind):
-            column = column.view(pa.int64())
-        values = pc.fill_null(column, False if pa.types.is_boolean(kind) else 0).to_numpy(
-            zero_copy_only=False
-        )
-    left, right = values[one], values[other]
-    same = left == right
-    if left.dtype.kind == "f":
-        same |= np.isnan(left) & np.isnan(right)
-    if tolerance and left.dtype.kind in "iuf" and pa.types.is_primitive(kind):
-        with np.errstate(invalid="ignore"):  # inf - inf is NaN, which is not near
-            same |= np.abs(left.astype(np.float64) - right.astype(np.float64)) <= tolerance
-    differs: NDArray[np.bool_] = ~same
-    return differs
-
-
-def _lists(
-    column: pa.Array[Any], one: Places, other: Places, tolerance: float
-) -> NDArray[np.bool_]:
-    length = lengths_of(column)
-    if pa.types.is_fixed_size_list(column.type):
-        start = (column.offset + np.arange(len(column))) * column.type.list_size
-    else:
-        start = column.offsets.to_numpy()[:-1].astype(np.int64)
-    elements = column.values
-    count = length[one]
-    found: NDArray[np.bool_] = count != length[other]
-    alike = np.flatnonzero(~found & (count > 0))
-    if len(alike):
-        count = count[alike]
-        differs = rows_differ(
-            elements,
-            ranges(start[one[alike]], count),
-            ranges(start[other[alike]], count),
-            tolerance,
-        )
-        found[alike] = np.logical_or.reduceat(differs, np.cumsum(count) - count)
-    return found

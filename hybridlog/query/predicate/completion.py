@@ -36,7 +36,7 @@ class Candidate(NamedTuple):
 def complete(
     text: str, topics: Collection[str], fields: Fields, *, most: int = 50
 ) -> tuple[int, list[Candidate]]:
-    """Where the last word of a text begins, and what it may become.
+    """The place at which the last word of a text begins, and words to complete it.
 
     Args:
         text: The beginning of a predicate.

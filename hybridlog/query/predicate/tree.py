@@ -158,7 +158,7 @@ class MongoFilter(_Node):
 
 
 ALWAYS: Final = And(())
-"""What every message satisfies."""
+"""The condition that every message satisfies."""
 Node: TypeAlias = Condition | And | Or | Not | Near | MongoFilter
 
 

@@ -67,7 +67,7 @@ class OpenChunk:
         parts: list[Buffer] = [b""] * (2 * len(length))
         parts[::2] = heads.view(f"V{_HEAD}").tolist()
         parts[1::2] = self._payloads
-        content = _joined(parts, self.size)
+        content = _in_one_buffer(parts, self.size)
         offset = np.cumsum(length + _HEAD) - length
         batch = Batch(content, offset, length, channel, log_time, publish_time, sequence)
         return batch, np.concatenate(self._seq)
@@ -76,7 +76,7 @@ class OpenChunk:
         return np.concatenate([getattr(batch, name) for batch in self._batches])
 
 
-def _joined(parts: list[Buffer], size: int) -> Buffer:
+def _in_one_buffer(parts: list[Buffer], size: int) -> Buffer:
     """The parts in one buffer. Large ones are copied without the interpreter lock."""
     if size < _LARGE * len(parts):
         return b"".join(parts)
