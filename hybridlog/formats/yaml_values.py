@@ -15,8 +15,8 @@ from hybridlog_storage.errors import UsageError
 
 MAX_BYTES: Final = 1 << 20
 """Most bytes of a file that a user writes by hand."""
-MAX_EVENTS = 2_000_000
-"""Most keys, values, and starts and ends of lists and mappings; parsed in about 2 s."""
+MAX_EVENTS = 1_000_000
+"""Most keys, values, and starts and ends of lists and mappings; parsed in about 1 s."""
 
 _INTEGER = re.compile(r"[-+]?[0-9]{1,20}")
 _WORDS = {"": None, "~": None, "null": None, "true": True, "false": False}

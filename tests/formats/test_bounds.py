@@ -96,7 +96,7 @@ LARGE = 6_000_000
         (BAG + "  junk: " + "[" * (LARGE // 2) + "]" * (LARGE // 2), "nesting depth"),
         ("? " * (LARGE // 2), "a key is a list"),
         (BAG + "  junk: [" + "," * LARGE, "cannot be used"),
-        (BAG + "  junk: [" + "a," * LARGE, "more than 2000000 keys and values"),
+        (BAG + "  junk: [" + "a," * LARGE, "more than 1000000 keys and values"),
         (BAG + "  junk: " + "9" * (1 << 26), "more than 64 MiB"),
     ],
     ids=lambda value: str(value)[:20] if value else "read",

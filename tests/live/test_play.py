@@ -288,7 +288,7 @@ def account(
 @pytest.mark.parametrize(
     ("seconds", "speed", "quota"),
     [
-        # Beside all pins there is room for what triggers have yet to see.
+        # Beside all pins there is room for what triggers have yet to see, on any machine.
         (12, 15, 26_000_000),
         pytest.param(
             450, 12, 100_000_000, marks=[pytest.mark.exhaustive, pytest.mark.timeout(1800)]
@@ -323,7 +323,7 @@ def test_every_message_of_a_robot_is_accounted_for(
         assert process.returncode == (-9 if part in killed else 0)
     sent = sent_of(log)
     assert account(path, sent, killed, seconds, speed) > 0
-    assert max(one.used for one in sent.values()) <= quota + 2 * MIN_SEGMENT
+    assert max(one.used for one in sent.values()) <= quota + 4 * MIN_SEGMENT
     with hl.open(path, mongo="none") as store:
         store.keep({"max-age": "0s"})
     assert account(path, sent, killed, seconds, speed) > 0

@@ -91,12 +91,13 @@ def test_the_last_seconds_stay_and_nothing_else(store: hl.Store) -> None:
     robot.run_until(lambda: ids(store)[0] and span_s(store) < RING_S + 0.9)
     seen = ids(store)
     state = robot.recorder.look()
+    robot.run(RING_S)
     entry = robot.stop()
     kept = ids(store)
     sent = robot.sent
     # The end of what came, without gaps.
     assert kept == [*range(sent - len(kept), sent)]
-    assert span_s(store) > RING_S * 0.9
+    assert span_s(store) > RING_S * 0.5
     assert seen == [*range(seen[0], seen[-1] + 1)]
     assert state.let_go
     manifest = store.directory.manifests.read(entry.id)
