@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import (
     Callable,
     Collection,
@@ -20,6 +20,7 @@ from hybridlog.entries import channels_of, put_entry, summary_of, take_inventory
 from hybridlog.query.chunk_columns import PARTS, ChunkColumns, log_bounds
 from hybridlog.query.question import Question, RecordedChannel, field_types
 from hybridlog.query.topics import resolve
+from hybridlog.record.losses import lost_spans
 from hybridlog.record.marks import MARKS
 from hybridlog.snapshot import UNFINISHED
 from hybridlog.wording import counted, listed
@@ -558,10 +559,20 @@ class Session:
             raise _changed(entry)
 
     def table(self, recording: RecordingEntry, topic: str) -> TopicTable | None:
-        """The table of a topic; None without one."""
-        if recording.status in UNFINISHED or (topic == MARKS and recording.marks):
+        """The table of a topic, of all segments or of some; None without one.
+
+        Where messages are lost there is none, since rows of these must not answer.
+        """
+        if (topic == MARKS and recording.marks) or any(True for _ in lost_spans(recording)):
             return None
-        return self.tables.of(recording, topic)
+        if recording.status not in UNFINISHED:
+            return self.tables.of(recording, topic)
+        ids = [channel.id for channel in recording.channels if channel.topic == topic]
+        messages: Counter[int] = Counter()
+        parts = self.parts(recording, ids, (BEGIN, END))
+        for segment, number in parts[["segment", "messages"]].tolist():
+            messages[segment] += number
+        return self.tables.of_sealed(recording, topic, messages)
 
 
 def _file_in(entry: RecordingEntry, number: int) -> tuple[object, ...]:

@@ -170,7 +170,7 @@ def records_of(
                 values = _emptied(values)
             if has_summaries(field):
                 if is_summarised(path):
-                    found[name] = _filled(values, found.get(name))
+                    found[name] = filled(values, found.get(name))
                 else:
                     found.setdefault(name, values)
             else:
@@ -188,7 +188,7 @@ def _emptied(array: Array) -> Array:
     return structs({}, len(array), missing_of(array))
 
 
-def _filled(summaries: Array, lists: Array | None) -> Array:
+def filled(summaries: Array, lists: Array | None) -> Array:
     """Summaries, worked out from the list where that is there."""
     if lists is None or lists.null_count == len(lists):
         return summaries

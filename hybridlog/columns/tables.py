@@ -240,10 +240,10 @@ class Tables:
 
     def of_sealed(
         self, recording: RecordingEntry, topic: str, messages: Mapping[int, int]
-    ) -> tuple[TopicTable, frozenset[int]] | None:
+    ) -> TopicTable | None:
         """The table of some sealed segments of a running recording; None without a valid one.
 
-        Returns also the segments of which it has all rows; `messages` counts by sealed segment.
+        `messages` counts those of the topic by segment.
         """
         if not self.can_have(recording, topic):
             return None
@@ -260,10 +260,9 @@ class Tables:
             table = self._table(recording, topic, rows)
         except StoreError:
             return None
-        segments = frozenset(int(number) for one in rows for number in one.section.segments)
-        if table is None or table.rows != sum(messages.get(number, 0) for number in segments):
+        if table is None or table.rows != sum(messages.get(n, 0) for n in table.segments):
             return None  # its files are just getting their names
-        return table, segments
+        return table
 
     def _look(
         self, recording: RecordingEntry, topics: Collection[str]
@@ -311,6 +310,7 @@ class Tables:
             self.opened,
             unreadable=sum(one.section.unreadable for one in found),
             has_arrays=not is_expired and all(one.section.has_arrays for one in found),
+            segments=(int(number) for one in found for number in one.section.segments),
         )
         if len(table.files) > 1:
             try:

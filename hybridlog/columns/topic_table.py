@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain
@@ -26,7 +26,7 @@ from hybridlog_storage.times import placed, span_of
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.columns.column_file import ColumnFile, OpenFiles, TablePart
+    from hybridlog.columns.column_file import OpenFiles, TablePart
     from hybridlog.query.intervals import Span
 
 _MAX_TYPES: Final = 64  # sets of fields whose types are kept for a table
@@ -77,7 +77,10 @@ class TableRows:
 
 
 class TopicTable:
-    """All messages of a topic in a recording; `has_arrays` if they are in full, but for bytes."""
+    """All messages of a topic in the `segments` of a recording that it covers, by number.
+
+    `has_arrays` if arrays are in full, but for bytes.
+    """
 
     def __init__(
         self,
@@ -86,7 +89,9 @@ class TopicTable:
         *,
         unreadable: int = 0,
         has_arrays: bool = False,
+        segments: Iterable[int] = (),
     ) -> None:
+        self.segments = frozenset(segments)
         self.rows = sum(part.rows for part in parts)
         self.unreadable = unreadable
         self.has_arrays = has_arrays
@@ -104,6 +109,12 @@ class TopicTable:
                 self._types.clear()
             self._types[key] = self._find_type(paths)
         return self._types[key]
+
+    def whole_types(self) -> list[Any]:
+        """Types of the messages in each file, with whole arrays."""
+        own = {name for file in self.files for name in file.own}
+        schemas = ([f for f in file.schema if f.name not in own] for file in self.files)
+        return [records_of(pa.nulls(0, pa.struct(fields))).type for fields in schemas]
 
     @property
     def has_fields(self) -> bool:
@@ -199,36 +210,32 @@ class TopicTable:
         own: Collection[str],
         kind: Any,
     ) -> TableRows:
-        ours, records = self.read(part, paths, {"t", "seq", *own})
+        ours, columns = self.columns(part, paths, {"t", "seq", *own})
         t, seq = (ours.pop(name).to_numpy() for name in ("t", "seq"))
-        return TableRows(t, seq, ours, converted(records, kind))
+        return TableRows(t, seq, ours, converted(records_of(columns, self._is_summarised), kind))
 
     @property
     def parts(self) -> list[TablePart]:
         """Its row groups, by the log time of their first rows."""
         return sorted(self._parts, key=lambda part: part.first)
 
-    def read(
+    def columns(
         self, part: TablePart, paths: Collection[str] | None, own: Collection[str]
     ) -> tuple[dict[str, Any], Any]:
-        """The table's own columns of a row group by name, and fields in the types of the file."""
+        """The table's own columns of a row group by name, and those of fields, a struct each."""
         check_wanted()
         chosen = part.file.choose(paths, own, arrays=self.has_arrays)
         columns = {top: self._column(part, top, numbers) for top, numbers in chosen.items()}
         ours = {name: columns.pop(name) for name in own if name in columns}
-        return ours, self._records(part.file, columns, part.rows)
+        if not columns:
+            return ours, structs({}, part.rows)
+        schema = part.file.schema
+        fields = [schema.field(top).with_type(one.type) for top, one in columns.items()]
+        return ours, pa.StructArray.from_arrays([*columns.values()], fields=fields)
 
     def _column(self, part: TablePart, top: str, leaves: tuple[int, ...]) -> Any:
         column = self._opened.column(part.file, part.group, top, leaves)
         return column.slice(part.begin, part.rows)
-
-    def _records(self, file: ColumnFile, columns: Mapping[str, Any], rows: int) -> Any:
-        """Columns as fields of messages, under their own names."""
-        if not columns:
-            return structs({}, rows)
-        fields = [file.schema.field(top).with_type(one.type) for top, one in columns.items()]
-        array = pa.StructArray.from_arrays(list(columns.values()), fields=fields)
-        return records_of(array, self._is_summarised)
 
     def _is_full(self, array: tuple[str, ...]) -> bool:
         """True if an array is there in full in all rows, and its summary, too."""
@@ -257,8 +264,8 @@ class TopicTable:
         for file in self.files:
             chosen = file.choose(paths, (), arrays=self.has_arrays).values()
             table = file.read(None, [*chain.from_iterable(chosen)])
-            columns = [(field.name, pa.nulls(0, field.type)) for field in table.schema]
-            found.append(self._records(file, dict(columns), 0).type)
+            columns = pa.nulls(0, pa.struct([*table.schema]))
+            found.append(records_of(columns, self._is_summarised).type)
         return type_of_all(found)
 
 

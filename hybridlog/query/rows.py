@@ -7,7 +7,7 @@ times without a predicate come from chunk tables and message indexes.
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -19,8 +19,6 @@ import numpy as np
 
 from hybridlog.query.chunk_scan import ChunkKey, ChunkScan, RecordingScan, ScanPlan
 from hybridlog.query.predicate.tree import is_meta
-from hybridlog.record.losses import lost_spans
-from hybridlog.snapshot import UNFINISHED
 from hybridlog_storage.errors import ChangedError, SegmentError, StoreError
 from hybridlog_storage.times import inside, placed
 
@@ -74,13 +72,11 @@ class Tabled(NamedTuple):
     Attributes:
         part: The part as asked.
         rest: It in the segments that the table does not cover, which are all later; or None.
-        segments: Numbers of the segments that it covers; None for all.
     """
 
     table: TopicTable
     part: Part
-    rest: Part | None = None
-    segments: frozenset[int] | None = None
+    rest: Part | None
 
 
 class Rows:
@@ -108,7 +104,7 @@ class Rows:
         asked = () if part.predicate is None else part.predicate.fields()
         asks_fields = part.predicate is not None and part.predicate.asks_fields
         # A table does not say which messages have a publish time, and may be older than the
-        # package that reads the messages. Lost rows must not answer.
+        # package that reads the messages.
         if (
             not part.is_by_log_time
             or (asks_fields and not part.has_fields)
@@ -116,36 +112,21 @@ class Rows:
                 "_meta.pub" in asked
                 and len({c.channel.has_publish_time for c in part.channels}) > 1
             )
-            or any(True for _ in lost_spans(part.recording))
         ):
             return None
-        if part.recording.status in UNFINISHED:
-            found = self._of_sealed(part)
-        else:
-            table = self.session.table(part.recording, part.topic)
-            found = None if table is None else Tabled(table, part)
-        if found is None or (found.table.unreadable and part.predicate is None):
+        table = self.session.table(part.recording, part.topic)
+        if table is None or (table.unreadable and part.predicate is None):
             return None  # fields of such messages are not in the table
-        is_older = not found.table.has_fields and any(c.codec.indexed for c in part.channels)
-        return None if is_older else found
-
-    def _of_sealed(self, part: Part) -> Tabled | None:
-        """A part of a running recording; None if no segment has a table, or times overlap."""
-        held = self._held(replace(part, bounds=None, windows=None))
-        messages: Counter[int] = Counter()
-        for segment, number in held[["segment", "messages"]].tolist():
-            messages[segment] += number
-        made = self.session.tables.of_sealed(part.recording, part.topic, messages)
-        if made is None:
-            return None
-        table, segments = made
-        is_sealed = np.isin(held["segment"], [*segments])
-        early, late = held["last"][is_sealed], held["first"][~is_sealed]
-        if not len(early) or (len(late) and early.max() >= late.min()):
-            return None
-        spans = [span for span in part.recording.spans if span[0] not in segments]
+        if not table.has_fields and any(c.codec.indexed for c in part.channels):
+            return None  # it is older than a definition
+        if table.rows == part.messages:
+            return Tabled(table, part, None)
+        spans = [span for span in part.recording.spans if span[0] not in table.segments]
         rest = replace(part, recording=replace(part.recording, spans=spans))
-        return Tabled(table, part, rest, segments)
+        late = self._held(replace(rest, bounds=None, windows=None))["first"]
+        if len(late) and late.min() <= max(one.last for one in table.parts):
+            return None  # no order of times would be theirs
+        return Tabled(table, part, rest)
 
     # Answers.
 
@@ -314,7 +295,7 @@ class Rows:
             if any(map(is_meta, part.predicate.fields())):
                 continue  # known of the part, not of a row
             found = self.tabled(part)
-            if found is not None and found.segments is None and len(found.table.files) == 1:
+            if found is not None and found.rest is None and len(found.table.files) == 1:
                 by_file[found.table.files[0].number, found.table.has_arrays].append(found)
         for group in by_file.values():
             if len(group) > 1:
@@ -391,9 +372,8 @@ class Rows:
                 offsets[key].append(own)
             for channel in part.channels:
                 indexes[channel.channel_id] = len(channels)
-                if asks and (found is None or found.segments is not None):
-                    covered = () if found is None or found.segments is None else found.segments
-                    filters[len(channels)] = part, covered
+                if asks and (found is None or found.rest is not None):
+                    filters[len(channels)] = part, () if found is None else found.table.segments
                 channels.append(channel)
         return ScanPlan(
             channels,

@@ -8,25 +8,24 @@ Durations are nanoseconds. Fields without a common exact type are JSON text.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from hybridlog.columns.fields import LIMIT
-from hybridlog.columns.layout import OWN_COLUMNS, column_names
+from hybridlog.columns.fields import LIMIT, filled, has_summaries, original_name
+from hybridlog.columns.layout import OWN_COLUMNS, POINTS, column_names
 from hybridlog.schema.arrow_columns import json_array, structs
 from hybridlog.schema.arrow_types import (
     COMPUTED_AS,
     common_type,
+    exact,
     is_array,
     is_bytes,
     is_list,
-    is_number,
-    is_summary,
     is_text,
     is_time,
     missing_of,
@@ -35,6 +34,9 @@ from hybridlog.schema.arrow_types import (
     with_values,
 )
 from hybridlog_storage.errors import UsageError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 OWN: Final = pa.schema(
     [
@@ -52,8 +54,9 @@ OWN: Final = pa.schema(
 """Columns of every view in addition to the fields."""
 _RESERVED: Final = frozenset({*OWN_COLUMNS, *OWN.names})
 _types = pa.types
-Key = tuple[tuple[str, ...], bool]
-"""The path of the field of a column that is no struct; True if it is a summary."""
+Path = tuple[str, ...]
+Key = tuple[Path, bool]
+"""The path of a field of messages; True for the summary of an array."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,14 +73,14 @@ class ViewColumn:
     """
 
     name: str
-    source: tuple[str, ...]
+    source: Path
     kind: Any
     type: Any
     inner: tuple[ViewColumn, ...] = ()
     is_summary: bool = False
     is_points: bool = False
 
-    def leaves(self, above: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], ViewColumn]]:
+    def leaves(self, above: Path = ()) -> Iterator[tuple[Path, ViewColumn]]:
         """Its fields that are no structs, each with the names on the way in SQL, folded."""
         path = (*above, self.name.casefold())
         if not self.inner:
@@ -90,39 +93,68 @@ class ViewColumn:
         """Tells it from the others of a view."""
         return self.source, self.is_summary
 
-    @property
-    def is_array(self) -> bool:
-        """True for an array that tables may hold as a summary."""
-        return not (self.is_summary or self.is_points) and _may_be_summary(self.kind)
+    def values(self, records: Any, columns: Any, wanted: Collection[Key]) -> Any:
+        """Its values in SQL's types, null where messages lack them; those of `wanted` fields only.
 
-    def values(self, records: Any, summaries: Any, known: Collection[Key], rows: int) -> Any:
-        """Its values in their SQL types, from messages, and these with summaries of arrays.
-
-        They are null but for the `known` fields, and where the messages lack them.
+        `records` are fields of messages, and `columns` the same as tables have them.
         """
-        here = _field(records, self.source[-1])
+        here, rows = field_of(records, self.source[-1]), len(records)
         if self.inner:
-            beside = _field(summaries, self.source[-1])
-            children = [one.values(here, beside, known, rows) for one in self.inner]
-            missing = None if here is not None else pa.array(np.ones(rows, np.bool_))
-            if here is not None and here.null_count:
-                missing = here.is_null()
-            return pa.StructArray.from_arrays(children, fields=list(self.type), mask=missing)
-        if self.is_summary:
-            here = _field(summaries, self.source[-1])
-        if here is None or self.key not in known:
+            beside = field_of(columns, self.source[-1])
+            here = here if here is not None else pa.nulls(rows, pa.struct([]))
+            beside = beside if beside is not None else here
+            children = [one.values(here, beside, wanted) for one in self.inner]
+            fields = list(self.type)
+            return pa.StructArray.from_arrays(children, fields=fields, mask=here.is_null())
+        if self.is_summary and self.key in wanted:
+            here = field_of(columns, self.source[-1])
+            made = field_of(columns, self.source[-1], is_summary=True)
+            here = summary(here) if made is None and here is not None else filled(made, here)
+        if here is None or self.key not in wanted:
             return pa.nulls(rows, self.type)
-        if self.is_summary and not is_summary(here.type):
-            here = summary(here)
         return fitted(here, self.kind)
 
 
-def _field(records: Any, name: str) -> Any:
-    """A field of structs, null where these are; None without it."""
-    if records is None or not _types.is_struct(records.type):
-        return None
-    there = records.type.get_field_index(name) >= 0
-    return pc.struct_field(records, [name]) if there else None
+def field_of(columns: Any, name: str, *, is_summary: bool = False) -> Any:
+    """A field of structs, null where these are, or its summaries; None without it."""
+    for place, field in enumerate(columns.type if _types.is_struct(columns.type) else ()):
+        if original_name(field) == name and has_summaries(field) == is_summary:
+            return pc.struct_field(columns, [place])
+    return None
+
+
+def absent(columns: Any, path: Path) -> NDArray[np.bool_]:
+    """bool[n], true for rows of which columns have only the summary of an array at a path."""
+    for name in path[:-1]:
+        columns = field_of(columns, name)
+        if columns is None:
+            return np.zeros(1, np.bool_)
+    array = field_of(columns, path[-1])
+    found = _absent_in(array) if array is not None else np.zeros(1, np.bool_)
+    made = field_of(columns, path[-1], is_summary=True)
+    return found if made is None else found | _replaces(made, array)
+
+
+def _absent_in(columns: Any) -> NDArray[np.bool_]:
+    """The same for all arrays in some values."""
+    found = np.zeros(len(columns), np.bool_)
+    if is_list(columns.type):
+        inner = columns.flatten()
+        if _types.is_struct(inner.type) or is_list(inner.type):
+            rows = pc.list_parent_indices(columns).to_numpy(zero_copy_only=False)
+            found[rows[_absent_in(inner)]] = True
+    elif _types.is_struct(columns.type):
+        for field, column in zip(columns.type, columns.flatten(), strict=True):
+            if has_summaries(field):
+                found |= _replaces(column, field_of(columns, original_name(field)))
+            else:
+                found |= _absent_in(column)
+    return found
+
+
+def _replaces(summaries: Any, array: Any) -> NDArray[np.bool_]:
+    found = pc.and_(summaries.is_valid(), True if array is None else array.is_null())
+    return found.to_numpy(zero_copy_only=False)  # type: ignore[no-any-return]
 
 
 def view_columns(kind: Any) -> list[ViewColumn]:
@@ -130,24 +162,29 @@ def view_columns(kind: Any) -> list[ViewColumn]:
     return list(_columns(kind, (), _RESERVED))
 
 
-def _columns(message: Any, path: tuple[str, ...], reserved: Iterable[str]) -> Iterator[ViewColumn]:
+def _columns(message: Any, path: Path, reserved: frozenset[str]) -> Iterator[ViewColumn]:
     fields: list[tuple[str, Any, bool]] = []
     for field in message:
         fields.append((field.name, field, False))
         if _may_be_summary(field.type):
             fields.append((f"{field.name}_summary", field, True))
-    named = column_names([name for name, _, _ in fields], frozenset(reserved))
+    named = column_names([name for name, _, _ in fields], reserved)
     for (_, name), (_, field, is_twin) in zip(named, fields, strict=True):
         source = (*path, field.name)
         if is_twin:
             kind = summary(pa.nulls(0, field.type)).type
             yield ViewColumn(name, source, kind, sql_type(kind), is_summary=True)
         elif _types.is_struct(field.type) and field.type.num_fields:
-            inner = tuple(_columns(field.type, source, ()))
+            inner = tuple(_columns(field.type, source, frozenset()))
             made = pa.struct([pa.field(column.name, column.type) for column in inner])
             yield ViewColumn(name, source, field.type, made, inner)
         else:
             yield ViewColumn(name, source, field.type, sql_type(field.type))
+
+
+def points_column(kind: Any) -> ViewColumn:
+    """The column of the points of clouds, of a type."""
+    return ViewColumn(POINTS, (POINTS,), kind, sql_type(kind), is_points=True)
 
 
 def _may_be_summary(kind: Any) -> bool:
@@ -158,63 +195,15 @@ def _may_be_summary(kind: Any) -> bool:
 
 
 def merged(kinds: Sequence[Any]) -> Any:
-    """The type for values of several types.
-
-    Integers beside floats become doubles. Values that no type represents become JSON text.
-    """
-    return common_type([pa.nulls(0, kind) for kind in kinds], _merged_leaves)
+    """The type for values of several types; JSON text without a common one."""
+    return common_type([pa.nulls(0, kind) for kind in kinds], _merged)
 
 
-def _merged_leaves(kinds: Sequence[Any], _: Sequence[Any]) -> Any:
-    if all(map(is_number, kinds)):
-        return _merged_numbers(kinds)
-    if all(map(is_text, kinds)):
-        return pa.string()
-    return pa.binary() if all(map(is_bytes, kinds)) else pa.json_()
-
-
-def _merged_numbers(kinds: Sequence[Any]) -> Any:
-    if any(map(_types.is_floating, kinds)):
-        return pa.float64()
-    signed = [kind.bit_width for kind in kinds if _types.is_signed_integer(kind)]
-    unsigned = [kind.bit_width for kind in kinds if _types.is_unsigned_integer(kind)]
-    if not signed:
-        return pa.type_for_alias(f"uint{max(unsigned)}")
-    bits = max([*signed, *(2 * width for width in unsigned)])
-    return pa.type_for_alias(f"int{bits}") if bits <= 64 else pa.decimal128(20, 0)
-
-
-def whole_message(kind: Any) -> Any:
-    """The type of messages of which a table holds some arrays as summaries.
-
-    Such an array is a list of numbers, or JSON text where its elements are no numbers.
-    """
-    return pa.struct([field.with_type(whole_type(field.type)) for field in kind])
-
-
-def whole_type(kind: Any) -> Any:
-    """The same for the type of a field."""
-    if is_summary(kind):
-        if kind.num_fields == 1:
-            return pa.json_()
-        return pa.list_(kind.field("min").type)
-    if _types.is_struct(kind):
-        return pa.struct([field.with_type(whole_type(field.type)) for field in kind])
-    if is_list(kind):
-        return pa.list_(whole_type(kind.value_type))
-    return kind
-
-
-def lacks(have: Any, want: Any) -> bool:
-    """True if a table holds a summary where a view has the array."""
-    if is_summary(have) and not _types.is_struct(want):
-        return True
-    if is_list(have) and is_list(want):
-        return lacks(have.value_type, want.value_type)
-    if _types.is_struct(have) and _types.is_struct(want):
-        inner = {field.name: field.type for field in want}
-        return any(f.name in inner and lacks(f.type, inner[f.name]) for f in have)
-    return False
+def _merged(kinds: Sequence[Any], arrays: Sequence[Any]) -> Any:
+    is_large = pa.uint64() in kinds and any(map(_types.is_signed_integer, kinds))
+    if is_large and all(map(_types.is_integer, kinds)):
+        return pa.decimal128(20, 0)
+    return exact(kinds, arrays)
 
 
 def sql_type(kind: Any) -> Any:
@@ -250,42 +239,29 @@ def fitted(array: Any, kind: Any) -> Any:
 
     A `UsageError` says that the type does not represent one.
     """
-    target = sql_type(kind)
-    if array.type == target and kind != pa.json_():
-        return array
+    target, have = sql_type(kind), array.type
     if array.null_count == len(array):
         return pa.nulls(len(array), target)
-    return _converted(array, kind, target)
-
-
-def _converted(array: Any, kind: Any, target: Any) -> Any:
-    have = array.type
     if kind == pa.json_():
         return (array if have == kind else json_array(plain_values(array))).storage
+    return array if have == target else _fitted(array, kind, target)
+
+
+def _fitted(array: Any, kind: Any, target: Any) -> Any:
+    have = array.type
     if is_list(have) and is_list(target):
         made = with_values(array, fitted(array.flatten(), kind.value_type))
         return made if made.type == target else made.cast(target)
     if _types.is_struct(have) and _types.is_struct(target):
-        return _fitted_struct(array, kind)
+        found = [field_of(array, field.name) for field in kind]
+        columns = {
+            to.name: pa.nulls(len(array), to.type) if one is None else fitted(one, field.type)
+            for one, field, to in zip(found, kind, target, strict=True)
+        }
+        return structs(columns, len(array), missing_of(array))
     if _types.is_struct(have) and _types.is_boolean(target):  # a message without fields
-        there = np.ones(len(array), np.bool_)
-        return pa.array(there, mask=missing_of(array))
-    if is_time(have):
-        return array.view(pa.int64()).view(target)
+        return pa.array(np.ones(len(array), np.bool_), mask=missing_of(array))
     try:
-        return array.cast(target)
+        return array.cast(pa.int64()).cast(target) if is_time(have) else array.cast(target)
     except pa.ArrowException as error:
         raise UsageError(f"{have} is not {target}: {error}") from error
-
-
-def _fitted_struct(array: Any, kind: Any) -> Any:
-    have = dict(zip([field.name for field in array.type], array.flatten(), strict=True))
-    columns = {
-        name: fitted(have[field.name], field.type)
-        if field.name in have
-        else pa.nulls(len(array), sql_type(field.type))
-        for (_, name), field in zip(
-            column_names([field.name for field in kind], frozenset()), kind, strict=True
-        )
-    }
-    return structs(columns, len(array), missing_of(array))

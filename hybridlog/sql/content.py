@@ -5,11 +5,10 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Final, TypeAlias
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 
 from hybridlog.columns.layout import POINTS
 from hybridlog.columns.recordings_file import (
@@ -23,7 +22,7 @@ from hybridlog.columns.recordings_file import (
 from hybridlog.query.answers.marks import marks_in
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.snapshot import UNFINISHED
-from hybridlog.sql.columns import OWN, ViewColumn, merged, sql_type, view_columns
+from hybridlog.sql.columns import OWN, merged, points_column, view_columns
 from hybridlog.sql.names import ViewNames
 from hybridlog.sql.rows import Plan, TopicOfRecording
 from hybridlog_storage.catalog import ChannelStats
@@ -34,7 +33,7 @@ if TYPE_CHECKING:
 
     from hybridlog.query.question import Question, Span
     from hybridlog.session import Session
-    from hybridlog.sql.rows import Reading
+    from hybridlog.sql.rows import Bounds, Filter, Reading
     from hybridlog_storage.summary import RecordingSummary
 
 
@@ -66,11 +65,10 @@ class StoreContent:
             self._windows = {one.summary.id: one.bounds for one in found if one.bounds}
         self._views: dict[str, TopicView] = {}
         self._lock = threading.RLock()
-        # DuckDB asks on threads of its own, which see a later moment.
-        unfinished = (one for one in self.summaries if one.status in UNFINISHED)
-        self._running = {one.id: session.entry_of(one) for one in unfinished}
-        for entry in self._running.values():
-            session.hold(entry, map(int, entry.digests))
+        for summary in self.summaries:
+            if summary.status in UNFINISHED:
+                entry = session.entry_of(summary)
+                session.hold(entry, map(int, entry.digests))
         self.names = ViewNames(topics)
 
     def summaries_of(self, topic: str) -> list[RecordingSummary]:
@@ -91,8 +89,7 @@ class StoreContent:
 
     def topic_of(self, summary: RecordingSummary, topic: str) -> TopicOfRecording:
         """A topic in a recording."""
-        entry = self._running.get(summary.id) or self.session.entry_of(summary)
-        return TopicOfRecording(self.session, entry, topic)
+        return TopicOfRecording(self.session, self.session.entry_of(summary), topic)
 
     def view(self, topic: str) -> TopicView:
         """The view of a topic."""
@@ -121,13 +118,11 @@ class TopicView:
         self._columns = {column.name: column for column in columns}
         points = self._points()
         if points is not None and POINTS not in self._columns:
-            own = ViewColumn(POINTS, (POINTS,), points, sql_type(points), is_points=True)
-            self._columns[POINTS] = own
+            self._columns[POINTS] = points_column(points)
         fields = [pa.field(column.name, column.type) for column in self._columns.values()]
         self.schema = pa.schema([*OWN, *fields])
         some = [self._of(one) for one in self._summaries[:_SAMPLED]]
-        messages = sum(c.stats.messages for one in some for c in one.channels.values())
-        self.size = messages * len(self._summaries) // max(len(some), 1)
+        self.size = sum(one.messages for one in some) * len(self._summaries) // max(len(some), 1)
 
     def _of(self, summary: RecordingSummary) -> TopicOfRecording:
         if summary.id not in self._known:
@@ -150,36 +145,23 @@ class TopicView:
         return merged(kinds) if kinds else None
 
     def rows(
-        self, columns: Sequence[str], where: Any, may_hold: MayHold, reading: Reading
+        self, columns: Sequence[str], where: Filter, reading: Reading
     ) -> Iterator[pa.RecordBatch]:
-        """Rows for a query: those columns, where an expression holds (None for all)."""
-        plans: dict[Span | None, Plan] = {}
+        """Rows for a query: those columns, where a filter holds."""
+        plan = Plan(self.schema, self._columns, columns, where, reading)
         # The end of a recording is one more than its last time: for messages at the end of time.
         spans = ((one.name, one.extent) for one in self._summaries)
         bounds = _bounds((name, span if span[0] < span[1] else None) for name, span in spans)
-        for number in np.flatnonzero(may_hold(bounds)).tolist():
+        for number in np.flatnonzero(where.may_hold(bounds)).tolist():
             summary = self._summaries[number]
             recording, window = self._of(summary), self._content.window(summary.id)
             reading.add(recording)
             bounds = _bounds((summary.name, source.span) for source in recording.sources)
-            chosen, holds = may_hold(bounds), where
+            chosen, (first, last) = where.may_hold(bounds), bounds["t"]
             if window is not None:
-                first, last = bounds["t"]
                 chosen &= (first < window[1]) & (last >= window[0])
-                inside = pc.field("t") >= window[0]
-                if window[1] < END:  # a range without an end holds the last time, too
-                    inside &= pc.field("t") < window[1]
-                holds = inside if where is None else inside & where
-            if window not in plans:
-                plans[window] = Plan(self.schema, self._columns, columns, holds, reading)
             for place in np.flatnonzero(chosen).tolist():
-                yield from plans[window].read(recording, recording.sources[place])
-
-
-Bounds: TypeAlias = "Mapping[str, tuple[NDArray[Any], NDArray[Any]]]"
-"""Least and greatest values in parts of a view, by column."""
-MayHold: TypeAlias = Callable[[Bounds], "NDArray[np.bool_]"]
-"""Tells which of some parts may have rows that a query asks for."""
+                yield from plan.read(recording, recording.sources[place], window)
 
 
 def _bounds(parts: Iterable[tuple[str, Span | None]]) -> Bounds:

@@ -1,18 +1,17 @@
-"""Rows of a topic in one recording for a query: from its table, or from its chunks.
+"""Rows of a topic for SQL: from tables, from chunks where there are none, in the columns of a view.
 
-A topic of an ended recording has a table. Where that is missing or damaged, or there can be none,
-and for what a running recording has flushed, chunks are decoded instead, into the same columns.
-Arrays that a table only summarises come from the chunks of the rows that need them.
+Tables may have only summaries of long arrays. Arrays that are asked for then come from the
+payloads of the rows that need them.
 """
 
 from __future__ import annotations
 
-import re
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from functools import reduce
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 import pyarrow as pa
@@ -21,22 +20,21 @@ from pyarrow import acero
 
 from hybridlog.columns.clouds import NEEDED, PointColumns, is_cloud
 from hybridlog.columns.column_file import FIRST
-from hybridlog.columns.fields import without
+from hybridlog.columns.fields import records_of
 from hybridlog.columns.layout import POINTS
 from hybridlog.columns.rows import piece_of
 from hybridlog.query.question import Counters, RecordedChannel
 from hybridlog.query.rows import offsets_by_chunk, places_of
-from hybridlog.record.losses import lost_spans
-from hybridlog.schema.arrow_columns import structs
-from hybridlog.schema.arrow_types import has_empty
+from hybridlog.schema.arrow_types import has_empty, is_array
 from hybridlog.schema.left import LeftFields
 from hybridlog.schema.states import GONE, State
-from hybridlog.sql.columns import OWN, Key, ViewColumn, lacks, whole_message
+from hybridlog.sql.columns import OWN, ViewColumn, absent, points_column
 from hybridlog.sql.usage import EVERYTHING, Usage
 from hybridlog_storage.errors import ChangedError, StoreError
 from hybridlog_storage.lazy import lazy
 from hybridlog_storage.messages import EXPIRED_IDS
 from hybridlog_storage.segments.chunk import Placed
+from hybridlog_storage.times import BEGIN, END
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -45,15 +43,33 @@ if TYPE_CHECKING:
 
     from hybridlog.columns.column_file import TablePart
     from hybridlog.columns.topic_table import TopicTable
+    from hybridlog.query.chunk_columns import Chunk
     from hybridlog.query.question import Span
+    from hybridlog.schema.codec import Decoded
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
-    from hybridlog_storage.segments.chunk_table import ChunkPlace
+
+    Mask = NDArray[np.bool_]
 
 _FIXED: Final = frozenset({"ros1", "cdr"})
 """Encodings whose definition fixes the fields."""
 _TABLE_OWN: Final = frozenset({"log_time", "t", "seq", "pub", "stamp", "state", "error"})
-_WORD: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+Bounds: TypeAlias = "Mapping[str, tuple[NDArray[Any], NDArray[Any]]]"
+"""Least and greatest values in parts of a view, by column."""
+
+
+class Filter(NamedTuple):
+    """The rows that a query asks for.
+
+    Attributes:
+        expression: Of pyarrow; None for all rows.
+        paths: Names of columns, and of fields in them, that it tests.
+        may_hold: Tells which of some parts may have such rows.
+    """
+
+    expression: Any
+    paths: Collection[tuple[str, ...]]
+    may_hold: Callable[[Bounds], Mask]
 
 
 class Rows(NamedTuple):
@@ -61,21 +77,21 @@ class Rows(NamedTuple):
 
     Attributes:
         own: Columns of the table itself, by name; with `state` unless all are whole.
-        records: Fields of the messages; of a table, arrays may be summaries.
-        summaries: The same, of messages without payload with summaries of arrays.
+        columns: Fields as tables have them, a struct each.
+        lacks: bool[n], true for messages of which an array that is asked for is not there.
     """
 
     own: Mapping[str, Any]
-    records: Any
-    summaries: Any
-    size: int
+    columns: Any
+    lacks: Mask
 
-    def where(self, chosen: NDArray[np.bool_]) -> Rows:
-        """The rows that are chosen."""
+    def take(self, chosen: Mask) -> Rows:
+        """The chosen rows."""
+        if chosen.all():
+            return self
         places = pa.array(np.flatnonzero(chosen))
         own = {name: column.take(places) for name, column in self.own.items()}
-        records, summaries = self.records.take(places), self.summaries.take(places)
-        return Rows(own, records, summaries, len(places))
+        return Rows(own, self.columns.take(places), self.lacks[chosen])
 
 
 class Source(NamedTuple):
@@ -86,9 +102,8 @@ class Source(NamedTuple):
     """
 
     span: Span | None
-    table: TopicTable | None = None
     part: TablePart | None = None
-    chunk: tuple[int, int] = (0, 0)
+    chunk: Chunk | None = None
 
 
 class TopicOfRecording:
@@ -104,6 +119,11 @@ class TopicOfRecording:
         """Channels of the topic, by id."""
         found = self.session.channels_of(self.entry, [self.topic])
         return {channel.channel_id: channel for channel in found}
+
+    @property
+    def messages(self) -> int:
+        """Number of its messages."""
+        return sum(channel.stats.messages for channel in self.channels.values())
 
     @property
     def is_fixed(self) -> bool:
@@ -122,57 +142,44 @@ class TopicOfRecording:
         if self.is_fixed:
             known = self.channels.values()
             return [channel.arrow_type() for channel in known if channel.codec.indexed]
-        found: list[Any] = []
-        for source in self.sources:
-            if source.table is not None:
-                found.append(whole_message(self._types(source.table, None)))
-            else:
-                rows = self.in_chunk(source.chunk, None, (), Counters())
-                found += [one.records.type for one in rows]
-        return found
+        found = [] if self.table is None else self.table.whole_types()
+        chunks = (source.chunk for source in self.sources)
+        rows = (one for chunk in chunks if chunk for one in self.in_chunk(chunk, Asked()))
+        return [*found, *(records_of(one.columns).type for one in rows)]
 
     @lazy
     def table(self) -> TopicTable | None:
-        """Its table; None if it can have none."""
-        if any(True for _ in lost_spans(self.entry)):
-            return None  # rows of lost messages must not answer
+        """Its table, of all segments or of some; None without one."""
         return self.session.table(self.entry, self.topic)
 
     @lazy
     def sources(self) -> list[Source]:
         """Its rows, in parts, by log time."""
-        table, covered = self.table, frozenset[int]()
-        chunks = [] if table else self.session.chunks(self.entry, [*self.channels], None, "log")
-        if table is None and self.entry.flushed:
-            messages = Counter[int]()
-            for chunk in chunks:
-                messages[chunk.segment] += chunk.messages
-            made = self.session.tables.of_sealed(self.entry, self.topic, messages)
-            table, covered = made or (None, covered)
-        found = [
-            Source((one.first, one.last), chunk=(one.segment, one.number))
-            for one in chunks
-            if one.segment not in covered
-        ]
-        for part in table.parts if table is not None else ():
-            span = (part.first, part.last) if part.first > FIRST else None
-            found.append(Source(span, table, part))
-        return sorted(found, key=lambda one: (one.span is not None, (one.span or (0, 0))[0]))
+        found, covered = [], frozenset[int]()
+        if self.table is not None:
+            covered = self.table.segments
+            for part in self.table.parts:
+                span = (part.first, part.last) if part.first > FIRST else None
+                found.append(Source(span, part=part))
+        if self.table is None or self.table.rows < self.messages:
+            chunks = (one for one in self.chunks.values() if one.segment not in covered)
+            found += [Source((one.first, one.last), chunk=one) for one in chunks]
+        return sorted(found, key=lambda one: (one.span or (BEGIN, BEGIN))[0])
 
     @lazy
-    def _places(self) -> dict[tuple[int, int], ChunkPlace]:
-        """Positions of its chunks, by segment and number."""
-        chunks = self.session.chunks(self.entry, [*self.channels], None, "log")
-        return {(chunk.segment, chunk.number): chunk.place for chunk in chunks}
+    def chunks(self) -> dict[tuple[int, int], Chunk]:
+        """All of its chunks, by segment and number."""
+        found = self.session.chunks(self.entry, [*self.channels], None, "log")
+        return {(one.segment, one.number): one for one in found}
 
     @lazy
     def _expired(self) -> dict[State, set[int]]:
         """Segments whose payloads are gone, by state."""
         found: dict[State, set[int]] = {}
-        for (segment, _), place in self._places.items():
-            if place.is_expired:
-                state = GONE[place.channels[0] // EXPIRED_IDS - 1]
-                found.setdefault(state, set()).add(segment)
+        for one in self.chunks.values():
+            if one.place.is_expired:
+                state = GONE[one.place.channels[0] // EXPIRED_IDS - 1]
+                found.setdefault(state, set()).add(one.segment)
         return found
 
     def points(self) -> Any:
@@ -180,105 +187,108 @@ class TopicOfRecording:
         if self.table is not None and self.table.points is not None:
             return self.table.points
         if any(is_cloud(channel.channel) for channel in self.channels.values()):
-            for chunk in self._places:
+            for chunk in self.chunks.values():
                 with suppress(StoreError):
-                    for rows in self.in_chunk(chunk, (), {POINTS}, Counters()):
-                        if POINTS in rows.own:
-                            return rows.own[POINTS].type
+                    for rows in self.in_chunk(chunk, Asked([points_column(pa.null())])):
+                        if POINTS in rows.columns.type.names:
+                            return rows.columns.type.field(POINTS).type
         return None
 
-    def lacks(self, table: TopicTable, leaf: ViewColumn) -> bool:
-        """True if a table has only summaries of an array."""
-        if leaf.is_points:
-            return table.points is None
-        if leaf.is_summary:
-            return False
-        kind = self._types(table, paths_of([leaf]))
-        for name in leaf.source:
-            place = kind.get_field_index(name) if pa.types.is_struct(kind) else -1
-            if place < 0:
-                return False
-            kind = kind.field(place).type
-        return lacks(kind, leaf.kind)
-
-    def _types(self, table: TopicTable, paths: Collection[str] | None) -> Any:
-        try:
-            return table.fields(paths)
-        except StoreError as error:
-            raise self._damaged(error) from error
-
-    def _damaged(self, error: StoreError) -> StoreError:
-        self.session.tables.reject(self.entry, self.topic)
-        return ChangedError(f"{error} Ask again: messages answer then.")
-
-    def in_table(
-        self, table: TopicTable, part: TablePart, leaves: Sequence[ViewColumn], own: Collection[str]
-    ) -> Rows:
-        """The rows of a row group, with some fields."""
+    def in_table(self, part: TablePart, asked: Asked) -> Rows:
+        """The rows of a row group."""
+        table = self.table
+        assert table is not None
         is_reduced = any(channel.state is State.REDUCED for channel in self.channels.values())
         has_states = bool(table.unreadable or self._expired or is_reduced)
-        wanted = {*own, *({"state", "ref"} if has_states else ())}
-        wanted |= {POINTS for leaf in leaves if leaf.is_points}
-        paths = paths_of(leaves, summaries=table.has_arrays)
+        wanted = {*asked.own, *({"state", "ref"} if has_states else ())}
+        wanted |= {"ref"} if asked.arrays or asked.has_points else set()
+        paths = paths_of(asked.leaves, summaries=table.has_arrays)
         try:
-            ours, records = table.read(part, paths, wanted)
+            own, columns = table.columns(part, paths, wanted | {*[POINTS] * asked.has_points})
         except StoreError as error:
-            raise self._damaged(error) from error
+            self.session.tables.reject(self.entry, self.topic)
+            raise ChangedError(f"{error} Ask again: messages answer then.") from error
         if has_states:
-            states, segment = ours["state"], ours["ref"].field("seg")
-            # Payloads may have gone, or come, since the rows were made.
-            was_gone = pc.is_in(states, pa.array([*map(str, GONE)]))
-            states = pc.if_else(was_gone, State.WHOLE.value, states)
-            for state, gone in self._expired.items():
-                is_gone = pc.is_in(segment, pa.array([*gone], segment.type))
-                is_gone = pc.and_(is_gone, pc.equal(states, State.WHOLE.value))
-                states = pc.if_else(is_gone, state.value, states)
-            ours["state"] = states
-        return Rows(ours, records, records, part.rows)
+            own["state"] = self._states(own["state"], own["ref"].field("seg"))
+        points = own.pop(POINTS, None)
+        if table.points is not None and points is not None:
+            fields = [*columns.type, pa.field(POINTS, points.type)]
+            columns = pa.StructArray.from_arrays([*columns.flatten(), points], fields=fields)
+        return Rows(own, columns, asked.lacking(columns, part.rows))
+
+    def _states(self, states: Any, segment: Any) -> Any:
+        """States as they are now: payloads may have gone, or come, since the rows were made."""
+        was_gone = pc.is_in(states, pa.array([*map(str, GONE)]))
+        states = pc.if_else(was_gone, State.WHOLE.value, states)
+        for state, gone in self._expired.items():
+            is_gone = pc.is_in(segment, pa.array([*gone], segment.type))
+            is_gone = pc.and_(is_gone, pc.equal(states, State.WHOLE.value))
+            states = pc.if_else(is_gone, state.value, states)
+        return states
 
     def in_chunk(
-        self,
-        key: tuple[int, int],
-        paths: Collection[str] | None,
-        own: Collection[str],
-        counters: Counters,
-        offsets: NDArray[np.int64] | None = None,
+        self, one: Chunk, asked: Asked, offsets: NDArray[np.int64] | None = None
     ) -> Iterator[Rows]:
-        """The messages in a chunk, by segment and number; of those at some offsets."""
-        place = self._places[key]
-        chunk = self.session.chunk(self.entry, key[0], place, counters.add_chunk)
+        """The messages in a chunk, or those of them at some offsets."""
+        counters = asked.counters
+        chunk = self.session.chunk(self.entry, one.segment, one.place, counters.add_chunk)
         chosen = np.ones(len(chunk.batch), np.bool_)
         if offsets is not None:
             chosen = np.isin(chunk.batch.places[0], offsets)
-        wanted = None if paths is None else {*paths, "header.stamp"}
-        if wanted is not None and POINTS in own:
-            wanted.update(NEEDED)
-        for number in place.channels:
+        paths = paths_of(asked.leaves)
+        if paths is not None:
+            paths += ["header.stamp", *(NEEDED if asked.has_points else ())]
+
+        def columns_of(decoded: Decoded) -> Any:
+            if isinstance(decoded.records, LeftFields):
+                return decoded.records.columns()
+            found = decoded.arrow()
+            return PointColumns().with_points(found, found) if asked.has_points else found
+
+        for number in one.place.channels:
             channel = self.channels.get(number)
             rows = np.flatnonzero(chosen & (chunk.batch.channel == number))
             if channel is None or not len(rows):
                 continue
             placed = Placed.of([chunk]).take(rows)
-            if channel.codec.indexed and not channel.is_reduced:
-                counters.payload_bytes += placed.batch.payload_bytes
             decoded = None
             if channel.codec.indexed:
-                decoded = channel.codec.columns_of(placed.batch, wanted)
+                decoded = channel.codec.columns_of(placed.batch, paths)
+                counters.payload_bytes += placed.batch.payload_bytes * (not channel.is_reduced)
+            has_times = channel.channel.has_publish_time
             piece = piece_of(
-                placed,
-                decoded,
-                channel.state,
-                has_publish_time=channel.channel.has_publish_time,
-                columns=lambda one: one.arrow(),
+                placed, decoded, channel.state, has_publish_time=has_times, columns=columns_of
             )
-            records = piece.fields_as(pa.struct([]))
-            summaries, ours = records, dict(piece.own)
-            if decoded is not None and isinstance(decoded.records, LeftFields):
-                summaries = without(decoded.records.summarised(), decoded.rows, len(rows))
-            elif decoded is not None and POINTS in own:
-                points = PointColumns().points(decoded.arrow())
-                ours[POINTS] = without(points, decoded.rows, len(rows))
-            yield Rows(ours, records, summaries, len(rows))
+            columns = piece.fields_as(pa.struct([]))
+            yield Rows(piece.own, columns, asked.lacking(columns, len(rows)))
+
+
+class Asked:
+    """What a query asks of messages: fields, and columns of the table itself.
+
+    Without `leaves`, all fields.
+    """
+
+    def __init__(
+        self,
+        leaves: Sequence[ViewColumn] | None = None,
+        own: Collection[str] = (),
+        counters: Counters | None = None,
+    ) -> None:
+        self.leaves = leaves
+        self.own = {*own}
+        self.counters = counters or Counters()
+        known = leaves or ()
+        self.keys = {one.key for one in known}
+        self.has_points = any(one.is_points for one in known)
+        self.arrays = [one for one in known if is_array(one.kind) and not one.is_summary]
+
+    def lacking(self, columns: Any, rows: int) -> Mask:
+        """bool[n], true for messages of which columns lack what tables may lack."""
+        found = [absent(columns, one.source) for one in self.arrays]
+        if self.has_points and POINTS not in columns.type.names:
+            found.append(np.ones(1, np.bool_))
+        return reduce(np.logical_or, found, np.zeros(rows, np.bool_))
 
 
 @dataclass(slots=True)
@@ -312,122 +322,113 @@ class Reading:
             if channel.codec.reason is not None:
                 self.undefined[recording.topic] = channel.codec.reason
 
-    def remark(self, topic: str, rows: Rows, *, asks_arrays: bool) -> None:
+    def remark(self, topic: str, rows: Rows) -> None:
         """Count rows without fields, or without arrays that are asked for."""
-        for found in pc.value_counts(rows.own["state"]).to_pylist() if "state" in rows.own else ():
-            state = State(found["values"])
-            if state is State.UNREADABLE or (asks_arrays and state is not State.WHOLE):
-                self.absent[topic, state] += found["counts"]
+        if "state" in rows.own:
+            states = rows.own["state"]
+            lacks = pc.or_(pa.array(rows.lacks), pc.equal(states, State.UNREADABLE.value))
+            for found in pc.value_counts(states.filter(lacks)).to_pylist():
+                if found["values"] != State.WHOLE:
+                    self.absent[topic, State(found["values"])] += found["counts"]
 
 
 class Plan:
-    """Reads some columns of a topic, where the expression `where` holds (None for all rows)."""
+    """Reads some columns of a topic, of the rows for which a filter holds."""
 
     def __init__(
         self,
         schema: Any,
         fields: Mapping[str, ViewColumn],
         columns: Sequence[str],
-        where: Any,
+        where: Filter,
         reading: Reading,
     ) -> None:
-        self._where = where
-        self._reading = reading
-        self._columns = list(columns)
         self._schema = schema
-        self._tested = [] if where is None else _named(str(where), schema.names)
-        read = dict.fromkeys([*self._columns, *self._tested])
+        self._columns = columns
+        self._tested = [*dict.fromkeys(path[0] for path in where.paths)]
+        self._where = where.expression
+        self._reading = reading
+        read = dict.fromkeys([*columns, *self._tested])
         self._fields = {name: fields[name] for name in read if name in fields}
         leaves = (leaf for column in self._fields.values() for leaf in column.leaves())
-        self._leaves = [leaf for path, leaf in leaves if reading.usage.uses(path)]
-        self._own = {name for name in read if name in _TABLE_OWN}
+        used = [(path, leaf) for path, leaf in leaves if reading.usage.uses(path)]
+        own = {"t", *(name for name in read if name in _TABLE_OWN)}
+        self._asked = Asked([leaf for _, leaf in used], own, reading.counters)
+        self._tests_arrays = any(
+            all(one == name.casefold() for one, name in zip(path, tested, strict=False))
+            for path, leaf in used
+            if leaf in self._asked.arrays or leaf.is_points
+            for tested in where.paths
+        )
 
-    def read(self, recording: TopicOfRecording, source: Source) -> Iterator[pa.RecordBatch]:
-        """The rows of a source."""
-        if source.table is None or source.part is None:
-            yield from self._decoded(recording, source.chunk, self._where)
-            return
-        self._reading.groups.add((source.part.file.path, source.part.group))
-        lacking = [one for one in self._leaves if recording.lacks(source.table, one)]
-        absent = {one.key for one in lacking}
-        # The summary of a nested array tells where the struct above it is missing.
-        held = [one for one in self._leaves if one.key not in absent or len(one.source) > 1]
-        own = self._own | ({"ref"} if absent else set())
-        rows = recording.in_table(source.table, source.part, held, own)
-        self._reading.remark(recording.topic, rows, asks_arrays=bool(absent))
-        if not absent:
-            yield from self._finished(recording, rows, self._where)
-            return
-        # Of payloads, as few as possible are decoded.
-        where, chosen = self._where, np.ones(rows.size, np.bool_)
-        if where is not None and not _named(str(where), [one.name for one in lacking]):
-            chosen = _mask(self._batch(recording, rows, self._tested, absent), where)
-            where = None
-        is_whole = chosen
-        if "state" in rows.own:
-            states = pc.equal(rows.own["state"], State.WHOLE.value)
-            is_whole = chosen & states.to_numpy(zero_copy_only=False)
-            if (gone := chosen & ~is_whole).any():
-                yield from self._finished(recording, rows.where(gone), where, absent)
-        places = offsets_by_chunk(recording.entry.id, places_of(rows.own["ref"])[is_whole])
-        for (_, segment, chunk), offsets in places.items():
-            yield from self._decoded(recording, (segment, chunk), where, offsets)
+    def read(
+        self, recording: TopicOfRecording, source: Source, window: Span | None
+    ) -> Iterator[pa.RecordBatch]:
+        """The rows of a source in a range of log time, ns; None for all times."""
+        if source.chunk is not None:
+            for rows in recording.in_chunk(source.chunk, self._asked):
+                self._reading.remark(recording.topic, rows)
+                yield from self._finished(recording, rows, self._holds(recording, rows, window))
+        elif source.part is not None:
+            self._reading.groups.add((source.part.file.path, source.part.group))
+            rows = recording.in_table(source.part, self._asked)
+            self._reading.remark(recording.topic, rows)
+            holds = self._holds(recording, rows, window)
+            # Of payloads, as few as possible are decoded.
+            left = rows.lacks
+            if "state" in rows.own:
+                states = pc.equal(rows.own["state"], State.WHOLE.value)
+                left = left & states.to_numpy(zero_copy_only=False)
+            yield from self._finished(recording, rows, holds & ~left)
+            left = left if self._tests_arrays else left & holds
+            if left.any():
+                yield from self._decoded(recording, places_of(rows.own["ref"])[left], window)
 
     def _decoded(
-        self,
-        recording: TopicOfRecording,
-        chunk: tuple[int, int],
-        where: Any,
-        offsets: NDArray[np.int64] | None = None,
+        self, recording: TopicOfRecording, places: NDArray[np.int64], window: Span | None
     ) -> Iterator[pa.RecordBatch]:
-        """The rows of a chunk, or those at some offsets of it, which are noted already."""
-        own = {POINTS for leaf in self._leaves if leaf.is_points}
-        paths, asks_arrays = paths_of(self._leaves), any(leaf.is_array for leaf in self._leaves)
-        for rows in recording.in_chunk(chunk, paths, own, self._reading.counters, offsets):
-            if offsets is None:
-                self._reading.remark(recording.topic, rows, asks_arrays=asks_arrays)
-            yield from self._finished(recording, rows, where)
+        """The rows at some places, from their payloads."""
+        for (_, *chunk), offsets in offsets_by_chunk(recording.entry.id, places).items():
+            one = recording.chunks[chunk[0], chunk[1]]
+            for rows in recording.in_chunk(one, self._asked, offsets):
+                yield from self._finished(recording, rows, self._holds(recording, rows, window))
+
+    def _holds(self, recording: TopicOfRecording, rows: Rows, window: Span | None) -> Mask:
+        """Mask of the rows in a range of log time for which the filter holds."""
+        holds = np.ones(len(rows.lacks), np.bool_)
+        if window is not None:
+            t = rows.own["t"].to_numpy()
+            holds = (t >= window[0]) & ((t < window[1]) | (window[1] >= END))
+        if self._where is not None and holds.any():
+            holds &= _mask(self._batch(recording, rows, self._tested), self._where)
+        return holds
 
     def _finished(
-        self,
-        recording: TopicOfRecording,
-        rows: Rows,
-        where: Any,
-        absent: Collection[Key] = (),
+        self, recording: TopicOfRecording, rows: Rows, chosen: Mask
     ) -> Iterator[pa.RecordBatch]:
-        """Rows for which an expression holds, with the columns to return."""
-        if where is not None:
-            mask = _mask(self._batch(recording, rows, self._tested, absent), where)
-            rows = rows if mask.all() else rows.where(mask)
-        if rows.size:
-            yield self._batch(recording, rows, self._columns, absent)
+        """The chosen rows, with the columns to return."""
+        if chosen.any():
+            yield self._batch(recording, rows.take(chosen), self._columns)
 
     def _batch(
-        self,
-        recording: TopicOfRecording,
-        rows: Rows,
-        names: Sequence[str],
-        absent: Collection[Key],
+        self, recording: TopicOfRecording, rows: Rows, names: Sequence[str]
     ) -> pa.RecordBatch:
-        """Columns of some rows; those of absent fields are null."""
-        known = {leaf.key for leaf in self._leaves}.difference(absent)
-        arrays = []
+        """Columns of some rows; those of fields that are not used are null."""
+        count, records = len(rows.lacks), records_of(rows.columns)
         schema = pa.schema([self._schema.field(name) for name in names])
+        arrays = []
         for name in names:
             if name in self._fields:
-                column = self._fields[name]
-                records = rows.records
-                if column.is_points:
-                    records = structs({n: a for n, a in rows.own.items() if n == POINTS}, rows.size)
-                arrays.append(column.values(records, rows.summaries, known, rows.size))
+                values = self._fields[name].values(records, rows.columns, self._asked.keys)
             elif name in rows.own:
-                arrays.append(rows.own[name].cast(schema.field(name).type))
+                values = rows.own[name].cast(schema.field(name).type)
             else:
-                arrays.append(_constant(name, recording.entry, rows.size))
+                values = _constant(name, recording.entry, count)
+            arrays.append(values)
         return pa.RecordBatch.from_arrays(arrays, schema=schema)
 
 
-def _mask(batch: pa.RecordBatch, where: Any) -> NDArray[np.bool_]:
+def _mask(batch: pa.RecordBatch, where: Any) -> Mask:
     """For each row, whether an expression holds; false where it is null."""
     options = acero.ProjectNodeOptions([where], ["holds"])
     source = acero.TableSourceNodeOptions(pa.Table.from_batches([batch]))
@@ -438,24 +439,21 @@ def _mask(batch: pa.RecordBatch, where: Any) -> NDArray[np.bool_]:
     return found.to_numpy()  # type: ignore[no-any-return]
 
 
-def _named(text: str, names: Sequence[str]) -> list[str]:
-    """Names of columns that may be in the text of an expression; some of them are not."""
-    words = set(_WORD.findall(text))
-    return [name for name in names if name in words or not _WORD.fullmatch(name)]
+def paths_of(leaves: Iterable[ViewColumn] | None, *, summaries: bool = False) -> list[str] | None:
+    """Dotted paths of fields, or of numbers of their summaries; None for all.
 
-
-def paths_of(leaves: Collection[ViewColumn], *, summaries: bool = False) -> list[str] | None:
-    """Dotted paths of fields, or of numbers of their summaries; None if a name has a dot itself."""
-    if any("." in name or "[" in name for leaf in leaves for name in leaf.source):
-        return None
+    A name with a dot of its own stands for all.
+    """
     found: dict[str, None] = {}
-    for leaf in leaves:
+    for leaf in leaves or ():
+        if any("." in name or "[" in name for name in leaf.source):
+            return None
         path = ".".join(leaf.source)
         if summaries and leaf.is_summary:
             found |= dict.fromkeys(f"{path}.{field.name}" for field in leaf.kind)
         elif not leaf.is_points:
             found[path] = None
-    return list(found)
+    return None if leaves is None else list(found)
 
 
 def _constant(name: str, entry: RecordingEntry, rows: int) -> Any:

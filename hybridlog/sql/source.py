@@ -9,13 +9,13 @@ from typing import Any, Final
 import numpy as np
 import pyarrow as pa
 import pyarrow.dataset as ds
-from duckdb._sources.nodes import Binary, Col, In, Lit, Node, Untranslatable
+from duckdb._sources.nodes import Binary, Col, In, Lit, Node, Postfix, Unary, Untranslatable
 from duckdb._sources.pyarrow import PyArrowDatasetSource
 from duckdb._sources.to_arrow import to_arrow
 from numpy.typing import NDArray
 
-from hybridlog.sql.content import Bounds, TopicView
-from hybridlog.sql.rows import Reading
+from hybridlog.sql.content import TopicView
+from hybridlog.sql.rows import Bounds, Filter, Reading
 
 _COMPARED: Final[Mapping[str, Callable[..., NDArray[np.bool_]]]] = {
     "=": lambda low, high, value: (low <= value) & (value <= high),
@@ -66,8 +66,9 @@ class TopicDataset(ds.Dataset, PyArrowDatasetSource):  # type: ignore[misc] # wi
         if columns is not None:
             schema = pa.schema([schema.field(place) for place in columns])
         whole = reduce(partial(Binary, "AND"), filters) if filters else Node()
-        where = to_arrow(whole, self.schema) if filters else None
-        rows = self.view.rows(schema.names, where, partial(_may_hold, whole), reading)
+        expression = to_arrow(whole, self.schema) if filters else None
+        where = Filter(expression, {*_paths(whole)}, partial(_may_hold, whole))
+        rows = self.view.rows(schema.names, where, reading)
         reader = pa.RecordBatchReader.from_batches(schema, _told(rows, reading))
         return reader.__arrow_c_stream__(), columns is not None
 
@@ -87,6 +88,19 @@ def _may_hold(node: Node, bounds: Bounds) -> NDArray[np.bool_]:
             each = (_may_hold(Binary("=", column, one), bounds) for one in values)
             return reduce(np.logical_or, each)
     return np.ones(len(bounds["t"][0]), np.bool_)
+
+
+def _paths(node: Node) -> Iterator[tuple[str, ...]]:
+    """The paths that a filter tests."""
+    pending = [node]
+    while pending:
+        match pending.pop():
+            case Col(parts=parts):
+                yield parts
+            case Binary(left=left, right=right):
+                pending += [left, right]
+            case Unary(operand=operand) | Postfix(operand=operand) | In(operand=operand):
+                pending.append(operand)
 
 
 def _told(batches: Iterator[pa.RecordBatch], reading: Reading) -> Iterator[pa.RecordBatch]:

@@ -13,6 +13,7 @@ from hybridlog.query.predicate.tree import is_meta
 from hybridlog.query.question import Question, field_types
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import format_time
+from hybridlog.snapshot import UNFINISHED
 from hybridlog.wording import like, meant
 
 if TYPE_CHECKING:
@@ -123,7 +124,7 @@ def _fields_in_tables(session: Session, question: Question, topic: str) -> set[s
     found: set[str] = set()
     for summary in summaries:
         table = session.table(session.entry_of(summary), topic)
-        if table is None or len(summaries) > _MAX_RECORDINGS:
+        if table is None or summary.status in UNFINISHED or len(summaries) > _MAX_RECORDINGS:
             return None
         found.update(_names_in(table.fields(None), ""))
     return found
