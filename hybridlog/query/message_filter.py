@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from itertools import takewhile
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from hybridlog.frames.names import is_summary
-from hybridlog.query.predicate.to_mask import mask_of_objects, to_mask
-from hybridlog.query.predicate.tree import Predicate, is_meta
+from hybridlog.query.predicate.evaluate import on_columns, on_objects
+from hybridlog.query.predicate.tree import is_meta
 from hybridlog.schema.arrow_columns import structs
 
 if TYPE_CHECKING:
     import pyarrow as pa
     from numpy.typing import NDArray
 
+    from hybridlog.query.predicate.evaluate import Verdict
     from hybridlog.query.question import Part, RecordedChannel
     from hybridlog_storage.messages import Batch
 
@@ -44,60 +42,35 @@ def matches(part: Part, channel: RecordedChannel, batch: Batch, seq: NDArray[np.
     fields = {path.split(".")[0].split("[")[0] for path in predicate.fields()} - {"_meta"}
     times = batch.log_time, seq, batch.publish_time
     if not fields:  # what a message itself provides can be asked of any
-        mask = mask_of(part, channel, structs({}, len(batch)), *times)
-        assert mask is not None
-        return Matches(mask, 0)
+        return Matches(verdict_of(part, channel, structs({}, len(batch)), *times).holds, 0)
     if not channel.codec.indexed:
         return Matches(holds, len(batch))
-    if channel.is_reduced:
-        fields = _elements_of(predicate, types or {})
     decoded = channel.codec.columns_of(batch, fields)
-    rows = decoded.rows
+    rows, left = decoded.rows, channel.is_reduced
     times = batch.log_time[rows], seq[rows], batch.publish_time[rows]
-    lacking = np.zeros(len(rows), np.bool_)
-    if channel.is_reduced:
-        from hybridlog.schema.left import LeftFields
-
-        assert isinstance(decoded.records, LeftFields)
-        lacking = decoded.records.lacking() if fields else lacking
-        mask = None  # of some arrays only summaries are left
-    else:
-        mask = mask_of(part, channel, decoded.arrow(), *times)
-    if mask is None:
+    found = None if left else verdict_of(part, channel, decoded.arrow(), *times)
+    if found is None or found.open.any():
         plain = decoded.plain(whole=False)
         if any(map(is_meta, predicate.fields())):
             meta = meta_array(structs({}, len(rows)), channel, *times).to_pylist()
             plain = [{**one, **own} for one, own in zip(plain, meta, strict=True)]
-        mask = mask_of_objects(predicate, types, plain)
-    holds[rows] = mask & ~lacking
-    unread, expired = len(batch) - len(rows), int(lacking.sum())
-    return Matches(holds, unread + expired, expired)
+        found = on_objects(predicate, types, plain, left=left)
+    holds[rows] = found.holds
+    lacking = int(found.open.sum())
+    return Matches(holds, len(batch) - len(rows) + lacking, lacking)
 
 
-def mask_of(
+def verdict_of(
     part: Part, channel: RecordedChannel, records: pa.StructArray, *times: Any
-) -> NDArray[np.bool_] | None:
-    """Mask of the messages for which a part's predicate holds; None if columns cannot decide.
+) -> Verdict:
+    """The outcome of a part's predicate on columns.
 
     `times` are log times, arrival numbers and publish times, as of `meta_array`.
     """
     assert part.predicate is not None
     if any(map(is_meta, part.predicate.fields())):
         records = meta_array(records, channel, *times)
-    return to_mask(part.predicate, part.field_types, records)
-
-
-def _elements_of(predicate: Predicate, types: Mapping[str, str]) -> set[str]:
-    """Fields in a predicate, but for summaries of arrays that are in no other array."""
-    found = set()
-    for condition in predicate.conditions():
-        parts = condition.field.parts
-        path = condition.field.path
-        is_plain = all(isinstance(part, str) for part in parts) and is_summary(path, types)
-        if not is_plain or path.rpartition(".")[0] not in types:
-            names = takewhile(lambda part: isinstance(part, str), parts)
-            found.add(".".join(map(str, names)))
-    return found - {"_meta"}
+    return on_columns(part.predicate, part.field_types, records)
 
 
 def meta_array(

@@ -344,7 +344,7 @@ class Rows:
             size = table.size(paths, own)
             self.counters.bytes_read += int(size * min(part.share * 1.2, 1.0))
             for rows in table.scan(paths, own=columns, spans=spans):
-                yield rows, _decided(part, rows) & ~rows.is_unreadable()
+                yield rows, _decided(part, rows)
         except StoreError as error:
             if whole is not None:
                 raise
@@ -486,15 +486,16 @@ def offsets_by_chunk(
 
 
 def _decided(part: Part, rows: TableRows) -> NDArray[np.bool_]:
+    readable = ~rows.is_unreadable()
     if part.predicate is None:
-        return np.ones(len(rows), np.bool_)
-    from hybridlog.query.message_filter import mask_of
+        return readable
+    from hybridlog.query.message_filter import verdict_of
 
     times = rows.t, rows.seq, rows.own.get("pub")
-    found = mask_of(part, part.channels[0], rows.records, *times)
-    if found is None:
+    found = verdict_of(part, part.channels[0], rows.records, *times)
+    if (found.open & readable).any():
         raise _UndecidedError
-    return found
+    return found.holds & readable
 
 
 def _plain(path: str) -> str:

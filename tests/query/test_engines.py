@@ -23,8 +23,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import hybridlog as hl
 from hybridlog.query.intervals import Intervals
+from hybridlog.query.predicate.evaluate import on_objects
 from hybridlog.query.predicate.parser import parse
-from hybridlog.query.predicate.to_mask import mask_of_objects
 from hybridlog.query.query import Query, field_types
 from hybridlog.query.rows import Rows
 from hybridlog_storage.errors import DatabaseError, TimeError
@@ -323,7 +323,7 @@ def expected(world: World, question: dict[str, Any]) -> list[Sent]:
     if question["condition"] is not None:
         types = None if question["topics"] == ("/state",) else _types(world, question)
         objects = [{**one.fields, "_meta": {"seq": one.seq}} for one in world.sent]
-        mask = mask_of_objects(parse(question["condition"]), types, objects)
+        mask = on_objects(parse(question["condition"]), types, objects).holds
         matching = {id(one) for one, holds in zip(world.sent, mask, strict=True) if holds}
     named = {world.ids[name] for name in question["recordings"]}
     found = []

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
+from hybridlog.query.predicate.evaluate import on_objects
 from hybridlog.query.predicate.parser import parse
-from hybridlog.query.predicate.to_mask import mask_of_objects
 from hybridlog.query.predicate.tree import Condition, Predicate
 from hybridlog.query.predicate.types import check
 from hybridlog_storage.errors import WhereError
@@ -254,7 +254,7 @@ def test_any_text_is_a_filter_or_an_error(where: str) -> None:
         predicate = parse(where)
     except WhereError:
         return
-    mask_of_objects(predicate, None, [{}])
+    on_objects(predicate, None, [{}])
     assert parse(predicate.text) == predicate
 
 
@@ -501,12 +501,12 @@ def test_messages_answer_as_the_language_says(docs: list[Document], asked: list[
             return where, [docs[n] for n in found ^ expected]  # type: ignore[index]
 
         predicate = parse(where)
-        mask = mask_of_objects(predicate, types, docs)
+        mask = on_objects(predicate, types, docs).holds
         in_memory: set[object] = {*np.flatnonzero(mask).tolist()}
         assert in_memory == expected, wrong(in_memory)
 
 
 def test_the_deepest_predicate_is_taken() -> None:
     for where in ("not " * 49 + "m.q.min < 5", " or ".join(["m.q.mean < 5"] * 200)):
-        mask = mask_of_objects(checked(where, TYPES), TYPES, [{"m": [{"q": [1.0]}]}])
+        mask = on_objects(checked(where, TYPES), TYPES, [{"m": [{"q": [1.0]}]}]).holds
         assert mask.tolist() == ["not" not in where]

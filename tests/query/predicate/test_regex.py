@@ -5,9 +5,9 @@ from __future__ import annotations
 import pyarrow as pa
 import pytest
 
+from hybridlog.query.predicate.evaluate import on_columns, on_objects
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.regex import compile_regex
-from hybridlog.query.predicate.to_mask import mask_of_objects, to_mask
 
 JOINTS = "joint_{0}: pos=-1.503 vel=0.204 temp=9{0} state=ok;"
 
@@ -33,13 +33,12 @@ def test_long_lines_are_matched_to_their_end(pattern: str, found: list[bool]) ->
     for operator, expected in (("~", found), ("!~", [not each for each in found])):
         predicate = parse(f's {operator} "{pattern}"')
         objects = [{"s": line} for line in lines]
-        assert mask_of_objects(predicate, None, objects).tolist() == expected
-        mask = to_mask(predicate, None, pa.StructArray.from_arrays([pa.array(lines)], ["s"]))
-        assert mask is not None
-        assert mask.tolist() == expected
+        assert on_objects(predicate, None, objects).holds.tolist() == expected
+        records = pa.StructArray.from_arrays([pa.array(lines)], ["s"])
+        assert on_columns(predicate, None, records).holds.tolist() == expected
 
 
 def test_strings_that_are_no_unicode() -> None:
     for where in ("s ~ '^.$'", "s == '\N{REPLACEMENT CHARACTER}'"):
-        assert mask_of_objects(parse(where), None, [{"s": "\ud800"}]).all()
+        assert on_objects(parse(where), None, [{"s": "\ud800"}]).holds.all()
     assert compile_regex(r"\Q\C\E").search(r"a\Cb")

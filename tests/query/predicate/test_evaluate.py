@@ -12,9 +12,9 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from hybridlog.query.predicate.evaluate import on_columns, on_objects
 from hybridlog.query.predicate.mongo_filter import mongo_filter
 from hybridlog.query.predicate.parser import parse
-from hybridlog.query.predicate.to_mask import mask_of_objects, to_mask
 from hybridlog.query.predicate.tree import Condition, Field
 
 ORDERS = {
@@ -56,20 +56,19 @@ def test_numbers_are_compared_by_value(name: str, order: str) -> None:
     for bound in bounds:
         asked = Condition(Field(("x",)), order, (bound,))  # type: ignore[arg-type]
         records = pa.StructArray.from_arrays([pa.array(values)], ["x"])
-        mask = to_mask(asked, {"x": name}, records)
-        assert mask is not None
+        mask = on_columns(asked, {"x": name}, records).holds
         given = Fraction(as_single(bound) if name == "float32" else bound)
         expected = [ORDERS[order](Fraction(v), given) for v in values.tolist()]
         assert mask.tolist() == expected, bound
         objects = [{"x": value} for value in values.tolist()]
-        assert mask_of_objects(asked, {"x": name}, objects).tolist() == expected
+        assert on_objects(asked, {"x": name}, objects).holds.tolist() == expected
 
 
 def mask_of(
     text: str, records: pa.RecordBatch, types: dict[str, str] | None = None
 ) -> list[bool] | None:
-    mask = to_mask(parse(text), types, records.to_struct_array())
-    return None if mask is None else mask.tolist()
+    found = on_columns(parse(text), types, records.to_struct_array())
+    return None if found.open.any() else found.holds.tolist()
 
 
 def test_decimal_literals_are_those_of_float32() -> None:
@@ -94,17 +93,15 @@ def test_decimal_literals_are_those_of_float32() -> None:
         ("v < 1e300", [True] * 3),
         ("v < 16777217", [True] * 3),
     ):
-        mask = to_mask(parse(text), types, records)
-        assert mask is not None, text
-        assert mask.tolist() == wanted, text
-        assert mask_of_objects(parse(text), types, rows).tolist() == wanted, text
+        found = on_columns(parse(text), types, records)
+        assert found.holds.tolist() == wanted, text
+        assert found.fails.tolist() == [not one for one in wanted], text
+        assert on_objects(parse(text), types, rows).holds.tolist() == wanted, text
 
 
 def test_a_literal_beyond_float32_is_no_infinity() -> None:
     records = pa.array([{"v": np.inf}], pa.struct([("v", pa.float32())]))
-    found = to_mask(parse("v == 1e300"), {"v": "float32"}, records)
-    assert found is not None
-    assert not found.any()
+    assert on_columns(parse("v == 1e300"), {"v": "float32"}, records).fails.all()
 
 
 def test_times_are_nanoseconds() -> None:
@@ -123,11 +120,9 @@ def test_what_columns_cannot_tell() -> None:
     assert mask_of("x == 1", pa.record_batch({"x": text})) is None
     assert mask_of("x.a == 1", pa.record_batch({"x": text})) is None
     table = pa.record_batch({"x": [1]})
-    assert to_mask(mongo_filter({"x": 1}, None), None, table.to_struct_array()) is None
+    assert on_columns(mongo_filter({"x": 1}, None), None, table.to_struct_array()).open.all()
     assert mask_of("_meta.seq > 1", table) is None
-    mask = to_mask(mongo_filter({}, None), None, table.to_struct_array())
-    assert mask is not None
-    assert mask.tolist() == [True]
+    assert on_columns(mongo_filter({}, None), None, table.to_struct_array()).holds.all()
     assert mask_of("x == 1", table.slice(0, 0)) == []
 
 
@@ -145,11 +140,12 @@ def test_two_fields_are_compared_by_value(order: str) -> None:
     compare = operator.ne if order == "!=" else ORDERS[order]
     for one, other in itertools.permutations(kinds, 2):
         predicate = parse(f"{one} {order} {other}")
-        pairs = zip(kinds[one], kinds[other], strict=True)  # Python compares exactly
+        pairs = [*zip(kinds[one], kinds[other], strict=True)]  # Python compares exactly
         want = [a is not None and b is not None and compare(a, b) for a, b in pairs]
-        mask = to_mask(predicate, {}, records)
+        found = on_columns(predicate, {}, records)
         # Of nulls, columns do not say which are missing.
-        assert mask is None or mask.tolist() == want
-        assert (mask is None) == (None in kinds[other] or (order == "!=" and None in kinds[one]))
+        nulls = [b is None or (order == "!=" and a is None) for a, b in pairs]
+        assert found.holds.tolist() == want
+        assert [*map(operator.and_, found.open, nulls)] == found.open.tolist()
         rows = [{k: v for k, v in row.items() if v is not None} for row in records.to_pylist()]
-        assert mask_of_objects(predicate, {}, rows).tolist() == want
+        assert on_objects(predicate, {}, rows).holds.tolist() == want
