@@ -99,7 +99,7 @@ ALLOWED = {
         "hybridlog.training",
     ),
     "pymongo": ("hybridlog_storage.mongo.database",),
-    "re2": ("hybridlog.query.predicate.regex",),
+    "re2": ("hybridlog.query.predicate.tokens",),
     "rclpy": ("hybridlog.live.sources.ros2.child.middleware",),
     "rich": ("hybridlog.cli",),
     "rosbags": (

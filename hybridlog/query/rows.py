@@ -67,15 +67,14 @@ class _UndecidedError(StoreError):
 
 
 class Tabled(NamedTuple):
-    """The table of a part of a question.
+    """A part of a question, as asked, with its table.
 
     Attributes:
-        part: The part as asked.
         rest: It in the segments that the table does not cover, which are all later; or None.
     """
 
-    table: TopicTable
     part: Part
+    table: TopicTable
     rest: Part | None
 
 
@@ -120,13 +119,13 @@ class Rows:
         if not table.has_fields and any(c.codec.indexed for c in part.channels):
             return None  # it is older than a definition
         if table.rows == part.messages:
-            return Tabled(table, part, None)
+            return Tabled(part, table, None)
         spans = [span for span in part.recording.spans if span[0] not in table.segments]
         rest = replace(part, recording=replace(part.recording, spans=spans))
         late = self._held(replace(rest, bounds=None, windows=None))["first"]
         if len(late) and late.min() <= max(one.last for one in table.parts):
             return None  # no order of times would be theirs
-        return Tabled(table, part, rest)
+        return Tabled(part, table, rest)
 
     # Answers.
 
@@ -213,29 +212,24 @@ class Rows:
                 matched, unreadable = self._counts[part]
                 total += matched
                 self.counters.unreadable += unreadable
-            elif (found := self.tabled(part)) is not None:
-                total += sum(int(holds.sum()) for _, holds in self._answers(found))
-                left += [] if found.rest is None else [found.rest]
             else:
-                left.append(part)
+                found = self.tabled(part)
+                total += sum(int(holds.sum()) for _, holds in self._in_table(found))
+                left += _rest_of(part, found)
         return total + (self.count_in_chunks(left) if left else 0)
 
     def _outcomes(self, part: Part) -> Iterator[RowBatch]:
         found = self.tabled(part)
-        if found is not None:
-            for rows, holds in self._answers(found):
-                yield RowBatch(rows.t, rows.seq, holds)
-            if found.rest is None:
-                return
-            part = found.rest
-        if part.predicate is None and part.is_by_log_time:
-            with suppress(SegmentError):
-                time = self._times(part, self._held(part))
-                yield RowBatch(time, np.zeros_like(time), np.ones(len(time), np.bool_))
-                return
-        for channel, run in self._by_channel(part):
-            holds = self._decided(part, channel, run)
-            yield RowBatch(run.batch.log_time, run.seq, holds)
+        for rows, holds in self._in_table(found):
+            yield RowBatch(rows.t, rows.seq, holds)
+        for rest in _rest_of(part, found):
+            if part.predicate is None and part.is_by_log_time:
+                with suppress(SegmentError):
+                    time = self._times(rest, self._held(rest))
+                    yield RowBatch(time, np.zeros_like(time), np.ones(len(time), np.bool_))
+                    return
+            for channel, run in self._by_channel(rest):
+                yield RowBatch(run.batch.log_time, run.seq, self._decided(rest, channel, run))
 
     def _values(
         self, part: Part, fields: Collection[str] | None, *, partial: bool
@@ -245,19 +239,19 @@ class Rows:
         summaries = summaries_in(fields, part.field_types)
         wanted = None if fields is None else {*fields} - summaries
         found = self.tabled(part, wanted)
-        rest: Part | None = part
-        if found is not None and all(map(found.table.has, summaries)):
-            rest = found.rest
-            kind = None if fields is None else found.table.fields(fields)
-            for rows, holds in self._answers(found, fields):
-                chosen = rows if holds.all() else rows.take(np.flatnonzero(holds))
-                # Without the columns that only the predicate needs.
-                records = chosen.records
-                records = records if kind is None else converted(records, kind, drops=True)
-                yield RowBatch(chosen.t, chosen.seq, holds[holds], records)
+        if found is not None and not all(map(found.table.has, summaries)):
+            found = None
+        kind = None if fields is None or found is None else found.table.fields(fields)
+        for rows, holds in self._in_table(found, fields):
+            chosen = rows if holds.all() else rows.take(np.flatnonzero(holds))
+            # Without the columns that only the predicate needs.
+            records = chosen.records
+            records = records if kind is None else converted(records, kind, drops=True)
+            yield RowBatch(chosen.t, chosen.seq, holds[holds], records)
         arrays = {path.rpartition(".")[0] for path in summaries}
         wanted = None if wanted is None else wanted | arrays
-        for channel, run in self._by_channel(rest) if rest is not None else ():
+        runs = (own for rest in _rest_of(part, found) for own in self._by_channel(rest))
+        for channel, run in runs:
             own = run.take(self._decided(part, channel, run))
             decoded, made = channel.codec.columns_of(own.batch, wanted), {}
             self.counters.unreadable += len(own.batch) - len(decoded.rows)
@@ -278,13 +272,46 @@ class Rows:
 
     # Tables.
 
-    def _answers(
-        self, found: Tabled, fields: Collection[str] | None = (), own: Collection[str] = ()
+    def _in_table(
+        self, found: Tabled | None, fields: Collection[str] | None = (), own: Collection[str] = ()
     ) -> Iterator[tuple[TableRows, NDArray[np.bool_]]]:
-        """Rows of a table with the outcome for each; those that are unreadable are counted."""
-        for rows, holds in self._in_table(found, fields, own):
-            self.counters.unreadable += int(rows.is_unreadable().sum())
-            yield rows, holds
+        """Rows of the part's time in its table, with the outcome for each; None without a table.
+
+        `own` are columns of the table itself. Unreadable ones are counted. Of a table that is
+        damaged or cannot tell, a `ChangedError` says that it is left.
+        """
+        if found is None:
+            return
+        part, table = found.part, found.table
+        try:
+            for rows, holds in self._scanned(part, table, fields, own):
+                self.counters.unreadable += int(rows.is_unreadable().sum())
+                yield rows, holds
+        except StoreError as error:
+            self._tabled[part] = None
+            if not isinstance(error, _UndecidedError):
+                self.session.tables.reject(part.recording, part.topic)
+            raise ChangedError(f"The table of {part.topic} is left. Ask again.") from error
+
+    def _scanned(
+        self,
+        part: Part,
+        table: TopicTable,
+        fields: Collection[str] | None = (),
+        own: Collection[str] = (),
+    ) -> Iterator[tuple[TableRows, NDArray[np.bool_]]]:
+        """Rows of a part's time in a table, with the outcome for each."""
+        spans = None if part.is_unbounded else [(a, b) for a, b in part.log_windows.tolist()]
+        columns = {*own}
+        if part.predicate is not None:
+            columns |= {"pub"} if "_meta.pub" in part.predicate.fields() else set()
+            columns |= {"state"} if part.predicate.asks_fields and table.unreadable else set()
+        names = (path.replace("[]", "") for path in fields or ())
+        paths = None if fields is None else {*_paths(table, part), *names}
+        size = table.size(paths, own)
+        for rows in table.scan(paths, own=columns, spans=spans):
+            self.counters.bytes_read += size * len(rows) // max(table.rows, 1)
+            yield rows, _decided(part, rows)
 
     def _count_by_file(self, parts: Sequence[Part]) -> None:
         """Count whole parts that lie in one file: the predicate is evaluated once for all rows."""
@@ -303,55 +330,20 @@ class Rows:
                     self._count_in_file(group)
 
     def _count_in_file(self, group: Sequence[Tabled]) -> None:
-        first = group[0]
-        types = first.part.field_types
-        file = first.table.files[0]
-        whole = self.session.tables.whole(file, arrays=first.table.has_arrays)
+        (first, table, _), types = group[0], group[0].part.field_types
+        whole = self.session.tables.whole(table.files[0], arrays=table.has_arrays)
         sums, before = [np.zeros((2, 1), np.int64)], [0]
-        for rows, holds in self._in_table(first, whole=whole):
+        for rows, holds in self._scanned(first, whole):
             before.append(before[-1] + len(rows))
             both = np.stack([holds, rows.is_unreadable()])
             sums.append(sums[-1][:, -1:] + np.cumsum(both, axis=1))
         total = np.concatenate(sums, axis=1)
-        for one in group:
-            if one.part.field_types == types:
-                begin = np.array([before[p.group] + p.begin for p in one.table.parts])
-                end = begin + [p.rows for p in one.table.parts]
+        for part, table, _ in group:
+            if part.field_types == types:
+                begin = np.array([before[p.group] + p.begin for p in table.parts])
+                end = begin + [p.rows for p in table.parts]
                 matched, unreadable = (total[:, end] - total[:, begin]).sum(axis=1).tolist()
-                self._counts[one.part] = matched, unreadable
-
-    def _in_table(
-        self,
-        found: Tabled,
-        fields: Collection[str] | None = (),
-        own: Collection[str] = (),
-        whole: TopicTable | None = None,
-    ) -> Iterator[tuple[TableRows, NDArray[np.bool_]]]:
-        """Rows of the part's time in its table, with the outcome for each.
-
-        `own` are columns of the table itself; `whole` are all rows of its file, in place of its
-        table. Of a table that is damaged or cannot tell, a `ChangedError` says that it is left.
-        """
-        part, table = found.part, whole or found.table
-        spans = None if part.is_unbounded else [(a, b) for a, b in part.log_windows.tolist()]
-        columns = {*own}
-        if part.predicate is not None and "_meta.pub" in part.predicate.fields():
-            columns.add("pub")
-        if part.predicate is not None and part.predicate.asks_fields and table.unreadable:
-            columns.add("state")
-        try:
-            paths = None if fields is None else {*_paths(table, part), *map(_plain, fields)}
-            size = table.size(paths, own)
-            self.counters.bytes_read += int(size * min(part.share * 1.2, 1.0))
-            for rows in table.scan(paths, own=columns, spans=spans):
-                yield rows, _decided(part, rows)
-        except StoreError as error:
-            if whole is not None:
-                raise
-            self._tabled[part] = None
-            if not isinstance(error, _UndecidedError):
-                self.session.tables.reject(part.recording, part.topic)
-            raise ChangedError(f"The table of {part.topic} is left. Ask again.") from error
+                self._counts[part] = matched, unreadable
 
     # Chunks.
 
@@ -389,7 +381,7 @@ class Rows:
     def _offsets(self, found: Tabled) -> dict[ChunkKey, NDArray[np.int64]]:
         """Payload offsets of the matching messages that a table has, by chunk."""
         places = [
-            places_of(rows.own["ref"])[holds] for rows, holds in self._answers(found, own=("ref",))
+            places_of(rows.own["ref"])[holds] for rows, holds in self._in_table(found, own=("ref",))
         ]
         none = np.empty((0, 3), np.int64)
         return offsets_by_chunk(found.part.recording.id, np.concatenate([none, *places]))
@@ -424,7 +416,7 @@ class Rows:
         """bool[n], true for matching messages; those that cannot be tested are counted."""
         if part.predicate is None:
             return np.ones(len(run.batch), np.bool_)
-        from hybridlog.query.message_filter import matches
+        from hybridlog.query.chunk_scan import matches
 
         found = matches(part, channel, run.batch, run.seq)
         self.counters.unreadable += found.unreadable
@@ -459,6 +451,12 @@ class Rows:
         return self.session.parts(part.recording, ids, part.log_span)
 
 
+def _rest_of(part: Part, found: Tabled | None) -> list[Part]:
+    """What a table does not have of a part: all of it without a table."""
+    rest = part if found is None else found.rest
+    return [] if rest is None else [rest]
+
+
 def summaries_in(fields: Collection[str] | None, types: Mapping[str, str] | None) -> set[str]:
     """The paths among some fields that are summaries of arrays."""
     from hybridlog.frames.names import is_summary  # a count needs no frames
@@ -489,17 +487,13 @@ def _decided(part: Part, rows: TableRows) -> NDArray[np.bool_]:
     readable = ~rows.is_unreadable()
     if part.predicate is None:
         return readable
-    from hybridlog.query.message_filter import verdict_of
+    from hybridlog.query.chunk_scan import verdict_of
 
     times = rows.t, rows.seq, rows.own.get("pub")
     found = verdict_of(part, part.channels[0], rows.records, *times)
     if (found.open & readable).any():
         raise _UndecidedError
     return found.holds & readable
-
-
-def _plain(path: str) -> str:
-    return path.replace("[]", "")
 
 
 def _holds(found: Tabled, fields: Collection[str] | None) -> bool:

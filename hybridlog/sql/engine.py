@@ -18,9 +18,8 @@ from hybridlog.query.question import Question
 from hybridlog.schema.states import without_fields
 from hybridlog.sql.content import StoreContent, store_schema, store_table
 from hybridlog.sql.duck import MEMORY, Worker, explained, open_duckdb, shortage_of
-from hybridlog.sql.names import TABLES
+from hybridlog.sql.names import EVERYTHING, TABLES, Usage, usage_of
 from hybridlog.sql.rows import Reading
-from hybridlog.sql.usage import EVERYTHING, Usage, usage_of
 from hybridlog.wording import meant
 from hybridlog_storage.errors import ChangedError, HybridlogError, TopicError, UsageError
 

@@ -29,7 +29,7 @@ from hybridlog.schema.arrow_types import has_empty, is_array
 from hybridlog.schema.left import LeftFields
 from hybridlog.schema.states import GONE, State
 from hybridlog.sql.columns import OWN, ViewColumn, absent, points_column
-from hybridlog.sql.usage import EVERYTHING, Usage
+from hybridlog.sql.names import EVERYTHING, Usage
 from hybridlog_storage.errors import ChangedError, StoreError
 from hybridlog_storage.lazy import lazy
 from hybridlog_storage.messages import EXPIRED_IDS

@@ -6,7 +6,7 @@ import duckdb
 import pytest
 
 from hybridlog.sql.engine import _TREE
-from hybridlog.sql.usage import EVERYTHING, usage_of
+from hybridlog.sql.names import EVERYTHING, usage_of
 
 VIEWS = ("scan", "odom", "topics")
 PATH = ("echo", "far")

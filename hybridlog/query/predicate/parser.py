@@ -53,8 +53,15 @@ from itertools import groupby
 from operator import itemgetter
 from typing import TypeAlias
 
-from hybridlog.query.predicate.regex import RegexError, compile_regex
-from hybridlog.query.predicate.tokens import Token, error_at, is_filter, tokenize, unescape
+from hybridlog.query.predicate.tokens import (
+    RegexError,
+    Token,
+    compile_regex,
+    error_at,
+    is_filter,
+    tokenize,
+    unescape,
+)
 from hybridlog.query.predicate.tree import (
     ALWAYS,
     And,

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, Phase, example, given, settings
 from hypothesis import strategies as st
 
 from hybridlog.columns.left_rows import reduced
-from hybridlog.query.message_filter import matches
+from hybridlog.query.chunk_scan import matches
 from hybridlog.query.predicate.evaluate import on_columns, on_objects, statistic_of
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.tree import Predicate
