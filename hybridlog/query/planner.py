@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -122,22 +122,6 @@ class Planner(Rows):
         """Ids of the recordings that have a message in the answer."""
         return {part.recording.id for part in self.parts() if self.count_of([part])}
 
-    def decided(self, parts: Sequence[Part]) -> list[Part]:
-        """The parts with predicates for columns and messages: MongoDB is asked once for all."""
-        wanted = [part for part in parts if part.needs_index]
-        if not wanted:
-            return [*parts]
-        from hybridlog.query import index_reader
-
-        found, documents = index_reader.decided(self.session, wanted, self.counters)
-        self.counters.not_indexed += self._lacking(documents)
-        decidable = dict(zip(wanted, found, strict=True))
-        return [decidable.get(part, part) for part in parts]
-
-    def _lasting(self, part: Part, ask: Callable[[Part], Iterator[RowBatch]]) -> Iterator[RowBatch]:
-        (part,) = self.decided([part])
-        return super()._lasting(part, ask)
-
     def runs(self) -> Iterator[MessageRun]:
         """The messages of the answer, in order."""
         question = self.question
@@ -201,15 +185,7 @@ class Planner(Rows):
         from hybridlog.query import index_reader
 
         parts = self.split()
-        return self._lacking(index_reader.documents(self.session, parts)) if parts else ()
-
-    def _lacking(self, documents: Mapping[Part, int]) -> tuple[tuple[str, int], ...]:
-        """Messages that the index lacks, from the documents that it has of some parts."""
-        found: Counter[str] = Counter()
-        for part, number in documents.items():
-            whole = replace(part, predicate=None)
-            found[part.recording.name] += max(self.count_of([whole]) - number, 0)
-        return tuple((name, number) for name, number in found.items() if number)
+        return self.lacking(index_reader.documents(self.session, parts)) if parts else ()
 
     def _check_clock(self, channel: RecordedChannel) -> None:
         if self.question.bounds is None:

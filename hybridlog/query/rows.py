@@ -7,7 +7,7 @@ times without a predicate come from chunk tables and message indexes.
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -156,6 +156,28 @@ class Rows:
         """
         return self._lasting(part, lambda own: self._values(own, fields, partial=partial))
 
+    # Filters of MongoDB.
+
+    def decided(self, parts: Sequence[Part]) -> list[Part]:
+        """The parts with predicates for columns and messages: MongoDB is asked once for all."""
+        wanted = [part for part in parts if part.needs_index]
+        if not wanted:
+            return [*parts]
+        from hybridlog.query import index_reader
+
+        found, documents = index_reader.decided(self.session, wanted, self.counters)
+        self.counters.not_indexed += self.lacking(documents)
+        decidable = dict(zip(wanted, found, strict=True))
+        return [decidable.get(part, part) for part in parts]
+
+    def lacking(self, documents: Mapping[Part, int]) -> tuple[tuple[str, int], ...]:
+        """Messages that the index lacks, from the documents that it has of some parts."""
+        found: Counter[str] = Counter()
+        for part, number in documents.items():
+            whole = replace(part, predicate=None)
+            found[part.recording.name] += max(self.count_of([whole]) - number, 0)
+        return tuple((name, number) for name, number in found.items() if number)
+
     # Files that go, and tables that cannot tell.
 
     def again(self, ask: Callable[[Sequence[Part]], _T], parts: Sequence[Part]) -> _T:
@@ -172,6 +194,7 @@ class Rows:
     def _lasting(self, part: Part, ask: Callable[[Part], Iterator[RowBatch]]) -> Iterator[RowBatch]:
         """Rows of a part, to the end if files are replaced or a table fails meanwhile."""
         last: tuple[int, int] | None = None
+        (part,) = self.decided([part])
         before = self.counters.copy()
         for turn in range(_RENEWALS + 1):
             try:

@@ -273,6 +273,8 @@ class _Objects:
         for array in self._reached(message, parts[:-1]):
             if isinstance(array, list | bytes) and (types.known or _has_statistic(array, stat)):
                 yield statistic_of(array, stat)
+            elif array is _HIDDEN:
+                yield array
             elif types.known and isinstance(array, Mapping) and stat in array:
                 yield array[stat]
 
