@@ -12,8 +12,15 @@ import numpy as np
 import pyarrow as pa
 
 from hybridlog.across.bins import AGGREGATES, Bins, RegularTimes, with_numbers
-from hybridlog.across.match import HOWS, Matched
-from hybridlog.across.topic_reader import RECORDING, TIME, Beside, TopicReader, concatenated
+from hybridlog.across.match import HOWS
+from hybridlog.across.topic_reader import (
+    RECORDING,
+    TIME,
+    Beside,
+    Empty,
+    TopicReader,
+    concatenated,
+)
 from hybridlog.frames.answer import text_column
 from hybridlog.query.answers.lost import completeness_of
 from hybridlog.query.answers.remarks import remarks
@@ -42,44 +49,20 @@ class Aligned:
     Rows are ordered by recording, oldest first, then by log time. Messages of different
     recordings are in one row only where that is asked for.
 
-    Args:
-        session: The open store.
-        base: The rows.
-        others: The topics beside them.
-        how: Which message of each.
-        tolerance: Greatest distance in time, a duration; None for any.
-
     Attributes:
         rows: Number of rows of the last answer.
         empty: Numbers of rows that are empty in the last answer, by reason: by topic where it
             has no message for the row, by column where that has no value.
-
-    Raises:
-        UsageError: an unknown way or clock, or a question with limit, every or reverse.
-        TopicError: a topic does not have the clock.
-        TimeError: the tolerance is no duration.
     """
 
     def __init__(
-        self,
-        session: Session,
-        base: TopicReader | RegularTimes,
-        others: Sequence[TopicReader],
-        *,
-        how: str,
-        tolerance: DurationLike | None,
+        self, session: Session, base: TopicReader | RegularTimes, beside: Sequence[Beside], how: str
     ) -> None:
-        hows = (*HOWS, *AGGREGATES) if isinstance(base, RegularTimes) else HOWS
-        if how not in hows:
-            raise UsageError(f"Unknown way {how!r}; choose {', '.join(hows)}.")
-        if how in AGGREGATES and tolerance is not None:
-            raise UsageError(f"{how} is of the messages between two rows: leave out tolerance.")
         self._session = session
         self._base = base
-        self._others = others
-        self._readers = [*([base] if isinstance(base, TopicReader) else []), *others]
+        self._beside = beside
+        self._readers = [*([base] if isinstance(base, TopicReader) else []), *beside]
         self._how = how
-        self._tolerance = None if tolerance is None else parse_duration(tolerance)
         self.rows = 0
         self.empty: dict[str, dict[str, int]] = {}
 
@@ -116,7 +99,7 @@ class Aligned:
         return completeness_of(self._session, *answered[0], *answered[1:])
 
     def __repr__(self) -> str:
-        names = [name for reader in self._others for name in reader.question.topics]
+        names = [name for reader in self._beside for name in reader.question.topics]
         return f"<Aligned {', '.join(names)}; {self._how}>"
 
     def to_tables(self, limit: int | None = None) -> Iterator[pa.Table]:
@@ -127,57 +110,39 @@ class Aligned:
         for reader in self._readers:
             reader.counters.reset()
         self.rows, self.empty = 0, {}
-        base, beside = self._base, [self._beside(reader) for reader in self._others]
+        base = self._base
         several = len(self._session.chosen(base.question)) > 1
         chosen = RangeResolver(self._session, base.question).resolve()
         for summary, bounds, _ in chosen if limit != 0 else ():
             span = None if summary.status in UNFINISHED else summary.extent
             if bounds is not None and base.question.clock == "log":
                 span = bounds
-            for one in beside:
+            for one in self._beside:
                 one.enter(summary.id, span)
-            name = summary.name if several else None
             for times, table in base.rows(summary.id):
-                matched = [one.match(times) for one in beside]
                 begin = 0
                 while begin < len(times):
-                    left = len(times) - begin if limit is None else limit - self.rows
+                    left = len(times) if limit is None else limit - self.rows
                     if left <= 0:
                         return
-                    room = [one.fitting(m, begin) for one, m in zip(beside, matched, strict=True)]
-                    end = begin + min([len(times) - begin, left, *room])
+                    end = begin + min([left, *(one.most for one in self._beside)])
                     own = table.slice(begin, end - begin)
-                    parts = [Matched._make(column[begin:end] for column in m) for m in matched]
-                    yield self._rows(times[begin:end], own, name, beside, parts)
+                    yield self._rows(times[begin:end], own, summary.name if several else None)
                     begin = end
         if not self.rows:
-            none = np.empty(0, np.int64)
-            parts = [Matched(none, none, none)] * len(beside)
-            yield self._rows(none, base.empty, "" if several else None, beside, parts)
+            yield self._rows(np.empty(0, np.int64), base.empty, "" if several else None)
 
-    def _beside(self, reader: TopicReader) -> Beside:
-        if isinstance(self._base, RegularTimes) and self._how in AGGREGATES:
-            return Bins(reader, self._how, self._base)
-        return Beside(reader, self._how, self._tolerance)
-
-    def _rows(
-        self,
-        times: NDArray[np.int64],
-        own: pa.Table,
-        recording: str | None,
-        beside: Sequence[Beside],
-        found: Sequence[Matched],
-    ) -> pa.Table:
-        """Some rows with what was found beside them."""
+    def _rows(self, times: NDArray[np.int64], own: pa.Table, recording: str | None) -> pa.Table:
+        """Some rows with what is beside them."""
         self.rows += len(times)
-        empty = Counter[tuple[str, str]]()
+        empty: Empty = Counter()
         columns: dict[str, Any] = {TIME: own[TIME]}
         if recording is not None:
             columns[RECORDING] = text_column(recording, len(times))
         if isinstance(self._base, TopicReader):
-            self._base.add(columns, own, empty, 0)
-        for one, matched in zip(beside, found, strict=True):
-            one.add(columns, times, matched, empty)
+            self._base.put(columns, own, empty)
+        for one in self._beside:
+            one.add(columns, times, empty)
         for (name, reason), rows in (+empty).items():
             reasons = self.empty.setdefault(name, {})
             reasons[reason] = reasons.get(reason, 0) + rows
@@ -210,7 +175,7 @@ class Aligned:
 
     def schema(self) -> pa.Schema | None:
         """Columns where only messages determine them, which are read; None otherwise."""
-        questions = [self._base.question, *(other.question for other in self._others)]
+        questions = [self._base.question, *(other.question for other in self._beside)]
         known = (self._session.field_types(q.topics, q.recordings) for q in questions)
         if all(types is not None for types in known):
             return None
@@ -235,12 +200,16 @@ def side_by_side(
             f"The rows are the messages of one topic, not of {len(base.topics)}: name one of "
             f"{listed(base.topics)}."
         )
+    near = _checked(how, tolerance, HOWS)
     chosen: Clock = clock  # type: ignore[assignment]
-    rows, *readers = (
-        TopicReader(session, one, chosen, prefix=prefix, is_apart=across_recordings and number > 0)
-        for number, (prefix, one) in enumerate(_named([base, *others]))
-    )
-    return Aligned(session, rows, readers, how=how, tolerance=tolerance)
+    (prefix, one), *named = _named([base, *others])
+    rows = TopicReader(session, one, chosen, prefix=prefix)
+    apart = across_recordings
+    beside = [
+        Beside(session, one, chosen, how=how, tolerance=near, prefix=prefix, is_apart=apart)
+        for prefix, one in named
+    ]
+    return Aligned(session, rows, beside, how)
 
 
 def resampled(
@@ -252,14 +221,25 @@ def resampled(
 ) -> Aligned:
     """An alignment of topics to regular times; see `Query.resample`."""
     times = RegularTimes(session, replace(question, predicate=None), parse_duration(step))
-    found = _named([question])
-    readers = [
-        TopicReader(
-            session, with_numbers(session, one, how), prefix=prefix if len(found) > 1 else ""
-        )
-        for prefix, one in found
-    ]
-    return Aligned(session, times, readers, how=how, tolerance=tolerance)
+    near = _checked(how, tolerance, (*HOWS, *AGGREGATES))
+    named = [(prefix, with_numbers(session, one, how)) for prefix, one in _named([question])]
+    beside: list[Beside] = []
+    for prefix, one in named:
+        own = prefix if len(named) > 1 else ""
+        if how in AGGREGATES:
+            beside.append(Bins(session, one, how=how, grid=times, prefix=own))
+        else:
+            beside.append(Beside(session, one, how=how, tolerance=near, prefix=own))
+    return Aligned(session, times, beside, how)
+
+
+def _checked(how: str, tolerance: DurationLike | None, hows: Sequence[str]) -> int | None:
+    """The tolerance, ns, of one of some ways."""
+    if how not in hows:
+        raise UsageError(f"Unknown way {how!r}; choose {', '.join(hows)}.")
+    if how in AGGREGATES and tolerance is not None:
+        raise UsageError(f"{how} is of the messages between two rows: leave out tolerance.")
+    return None if tolerance is None else parse_duration(tolerance)
 
 
 def _named(questions: Sequence[Question]) -> list[tuple[str, Question]]:

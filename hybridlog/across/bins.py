@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import pyarrow as pa
 
-from hybridlog.across.match import Matched
-from hybridlog.across.topic_reader import TIME, Beside, Block, TopicReader, nanoseconds
+from hybridlog.across.topic_reader import TIME, Beside, Block, Empty, nanoseconds
 from hybridlog.frames.names import free_name, is_summary
 from hybridlog.query.predicate.types import FieldTypes
 from hybridlog.query.ranges import RangeResolver
@@ -43,71 +42,59 @@ _GRID_ROWS = 65_536
 class Bins(Beside):
     """A topic beside regular times: gives what its messages say until the next time."""
 
-    def __init__(self, reader: TopicReader, how: str, grid: RegularTimes) -> None:
-        super().__init__(reader, how)
+    def __init__(
+        self, session: Session, question: Question, *, how: str, grid: RegularTimes, prefix: str
+    ) -> None:
+        super().__init__(session, question, how=how, prefix=prefix)
         self._grid = grid
 
-    def match(self, times: NDArray[np.int64]) -> Matched:
-        """The first or last message from each time to the next, with the number of all."""
-        edges = np.append(times, self._grid.end(self._recording, int(times[-1])))
+    def _fit(self, size: int) -> None:
+        super()._fit(size)
+        if self._how not in {"first", "last"}:
+            self.most = _GRID_ROWS  # an aggregate has no size
+
+    def add(self, columns: dict[str, Any], times: NDArray[np.int64], empty: Empty) -> None:
+        """Add the number of messages, and their fields, from each time, ns, to the next."""
+        edges = times[:0]
+        if len(times):
+            edges = np.append(times, self._grid.end(self._recording, int(times[-1])))
         places = np.searchsorted(placed(self._moments.time), edges)
         counts = np.diff(places)
-        chosen = places[1:] - 1 if self._how == "last" else places[:-1]
-        chosen = np.where(counts > 0, chosen, -1)
-        return Matched(chosen, chosen, counts)
-
-    def fitting(self, matched: Matched, begin: int) -> int:
-        """The number of rows from one on that are made together."""
-        is_of_one = self._how in {"first", "last"}
-        return super().fitting(matched, begin) if is_of_one else len(matched.before) - begin
-
-    def add(
-        self,
-        columns: dict[str, Any],
-        times: NDArray[np.int64],
-        matched: Matched,
-        empty: Counter[tuple[str, str]],
-    ) -> None:
-        """Add the number of messages, and their fields, from each time, ns, to the next."""
-        columns[free_name(self._reader.prefix + _COUNT, columns)] = pa.array(matched.distance)
+        columns[free_name(self.prefix + _COUNT, columns)] = pa.array(counts)
         if self._how == _COUNT:
-            self._reader.counters.messages += int(matched.distance.sum())
+            self.counters.messages += int(counts.sum())
             return
         if self._how in _OF_NUMBERS:
-            table = self._aggregates(times)
+            table = self._aggregates(edges)
         else:
-            (table,) = self._read(matched.before)
-        self._reader.add(columns, table, Counter(), len(times))
+            chosen = places[1:] - 1 if self._how == "last" else places[:-1]
+            (table,) = self._read(np.where(counts > 0, chosen, -1))
+        self.put(columns, table, Counter(), len(times))
 
-    def _aggregates(self, times: NDArray[np.int64]) -> pa.Table:
-        """The aggregate of each column of numbers, from each time, ns, to the next."""
+    def _aggregates(self, edges: NDArray[np.int64]) -> pa.Table:
+        """The aggregate of each column of numbers, from each of some times, ns, to the next."""
         found: dict[str, _Column] = {}
         others: set[str] = set()  # columns with values that are no numbers
-        for table in self._tables(times):
-            row = (placed(nanoseconds(table[TIME])) - times[:1]) // self._grid.step
+        size = max(len(edges) - 1, 0)
+        windows = np.array([edges[[0, -1]]]) if size else edges.reshape(0, 2)
+        for table in (self.empty, *self.within(self._recording, windows)):
+            row = (placed(nanoseconds(table[TIME])) - edges[:1]) // self._grid.step
             for name, column in zip(table.column_names, table.columns, strict=True):
                 numeric = _values_of(column, self._how)
                 if numeric is not None:
                     values, is_value = numeric
-                    own = found.setdefault(name, _Column(self._how, len(times)))
+                    own = found.setdefault(name, _Column(self._how, size))
                     own.add(column.type, values, row[is_value])
                 elif not pa.types.is_null(column.type):
                     others.add(name)
-        for field in self._reader.question.fields or ():
+        for field in self.question.fields or ():
             some, numeric_ones = (
                 any(name == field or name.startswith(f"{field}.") for name in names)
                 for names in (others, found)
             )
             if some and not numeric_ones:
-                raise _no_number(field, self._reader.question.topics[0])
+                raise _no_number(field, self.question.topics[0])
         return pa.table({name: column.array() for name, column in found.items()})
-
-    def _tables(self, times: NDArray[np.int64]) -> Iterator[pa.Table]:
-        """No rows, then the messages from the first of some times, ns, to the end of the last."""
-        yield self._reader.empty
-        if len(times):
-            end = self._grid.end(self._recording, int(times[-1]))
-            yield from self._reader.values(self._recording, (int(times[0]), end))
 
 
 def with_numbers(session: Session, question: Question, how: str) -> Question:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, overload
 
 import numpy as np
 
-from hybridlog.across.topic_reader import SIDES, TopicReader
+from hybridlog.across.topic_reader import TopicReader
 from hybridlog.message import messages_in
 from hybridlog.query.answers.current import message_at
 from hybridlog.query.answers.lost import completeness_of
@@ -98,7 +98,8 @@ class Synced(Sequence[tuple["Message", ...]]):
             for n, one in enumerate(read):
                 message = one.place[rows[:, n]]
                 log = one.log_time[message]
-                first, behind = (np.searchsorted(one.log_time, log, side) for side in SIDES)
+                first = one.log_time.searchsorted(log)
+                behind = one.log_time.searchsorted(log, "right")
                 is_whole = questions[n].is_unbounded and questions[n].predicate is None
                 own = one.time[rows[:, n]] - epochs.offsets(log)
                 is_alone = (behind - first == 1) & is_whole

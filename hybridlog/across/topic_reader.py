@@ -1,4 +1,4 @@
-"""One topic of an alignment: when its messages were, and their values, on a clock."""
+"""One topic of an alignment: when its messages were on a clock, and those that belong to rows."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 
-from hybridlog.across.match import UNKNOWN, Matched, interpolated, match, quaternion_paths
+from hybridlog.across.match import UNKNOWN, interpolated, match, quaternion_paths
 from hybridlog.frames.names import free_name
 from hybridlog.query.answers.lost import lost_times
 from hybridlog.query.intervals import Intervals, joined
 from hybridlog.query.planner import Planner, log_times
 from hybridlog.query.question import Counters
 from hybridlog.query.times import format_duration
-from hybridlog.schema.arrow_columns import DURATION, numbers
+from hybridlog.schema.arrow_columns import DURATION
 from hybridlog.schema.arrow_types import column_of, common_schema
 from hybridlog.schema.column import STAMP
 from hybridlog.tf.epochs import Epochs, epochs_of
@@ -26,7 +26,7 @@ from hybridlog.tf.in_frame import stream
 from hybridlog.wording import listed
 from hybridlog_storage.errors import TimeError, UsageError
 from hybridlog_storage.lazy import lazy
-from hybridlog_storage.times import BEGIN, END, span_of
+from hybridlog_storage.times import BEGIN, END, placed
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -36,11 +36,12 @@ if TYPE_CHECKING:
 
 Block = tuple["NDArray[np.int64]", pa.Table]
 """Times of some messages, ns, and their columns."""
+Empty = Counter[tuple[str, str]]
+"""Number of rows without a message, by topic and reason, or without a value, by column."""
 TIME: Final = "log_time"
 """Column of the time of a row."""
 RECORDING: Final = "recording"
 """Column of the recording of a row."""
-SIDES: Final[tuple[Literal["left", "right"], ...]] = ("left", "right")
 _DISTANCE: Final = "distance"
 _LOST: Final = "messages of that time are lost"
 _NO_TIME: Final = "the row has no time on the clock"
@@ -55,7 +56,8 @@ _WHY_NEAR: Final = {
     "nearest": "no message within {}",
     "interpolate": "no message within {} before and after",
 }
-_PIECE_BYTES = 32 << 20  # messages of a topic that are read together
+_PIECE_BYTES = 32 << 20  # messages of a topic that rows get together
+_SKIPPED_BYTES = 1 << 20  # messages between needed ones that are read along
 _MAX_NAMES: Final = 3  # recordings in a message
 
 
@@ -71,6 +73,9 @@ class Moments(NamedTuple):
     log_time: NDArray[np.int64]
     time: NDArray[np.int64]
     place: NDArray[np.intp]
+
+
+_NONE: Final = Moments(*[np.empty(0, np.int64)] * 3)
 
 
 class TopicReader:
@@ -98,7 +103,6 @@ class TopicReader:
         self.is_apart = is_apart
         self.counters = Counters()
         self._epochs: dict[str, Epochs] = {}
-        self._of_all: Moments | None = None  # of all recordings, if these are apart
         self._session = session
         self._time = {"log": TIME, "publish": "publish_time", "header": STAMP}[clock]
         self._hidden = {TIME} if is_apart else {TIME, RECORDING}
@@ -114,11 +118,6 @@ class TopicReader:
         return self._session.field_types(self.question.topics, self.question.recordings)
 
     @lazy
-    def quaternions(self) -> list[str]:
-        """Paths of the quaternions among the fields."""
-        return quaternion_paths(self._known)
-
-    @lazy
     def empty(self) -> pa.Table:
         """No rows, with the columns of all recordings."""
         question = replace(self.question, limit=0, bounds=None, during=None, predicate=None)
@@ -129,7 +128,8 @@ class TopicReader:
         fields = self.question.fields
         if self._time != TIME:
             fields = self._with_time(fields)
-        for table in self._stream(replace(self._beside(recording), fields=fields)):
+        question = replace(self._beside(recording), fields=fields)
+        for table in self._stream(question, self.counters):
             yield self._times(table, recording), table
 
     def _with_time(self, fields: tuple[str, ...] | None) -> tuple[str, ...] | None:
@@ -146,79 +146,58 @@ class TopicReader:
         self._hidden.add(name)
         return (*fields, name)
 
-    def values(self, recording: str, span: Span) -> Iterator[pa.Table]:
-        """The messages beside a recording in a span of log time, ns, in order."""
-        yield from self._stream(self._during(self._beside(recording), span), is_decided=True)
+    def within(self, recording: str, windows: NDArray[np.int64]) -> Iterator[pa.Table]:
+        """The messages beside a recording in windows of log time, int64[n, 2], in order.
 
-    def _during(self, question: Question, span: Span) -> Question:
-        row = np.array([[*span, 1]], np.int64)
-        ids = [one.id for one in self._session.summaries_of(question)]
-        return replace(question, during=Intervals((one, row) for one in ids))
+        What a predicate cannot decide `moments` has counted.
+        """
+        counters = Counters()
+        try:
+            yield from self._stream(self._during(self._beside(recording), windows), counters)
+        finally:
+            if self.question.predicate is not None:
+                counters.unreadable = counters.without_arrays = 0
+                counters.not_indexed = ()
+            self.counters.add(counters)
+
+    def _during(self, question: Question, windows: NDArray[np.int64]) -> Question:
+        rows = np.insert(windows, 2, 1, axis=1)
+        summaries = self._session.summaries_of(question)
+        return question.within(Intervals((one.id, rows) for one in summaries))
+
+    def _stream(self, question: Question, counters: Counters) -> Iterator[pa.Table]:
+        with suppress(TimeError):  # the range does not touch the recording
+            for table in stream(Planner(self._session, question, counters)):
+                if table.num_rows:
+                    yield table
 
     def moments(self, recording: str, span: Span | None = None) -> Moments:
         """The times of all messages beside a recording; no payload is read for log times.
 
         If these are compared, at least of those in a span, ns.
         """
-        if self._time != TIME or not self.question.is_unbounded:
-            span = None
-        if not self.is_apart or span is not None:
-            return self._moments(recording, span)
-        self._of_all = self._of_all or self._moments(recording, None)
-        return self._of_all
-
-    def _moments(self, recording: str, span: Span | None) -> Moments:
-        none = np.empty(0, np.int64)
         if self.elsewhere(recording) is not None:
-            return Moments(none, none, none)
+            return _NONE
         counters, question = Counters(), replace(self._beside(recording), frame=None)
-        if span is not None:
-            question = self._during(question, span)
-        log_time, time = none, none
-        with suppress(TimeError):  # the range does not touch the recording
-            if self._time == TIME:
+        log_time, time = _NONE[:2]
+        if self._time == TIME:
+            if span is not None and question.is_unbounded:
+                question = self._during(question, np.array([span], np.int64))
+            with suppress(TimeError):  # the range does not touch the recording
                 log_time = log_times(self._session, replace(question, fields=None), counters)
-            else:
-                question = replace(question, fields=(self._time,))
-                tables = stream(Planner(self._session, question, counters))
-                found = [(nanoseconds(one[TIME]), self._times(one, recording)) for one in tables]
+            time = log_time = np.sort(log_time) if self.is_apart else log_time
+        else:
+            tables = self._stream(replace(question, fields=(self._time,)), counters)
+            found = [(nanoseconds(one[TIME]), self._times(one, recording)) for one in tables]
+            if found:
                 log_time, time = (np.concatenate(parts) for parts in zip(*found, strict=True))
         counters.messages = counters.payload_bytes = 0
         if question.predicate is None:
             counters.unreadable = 0
         self.counters.add(counters)
-        if self._time == TIME:
-            log_time = np.sort(log_time) if self.is_apart else log_time
-            return Moments(log_time, log_time, np.arange(len(log_time)))
         order = np.argsort(time, kind="stable")
         order = order[time[order] != UNKNOWN]
         return Moments(log_time, time[order], order)
-
-    def _stream(self, question: Question, *, is_decided: bool = False) -> Iterator[pa.Table]:
-        """The tables with rows of an answer, whose cost counts.
-
-        If a predicate is decided, `moments` has counted what it cannot decide.
-        """
-        counters = Counters()
-        try:
-            with suppress(TimeError):  # the range does not touch the recording
-                for table in stream(Planner(self._session, question, counters)):
-                    if table.num_rows:
-                        yield table
-        finally:
-            if is_decided and question.predicate is not None:
-                counters.unreadable = counters.without_arrays = 0
-                counters.not_indexed = ()
-            self.counters.add(counters)
-
-    def message_bytes(self, recording: str) -> int:
-        """Mean bytes of the messages beside a recording, at least one."""
-        kinds = self.empty.schema.types
-        if self._known is not None and all(map(pa.types.is_primitive, kinds)):
-            return int(sum(kind.bit_width for kind in kinds)) // 8
-        stats = [one.stats for one in Planner(self._session, self._beside(recording)).channels()]
-        size = sum(one.payload_bytes for one in stats)
-        return max(size // max(sum(one.messages for one in stats), 1), 1)
 
     def epochs(self, recording: str) -> Epochs:
         """The epochs of a recording on the clock, looked up once."""
@@ -261,7 +240,72 @@ class TopicReader:
             f"({listed(names, _MAX_NAMES)}), which --beside or across_recordings takes"
         )
 
-    def lost(self, recording: str) -> NDArray[np.int64]:
+    def _beside(self, recording: str) -> Question:
+        """The question about the messages that may be beside the rows of a recording."""
+        return self.question if self.is_apart else replace(self.question, recordings=(recording,))
+
+    def put(self, columns: dict[str, Any], table: pa.Table, empty: Empty, known: int = 0) -> None:
+        """Add the columns of messages to those of the rows, under free names.
+
+        Rows that are `known` to have no message are not counted as without a value.
+        """
+        for name, column in zip(table.column_names, table.columns, strict=True):
+            if name not in self._hidden:
+                free = free_name(self.prefix + name, columns)
+                columns[free] = column
+                if column.null_count > known:
+                    empty[free, _NO_VALUE] += column.null_count - known
+
+
+class Beside(TopicReader):
+    """A topic beside rows: finds the messages that belong to their times.
+
+    Times are whole, values come for a piece of the rows.
+
+    Attributes:
+        most: Number of rows that may get messages together.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        question: Question,
+        clock: Clock = "log",
+        *,
+        how: str,
+        tolerance: int | None = None,
+        prefix: str = "",
+        is_apart: bool = False,
+    ) -> None:
+        super().__init__(session, question, clock, prefix=prefix, is_apart=is_apart)
+        self._how = how
+        self._tolerance = tolerance
+        self._recording = ""
+        self._moments = _NONE
+        self._of_all: Moments | None = None  # of all recordings, if these are apart
+        self._lost = np.empty((0, 2), np.int64)
+        self.most = 1
+
+    def enter(self, recording: str, span: Span | None) -> None:
+        """Go on with the rows of another recording, in a span of log time, ns; None: any."""
+        near = self._tolerance
+        if span is not None:
+            span = None if near is None else (max(span[0] - near, BEGIN), min(span[1] + near, END))
+        if self.is_apart and span is None:
+            self._of_all = self._of_all or self.moments(recording)
+        self._moments = self._of_all or self.moments(recording, span)
+        self._recording = recording
+        self._lost = self._lost_beside(recording)
+        stats = [one.stats for one in Planner(self._session, self._beside(recording)).channels()]
+        size = sum(one.payload_bytes for one in stats)
+        self._fit(max(size // max(sum(one.messages for one in stats), 1), 1))
+
+    def _fit(self, size: int) -> None:
+        """Take as many rows together as fit with messages of so many bytes."""
+        self.most = max(_PIECE_BYTES // size, 1)
+        self._skipped = _SKIPPED_BYTES // size
+
+    def _lost_beside(self, recording: str) -> NDArray[np.int64]:
         """int64[n, 2], log time in which messages beside a recording are lost, ns, in order."""
         spans: list[tuple[int, int, int]] = []
         if self._time == TIME and self.elsewhere(recording) is None:
@@ -272,104 +316,39 @@ class TopicReader:
                 spans = sorted((one.begin_ns, one.end_ns, 0) for one in known)
         return joined(np.array(spans, np.int64).reshape(-1, 3))[:, :2]
 
-    def _beside(self, recording: str) -> Question:
-        """The question about the messages that may be beside the rows of a recording."""
-        return self.question if self.is_apart else replace(self.question, recordings=(recording,))
-
-    def add(
-        self, columns: dict[str, Any], table: pa.Table, blank: Counter[tuple[str, str]], known: int
-    ) -> None:
-        """Add the columns of messages to those of the rows, under free names.
-
-        `blank` counts rows that have no value, by column and reason, but for those `known` to have
-        no message.
-        """
-        for name, column in zip(table.column_names, table.columns, strict=True):
-            if name not in self._hidden:
-                free = free_name(self.prefix + name, columns)
-                columns[free] = column
-                if column.null_count > known:
-                    blank[free, _NO_VALUE] += column.null_count - known
-
-
-class Beside:
-    """A topic beside rows: finds the messages that belong to times, and reads them in pieces.
-
-    The tolerance is the greatest distance, ns; None for any.
-    """
-
-    def __init__(self, reader: TopicReader, how: str, tolerance: int | None = None) -> None:
-        self._reader = reader
-        self._how = how
-        self._tolerance = tolerance
-        why = _WHY if tolerance is None else _WHY_NEAR
-        self._why = why.get(how, "").format(format_duration(tolerance or 0))
-
-    def enter(self, recording: str, span: Span | None) -> None:
-        """Go on with the rows of another recording, in a span of log time, ns; None: any."""
-        near = self._tolerance
-        if span is not None:
-            span = None if near is None else (max(span[0] - near, BEGIN), min(span[1] + near, END))
-        self._recording = recording
-        self._reason = self._reader.elsewhere(recording) or self._why
-        self._lost = self._reader.lost(recording)
-        self._moments = self._reader.moments(recording, span)
-        self._most = max(_PIECE_BYTES // self._reader.message_bytes(recording), 1)
-        self._held, self._first, self._last = self._reader.empty, END, BEGIN
-
-    def match(self, times: NDArray[np.int64]) -> Matched:
-        """The messages that belong to rows at times, ns: their rows in `Moments.time`."""
-        apart = self._reader.epochs(self._recording).apart
-        return match(times, self._moments.time, self._how, self._tolerance, apart)
-
-    def fitting(self, matched: Matched, begin: int) -> int:
-        """The number of rows from one on that are made together: one, or of bounded size."""
-        if len(self._moments.place) <= self._most >= len(matched.before):
-            return len(matched.before) - begin
-        rows = np.stack([part[begin : begin + self._most] for part in matched[:2]])
-        is_there, places = rows >= 0, self._moments.place
-        found = places[rows] if len(places) else rows
-        low = np.minimum.accumulate(np.where(is_there, found, len(places)).min(0))
-        high = np.maximum.accumulate(np.where(is_there, found, -1).max(0))
-        return max(int(np.searchsorted(high - low, self._most)), 1)
-
-    def add(
-        self,
-        columns: dict[str, Any],
-        times: NDArray[np.int64],
-        matched: Matched,
-        empty: Counter[tuple[str, str]],
-    ) -> None:
-        """Add the columns of the messages that belong to rows at times, ns, with their distance.
-
-        `empty` counts rows without a message or a value, by name and reason.
-        """
+    def add(self, columns: dict[str, Any], times: NDArray[np.int64], empty: Empty) -> None:
+        """Add the columns of the messages that belong to rows at times, ns, with their distance."""
+        known, apart = self._moments.time, self.epochs(self._recording).apart
+        found = match(times, known, self._how, self._tolerance, apart)
         if self._how == "interpolate":
-            known = self._moments.time if len(self._moments.time) else times
-            low, high = (known[np.maximum(rows, 0)] for rows in matched[:2])
+            known = known if len(known) else times
+            low, high = (known[np.maximum(rows, 0)] for rows in found[:2])
             length = (high - low).astype(np.float64)
             weight = (times - low) / np.where(length > 0, length, 1)
             weight[length <= 0] = 0
-            before, after = self._read(matched.before, matched.after)
-            table = interpolated(before, after, weight, self._reader.quaternions)
+            before, after = self._read(found.before, found.after)
+            table = interpolated(before, after, weight, quaternion_paths(self._known))
         else:
-            (table,) = self._read(matched.before)
-        missing = matched.before < 0
-        distance = (
-            pa.array(matched.distance, DURATION, mask=missing)
-            if missing.any()
-            else numbers(matched.distance, "duration")
-        )
-        columns[free_name(self._reader.prefix + _DISTANCE, columns)] = distance
+            (table,) = self._read(found.before)
+        missing = found.before < 0
+        distance = pa.array(found.distance, DURATION, mask=missing if missing.any() else None)
+        columns[free_name(self.prefix + _DISTANCE, columns)] = distance
         if none := distance.null_count:
-            (topic,) = self._reader.question.topics
+            (topic,) = self.question.topics
             is_unknown = times == UNKNOWN
             is_lost = missing & ~is_unknown & self._is_lost(times)
             lost, unknown = int(is_lost.sum()), int(is_unknown.sum())
             empty[topic, _NO_TIME] += unknown
             empty[topic, _LOST] += lost
-            empty[topic, self._reason] += none - lost - unknown
-        self._reader.add(columns, table, empty, none)
+            empty[topic, self._why()] += none - lost - unknown
+        self.put(columns, table, empty, none)
+
+    def _why(self) -> str:
+        """Why rows have no message, if none is known to be lost."""
+        why = _WHY if self._tolerance is None else _WHY_NEAR
+        return self.elsewhere(self._recording) or why[self._how].format(
+            format_duration(self._tolerance or 0)
+        )
 
     def _is_lost(self, times: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Rows whose message may have been lost."""
@@ -386,45 +365,45 @@ class Beside:
 
     def _read(self, *parts: NDArray[np.int64]) -> list[pa.Table]:
         """The messages at rows of `Moments.time`: null for -1, and where one cannot be read."""
-        own, known = self._moments, np.concatenate(parts)
-        places = own.place[known[known >= 0]]
-        if len(places):
-            self._hold(*(int(own.log_time[end]) for end in (places.min(), places.max())))
-        return [self._held.take(self._rows(rows)) for rows in parts]
+        own, rows = self._moments, np.concatenate(parts)
+        wanted = own.place[rows[rows >= 0]]
+        if not len(wanted):
+            return [self.empty.take(pa.nulls(len(part), pa.int64())) for part in parts]
+        first = int(wanted.min())
+        is_wanted = np.zeros(int(wanted.max()) + 1 - first, np.bool_)
+        is_wanted[wanted - first] = True
+        places = np.flatnonzero(is_wanted) + first
+        ends = np.flatnonzero(np.diff(places) > self._skipped + 1)
+        times = own.log_time[places]
+        begin = placed(times[np.append(0, ends + 1)])
+        end = placed(times[np.append(ends, len(times) - 1)]) + 1
+        tables = self.within(self._recording, np.stack([begin, end], axis=1))
+        if not is_wanted.all():
+            tables = (table.filter(np.isin(nanoseconds(table[TIME]), times)) for table in tables)
+        held = concatenated([self.empty, *tables])
+        row_of = np.full(len(is_wanted) + 1, -1)  # for -1, too
+        row_of[:-1][is_wanted] = _rows_of(times, own.log_time, nanoseconds(held[TIME]), places)
+        chosen = [row_of[np.where(part < 0, -1, own.place[part] - first)] for part in parts]
+        found = [held.take(pa.array(one, mask=one < 0)) for one in chosen]
+        # Of these the size is known; of the next ones there may be more.
+        self._fit(max(found[0].nbytes // len(parts[0]), _PIECE_BYTES // (2 * self.most), 1))
+        return found
 
-    def _rows(self, rows: NDArray[np.int64]) -> pa.Array:
-        """The rows of what is held for rows of `Moments.time`."""
-        own, is_none = self._moments, rows < 0
-        if is_none.all():
-            return pa.nulls(len(rows), pa.int64())
-        place = own.place[rows]
-        begin = np.searchsorted(own.log_time, self._first)
-        row = place - begin
-        if self._held.num_rows != np.searchsorted(own.log_time, self._last, "right") - begin:
-            # Some cannot be read: of an equal log time there are as many, or it is unknown which.
-            times, read = own.log_time[place], nanoseconds(self._held[TIME])
-            first, behind = (np.searchsorted(own.log_time, times, side) for side in SIDES)
-            start, end = (np.searchsorted(read, times, side) for side in SIDES)
-            row = start + place - first
-            is_none = is_none | (end - start != behind - first)
-        return pa.array(row, mask=is_none)
 
-    def _hold(self, first: int, last: int) -> None:
-        """Hold the messages from one log time to another, ns; those that are held stay."""
-        if self._first <= first <= self._last:
-            begin = int(np.searchsorted(nanoseconds(self._held[TIME]), first))
-            kept, start = self._held.slice(begin), self._last + 1
-        else:
-            kept, start, self._last = self._reader.empty, first, BEGIN
-        self._first = first
-        if self._last < last:
-            self._last = last
-            tables = self._reader.values(self._recording, span_of(start, last))
-            self._held = kept = concatenated([kept, *tables])
-            # Of what was read the size is known; it may be more at a time, but not at once.
-            fitting = _PIECE_BYTES * kept.num_rows // max(kept.nbytes, 1)
-            self._most = max(min(fitting, 2 * self._most), 1)
-        self._held = kept
+def _rows_of(
+    times: NDArray[np.int64],
+    known: NDArray[np.int64],
+    read: NDArray[np.int64],
+    places: NDArray[np.intp],
+) -> NDArray[np.intp]:
+    """The rows of messages at some places among those that were read; -1 for unknown ones.
+
+    Some cannot be read: of an equal log time there are as many as known, or it is unknown which.
+    """
+    first, start = known.searchsorted(times), read.searchsorted(times)
+    count = known.searchsorted(times, "right") - first
+    is_known = read.searchsorted(times, "right") - start == count
+    return np.where(is_known, start + places - first, -1)
 
 
 def nanoseconds(column: pa.ChunkedArray[Any]) -> NDArray[np.int64]:

@@ -118,7 +118,7 @@ def test_only_what_belongs_to_the_range_is_read(logs: Logs) -> None:
 
 
 def test_rows_with_large_messages_are_made_a_few_at_a_time(logs: Logs, limit: Limit) -> None:
-    """A message that is in many rows is copied into each of them."""
+    """A message that is in many rows is copied into each of them; some are ten times the mean."""
     aligned = logs.store.align(logs.store.topic("left/pose").in_recording("b"), ["right/pose"])
     whole, tables = aligned.to_arrow(), list(aligned.to_tables())
     limit(align_piece_bytes=1000)
@@ -127,7 +127,7 @@ def test_rows_with_large_messages_are_made_a_few_at_a_time(logs: Logs, limit: Li
     pd.testing.assert_frame_equal(found.to_pandas(), whole.to_pandas())
     assert len(pieces) > len(tables)
     beside = [n for n in whole.column_names if n.startswith("right/pose.")]
-    assert max(piece.select(beside).nbytes for piece in pieces) < 2000
+    assert max(piece.select(beside).nbytes for piece in pieces) < 5000 < whole.nbytes / 10
 
 
 def test_batches_and_other_frames(logs: Logs) -> None:
