@@ -22,7 +22,7 @@ from hybridlog.across.topic_reader import (
     concatenated,
 )
 from hybridlog.frames.answer import text_column
-from hybridlog.query.answers.lost import completeness_of
+from hybridlog.query.answers.completeness import completeness_of
 from hybridlog.query.answers.remarks import remarks
 from hybridlog.query.question import Counters
 from hybridlog.query.ranges import RangeResolver

@@ -16,8 +16,8 @@ import numpy as np
 
 from hybridlog.across.topic_reader import TopicReader
 from hybridlog.message import messages_in
+from hybridlog.query.answers.completeness import completeness_of
 from hybridlog.query.answers.current import message_at
-from hybridlog.query.answers.lost import completeness_of
 from hybridlog.query.answers.video import picture_of
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.planner import Planner

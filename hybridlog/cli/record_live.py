@@ -20,7 +20,7 @@ from hybridlog.cli.record_choices import DEFAULT_CHUNK, OF_ENVIRONMENT, RecordCh
 from hybridlog.cli.record_summary import fields_of, remarks_on, row_of
 from hybridlog.cli.render import print_fields
 from hybridlog.cli.signals import handled, write_note
-from hybridlog.query.answers.completeness import coverage, in_words
+from hybridlog.query.answers.lost import coverage, in_words
 from hybridlog.record.losses import Cause, losses_of
 from hybridlog_storage.errors import (
     DatabaseError,

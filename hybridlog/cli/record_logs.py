@@ -19,7 +19,7 @@ from hybridlog.cli.record_summary import COLUMNS, fields_of, remarks_on, row_of
 from hybridlog.cli.render import print_fields, print_table
 from hybridlog.cli.signals import if_stopped
 from hybridlog.cli.watching import watch
-from hybridlog.query.answers.completeness import coverage
+from hybridlog.query.answers.lost import coverage
 from hybridlog.record.losses import losses_of
 from hybridlog.wording import listed
 from hybridlog_storage.errors import (

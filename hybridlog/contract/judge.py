@@ -12,7 +12,7 @@ import numpy as np
 
 from hybridlog.across.match import match
 from hybridlog.arrays.message_arrays import plain_type
-from hybridlog.query.answers.lost import completeness_of
+from hybridlog.query.answers.completeness import completeness_of
 from hybridlog.query.answers.marks import marks_in
 from hybridlog.query.answers.statistics import check
 from hybridlog.query.planner import log_times

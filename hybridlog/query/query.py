@@ -686,7 +686,7 @@ class Query:
 
         Losses of topics in conditions count as an unknown number.
         """
-        from hybridlog.query.answers.lost import completeness_of
+        from hybridlog.query.answers.completeness import completeness_of
 
         others = ((one.question, one.counters) for one in self.conditions)
         return completeness_of(self.session, self.question, self.counters, *others)

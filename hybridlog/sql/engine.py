@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import pyarrow as pa
 
-from hybridlog.query.answers.lost import completeness_of
+from hybridlog.query.answers.completeness import completeness_of
 from hybridlog.query.question import Question
 from hybridlog.schema.states import without_fields
 from hybridlog.sql.content import StoreContent, store_schema, store_table

@@ -14,7 +14,7 @@ import pyarrow.compute as pc
 
 from hybridlog.arrays.message_arrays import plain_type
 from hybridlog.frames.answer import stream, to_arrow
-from hybridlog.query.answers.lost import completeness_of
+from hybridlog.query.answers.completeness import completeness_of
 from hybridlog.query.planner import Planner, log_times
 from hybridlog.query.question import Counters, Question
 from hybridlog.tf import is_of_transforms

@@ -15,7 +15,7 @@ from pydantic import Field
 
 from hybridlog.arrays.message_arrays import IMAGES, plain_type
 from hybridlog.drawing.images import Picture, picture
-from hybridlog.query.answers.completeness import coverage
+from hybridlog.query.answers.lost import coverage
 from hybridlog.query.planner import match_times
 from hybridlog.query.predicate.tokens import MAX_TEXT
 from hybridlog.query.times import format_duration, format_time

@@ -33,7 +33,7 @@ from hybridlog.cli.options import (
     query_of,
 )
 from hybridlog.cli.render import Column, numbers, print_fields, print_table
-from hybridlog.query.answers.completeness import coverage, line_of
+from hybridlog.query.answers.lost import coverage, line_of
 from hybridlog.query.topics import resolve
 from hybridlog.record.losses import losses_of
 from hybridlog_storage.errors import SegmentError, StoreError

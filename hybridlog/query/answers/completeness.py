@@ -1,31 +1,40 @@
-"""Completeness of an answer: the value, and the sentences about it.
+"""Completeness of an answer: what it lacks, as a value and in sentences.
 
-An answer may lack messages that are lost, not written or not indexed yet, or that it could
-not read. `lost.py` finds them.
+An answer may lack messages that are lost (see `lost.py`), not written or not indexed yet, or
+that it could not read.
 """
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from shlex import quote
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
+from hybridlog.query.answers.lost import (
+    MAX_NAMES,
+    NOT_LOST,
+    about_losses,
+    copies_of,
+    losses_in,
+    number_of,
+)
+from hybridlog.query.planner import Planner
+from hybridlog.query.ranges import RangeResolver
 from hybridlog.record.losses import Cause
+from hybridlog.schema.states import CAUSES, GONE, State, without_fields, without_payload
+from hybridlog.snapshot import UNFINISHED
 from hybridlog.wording import counted, listed, unfit
-from hybridlog_storage.errors import IncompleteError
+from hybridlog_storage.errors import HybridlogError, IncompleteError, TimeError, TopicError
+from hybridlog_storage.times import BEGIN, END
 
 if TYPE_CHECKING:
     from hybridlog.query.question import Counters, Question
-    from hybridlog.schema.states import State
-    from hybridlog_storage.catalog import RecordingEntry
+    from hybridlog.session import Session
+    from hybridlog_storage.summary import RecordingSummary
 
-MANIFEST_LOST = "manifest lost"
-"""Cause of a row for what may have been lost with a manifest."""
-NOT_LOST = {Cause.THROTTLE: "left out by a throttle", Cause.DEGRADE: "without their payload"}
-"""Causes of rows about messages that are no loss: not wanted, or with their fields kept."""
-_MAX_NAMES = 5
+_INTERVAL_S: Final = 1.0  # flush interval of recorders that do not say it
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,11 +52,9 @@ class Completeness:
         unwritten: Messages that a running recorder has taken and not written yet, which are not
             lost; None for an unknown number.
         unindexed: Messages that the index lacks, where MongoDB must answer.
-        untransformed: Messages whose points or poses are not in the frame asked for.
-        untested: Messages that lack what the predicate asks for, since their payloads were
-            deleted; known after the answer.
-        late: Sentences about messages that are not written or not indexed yet.
-        sentences: Everything that the answer lacks, in sentences, those of `late` included.
+        problems: What is not as it should be besides losses, in sentences: messages that are not
+            written or indexed yet, or lack a transform or what the predicate asks for.
+        sentences: Everything that the answer lacks, in sentences.
     """
 
     messages: int
@@ -58,9 +65,7 @@ class Completeness:
     rows: tuple[Mapping[str, Any], ...] = ()
     unwritten: int | None = 0
     unindexed: int = 0
-    untransformed: int = 0
-    untested: int = 0
-    late: tuple[str, ...] = ()
+    problems: tuple[str, ...] = ()
     sentences: tuple[str, ...] = ()
 
     @property
@@ -70,16 +75,13 @@ class Completeness:
 
     def __str__(self) -> str:
         """The missing messages in words: `4 messages are lost`, and payloads by cause."""
-        from hybridlog.schema.states import without_payload
-
-        gone = (without_payload(number, state) for state, number in _gone(self).items())
-        return "; ".join([self._losses(), *gone])
+        return "; ".join([self._losses(), *_payloads_gone(self)])
 
     def _losses(self) -> str:
         if not self.has_losses:
             return "no message is lost"
         are = "is" if self.messages == 1 else "are"
-        return f"{_number(self.messages, is_exact=self.is_exact)} {are} lost"
+        return f"{number_of(self.messages, is_exact=self.is_exact)} {are} lost"
 
     def limits(self, count: int, limit: int | None = None) -> tuple[int, int | None]:
         """Least and greatest number of messages if none had been lost; None for any number.
@@ -111,56 +113,112 @@ class Completeness:
         Raises:
             IncompleteError: some are.
         """
-        problems = {
-            f"{self._losses()} in this range; `hybridlog info --losses` says where.": (
-                self.has_losses
-            ),
-            " ".join(self.late): self.late,
-            f"{counted(self.untransformed, 'message')} without a transform.": self.untransformed,
-            f"{counted(self.untested, 'message')} could not be tested: their arrays were deleted, "
-            "or not copied yet.": self.untested,
-            f"Of {self.reduced} messages in this range only the fields are stored.": (
-                payloads and self.reduced
-            ),
-        }
-        for problem, is_there in problems.items():
-            if is_there:
-                raise IncompleteError(f"{problem} Without --strict the rest is given.")
+        problem = " ".join(self.problems)
+        if self.has_losses:
+            problem = f"{self._losses()} in this range; `hybridlog info --losses` says where."
+        elif not problem and payloads and self.reduced:
+            problem = f"Of {self.reduced} messages in this range only the fields are stored."
+        if problem:
+            raise IncompleteError(f"{problem} Without --strict the rest is given.")
 
 
-def not_written(name: str, messages: int | None, interval_ns: int) -> str:
-    """Sentence about messages not yet written; None for an unknown number of them."""
-    what = f"up to {interval_ns / 1e9:g} s" if messages is None else counted(messages, "message")
-    return f"{name} is being recorded: {what} not written yet, nor in this answer."
+def completeness_of(
+    session: Session,
+    question: Question,
+    counters: Counters | None = None,
+    *others: tuple[Question, Counters | None],
+) -> Completeness:
+    """Completeness of an answer.
+
+    Args:
+        session: The open store.
+        question: The question.
+        counters: Of the answer; None before there is one. An answer that was limited lacks
+            nothing that comes later.
+        others: Questions that the answer depends on. What they have lost counts as an unknown
+            number.
+    """
+    answered = [(question, counters), *others]
+    given = 0 if counters is None else counters.messages
+    is_full = question.limit is not None and given >= question.limit and not question.reverse
+    gone, unread = _gone(session, question), _unreadable_recordings(session, question)
+    unwritten = [] if is_full else _unwritten(session, [one for one, _ in answered])
+    unindexed = _unindexed(session, answered)
+    late = [*(_not_written(*one) for one in unwritten), *_not_indexed(unindexed)]
+    costs = [(one, cost) for one, cost in answered if cost is not None]
+    sentences = [text for one, cost in costs for text in _left_out(session, one, cost)]
+    ledgers = [[*_rows_of(session, one)] for one, _ in answered]
+    lost = [row for row in ledgers[0] if row["cause"] not in NOT_LOST]
+    by_recording: dict[str, dict[Any, Mapping[str, Any]]] = defaultdict(dict)
+    for row in (row for rows in ledgers for row in rows):  # one of unknown topics is in several
+        by_recording[row["recording"]][(*row.items(),)] = row
+    sentences += [*late, *unread]
+    for name, rows in by_recording.items():
+        sentences += about_losses(name, [*rows.values()])
+    if gone:
+        found = RangeResolver(session, question).resolve()
+        sentences += [f"{what}." for one in found for what in copies_of(session.entry_of(one[0]))]
+    is_exact = not unread and all(row["count"] is not None for row in lost)
+    is_exact &= all(row["cause"] in NOT_LOST for rows in ledgers[1:] for row in rows)
+    dropped = sum(row["count"] or 0 for row in ledgers[0] if row["cause"] == Cause.DEGRADE)
+    numbers = [number for _, number in unwritten]
+    return Completeness(
+        sum(row["count"] or 0 for row in lost),
+        is_exact,
+        reduced=dropped + gone.total(),
+        expired=gone[State.EXPIRED],
+        not_copied=gone[State.NOT_COPIED],
+        rows=tuple(lost),
+        unwritten=None if None in numbers else sum(number or 0 for number in numbers),
+        unindexed=unindexed.total(),
+        problems=(*dict.fromkeys(late), *_undecided([cost for _, cost in costs])),
+        sentences=tuple(dict.fromkeys(sentences)),
+    )
 
 
-def not_indexed(lacks: Iterable[tuple[str, int]]) -> Iterator[str]:
-    """Messages that the index lacks, by the name of their recording."""
-    total: Counter[str] = Counter()
-    for name, number in lacks:
-        total[name] += number
-    if total:
-        are = "is" if total.total() == 1 else "are"
+def _rows_of(session: Session, question: Question) -> Iterator[Mapping[str, Any]]:
+    """Rows of the ledger about a question, with the name of their recording."""
+    with suppress(TimeError):  # nothing is in the range
+        yield from ({"recording": e.name, **row} for e, row in losses_in(session, question))
+
+
+def _undecided(costs: Sequence[Counters]) -> Iterator[str]:
+    """Messages that lack what was asked for."""
+    if number := sum(number for cost in costs for _, number in cost.no_transform):
+        yield f"{counted(number, 'message')} without a transform."
+    if number := sum(cost.without_arrays for cost in costs):
         yield (
-            f"{counted(total.total(), 'message')} of {listed(total, _MAX_NAMES)} {are} not in the "
-            "index, nor in this answer of MongoDB; `hybridlog index rebuild` brings in those of "
-            "recordings that have ended."
+            f"{counted(number, 'message')} could not be tested: their arrays were deleted, or not "
+            "copied yet."
         )
 
 
-def _gone(counted: Completeness | Counters) -> dict[State, int]:
-    """Number of messages without their payloads, by state; none is 0."""
-    from hybridlog.schema.states import GONE, State
-
-    found = {State.REDUCED: counted.reduced - counted.expired - counted.not_copied}
-    found |= {state: getattr(counted, state) for state in GONE}
-    return {state: number for state, number in found.items() if number}
+# Messages without payload, and those that could not be read.
 
 
-def left_out(question: Question, counters: Counters, expired: str) -> Iterator[str]:
+def _gone(session: Session, question: Question) -> Counter[State]:
+    """Number of messages in the range of a question whose payloads are gone, by state."""
+    summaries = session.snapshot().summaries
+    if not any(one.expired or one.not_copied or one.status in UNFINISHED for one in summaries):
+        return Counter()
+    with suppress(TimeError, TopicError):  # nothing is in the range, or has this clock
+        return +Planner(session, question).count_expired()
+    return Counter()
+
+
+def _payloads_gone(found: Completeness | Counters) -> Iterator[str]:
+    """Messages without their payloads, by state."""
+    numbers = {State.REDUCED: found.reduced - found.expired - found.not_copied}
+    numbers |= {state: getattr(found, state) for state in GONE}
+    yield from (without_payload(number, state) for state, number in numbers.items() if number)
+
+
+def _left_out(session: Session, question: Question, counters: Counters) -> Iterator[str]:
     """Messages that an answer could not read or has no payload of."""
-    from hybridlog.schema.states import State, without_fields, without_payload
-
+    expired = ""
+    if counters.lacking or counters.without_arrays:  # a copy may be waiting for them
+        gone = _gone(session, question)
+        expired = ", or ".join(CAUSES[state] for state in gone) or CAUSES[State.REDUCED]
     if counters.unreadable > counters.without_arrays:
         yield _unreadable(counters.unreadable - counters.without_arrays, question)
     if counters.without_arrays:
@@ -169,11 +227,8 @@ def left_out(question: Question, counters: Counters, expired: str) -> Iterator[s
             f"{counted(counters.without_arrays, 'message')} could not be tested: {its} {expired}; "
             "of long arrays only summaries are left."
         )
-    for state, number in _gone(counters).items():
-        yield (
-            f"{without_payload(number, state)}: not in this answer; --where and --fields find "
-            "the fields."
-        )
+    for gone_ones in _payloads_gone(counters):
+        yield f"{gone_ones}: not in this answer; --where and --fields find the fields."
     if counters.lacking:
         yield f"{without_fields(counters.lacking, State.EXPIRED, expired)}; these are null."
     reasons: Counter[str] = Counter()
@@ -181,7 +236,7 @@ def left_out(question: Question, counters: Counters, expired: str) -> Iterator[s
         reasons[why] += number
     for why, number in reasons.items():
         yield f"{counted(number, 'message')} without a transform {why}."
-    yield from dict.fromkeys(counters.of_frames)
+    yield from counters.of_frames
 
 
 def _unreadable(messages: int, question: Question) -> str:
@@ -201,78 +256,95 @@ def _unreadable(messages: int, question: Question) -> str:
     return f"{counted(messages, 'message')} could not be tested: {why}."
 
 
-def about_losses(name: str, rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """Rows of the ledger of a recording."""
-    if any(row["cause"] == MANIFEST_LOST for row in rows):
-        yield f"{name} has lost its manifest once, so this answer may not be complete."
-    for row in rows:
-        if row["cause"] == Cause.THROTTLE:
-            yield f"{name}: {line_of(row)} while it was recorded."
-    lost = [row for row in rows if row["cause"] not in {MANIFEST_LOST, *NOT_LOST}]
-    if lost:
-        causes = listed(dict.fromkeys(row["cause"] for row in lost), _MAX_NAMES)
+def _unreadable_recordings(session: Session, question: Question) -> list[str]:
+    """A sentence about recordings that cannot be read, if a question is about all."""
+    known = session.snapshot().by_id
+    number = sum(one not in known for one in [*session.shared.repairs.unreadable])
+    if not number or question.recordings is not None:
+        return []
+    are = "is" if number == 1 else "are"
+    return [
+        f"{counted(number, 'recording')} cannot be read and {are} left out; `hybridlog verify` "
+        "says why."
+    ]
+
+
+# Messages that are not written or not indexed yet.
+
+
+def flush_interval_ns(recording: RecordingSummary) -> int:
+    """Time after which a running recording has written a message at the latest, ns."""
+    said = recording.source.get("flush_interval_s")
+    return int(1e9 * (said if isinstance(said, int | float) else _INTERVAL_S))
+
+
+def _unwritten(
+    session: Session, questions: Sequence[Question]
+) -> list[tuple[RecordingSummary, int | None]]:
+    """Messages that are not written yet, where questions reach past the last flush.
+
+    None for an unknown number, of a recorder that does not answer.
+    """
+    running: dict[str, RecordingSummary] = {}
+    topics: dict[str, set[str]] = defaultdict(set)
+    for question in questions:
+        for one in session.summaries_of(question):
+            if one.status == "open" and _reaches_past(session, question, one):
+                running[one.id] = one
+                topics[one.id].update(question.topics)
+    found = ((one, _taken(session, one, topics[one.id])) for one in running.values())
+    return [(one, number) for one, number in found if number != 0]
+
+
+def _taken(session: Session, recording: RecordingSummary, topics: set[str]) -> int | None:
+    """Messages of topics that a recorder has taken and not written; None if it does not say it."""
+    from hybridlog.live.state import read
+
+    with suppress(HybridlogError):  # it has just begun or ended, or is no recorder's
+        taken = read(session.directory.path, recording.id).taken
+        written = session.entry_of(recording).messages_by_topic()
+        return sum(max(taken.get(topic, 0) - written[topic], 0) for topic in topics)
+    return None
+
+
+def _reaches_past(session: Session, question: Question, one: RecordingSummary) -> bool:
+    """True if a question is about times after the last flush of a recording."""
+    begin, end = BEGIN, END
+    if question.bounds is not None and question.clock == "log":
+        begin, end = RangeResolver(session, question).bounds_in(one)
+    if question.during is not None:
+        windows = question.during.of_recording(one.id)
+        end = min(end, int(windows[-1, 1])) if len(windows) else begin
+    return end > (begin if one.span is None else max(begin, one.span[1]))
+
+
+def _not_written(recording: RecordingSummary, messages: int | None) -> str:
+    what = f"up to {flush_interval_ns(recording) / 1e9:g} s"
+    if messages is not None:
+        what = counted(messages, "message")
+    return f"{recording.name} is being recorded: {what} not written yet, nor in this answer."
+
+
+def _unindexed(
+    session: Session, answered: Sequence[tuple[Question, Counters | None]]
+) -> Counter[str]:
+    """Messages that the index lacks, by recording, where MongoDB has answered or must answer."""
+    found: Counter[str] = Counter()
+    for question, counters in answered:
+        lacks = () if counters is None else counters.not_indexed
+        if not lacks and question.predicate is not None and question.predicate.filters:
+            with suppress(TimeError):  # nothing is in the range
+                lacks = Planner(session, question).not_indexed()
+        for name, number in lacks:
+            found[name] += number
+    return found
+
+
+def _not_indexed(lacks: Counter[str]) -> Iterator[str]:
+    if total := lacks.total():
+        are = "is" if total == 1 else "are"
         yield (
-            f"{name} is not complete, so this answer may not be: {in_words(lost)} ({causes}); "
-            f"`hybridlog info {quote(name)}` says where."
+            f"{counted(total, 'message')} of {listed(lacks, MAX_NAMES)} {are} not in the index, "
+            "nor in this answer of MongoDB; `hybridlog index rebuild` brings in those of "
+            "recordings that have ended."
         )
-
-
-def in_words(losses: Collection[Mapping[str, Any]]) -> str:
-    """The number of lost messages: `at least 4 messages lost in 2 places`."""
-    is_exact = all(loss["count"] is not None for loss in losses)
-    known = _number(sum(loss["count"] or 0 for loss in losses), is_exact=is_exact)
-    return f"{known} lost in {counted(len(losses), 'place')}"
-
-
-def _number(lost: int, *, is_exact: bool) -> str:
-    """A number of lost messages, which is the least one if it is not exact."""
-    known = counted(lost, "message")
-    return known if is_exact else f"at least {known}" if lost else "an unknown number of messages"
-
-
-def line_of(loss: Mapping[str, Any]) -> str:
-    """A row of the ledger in words."""
-    count = "messages" if loss["count"] is None else counted(loss["count"], "message")
-    place = f" at byte {loss['offset']}" if loss.get("offset") is not None else ""
-    file = f" {loss['file']}{place}:" if loss.get("file") else ""
-    topic = f" on {loss['topic']}" if loss.get("topic") else ""
-    if loss["cause"] == Cause.THROTTLE:
-        return f"{count}{topic} left out by a throttle"
-    said = f"{file} {loss['reason']}".rstrip()
-    lost = "" if loss["count"] == 0 else f"{count}{topic} lost, "
-    return f"{lost}{loss['cause']}{':' if said else ''}{said}"
-
-
-def coverage(entry: RecordingEntry, losses: Collection[Mapping[str, Any]]) -> str:
-    """The completeness of a recording in words: `complete`, or the number of missing messages."""
-    from hybridlog.schema.states import expired_messages, without_payload
-
-    found = _coverage(entry, [loss for loss in losses if loss["cause"] not in NOT_LOST])
-    for cause, what in NOT_LOST.items():
-        messages = sum(loss["count"] or 0 for loss in losses if loss["cause"] == cause)
-        found += f"; {counted(messages, 'message')} {what}" if messages else ""
-    gone = (without_payload(number, state) for state, number in expired_messages(entry).items())
-    return "; ".join([found, *gone, *copies_of(entry)])
-
-
-def copies_of(entry: RecordingEntry) -> list[str]:
-    """Where payloads are that a recording lacks, in words."""
-    return [f"{address} has more payloads of {entry.name}" for address in entry.copies]
-
-
-def _coverage(entry: RecordingEntry, losses: Collection[Mapping[str, Any]]) -> str:
-    if not losses:
-        if entry.status == "open":
-            return "being recorded"
-        if entry.status == "unproven":
-            return "not known: its manifest was lost, so a segment may be missing"
-        # An empty log is complete; a robot that sent nothing may not have been reached.
-        is_live = not entry.source["bytes"]
-        return "nothing was received" if is_live and not entry.messages else "complete"
-    lost = sum(loss["count"] or 0 for loss in losses)
-    if any(loss["count"] is None for loss in losses):
-        return in_words(losses)
-    if not lost:
-        return f"complete, although its source was damaged in {counted(len(losses), 'place')}"
-    share = min(100 * entry.messages / (entry.messages + lost), 99.99)
-    return f"{in_words(losses)} ({share:.2f} % there)"

@@ -13,7 +13,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from hybridlog.message import messages_in
-from hybridlog.query.answers.lost import flush_interval_ns
+from hybridlog.query.answers.completeness import flush_interval_ns
 from hybridlog.query.answers.video import picture_of
 from hybridlog.query.chunk_columns import ChunkColumns
 from hybridlog.query.chunk_scan import ChunkScan, RecordingScan

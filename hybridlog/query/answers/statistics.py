@@ -268,7 +268,7 @@ def check(
     session: Session, question: Question, counters: Counters | None = None
 ) -> list[TopicCheck]:
     """Regularity of topics, the worst first; see `Query.check`."""
-    from hybridlog.query.answers.lost import completeness_of
+    from hybridlog.query.answers.completeness import completeness_of
     from hybridlog.query.latching import depth_of
 
     _check_all(question)
@@ -324,7 +324,7 @@ def _parts(planner: Planner, summary: RecordingSummary, span: Span) -> list[Part
 
 def _end(summary: RecordingSummary, span: Span) -> int:
     """End of a span; in an open recording, other topics may be flushed later than this one."""
-    from hybridlog.query.answers.lost import flush_interval_ns
+    from hybridlog.query.answers.completeness import flush_interval_ns
 
     late = flush_interval_ns(summary) if summary.status == "open" else 0
     return max(span[0], span[1] - late)
