@@ -257,42 +257,21 @@ def test_queries_of_chosen_recordings(store: hl.Store) -> None:
     assert store.session.select(found) == found
 
 
-def test_tables_name_recordings_and_their_tags(store: hl.Store) -> None:
-    """A field that is called as a tag is there, too."""
-    query = store.topic("/scan", "/imu").tags("robot", "place")
+def test_tables_name_recordings(store: hl.Store) -> None:
+    query = store.topic("/scan", "/imu")
     frame = query.to_pandas()
-    assert list(frame.columns) == ["topic", "recording", "robot", "place", "n", "robot_"]
-    assert set(frame["robot_"]) == {"x"}
-    seen = frame.groupby("recording")[["robot", "place"]].first().to_dict("index")
-    assert seen["monday 1"] == {"robot": "7", "place": "lab"}
-    assert seen["monday 2"]["robot"] == "8"
-    assert frame["place"].isna().sum() == len(frame) - 3
-    assert set(frame.loc[frame["recording"] == "run[1]", "robot"].isna()) == {True}
-    table = query.to_arrow()
-    assert table.column_names[1:] == list(frame.columns)
-    assert table.schema.field("robot").metadata == {b"hybridlog.tag": b"robot"}
-    assert table.schema.field("robot_").metadata == {b"hybridlog.field": b"robot"}
-    assert table.column("robot").null_count == frame["robot"].isna().sum() == 1
+    assert list(frame.columns) == ["topic", "recording", "n", "robot"]
     rows = [json.loads(line) for lines in query.to_json_lines() for line in lines]
-    assert [list(row) for row in rows[:1]] == [
-        ["log_time_ns", "topic", "recording", "robot", "place", "n", "robot_"]
-    ]
-    assert [row["robot"] for row in rows] == table.column("robot").to_pylist()
-    assert {row["robot_"] for row in rows} == {"x"}
+    assert list(rows[0]) == ["log_time_ns", "topic", "recording", "n", "robot"]
+    assert [row["recording"] for row in rows] == frame["recording"].tolist()
 
 
 def test_one_recording_is_named_on_request(store: hl.Store) -> None:
     one = store.topic("/scan").in_recording("tues*", "monday 1")
     assert list(one.to_pandas().columns) == ["n", "robot"]
-    assert list(one.tags("robot").to_pandas().columns) == ["robot", "n", "robot_"]
     assert one.fields("recording", "n").to_arrow().column("recording").unique().to_pylist() == [
         "monday 1"
     ]
-    # Fields keep the order in which they were asked for.
-    asked = one.tags("robot").fields("robot", "n").to_arrow()
-    assert asked.column_names == ["log_time", "robot", "robot_", "n"]
-    with pytest.raises(TopicError, match=r"a tag 'colour'[.] The tags are: place, robot"):
-        one.tags("colour")
 
 
 def test_a_running_recording_reaches_until_now() -> None:

@@ -341,7 +341,6 @@ class Slices(Latched, Forced):
         needs=("output", "target"),
         excludes=("at", "follow", "reverse"),
     )
-    tags: str | None = option("Tags of the recordings as columns, with commas between them.", "A,B")
     storage: str | None = option(
         "For rosbag2: the storage of the bag; without, mcap.",
         type=click.Choice(["mcap", "sqlite3"]),
@@ -357,7 +356,6 @@ class Slices(Latched, Forced):
         logs, is_bag = formats_of("log"), form == "rosbag2"
         fits = {
             "original_times": form in logs,
-            "tags": form not in formats_of("log", "payloads", "pictures", "video"),
             "storage": is_bag,
             "file_size": is_bag,
         }

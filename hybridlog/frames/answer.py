@@ -12,14 +12,12 @@ import pyarrow.compute as pc
 
 from hybridlog.frames.names import (
     FIELD,
-    TAG,
     arranged,
     free_name,
     is_part,
     is_summary,
     own_columns,
     summary_of,
-    tag_columns,
 )
 from hybridlog.index.indexing import rows_by_channel
 from hybridlog.schema.arrow_columns import OFFSET_LIMIT, TIME, numbers, structs
@@ -50,7 +48,6 @@ if TYPE_CHECKING:
     from hybridlog.query.question import Part, Question, RecordedChannel
     from hybridlog.query.rows import RowBatch
     from hybridlog.schema.codec import Decoded
-    from hybridlog_storage.catalog import RecordingEntry
 
 
 _BLOCK_ROWS = 65_536
@@ -128,7 +125,7 @@ def _is_open(channel: RecordedChannel) -> bool:
 
 
 def _table(blocks: list[Block], question: Question) -> pa.Table:
-    table = table_of(blocks, question.fields, tag_columns(question.tags))
+    table = table_of(blocks, question.fields)
     return table.take(np.arange(table.num_rows - 1, -1, -1)) if question.reverse else table
 
 
@@ -150,7 +147,6 @@ class Decoder:
         names = {"log_time", *self.own}
         self.fields = None if self._chosen is None else [p for p in self._chosen if p not in names]
         self.fits_tables = self.fields != [] and names <= {"log_time", "topic", "recording"}
-        self._tags = tag_columns(planner.question.tags)
         self._ranks = {key: rank << _SEQ_BITS for key, rank in planner.ranks.items()}
 
     def empty(self) -> Iterator[Block]:
@@ -175,7 +171,6 @@ class Decoder:
             rows = len(found.log_time)
             self._counters.messages += rows
             own = {name: text_column(names[name], rows) for name in self.own}
-            own |= _tags_of(part.recording, self._tags, rows)
             order = found.seq + self._ranks[part.recording.key]
             yield Block(part.topic, found.log_time, order, own, found.records.cast(kind), 0)
 
@@ -221,8 +216,7 @@ class Decoder:
         stamps: pa.Array[Any] | None = None,
     ) -> dict[str, pa.Array[Any]]:
         """Built-in columns of messages of one channel, without the log time."""
-        own = {name: _own_column(name, channel, batch, seq, stamps) for name in self.own}
-        return own | _tags_of(channel.recording, self._tags, len(batch))
+        return {name: _own_column(name, channel, batch, seq, stamps) for name in self.own}
 
 
 def _own(planner: Planner) -> list[str]:
@@ -258,17 +252,6 @@ def _own_column(
         known = channel.channel.has_publish_time
         return numbers(batch.publish_time, "time") if known else pa.nulls(rows, TIME)
     return pa.nulls(rows, TIME) if stamps is None else stamps
-
-
-def _tags_of(
-    recording: RecordingEntry, tags: Mapping[str, str], rows: int
-) -> dict[str, pa.Array[Any]]:
-    """Columns with tags of a recording, by name; null where it lacks the tag."""
-    values = {name: recording.tags.get(key) for name, key in tags.items()}
-    return {
-        name: pa.nulls(rows, pa.string()) if value is None else text_column(value, rows)
-        for name, value in values.items()
-    }
 
 
 def text_column(text: str, rows: int) -> pa.Array[Any]:
@@ -322,18 +305,13 @@ class Block(NamedTuple):
     summaries: Mapping[str, pa.Array[Any]] = MappingProxyType({})
 
 
-def table_of(
-    blocks: list[Block],
-    fields: Sequence[str] | None = None,
-    tags: Mapping[str, str] = MappingProxyType({}),
-) -> pa.Table:
+def table_of(blocks: list[Block], fields: Sequence[str] | None = None) -> pa.Table:
     """The table of some blocks, sorted by log time and order; the list is empty afterwards.
 
     Nested messages become dotted columns (`pose.position.x`); `fields` are their paths, None for
     all. A column that a block lacks is null there. A column whose type changes gets the common
     exact type (`schema/arrow_types.py`). Messages of a topic are converted to one type before they
-    are flattened, which makes the table independent of the division into chunks. `tags` are keys of
-    tags, by the names of their columns.
+    are flattened, which makes the table independent of the division into chunks.
 
     The first column is `log_time`, timestamp[ns, UTC]. Numbers keep their wire type; times are
     timestamp[ns, UTC], durations duration[ns], strings string, arrays fixed_size_list if the
@@ -347,8 +325,7 @@ def table_of(
     for name in dict.fromkeys(name for block in blocks for name in block.own):
         arrays = [block.own[name] for block in blocks]
         columns.append(_ordered(arrays, common_type(arrays), order))
-        tag = {TAG: tags[name]} if name in tags else None
-        names.append(pa.field(name, columns[-1].type, metadata=tag))
+        names.append(pa.field(name, columns[-1].type))
     parts = _flat(blocks, fields)
     lengths = [len(block.log_time) for block in blocks]
     blocks.clear()  # the columns below take their memory
@@ -366,7 +343,7 @@ def table_of(
         of = {FIELD: path} if name != path else None
         names.append(pa.field(name, kind, metadata=of))
     table = pa.Table.from_arrays(columns, schema=pa.schema(names))
-    return table.select(arranged(table.column_names, fields, tags))
+    return table.select(arranged(table.column_names, fields))
 
 
 def _flat(blocks: Sequence[Block], fields: Sequence[str] | None) -> list[dict[str, pa.Array[Any]]]:

@@ -3,8 +3,7 @@
 Every table has `log_time`. Tables of several topics also have `topic`, and tables of
 several recordings `recording`. A field of one of these names always gets a trailing
 underscore. The other built-in columns are present on request; a field of that name gets an
-underscore then. So does a field with the name of a requested tag, and a tag with the name of
-a built-in column.
+underscore then.
 """
 
 from __future__ import annotations
@@ -23,9 +22,6 @@ OPTIONAL: Final = ("publish_time", "stamp", "seq", "sequence")
 the recording, and the sender's sequence number."""
 FIELD: Final = b"hybridlog.field"
 """Arrow metadata of a column that was renamed: the path of its field."""
-TAG: Final = b"hybridlog.tag"
-"""Arrow metadata of a column with a tag of the recordings: the key of the tag."""
-
 SUMMARIES = ("n", "min", "max", "mean")
 
 
@@ -36,14 +32,6 @@ def own_columns(requested: Sequence[str] | None, defined: Collection[str]) -> li
     """
     names = dict.fromkeys(requested or ())
     return [n for n in names if n in RESERVED or (n in OPTIONAL and n not in defined)]
-
-
-def tag_columns(keys: Sequence[str]) -> dict[str, str]:
-    """Names of the columns of tags, and the keys of the tags."""
-    found: dict[str, str] = {}
-    for key in keys:
-        found[free_name(key, {*OPTIONAL, "log_time_ns", *found})] = key
-    return found
 
 
 def is_own(name: str) -> bool:
@@ -58,23 +46,19 @@ def free_name(path: str, taken: Collection[str]) -> str:
     return path
 
 
-def arranged(
-    names: Sequence[str], fields: Sequence[str] | None, tags: Collection[str] = ()
-) -> list[str]:
+def arranged(names: Sequence[str], fields: Sequence[str] | None) -> list[str]:
     """Column names in the order in which their fields were requested; None for all.
 
-    Columns that were not requested come first: log time, topic, recording, tags.
+    Columns that were not requested come first: log time, topic, recording.
     """
     if fields is None:
         return list(names)
     requested = [path.replace("[]", "") for path in fields]
 
     def place(name: str) -> int:
-        if name in tags:
-            return -1
-        # A field with the name of a built-in column or a tag has an extra underscore.
+        # A field with the name of a built-in column has an extra underscore.
         plain = name.rstrip("_")
-        same = {name, plain} if is_own(plain) or plain in tags else {name}
+        same = {name, plain} if is_own(plain) else {name}
         exact = (number for number, path in enumerate(requested) if path in same)
         near = (number for number, path in enumerate(requested) if is_part(name, path))
         return next(exact, next(near, -1))

@@ -287,24 +287,6 @@ class Query:
         topics = self.session.resolve_in(tf_topics, self.question.recordings)
         return self._with(frame=frame, tf_topics=tuple(topics))
 
-    def tags(self, *keys: str) -> Query:
-        """Tags of the recordings as columns of tables, behind `topic` and `recording`.
-
-        A field with the name of such a column gets a trailing underscore. A recording without
-        the tag has null.
-
-        Raises:
-            TopicError: no recording of the query has such a tag.
-        """
-        known = {key for summary in self.summaries() for key in summary.tags}
-        for key in keys:
-            if key not in known:
-                raise TopicError(
-                    f"No recording of this query has a tag {key!r}. The tags are: "
-                    f"{listed(sorted(known))}."
-                )
-        return self._with(tags=tuple(dict.fromkeys(keys)))
-
     def in_recording(self, *names: str) -> Query:
         """Only these recordings, by name, id or glob; `Store.recordings` chooses by more.
 

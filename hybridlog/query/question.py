@@ -43,7 +43,6 @@ class Question:
         every: Take every n-th message of each topic.
         reverse: Latest message first.
         fields: Field paths for tables; None for all.
-        tags: Keys of tags of recordings that are columns of tables.
         names_recording: Tables have the column `recording` even if there is only one.
         during: Intervals of log time that messages must lie in; None for all times.
         frame: Frame of points and poses in the answer; None for that of each message.
@@ -59,7 +58,6 @@ class Question:
     every: int = 1
     reverse: bool = False
     fields: tuple[str, ...] | None = None
-    tags: tuple[str, ...] = ()
     names_recording: bool = False
     during: Intervals | None = None
     frame: str | None = None

@@ -396,7 +396,6 @@ def test_one_image(drive: Drive, tmp_path: Path) -> None:
     [
         (("-t", "drive"), UsageError.exit_code),
         (("-t", "broken"), PayloadError.exit_code),
-        (("-t", "front", "--tags", "robot"), UsageError.exit_code),
     ],
 )
 def test_no_pictures_leave_nothing(

@@ -476,10 +476,6 @@ METHODS: dict[str, Rule] = {
         lambda s: [(r.name, r.messages, r.span) for r in s.topic("arm").summaries()],
         lambda k: [(LABEL, len(k.of()), k.span)],
     ),
-    "tags": Rule(
-        lambda s: set(s.topic("arm").tags("robot").to_arrow().column("robot").to_pylist()),
-        lambda _: {"7"},
-    ),
     "to_arrow": Rule(
         lambda s: (
             _table(s.topic("arm").to_arrow(), "log_time", "n", "ranges", "position"),

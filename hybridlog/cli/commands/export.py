@@ -20,7 +20,7 @@ from hybridlog.cli.answers import (
 )
 from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.lerobot import LEROBOT, Training, export_set
-from hybridlog.cli.options import Slices, Topics, parse_fields
+from hybridlog.cli.options import Slices, Topics
 from hybridlog.formats import OUTPUTS, formats_of, is_directory, suffixes_of
 from hybridlog_storage.disk.unfinished import undone
 from hybridlog_storage.errors import (
@@ -73,8 +73,6 @@ def export_command(given: _Given) -> None:
         query = given.query(store)
         if not query.topics:
             raise UsageError(store.session.when_empty)
-        if given.tags is not None:
-            query = query.tags(*parse_fields(given.tags, "--tags"))
         if form == LEROBOT:
             if split is not None:
                 raise UsageError("lerobot has --episodes-by in place of --split-by.")

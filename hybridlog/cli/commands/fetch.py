@@ -231,8 +231,6 @@ def _query(store: Store, choices: _Choices) -> Query:
     if choices.fields is not None:
         query = query.fields(*parse_fields(choices.fields))
     query = choices.placed(query)
-    if choices.tags is not None:
-        query = query.tags(*parse_fields(choices.tags, "--tags"))
     if choices.every > 1:
         query = query.every(choices.every)
     if choices.reverse:
