@@ -1,18 +1,23 @@
-"""One file of columns, the columns to read for some fields, and what is open.
+"""One file of columns: written, read, and the columns to read for some fields.
 
-Files are read with `pread`: truncation of a mapped file would kill the process.
+Its pages have Parquet's checksums, and its footer has one of its own: the 4 bytes in front of
+it, a CRC-32, which other readers ignore. Files are read with `pread`: truncation of a mapped
+file would kill the process.
 """
 
 from __future__ import annotations
 
+import io
 import os
 import threading
-from collections import OrderedDict
 from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import suppress
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
+from weakref import WeakValueDictionary
 
+import msgspec
 import pyarrow as pa
 import pyarrow.parquet as pq
 
@@ -24,23 +29,22 @@ from hybridlog.columns.fields import (
     original_name,
 )
 from hybridlog.columns.layout import ABOUT, OWN, OWN_COLUMNS, About, Section
-from hybridlog.schema.arrow_types import is_list
+from hybridlog.schema.arrow_types import is_bytes, is_list
+from hybridlog_storage.cache import Cache
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import HybridlogError, StoreError, exhausted
 from hybridlog_storage.lazy import lazy
 from hybridlog_storage.manifest import digest_of
 
-if TYPE_CHECKING:
-    from hybridlog_storage.cache import Cache
-
 _OPEN_FILES: Final = 256
 _MAX_FIELD_SETS: Final = 64  # sets of fields whose columns are known for a file
-_READ: Final = 1 << 20  # bytes read together for a digest
+_AT_ONCE: Final = 1 << 20  # bytes read together for a digest, and written together
 _TAIL: Final = 8  # bytes: length of the footer, `PAR1`
 _SEAL: Final = 4  # bytes: CRC-32 of the footer, in front of it
 _MAX_FOOTER: Final = 256 << 20
 _NUMBERS: Final = count()
+_RUNNING: Final = frozenset({"t", "log_time", "seq", "pub", "stamp", "ref.chunk", "ref.off"})
 FIRST: Final = -(1 << 63)
 """Lower bound of all log times."""
 LAST: Final = (1 << 63) - 1
@@ -87,6 +91,104 @@ def leaves(schema: pa.Schema) -> Iterator[Leaf]:
             ]
 
 
+class ColumnFileWriter:
+    """Writes one file; no reader of Parquet looks at the bytes of `front`."""
+
+    def __init__(
+        self, path: Path, schema: pa.Schema, *, level: int = 1, front: bytes = b""
+    ) -> None:
+        self.path = path
+        self.schema = schema
+        self.rows = 0
+        self._raw = _Raw(files.open_file(path, os.O_RDWR | os.O_CREAT | os.O_EXCL))
+        kinds = {leaf.path: leaf.kind for leaf in leaves(schema)}
+        running = [  # adjacent values differ by little
+            path
+            for path, kind in kinds.items()
+            if path in _RUNNING
+            or pa.types.is_timestamp(kind)
+            or (path.endswith(".seq") and pa.types.is_integer(kind))
+        ]
+        # DuckDB answers wrongly from statistics of floats with NaN among them.
+        ordered = [
+            path
+            for path, kind in kinds.items()
+            if not (is_bytes(kind) or pa.types.is_floating(kind))
+        ]
+        repeating = [path for path in ordered if path not in running and kinds[path] != pa.bool_()]
+        try:
+            self._file = io.BufferedWriter(self._raw, _AT_ONCE)
+            sink = pa.PythonFile(self._file, mode="w")
+            self._parquet = pq.ParquetWriter(
+                sink,
+                schema,
+                compression="zstd",
+                compression_level=level,
+                use_dictionary=repeating,
+                column_encoding=dict.fromkeys(running, "DELTA_BINARY_PACKED"),
+                write_statistics=ordered,
+                write_page_checksum=True,
+            )
+            sink.write(front)
+        except BaseException:
+            self.discard()
+            raise
+
+    def write(self, table: pa.Table) -> None:
+        """Write a row group."""
+        self._parquet.write_table(table, row_group_size=max(table.num_rows, 1))
+        self.rows += table.num_rows
+
+    def close(self, sections: Sequence[Section], *, sync: bool = False) -> None:
+        """Finish the file, with its sections in order."""
+        try:
+            about = msgspec.json.encode(About(sections))
+            self._parquet.add_key_value_metadata({ABOUT.decode(): about.decode()})
+            body = self._file.tell()
+            self._parquet.close()
+            self._file.flush()
+            self._raw.seal(body)
+            if sync:
+                files.system.sync(self._raw.fd)
+            self._raw.abandon()
+        except BaseException:
+            self.discard()
+            raise
+
+    def discard(self) -> None:
+        """Delete the unfinished file."""
+        self._raw.abandon()
+        with suppress(OSError):
+            files.unlink(self.path)
+
+
+class _Raw(io.RawIOBase):
+    """Writes to a file; nothing once it is closed, since pyarrow ends what it collects."""
+
+    def __init__(self, fd: int) -> None:
+        self.fd = fd
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, data: Any) -> int:
+        return files.write_all(self.fd, [data]) if self.fd >= 0 else memoryview(data).nbytes
+
+    def tell(self) -> int:
+        return os.lseek(self.fd, 0, os.SEEK_CUR) if self.fd >= 0 else 0
+
+    def seal(self, begin: int) -> None:
+        """Put its checksum in front of the footer."""
+        footer = os.pread(self.fd, self.tell() - begin, begin)
+        os.lseek(self.fd, begin, os.SEEK_SET)
+        files.write_all(self.fd, [crc32(footer).to_bytes(_SEAL, "little"), footer])
+
+    def abandon(self) -> None:
+        if self.fd >= 0:
+            os.close(self.fd)
+        self.fd = -1
+
+
 class TablePart(NamedTuple):
     """Rows of one topic in a row group from `begin` on; `first` and `last` bound log times, ns."""
 
@@ -99,16 +201,20 @@ class TablePart(NamedTuple):
 
 
 class ColumnFile:
-    """Reads one file of a table; FileNotFoundError without it. Thread safe."""
+    """Reads one file; FileNotFoundError without it. Thread safe.
 
-    def __init__(self, path: Path) -> None:
+    Files that were opened long ago are closed if too many are open, and opened again.
+    """
+
+    def __init__(self, path: Path, cache: Cache | None = None) -> None:
         self.path = path
         self.number = next(_NUMBERS)
         """Unique number of this reader."""
+        self._cache = cache or Cache()
         self._lock = threading.Lock()
         self._chosen: dict[tuple[Any, ...], dict[str, tuple[int, ...]]] = {}
         try:
-            self._source = _Source(path)
+            self._source = _Source(path, self.number)
             metadata = pq.read_metadata(pa.BufferReader(b"PAR1" + self._source.footer))
             self.about = About.from_json(metadata.metadata.get(ABOUT, b""))
             self._parquet = pq.ParquetFile(
@@ -129,10 +235,6 @@ class ColumnFile:
         except (OSError, StoreError, pa.ArrowException, KeyError) as error:
             raise self._damaged(error) from error
 
-    def release(self) -> None:
-        """Close the file until it is read again."""
-        self._source.release()
-
     @property
     def size_bytes(self) -> int:
         """Bytes of the file."""
@@ -145,21 +247,21 @@ class ColumnFile:
 
     def size(self, group: int, leaves: Sequence[int]) -> int:
         """Stored bytes of some columns of a row group."""
-        return sum(self._column(group, leaf).total_compressed_size for leaf in leaves)
+        return sum(self._about(group, leaf).total_compressed_size for leaf in leaves)
 
     def has_values(self, group: int, leaf: int) -> bool:
         """False if a column of a row group is known to have nulls only."""
-        column = self._column(group, leaf)
+        column = self._about(group, leaf)
         found = column.statistics
         is_known = found is not None and found.has_null_count
         return not is_known or found.null_count < column.num_values
 
     def bounds(self, group: int, leaf: int) -> tuple[int, int] | None:
         """Least and greatest value in a column of a row group; None if unknown."""
-        found = self._column(group, leaf).statistics
+        found = self._about(group, leaf).statistics
         return (found.min, found.max) if found is not None and found.has_min_max else None
 
-    def _column(self, group: int, leaf: int) -> Any:
+    def _about(self, group: int, leaf: int) -> Any:
         return self._parquet.metadata.row_group(group).column(leaf)
 
     def numbers(self, *paths: str) -> list[int]:
@@ -172,6 +274,16 @@ class ColumnFile:
         groups = [self.read(group, numbers) for group in range(len(self.groups))]
         table = pa.concat_tables(groups) if groups else self.schema.empty_table()
         return table.replace_schema_metadata(None)
+
+    def column(self, group: int, leaves: Sequence[int]) -> Any:
+        """Some columns of a row group, below one column of the table, as one array; cached."""
+
+        def read() -> Any:
+            found = self.read(group, leaves).column(0).combine_chunks()
+            return pa.concat_arrays(found.chunks) if isinstance(found, pa.ChunkedArray) else found
+
+        key = self.number, group, *leaves
+        return self._cache.made("column", *key, make=read, size_of=lambda one: int(one.nbytes))
 
     def read(self, group: int | None, leaves: Sequence[int]) -> pa.Table:
         """Columns, numbered in Parquet's order (depth first), of a row group; None for no rows."""
@@ -252,29 +364,18 @@ class ColumnFile:
     ) -> dict[str, tuple[int, ...]]:
         """Numbers of the columns of some fields, None for all, by the table's column around them.
 
-        `own` are columns of the table itself. `arrays` says that all rows have arrays in full, and
-        their summaries.
+        `own` are columns of the table itself. Of an array, and of its summary, there are both;
+        but `arrays` says that all rows have arrays in full, and their summaries.
         """
         key = None if paths is None else frozenset(paths), frozenset(own), arrays
         found = self._chosen.get(key)
         if found is None:
             wanted = None if paths is None else list(map(names_of, paths))
             full = self.arrays if arrays else set()
-            numbers = {
-                number
-                for number, leaf in enumerate(self.leaves)
-                if (leaf.top in own if leaf.is_own else self._is_wanted(leaf, wanted, full))
-            }
-            # A summary tells whether the array is there.
-            known = {self.leaves[number].array for number in numbers}
-            for array, number in self.summaries.items():
-                is_asked = any(path[: len(array)] == array for path in wanted or ())
-                if is_asked and array not in known and array not in full:
-                    numbers.add(number)
             found = {}
-            for number in sorted(numbers):
-                top = self.leaves[number].top
-                found[top] = (*found.get(top, ()), number)
+            for number, leaf in enumerate(self.leaves):
+                if leaf.top in own if leaf.is_own else self._is_wanted(leaf, wanted, full):
+                    found[leaf.top] = (*found.get(leaf.top, ()), number)
             if len(self._chosen) >= _MAX_FIELD_SETS:
                 self._chosen.clear()
             self._chosen[key] = found
@@ -290,13 +391,12 @@ class ColumnFile:
             return wanted is not None and leaf.names in wanted
         if wanted is None or any(leaf.names[: len(path)] == path for path in wanted):
             return True
+        if leaf.array is not None:  # it tells whether the array is there
+            return any(path[: len(leaf.array)] == leaf.array for path in wanted)
         # A summary is worked out from the array where that is there.
-        summarised = self.summaries.keys() - full
-        return any(
-            leaf.names[: len(path) - 1] == path[:-1] and path[:-1] in summarised
-            for path in wanted
-            if leaf.array is None and path[-1] in SUMMARY_FIELDS
-        )
+        arrays = {path[:-1] for path in wanted if path[-1] in SUMMARY_FIELDS}
+        known = arrays & self.summaries.keys() - full
+        return any(leaf.names[: len(array)] == array for array in known)
 
     def sections(self) -> Iterator[tuple[int, Section]]:
         """The rows in it, each section with its first row."""
@@ -320,9 +420,10 @@ class ColumnFile:
 class _Source:
     """Provides Parquet's bytes, after verifying the checksum of the footer."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, number: int) -> None:
         self.closed = False
         self._path = path
+        self._number = number
         self._lock = threading.Lock()
         self._fd = -1
         self._position = 0
@@ -330,20 +431,19 @@ class _Source:
         with self._lock:
             self._open()
         self.size = os.fstat(self._fd).st_size
-        tail = self.raw(self.size - _TAIL, self.size) if self.size > 2 * _TAIL else b""
+        tail = self._raw(self.size - _TAIL, self.size) if self.size > 2 * _TAIL else b""
         length = int.from_bytes(tail[:4], "little") + _TAIL
         if tail[4:] != b"PAR1" or length > min(self.size - _SEAL, _MAX_FOOTER):
             raise StoreError("its end is missing")
-        sealed = self.raw(self.size - length - _SEAL, self.size)
+        sealed = self._raw(self.size - length - _SEAL, self.size)
         self.footer = sealed[_SEAL:]
         if crc32(self.footer) != int.from_bytes(sealed[:_SEAL], "little"):
             raise StoreError("the checksum of its footer differs")
 
     def digest(self) -> str:
         """BLAKE3 of all bytes."""
-        return digest_of(
-            self.raw(at, min(at + _READ, self.size)) for at in range(0, self.size, _READ)
-        )
+        begins = range(0, self.size, _AT_ONCE)
+        return digest_of(self._raw(at, min(at + _AT_ONCE, self.size)) for at in begins)
 
     def fetch(self, group: Any, leaves: Iterable[int]) -> None:
         """Ask a bucket once for some columns of a row group."""
@@ -355,8 +455,7 @@ class _Source:
                 for column in map(group.column, leaves):
                     begin = column.dictionary_page_offset or column.data_page_offset
                     begin = min(begin, column.data_page_offset)
-                    end = begin + column.total_compressed_size
-                    ranges.append((begin, end))
+                    ranges.append((begin, begin + column.total_compressed_size))
                 files.fetch(self._fd, ranges)
 
     def read(self, size: int = -1) -> bytes:
@@ -364,10 +463,9 @@ class _Source:
         begin = self._position
         end = self.size if size < 0 else min(begin + size, self.size)
         self._position = max(begin, end)
-        return self.raw(begin, end) if begin < end else b""
+        return self._raw(begin, end) if begin < end else b""
 
-    def raw(self, begin: int, end: int) -> bytes:
-        """Some bytes of the file."""
+    def _raw(self, begin: int, end: int) -> bytes:
         with self._lock:
             if self._fd < 0:
                 self._open()
@@ -379,12 +477,15 @@ class _Source:
     def __del__(self) -> None:
         self.release()
 
-    def release(self) -> None:
-        """Close the file until it is read again."""
-        with self._lock:
-            if self._fd >= 0:
-                os.close(self._fd)
-            self._fd = -1
+    def release(self, *, wait: bool = True) -> bool:
+        """Close the file until it is read again; without `wait` not one that is just read."""
+        if not self._lock.acquire(wait):
+            return False
+        if self._fd >= 0:
+            os.close(self._fd)
+        self._fd = -1
+        self._lock.release()
+        return True
 
     def _open(self) -> None:
         self._fd = files.open_file(self._path, os.O_RDONLY)
@@ -394,6 +495,12 @@ class _Source:
             self._fd = -1
             raise StoreError("it was replaced")
         self._same = same
+        with _OPENING:
+            _OPENED[self._number] = self
+            for number in [*_OPENED][: -files.most_open(_OPEN_FILES)]:
+                source = _OPENED.get(number)
+                if source is not None and source.release(wait=False):
+                    del _OPENED[number]
 
     def seek(self, position: int, whence: int = os.SEEK_SET) -> int:
         base = {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: self.size}[whence]
@@ -407,29 +514,5 @@ class _Source:
         """Do nothing: the file remains open as long as its reader."""
 
 
-class OpenFiles:
-    """The files that were read last, and their decoded columns. Thread safe."""
-
-    def __init__(self, cache: Cache) -> None:
-        self._cache = cache
-        self._open: OrderedDict[int, ColumnFile] = OrderedDict()
-        self._lock = threading.Lock()
-
-    def column(self, file: ColumnFile, group: int, top: str, leaves: tuple[int, ...]) -> Any:
-        """A column of a row group, or the requested parts of it."""
-
-        def read() -> Any:
-            self.opened(file)
-            found = file.read(group, leaves).column(0).combine_chunks()
-            return pa.concat_arrays(found.chunks) if isinstance(found, pa.ChunkedArray) else found
-
-        key = file.number, group, top, leaves
-        return self._cache.made("column", *key, make=read, size_of=lambda one: int(one.nbytes))
-
-    def opened(self, file: ColumnFile) -> None:
-        """Close files that were not read lately, if too many are open."""
-        with self._lock:
-            self._open[file.number] = file
-            self._open.move_to_end(file.number)
-            while len(self._open) > files.most_open(_OPEN_FILES):
-                self._open.popitem(last=False)[1].release()
+_OPENED: Final[WeakValueDictionary[int, _Source]] = WeakValueDictionary()  # the oldest ones first
+_OPENING: Final = threading.Lock()

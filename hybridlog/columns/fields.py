@@ -32,18 +32,14 @@ from hybridlog.schema.arrow_types import (
     lengths_of,
     missing_of,
     summary,
-    widened,
     with_values,
 )
+from hybridlog_storage.errors import StoreError
 
 LIMIT: Final = 32
 """Maximum number of elements of an array stored in full."""
 SUMMARY_FIELDS: Final = ("n", "min", "max", "mean")
 """Fields of a summary of numbers."""
-
-
-class UnfitError(Exception):
-    """Messages whose fields have no common type."""
 
 
 class FieldShape:
@@ -214,22 +210,15 @@ def joined(pieces: Sequence[Array]) -> Array:
     """Columns joined one after the other, with their common type.
 
     A column missing from a piece is null there. If one piece has summaries of an array, all
-    get summaries. Values without a common exact type become JSON text.
+    get summaries. Values without a common exact type become JSON text. Columns of one name that
+    stand for two fields raise StoreError.
     """
     try:
         kind = common_type(pieces, summaries=True)
         pieces = [converted(piece, kind) for piece in pieces]
     except (pa.ArrowException, NotImplementedError) as error:
-        raise UnfitError(str(error)) from error
+        raise StoreError(f"The fields of messages have no common type: {error}.") from error
     return pa.concat_arrays(pieces) if len(pieces) > 1 else pieces[0]
-
-
-def type_of_all(kinds: Sequence[Any]) -> Any:
-    """The type that all values of some types fit; without one, UnfitError."""
-    try:
-        return common_type([pa.nulls(0, kind) for kind in kinds], widened, summaries=True)
-    except pa.ArrowException as error:
-        raise UnfitError(str(error)) from error
 
 
 def copied(array: Array) -> Array:

@@ -11,9 +11,7 @@ that is full. So one that is looked for is in that file, or else in one of those
 from __future__ import annotations
 
 import logging
-import os
 import re
-import time
 from bisect import bisect_right
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -25,11 +23,10 @@ from typing import Any, Final
 
 import pyarrow as pa
 
-from hybridlog.columns.column_file import ColumnFile
+from hybridlog.columns.column_file import ColumnFile, ColumnFileWriter
 from hybridlog.columns.layout import SHARED, SUFFIX, TABLES, Section, parts_folder
-from hybridlog.columns.parquet_file import ParquetFileWriter
 from hybridlog_storage.disk import files
-from hybridlog_storage.errors import StoreError, unreadable
+from hybridlog_storage.errors import StoreError
 
 MAX_SHARED_ROWS: Final = 50_000
 """Maximum number of rows of several recordings in one file."""
@@ -38,7 +35,6 @@ MAX_SHARED_BYTES: Final = 4 << 20
 MAX_SHARED_RECORDINGS: Final = 256
 """Maximum number of recordings in one file: each one that comes costs a look at all of them."""
 _SHARED_NAME: Final = re.compile(rf"{SHARED}(\d{{20}}){re.escape(SUFFIX)}", re.ASCII)
-_STABLE_NS: Final = 100_000_000  # a time of change that is older tells of every later change
 _log = logging.getLogger(__name__)
 _Piece = tuple[Section, Any]
 """Rows of a topic of a recording, and what they are."""
@@ -180,7 +176,7 @@ class TableFolders:
         files.remove_tree(part)
         # A reader that knows the footer of the file before finds nothing at its places.
         front = bytes(1 + table.num_rows % 251)
-        writer = ParquetFileWriter(part, table.schema, front=front)
+        writer = ColumnFileWriter(part, table.schema, front=front)
         try:
             writer.write(table)
             writer.close(found, sync=True)
@@ -219,32 +215,6 @@ def shared_for(times: Sequence[int], created: int | None) -> Iterator[str]:
 
 def _shared_name(time: int) -> str:
     return f"{SHARED}{time:020d}{SUFFIX}"
-
-
-class Listing:
-    """Status of a folder's entries by name, read again after a change; none without the folder."""
-
-    def __init__(self, path: Path) -> None:
-        self.names: dict[str, os.stat_result] = {}
-        self._path = path
-        self._read_at: tuple[int, int] | None = None  # inode, and time of its last change
-
-    def read(self) -> bool:
-        """Read the entries if they may have changed; returns whether it did."""
-        try:
-            now, names = files.changed_names(self._path, self._read_at)
-            if names is None:
-                return False
-            self.names = names
-        except FileNotFoundError:
-            self.names, self._read_at = {}, None
-            return True
-        except OSError as error:
-            raise unreadable(error, self._path) from error
-        # A change within the same tick of the clock would have the same time.
-        is_stable = time.time_ns() - now[1] > _STABLE_NS
-        self._read_at = now if is_stable else None
-        return True
 
 
 def files_of(root: Path, prefixes: Collection[str] = ("",)) -> Iterator[ColumnFile]:

@@ -22,6 +22,7 @@ from hybridlog.columns.fields import (
     SUMMARY_FIELDS,
     FieldShape,
     has_summaries,
+    joined,
     names_of,
     original_name,
     records_of,
@@ -200,17 +201,9 @@ def with_rows(batch: Batch) -> Batch:
     """Reduced messages of a topic with their rows."""
     if not len(batch) or (batch.left is not None and batch.left.part[0] >= 0):
         return batch
-    found: dict[bytes, tuple[int, list[pa.StructArray]]] = {}  # by their columns
-    places = np.empty((2, len(batch)), np.int64)
-    for at in range(len(batch)):
-        row = _row_in(batch.payload(at))
-        columns = pa.schema([*row.type]).serialize().to_pybytes()
-        number, same = found.setdefault(columns, (len(found), []))
-        places[:, at] = number, len(same)
-        same.append(row)
-    parts = [pa.concat_arrays(same) for _, same in found.values()]
-    left = Left(parts, places[0].astype(np.int32), places[1], *batch.places)
-    return replace(batch, left=left)
+    rows = joined([_row_in(batch.payload(at)) for at in range(len(batch))])
+    part, row = np.zeros(len(batch), np.int32), np.arange(len(batch))
+    return replace(batch, left=Left([rows], part, row, *batch.places))
 
 
 def _row(

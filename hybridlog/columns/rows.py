@@ -6,7 +6,10 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 
+from hybridlog.columns.fields import without
 from hybridlog.schema.codec import no_rows, stamp_array
 from hybridlog.schema.left import LeftFields
 from hybridlog.schema.states import State
@@ -53,8 +56,6 @@ class Piece:
 
     def fields_as(self, kind: Any) -> Any:
         """The fields; without any, nulls of a type."""
-        import pyarrow as pa
-
         return pa.nulls(self.rows, kind) if self.fields is None else self.fields
 
 
@@ -70,11 +71,6 @@ def piece_of(
 
     `columns` turns fields into columns. Without a definition nothing is decoded.
     """
-    import pyarrow as pa
-    import pyarrow.compute as pc
-
-    from hybridlog.columns.fields import without
-
     batch = placed.batch
     count = len(batch)
     errors: list[str | None] = [None] * count
@@ -121,8 +117,6 @@ def columns_from(decoded: Decoded, shape: FieldShape) -> Any:
 
 def as_table(own: Mapping[str, Any], fields: Any) -> Any:
     """Columns of rows as a table; `fields` is a struct array, or None."""
-    import pyarrow as pa
-
     schema = [pa.field(name, column.type) for name, column in own.items()]
     arrays = [*own.values()]
     if fields is not None:

@@ -14,11 +14,10 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 import pyarrow as pa
 
-from hybridlog.columns.column_file import ColumnFile
+from hybridlog.columns.column_file import ColumnFile, ColumnFileWriter
 from hybridlog.columns.fields import FieldShape
 from hybridlog.columns.layout import Section, table_schema_of
 from hybridlog.columns.left_rows import digest_in, with_rows
-from hybridlog.columns.parquet_file import ParquetFileWriter
 from hybridlog.columns.rows import as_table, columns_from, piece_of
 from hybridlog.index.indexing import ChunkIndexer
 from hybridlog.schema.arrow_columns import structs
@@ -51,10 +50,9 @@ class RowsFile(ColumnFile):
 
     def __init__(self, folder: Path, listed: File, cache: Cache | None = None) -> None:
         self._listed = listed
-        self._cache = cache or Cache()
         path = folder / listed.name
         try:
-            super().__init__(path)
+            super().__init__(path, cache)
         except FileNotFoundError as error:
             raise StoreError(f"The file of rows {path} is missing.{RESTORE}") from error
         except StoreError as error:
@@ -121,8 +119,7 @@ class _OpenFile:
     """A file that is being written; `tables` wait for a row group."""
 
     topic: str
-    writer: ParquetFileWriter
-    rows: int = 0
+    writer: ColumnFileWriter
     tables: list[pa.Table] = field(default_factory=list)
 
     def flush(self) -> None:
@@ -164,7 +161,6 @@ class RowsWriter:
             kind = channel.topic, table_schema_of(channel), is_reduced
             table = _table(messages, self._shapes.setdefault(kind, FieldShape()))
             file = self._file(kind, table.schema)
-            file.rows += table.num_rows
             file.tables.append(table)
         for file in self._open.values():  # between chunks: none is in two row groups
             if sum(one.nbytes for one in file.tables) >= _GROUP_BYTES:
@@ -189,7 +185,7 @@ class RowsWriter:
             name = rows_name(self._log.number, self._version + len(self.names))
             front = b"" if self.names else self._front
             self.names.append(name)
-            writer = ParquetFileWriter(self._folder / name, schema, level=_LEVEL, front=front)
+            writer = ColumnFileWriter(self._folder / name, schema, level=_LEVEL, front=front)
             found = self._open[kind, schema] = _OpenFile(kind[0], writer)
         return found
 
@@ -197,7 +193,7 @@ class RowsWriter:
         if file.tables:
             file.flush()
         digests = {str(self._log.number): self._log.digest}
-        section = Section(self._folder.name, file.topic, 0, digests, file.rows)
+        section = Section(self._folder.name, file.topic, 0, digests, file.writer.rows)
         file.writer.close([section], sync=True)
 
 

@@ -19,6 +19,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+import pyarrow as pa
+
+from hybridlog.columns.clouds import PointColumns, is_cloud
+from hybridlog.columns.column_file import ColumnFileWriter
+from hybridlog.columns.fields import FieldShape, copied, joined
+from hybridlog.columns.folders import Addition, TableFolders
 from hybridlog.columns.layout import (
     POINTS,
     RESERVED,
@@ -30,6 +36,7 @@ from hybridlog.columns.layout import (
     type_prefix,
 )
 from hybridlog.columns.rows import Piece, as_table, columns_from, piece_of
+from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.codec import no_rows
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.left import LeftFields
@@ -39,7 +46,6 @@ from hybridlog_storage.ordering import order_of
 from hybridlog_storage.settings import read_settings
 
 if TYPE_CHECKING:
-    from hybridlog.columns.fields import FieldShape
     from hybridlog.index.indexing import Messages
     from hybridlog.schema.codec import Decoded
     from hybridlog_storage.catalog import RecordingEntry
@@ -60,27 +66,14 @@ _RESERVE = 256 << 20  # bytes of the disk reserved for segments
 _OPEN_FILES = 128  # maximum number of unfinished files
 _log = logging.getLogger(__name__)
 
-
-def load() -> None:
-    """Import what tables need: amid a recording, that would hold up all threads for a while."""
-    import pyarrow as pa
-
-    import hybridlog.columns.clouds
-    import hybridlog.columns.left_rows
-    import hybridlog.columns.parquet_file
-    import hybridlog.schema.arrow_columns  # noqa: F401
-
-    pa.array([0]).to_numpy(zero_copy_only=False)  # loads pandas, if it is installed
+# Loads pandas, if it is installed: amid a recording, that would hold up all threads for a while.
+pa.array([0]).to_numpy(zero_copy_only=False)
 
 
 class _Topic:
     """Messages of one topic and definition."""
 
     def __init__(self, recording: str, channel: Channel, *, arrays: bool = False) -> None:
-        from hybridlog.columns.clouds import PointColumns, is_cloud
-        from hybridlog.columns.fields import FieldShape
-        from hybridlog.schema.arrow_columns import structs
-
         self.recording = recording
         self.name = channel.topic
         self.type = channel.schema.name if channel.schema is not None else ""
@@ -89,7 +82,7 @@ class _Topic:
         whole = replace(channel, message_encoding=encoding)
         self.points = PointColumns() if arrays and is_cloud(whole) else None
         reserved = RESERVED if self.points is None else RESERVED | {POINTS}
-        self.shape: FieldShape = FieldShape(arrays=arrays, reserved=reserved)
+        self.shape = FieldShape(arrays=arrays, reserved=reserved)
         codec, none = codec_for(whole), no_rows()
         decoded = codec.columns(b"", none, none) if codec.indexed else None
         self.none = structs({}, 0) if decoded is None else self.shape.columns(decoded.arrow())
@@ -118,15 +111,22 @@ class _Topic:
         self.pieces.append(piece)
         self.rows += piece.rows
         if len(self.pieces) >= _PIECES:
-            self.pieces = [self.take()]
+            self.pieces = [self._joined()]
 
-    def take(self) -> Piece:
-        """Remove and return the rows in memory, of which there are some."""
-        import pyarrow as pa
+    def take(self) -> tuple[Piece, pa.Table]:
+        """Remove and return the rows in memory, of which there are some, also as a table.
 
-        from hybridlog.columns.fields import joined
+        That is in the order of log time and arrival.
+        """
+        piece, self.pieces = self._joined(), []
+        names = {"recording": self.recording, "topic": self.name}
+        columns = {name: pa.repeat(pa.scalar(value), piece.rows) for name, value in names.items()}
+        table = as_table({**columns, **piece.own}, piece.fields)
+        order = order_of(piece.own["t"].to_numpy(), piece.own["seq"].to_numpy())
+        return piece, table if order is None else table.take(pa.array(order))
 
-        pieces, self.pieces = self.pieces, []
+    def _joined(self) -> Piece:
+        pieces = self.pieces
         fields = joined([self.none, *(piece.fields_as(self.none.type) for piece in pieces)])
         own = {
             name: pa.concat_arrays([piece.own[name] for piece in pieces]) for name in pieces[0].own
@@ -150,50 +150,29 @@ class _Topic:
 
     def columns(self, decoded: Decoded) -> Any:
         """The fields of decoded messages as columns."""
-        from hybridlog.columns.fields import copied
-
         columns = columns_from(decoded, self.shape)
         if self.points is not None and not isinstance(decoded.records, LeftFields):
             columns = self.points.with_points(columns, decoded.arrow())
         return copied(columns)
 
-    def table(self, piece: Piece) -> Any:
-        """Rows in order of log time and arrival."""
-        import pyarrow as pa
 
-        names = {"recording": self.recording, "topic": self.name}
-        columns = {name: pa.repeat(pa.scalar(value), piece.rows) for name, value in names.items()}
-        table = as_table({**columns, **piece.own}, piece.fields)
-        order = order_of(piece.own["t"].to_numpy(), piece.own["seq"].to_numpy())
-        return table if order is None else table.take(pa.array(order))
+class _File(ColumnFileWriter):
+    """An unfinished file of one topic; it counts what a piece counts."""
 
-
-class _File:
-    """An unfinished file of one topic; its attributes are those of a piece."""
-
-    def __init__(self, path: Path, schema: Any) -> None:
-        from hybridlog.columns.parquet_file import ParquetFileWriter
-
-        self.path = path
-        self.schema = schema
+    def __init__(self, path: Path, schema: pa.Schema) -> None:
+        super().__init__(path, schema)
         self.segments: set[int] = set()
-        self.rows = self.unreadable = self.arrays = 0
-        self._writer = ParquetFileWriter(path, schema)
-        self.discard = self._writer.discard
+        self.unreadable = self.arrays = 0
 
-    def write(self, table: Any, piece: Piece) -> None:
+    def add(self, piece: Piece, table: pa.Table) -> None:
         """Write rows as row groups."""
-        step = _rows_of_group(table)
+        rows = max(table.num_rows, 1)
+        step = max(min(GROUP_ROWS, rows * GROUP_BYTES // max(table.nbytes, 1)), 1)
         for begin in range(0, table.num_rows, step):
-            self._writer.write(table.slice(begin, step))
+            self.write(table.slice(begin, step))
         self.segments |= piece.segments
-        self.rows += piece.rows
         self.unreadable += piece.unreadable
         self.arrays += piece.arrays
-
-    def close(self, section: Section) -> None:
-        """Finish the file."""
-        self._writer.close([section])
 
 
 class TableWriter:
@@ -321,13 +300,12 @@ class TableWriter:
         """Write rows to an unfinished file of a topic."""
         if topic.pieces:
             self._check_room()
-            piece = topic.take()
-            table = topic.table(piece)
+            piece, table = topic.take()
             file = next((one for one in topic.files if one.schema == table.schema), None)
             if file is None:
                 file = _File(self._new_part(), table.schema)
                 topic.files.append(file)
-            file.write(table, piece)
+            file.add(piece, table)
 
     def _new_part(self) -> Path:
         if not self._numbers:
@@ -345,7 +323,7 @@ class TableWriter:
         """Finish a topic's files of closed segments."""
         for file in [one for one in topic.files if one.segments <= self._cut.keys()]:
             topic.files.remove(file)
-            file.close(self._section(topic, file))
+            file.close([self._section(topic, file)])
             folder = shape_folder(topic.type, file.schema)
             place = self._parts / folder / file.path.name
             files.make_folders(place.parent)
@@ -359,8 +337,6 @@ class TableWriter:
         return Section(self._recording, topic.name, begin, digests, *counts)
 
     def _close(self, entry: RecordingEntry) -> None:
-        from hybridlog.columns.folders import Addition, TableFolders
-
         incomplete = self._incomplete(entry)
         begin = min((first for _, first, _ in entry.spans), default=entry.created)
         additions = defaultdict[str, Addition](Addition)
@@ -372,8 +348,7 @@ class TableWriter:
                     self._write(topic)
                     self._finish(topic)
                 elif topic.pieces:
-                    piece = topic.take()
-                    table = topic.table(piece)
+                    piece, table = topic.take()
                     rows = self._section(topic, piece, begin), table
                     additions[shape_folder(topic.type, table.schema)].pieces.append(rows)
             for folder, path in topic.finished:
@@ -396,8 +371,3 @@ class TableWriter:
         messages = entry.messages_by_topic()
         names = [*rows] if self._wanted is None else self._wanted
         return {name for name in names if rows[name] != messages[name]}
-
-
-def _rows_of_group(table: Any) -> int:
-    rows = max(int(table.num_rows), 1)
-    return max(min(GROUP_ROWS, rows * GROUP_BYTES // max(int(table.nbytes), 1)), 1)

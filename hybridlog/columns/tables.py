@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import os
 import threading
+import time
 from collections import OrderedDict, defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -19,9 +20,8 @@ from pathlib import Path
 from stat import S_ISDIR
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from hybridlog.columns.column_file import ColumnFile, OpenFiles, TablePart
-from hybridlog.columns.fields import UnfitError
-from hybridlog.columns.folders import Listing, shared_for, shared_times
+from hybridlog.columns.column_file import ColumnFile, TablePart
+from hybridlog.columns.folders import shared_for, shared_times
 from hybridlog.columns.layout import (
     SUFFIX,
     TABLES,
@@ -32,7 +32,8 @@ from hybridlog.columns.layout import (
 from hybridlog.columns.topic_table import TopicTable
 from hybridlog.schema.states import encoding_of
 from hybridlog_storage.cache import Cache
-from hybridlog_storage.errors import StoreError
+from hybridlog_storage.disk import files
+from hybridlog_storage.errors import StoreError, unreadable
 from hybridlog_storage.messages import EXPIRED_IDS, MARKS_CHANNEL
 
 if TYPE_CHECKING:
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
 
 _MAX_RUNNING: Final = 16  # recordings in progress whose tables are kept open
 _MAX_FOUND: Final = 65_536  # tables that are kept
+_STABLE_NS: Final = 100_000_000  # a time of change that is older tells of every later change
 
 
 class TopicRows(NamedTuple):
@@ -54,12 +56,38 @@ class TopicRows(NamedTuple):
         return self.section.segments.items() <= recording.digests.items()
 
 
-class _Folder(Listing):
+class _Listing:
+    """Status of a folder's entries by name, read again after a change; none without the folder."""
+
+    def __init__(self, path: Path, cache: Cache) -> None:
+        self.names: dict[str, os.stat_result] = {}
+        self._path = path
+        self._cache = cache
+        self._read_at: tuple[int, int] | None = None  # inode, and time of its last change
+
+    def read(self) -> bool:
+        """Read the entries if they may have changed; returns whether it did."""
+        try:
+            now, names = files.changed_names(self._path, self._read_at)
+            if names is None:
+                return False
+            self.names = names
+        except FileNotFoundError:
+            self.names, self._read_at = {}, None
+            return True
+        except OSError as error:
+            raise unreadable(error, self._path) from error
+        # A change within the same tick of the clock would have the same time.
+        is_stable = time.time_ns() - now[1] > _STABLE_NS
+        self._read_at = now if is_stable else None
+        return True
+
+
+class _Folder(_Listing):
     """The files of a folder."""
 
-    def __init__(self, path: Path, opened: OpenFiles) -> None:
-        super().__init__(path)
-        self._opened = opened
+    def __init__(self, path: Path, cache: Cache) -> None:
+        super().__init__(path, cache)
         self._shared: list[int] = []  # numbers in the names of shared files
         self._own: dict[str, list[str]] = {}  # files of long topics, by recording
         self._files: dict[str, tuple[tuple[int, int, int], ColumnFile | None]] = {}
@@ -83,15 +111,14 @@ class _Folder(Listing):
                 break
 
     def _drop_replaced(self) -> None:
-        before, self._files, self.rows = self._files, {}, {}
-        for name, (identity, file) in before.items():
-            if name in self.names and identity == _identity(self.names[name]):
-                self._add(name, identity, file)
+        before, self._files, self.rows, self._own = self._files, {}, {}, {}
         tables = sorted(name for name in self.names if name.endswith(SUFFIX))
         self._shared = shared_times(tables)
-        self._own = {}
         for name in tables:
             self._own.setdefault(name.rpartition("-")[0], []).append(name)
+            identity = _identity(self.names[name])
+            if name in before and before[name][0] == identity:
+                self._add(name, *before[name])
 
     def _open(self, name: str) -> ColumnFile | None:
         """A file, if there is one that can be read."""
@@ -101,12 +128,11 @@ class _Folder(Listing):
         file: ColumnFile | None = None
         for _ in range(2):  # of an object in a bucket, the first look tells that it has gone
             try:
-                file = ColumnFile(self._path / name)
+                file = ColumnFile(self._path / name, self._cache)
             except FileNotFoundError:
                 return None
             except StoreError:
                 continue
-            self._opened.opened(file)
             break
         self._add(name, _identity(status), file)
         return file
@@ -123,12 +149,11 @@ def _identity(status: os.stat_result) -> tuple[int, int, int]:
     return status.st_ino, status.st_size, status.st_mtime_ns
 
 
-class _Folders(Listing):
+class _Folders(_Listing):
     """The folders in one place."""
 
-    def __init__(self, place: Path, opened: OpenFiles) -> None:
-        super().__init__(place)
-        self._opened = opened
+    def __init__(self, path: Path, cache: Cache) -> None:
+        super().__init__(path, cache)
         self._known: dict[str, dict[str, _Folder]] = {}  # by the beginning of their names
 
     def look(self) -> None:
@@ -140,7 +165,7 @@ class _Folders(Listing):
             if S_ISDIR(about.st_mode):
                 begin = f"{name.rpartition('~')[0]}~"
                 folder = before.get(begin, {}).get(name)
-                folder = folder or _Folder(self._path / name, self._opened)
+                folder = folder or _Folder(self._path / name, self._cache)
                 self._known.setdefault(begin, {})[name] = folder
 
     def of(self, types: Iterable[str]) -> list[_Folder]:
@@ -153,9 +178,9 @@ class Tables:
 
     def __init__(self, root: Path, cache: Cache | None = None) -> None:
         self._root = root
-        self.opened = OpenFiles(cache or Cache())
+        self._cache = cache or Cache()
         self._found: OrderedDict[tuple[str, str], TopicTable | None] = OrderedDict()
-        self._folders = _Folders(root / TABLES, self.opened)
+        self._folders = _Folders(root / TABLES, self._cache)
         self._looked_at: set[str] = set()  # types whose folders were looked at
         self._sealed: OrderedDict[str, _Folders] = OrderedDict()
         self._channels: tuple[RecordingEntry, dict[str, list[ChannelEntry]]] | None = None
@@ -189,7 +214,7 @@ class Tables:
         """All rows of a file, as if of one topic; with `arrays`, all count as rows with arrays."""
         unreadable = sum(section.unreadable for section in file.about.sections)
         parts = [TablePart(file, group, 0, rows) for group, rows in enumerate(file.groups)]
-        return TopicTable(parts, self.opened, unreadable=unreadable, has_arrays=arrays)
+        return TopicTable(parts, unreadable=unreadable, has_arrays=arrays)
 
     def check(self, recording: RecordingEntry, topic: str) -> TopicTable:
         """The table of a topic in a recording; FileNotFoundError if these segments have none."""
@@ -249,7 +274,7 @@ class Tables:
             return None
         with self._lock:
             place = parts_folder(self._root, recording.id)
-            known = self._sealed.setdefault(recording.id, _Folders(place, self.opened))
+            known = self._sealed.setdefault(recording.id, _Folders(place, self._cache))
             known.look()
             for folder in known.of(self._types_of(recording, topic)):
                 folder.look(recording)
@@ -307,16 +332,12 @@ class Tables:
         is_expired = any(one.id >= EXPIRED_IDS for one in self._channels_of(recording, topic))
         table = TopicTable(
             [part for one in found for part in one.file.parts(one.begin, one.section.rows)],
-            self.opened,
             unreadable=sum(one.section.unreadable for one in found),
             has_arrays=not is_expired and all(one.section.has_arrays for one in found),
             segments=(int(number) for one in found for number in one.section.segments),
         )
         if len(table.files) > 1:
-            try:
-                table.fields()
-            except UnfitError as error:
-                raise StoreError(f"The tables of {topic} have no common type: {error}.") from error
+            table.fields()  # which some have not in common
         return table
 
     def _channels_of(self, recording: RecordingEntry, topic: str) -> list[ChannelEntry]:

@@ -13,12 +13,13 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from hybridlog.columns.column_file import FIRST
-from hybridlog.columns.fields import joined, names_of, records_of, type_of_all
+from hybridlog.columns.fields import joined, names_of, records_of
 from hybridlog.columns.layout import POINTS
 from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.arrow_types import converted
 from hybridlog.schema.column import ranges
 from hybridlog.schema.states import State
+from hybridlog_storage.errors import StoreError
 from hybridlog_storage.ordering import order_of
 from hybridlog_storage.stopping import check_wanted
 from hybridlog_storage.times import placed, span_of
@@ -26,7 +27,7 @@ from hybridlog_storage.times import placed, span_of
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.columns.column_file import OpenFiles, TablePart
+    from hybridlog.columns.column_file import TablePart
     from hybridlog.query.intervals import Span
 
 _MAX_TYPES: Final = 64  # sets of fields whose types are kept for a table
@@ -85,7 +86,6 @@ class TopicTable:
     def __init__(
         self,
         parts: Sequence[TablePart],
-        opened: OpenFiles,
         *,
         unreadable: int = 0,
         has_arrays: bool = False,
@@ -96,13 +96,15 @@ class TopicTable:
         self.unreadable = unreadable
         self.has_arrays = has_arrays
         self.files = list({part.file.number: part.file for part in parts}.values())
-        self._opened = opened
         self._parts = parts
         self._types: dict[frozenset[str] | None, Any] = {}
         self._summarised: dict[tuple[str, ...], bool] = {}
 
     def fields(self, paths: Collection[str] | None = None) -> Any:
-        """Type of `TableRows.records` for dotted paths, `[]` optional; None for all."""
+        """Type of `TableRows.records` for dotted paths, `[]` optional; None for all.
+
+        It is common to the files. In JSON, integers beside fractions are doubles.
+        """
         key = None if paths is None else frozenset(paths)
         if key not in self._types:
             if len(self._types) >= _MAX_TYPES:
@@ -212,7 +214,11 @@ class TopicTable:
     ) -> TableRows:
         ours, columns = self.columns(part, paths, {"t", "seq", *own})
         t, seq = (ours.pop(name).to_numpy() for name in ("t", "seq"))
-        return TableRows(t, seq, ours, converted(records_of(columns, self._is_summarised), kind))
+        try:
+            records = converted(records_of(columns, self._is_summarised), kind)
+        except pa.ArrowInvalid as error:  # an integer that no double is, beside fractions
+            raise StoreError(f"The tables have no common exact type: {error}.") from error
+        return TableRows(t, seq, ours, records)
 
     @property
     def parts(self) -> list[TablePart]:
@@ -225,17 +231,13 @@ class TopicTable:
         """The table's own columns of a row group by name, and those of fields, a struct each."""
         check_wanted()
         chosen = part.file.choose(paths, own, arrays=self.has_arrays)
-        columns = {top: self._column(part, top, numbers) for top, numbers in chosen.items()}
+        columns = {top: _column(part, numbers) for top, numbers in chosen.items()}
         ours = {name: columns.pop(name) for name in own if name in columns}
         if not columns:
             return ours, structs({}, part.rows)
         schema = part.file.schema
         fields = [schema.field(top).with_type(one.type) for top, one in columns.items()]
         return ours, pa.StructArray.from_arrays([*columns.values()], fields=fields)
-
-    def _column(self, part: TablePart, top: str, leaves: tuple[int, ...]) -> Any:
-        column = self._opened.column(part.file, part.group, top, leaves)
-        return column.slice(part.begin, part.rows)
 
     def _is_full(self, array: tuple[str, ...]) -> bool:
         """True if an array is there in full in all rows, and its summary, too."""
@@ -255,9 +257,7 @@ class TopicTable:
         leaf = part.file.summaries.get(array)
         if leaf is None or not part.file.has_values(part.group, leaf):
             return False
-        top = part.file.leaves[leaf].top
-        column = self._column(part, top, (leaf,))
-        return _has_values(column)
+        return _has_values(_column(part, (leaf,)))
 
     def _find_type(self, paths: Collection[str] | None) -> Any:
         found = []
@@ -265,8 +265,12 @@ class TopicTable:
             chosen = file.choose(paths, (), arrays=self.has_arrays).values()
             table = file.read(None, [*chain.from_iterable(chosen)])
             columns = pa.nulls(0, pa.struct([*table.schema]))
-            found.append(records_of(columns, self._is_summarised).type)
-        return type_of_all(found)
+            found.append(records_of(columns, self._is_summarised))
+        return joined(found).type
+
+
+def _column(part: TablePart, leaves: Sequence[int]) -> Any:
+    return part.file.column(part.group, leaves).slice(part.begin, part.rows)
 
 
 def _has_values(column: Any) -> bool:

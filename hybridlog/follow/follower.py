@@ -16,7 +16,6 @@ from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any, Final
 
 from hybridlog.columns.recording_logs import RecordingRows
-from hybridlog.columns.table_writer import TableWriter, load
 from hybridlog.entries import put_entry
 from hybridlog.follow.child import Followed
 from hybridlog.index.indexing import ChunkIndexer
@@ -129,6 +128,8 @@ class Follower:
         self._begin()
 
     def _begin(self) -> None:
+        from hybridlog.columns.table_writer import TableWriter  # loads pyarrow
+
         entry, topics = self._entry, self._topics
         self._tables = TableWriter(self._directory.path, entry.id, entry.name, topics)
         self._damage = self._catalog.damage(entry.id)
@@ -411,7 +412,6 @@ class FollowerThread(Follower):
         interval_s: float | None,
         entry: RecordingEntry,
     ) -> None:
-        load()
         super().__init__(directory, catalog, entry, target)
         self._interval_s = interval_s
         self._ended_as: RecordingEntry | None = None

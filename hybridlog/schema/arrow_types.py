@@ -147,16 +147,6 @@ def exact(kinds: Kinds, arrays: Arrays) -> pa.DataType:
     return pa.large_binary() if all(map(is_bytes, kinds)) else pa.json_()
 
 
-def widened(kinds: Kinds, arrays: Arrays) -> pa.DataType:
-    """The same by types alone: all values of the types fit; `pa.ArrowInvalid` without one."""
-    whole = all(map(_types.is_integer, kinds)) and not (
-        pa.uint64() in kinds and any(map(_types.is_signed_integer, kinds))
-    )
-    if whole or all(map(_types.is_floating, kinds)) or all(map(is_text, kinds)):
-        return exact(kinds, arrays)
-    raise pa.ArrowInvalid(f"{', '.join(map(str, kinds))} have no common type")
-
-
 def common_type(
     arrays: Arrays,
     leaf: Callable[[Kinds, Arrays], pa.DataType] = exact,
@@ -210,7 +200,7 @@ def _common_struct(arrays: Arrays, inner: _Common) -> pa.DataType:
     for array in arrays:
         for field, child in zip(array.type, array.flatten(), strict=True):
             known = fields.setdefault(field.name, field)
-            if known.metadata != field.metadata:
+            if (known.metadata or {}) != (field.metadata or {}):  # of JSON text it is empty
                 raise pa.ArrowInvalid(f"{field.name} stands for two fields")
             children.setdefault(field.name, []).append(child)
     return pa.struct([field.with_type(inner(children[name])) for name, field in fields.items()])

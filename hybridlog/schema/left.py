@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import chain
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
@@ -14,7 +13,7 @@ from hybridlog.schema.states import CAUSES, State
 from hybridlog_storage.errors import PayloadError
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Sequence
+    from collections.abc import Collection, Iterable
 
     import pyarrow as pa
     from numpy.typing import NDArray
@@ -27,27 +26,21 @@ class LeftFields(Objects):
     """Fields of messages whose payloads are gone.
 
     Args:
-        parts: Columns of tables, those of one type together; a struct has all of them.
-        order: int64[n], the row of each message among those of all parts.
+        columns: Columns of tables, one row for each message.
         fields: Dotted paths of those wanted in `arrow`, each with all below it; None for all.
         empty: No messages, as the codec of the payloads decodes them.
     """
 
     def __init__(
-        self,
-        parts: Sequence[pa.StructArray],
-        order: NDArray[np.int64],
-        fields: Collection[str] | None,
-        empty: Decoded,
+        self, columns: pa.StructArray, fields: Collection[str] | None, empty: Decoded
     ) -> None:
         super().__init__([], fields)
-        self._parts = parts
-        self._order = order
+        self._columns = columns
         self._empty = empty
 
     def __len__(self) -> int:
         """Number of messages."""
-        return len(self._order)
+        return len(self._columns)
 
     @property
     def is_typed(self) -> bool:
@@ -56,59 +49,40 @@ class LeftFields(Objects):
 
     def take(self, rows: NDArray[np.bool_]) -> LeftFields:
         """Select messages."""
-        return LeftFields(self._parts, self._order[rows], self.fields, self._empty)
+        return LeftFields(self._columns.filter(rows), self.fields, self._empty)
 
     def plain(self, *, whole: bool) -> list[dict[str, object]]:
         """The messages as plain values, long arrays and bytes as summaries."""
-        return self._documents(summaries=True)
-
-    def _documents(self, *, summaries: bool) -> list[dict[str, object]]:
         from hybridlog.columns.left_rows import documents
 
-        made = (documents(p, typed=self.is_typed, summaries=summaries) for p in self._parts)
-        found = [one for part in made for one in part]
-        return [found[row] for row in self._order.tolist()]
+        return documents(self._columns, typed=self.is_typed)
 
     def arrow(self) -> pa.StructArray:
         """The messages as an Arrow array; arrays of which only a summary is left are null."""
-        if not self.is_typed:
-            from hybridlog.schema.arrow_columns import objects_array
+        from hybridlog.columns.left_rows import documents
+        from hybridlog.schema.arrow_columns import objects_array
+        from hybridlog.schema.arrow_types import converted
 
-            return objects_array(self._documents(summaries=False), self.wanted())
-        return self._narrowed(self._records(()), self._empty.arrow().type)
+        if not self.is_typed:
+            found = documents(self._columns, typed=False, summaries=False)
+            return objects_array(found, self.wanted())
+        return converted(self._records(()), self._empty.arrow().type, drops=True)
 
     def columns(self) -> pa.StructArray:
         """The messages as columns of tables."""
-        return self._joined(self._parts)
+        return self._columns
 
     def summarised(self) -> pa.StructArray:
         """The messages as an Arrow array; those arrays are summaries of which one is left."""
         from hybridlog.columns.left_rows import summarised_in
 
-        return self._joined(self._records({one for p in self._parts for one in summarised_in(p)}))
+        return self._records({*summarised_in(self._columns)})
 
-    def _joined(self, parts: Sequence[pa.StructArray]) -> pa.StructArray:
-        from hybridlog.columns.fields import joined
-
-        return joined(parts).take(self._order)
-
-    def _records(self, summarised: Collection[str]) -> list[pa.StructArray]:
-        """The fields of each part; arrays at some paths are summaries."""
+    def _records(self, summarised: Collection[str]) -> pa.StructArray:
+        """The fields; arrays at some paths are summaries."""
         from hybridlog.columns.fields import records_of
 
-        return [records_of(p, lambda path: ".".join(path) in summarised) for p in self._parts]
-
-    def _narrowed(self, parts: Sequence[pa.Array[Any] | None], kind: Any) -> Any:
-        """Values of each part, or None, as one array of a type."""
-        import pyarrow as pa
-
-        from hybridlog.schema.arrow_types import converted
-
-        arrays = [
-            pa.nulls(len(part), kind) if one is None else converted(one, kind, drops=True)
-            for one, part in zip(parts, self._parts, strict=True)
-        ]
-        return pa.concat_arrays([pa.nulls(0, kind), *arrays]).take(self._order)
+        return records_of(self._columns, lambda path: ".".join(path) in summarised)
 
     def statistics(self, paths: Iterable[str]) -> dict[str, pa.Array[Any]]:
         """`n`, `min`, `max` or `mean` of arrays by path (`ranges.min`), of those that have one."""
@@ -117,19 +91,16 @@ class LeftFields(Objects):
         made = {}
         for path in paths:
             array, _, what = path.rpartition(".")
-            names = array.split(".")
-            found = [part_of_summary(part, names, what) for part in self._records({array})]
-            kind = next((one.type for one in found if one is not None), None)
-            if kind is not None:
-                made[path] = self._narrowed(found, kind)
+            found = part_of_summary(self._records({array}), array.split("."), what)
+            if found is not None:
+                made[path] = found
         return made
 
     def lacking(self, but: Collection[str] = ()) -> NDArray[np.bool_]:
         """bool[n], True where a wanted array, none of `but`, has only its summary left."""
         from hybridlog.columns.left_rows import lacking
 
-        found = [lacking(part, self.fields, but) for part in self._parts]
-        return np.concatenate([np.zeros(0, np.bool_), *found])[self._order]
+        return lacking(self._columns, self.fields, but)
 
 
 class LeftCodec(Codec):
@@ -157,7 +128,9 @@ class LeftCodec(Codec):
 
     def columns_of(self, batch: Batch, fields: Collection[str] | None = None) -> Decoded:
         """The fields that are left; see `Codec.columns`."""
+        from hybridlog.columns.fields import joined
         from hybridlog.columns.left_rows import fields_in, with_rows
+        from hybridlog.schema.arrow_columns import structs
 
         if self.state is State.REDUCED and self.indexed:
             batch = with_rows(batch)
@@ -165,23 +138,25 @@ class LeftCodec(Codec):
         if places is None:
             return self.columns(b"", no_rows(), no_rows(), fields)
         parts: list[pa.StructArray] = []
-        order = np.zeros(len(places.row), np.int64)
+        rows: list[NDArray[np.intp]] = []
         bad: dict[str, list[int]] = {}
         surplus: list[NDArray[np.intp]] = [no_rows()]
-        for part, own, rows in places.by_part():
-            found = part.take(rows)
-            order[own] = np.arange(len(own)) + sum(map(len, parts))
-            parts.append(fields_in(found))
+        for part, own, taken in places.by_part():
+            found = part.take(taken)
             error = found.field("error")
             for row, reason in zip(own.tolist(), error.to_pylist(), strict=True):
                 if reason is not None:
                     bad.setdefault(reason, []).append(row)
+            there = error.is_null().to_numpy(zero_copy_only=False)
+            parts.append(fields_in(found.filter(error.is_null())))
+            rows.append(own[there])
             has_surplus = found.field("ref").field("surplus").to_numpy(zero_copy_only=False)
             surplus.append(own[has_surplus])
-        good = np.setdiff1d(np.arange(len(order)), [*chain.from_iterable(bad.values())])
+        order = np.argsort(good := np.concatenate([no_rows(), *rows]))
         empty = self.original.columns(b"", no_rows(), no_rows(), fields)
-        records = LeftFields(parts, order[good], fields, empty)
-        return Decoded(good, records, unreadable(bad), np.sort(np.concatenate(surplus)))
+        columns = joined(parts).take(order) if parts else structs({}, 0)
+        records = LeftFields(columns, fields, empty)
+        return Decoded(good[order], records, unreadable(bad), np.sort(np.concatenate(surplus)))
 
     def decode(self, payload: Buffer) -> NoReturn:
         """Refuses with PayloadError."""

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow.parquet as pq
+import pytest
 
 import hybridlog as hl
 from hybridlog.columns.tables import Tables
@@ -41,7 +42,7 @@ def test_an_empty_message_that_is_missing_at_times(store: hl.Store, tmp_path: Pa
 
 def test_json_that_gets_fields_later(store: hl.Store, tmp_path: Path, limit: Limit) -> None:
     """A file has one type: what comes later goes to another one, and all is one table."""
-    limit(table_pending_bytes=1, table_left_bytes=0, group_bytes=1)
+    few_rows_a_file(limit)
     values = [{"a": n} if n < 1000 else {"a": n, "b": str(n)} for n in range(2000)]
     record(store, tmp_path, values)
     assert len(list((store.directory.path / "tables").glob("any~*"))) == 2
@@ -49,15 +50,35 @@ def test_json_that_gets_fields_later(store: hl.Store, tmp_path: Path, limit: Lim
     assert found == [{"a": n, "b": None if n < 1000 else str(n)} for n in range(2000)]
 
 
-def test_json_whose_types_change_has_files_and_no_answer(
-    store: hl.Store, tmp_path: Path, limit: Limit
-) -> None:
+def few_rows_a_file(limit: Limit) -> None:
     limit(table_pending_bytes=1, table_left_bytes=0, group_bytes=1)
+
+
+def test_json_whose_types_change_is_text(store: hl.Store, tmp_path: Path, limit: Limit) -> None:
+    few_rows_a_file(limit)
     record(store, tmp_path, [{"a": n if n < 1000 else str(n)} for n in range(2000)])
     files = list((store.directory.path / "tables").glob("any~*/*.parquet"))
     assert sum(pq.read_metadata(path).num_rows for path in files) == 2000
-    assert rows(store) is None
-    assert store.topic("/a").count() == 2000
+    assert rows(store) == [{"a": str(n) if n < 1000 else f'"{n}"'} for n in range(2000)]
+    assert store.topic("/a").where("a == 7").count() == 1
+
+
+@pytest.mark.parametrize("large", [7, 2**53 + 1])
+def test_json_integers_in_one_file_and_fractions_in_another(
+    store: hl.Store, tmp_path: Path, limit: Limit, large: int
+) -> None:
+    """They are doubles, or the messages answer."""
+    few_rows_a_file(limit)
+    values = [*range(9), large, *range(10, 1000), *(n / 4 for n in range(1000, 2000))]
+    record(store, tmp_path, [{"a": value} for value in values])
+    assert len(list((store.directory.path / "tables").glob("any~*"))) > 1
+    assert store.topic("/a").where(f"a == {large}").count() == (1 if large > 7 else 2)
+    column = store.topic("/a").fields("a").to_pandas()["a"]
+    assert (int(column.iloc[9]), float(column.iloc[1001])) == (large, 250.25)
+    if large == 7:
+        found = rows(store)
+        assert found is not None
+        assert {type(row["a"]) for row in found} == {float}
 
 
 def test_a_field_that_breaks_parquet_costs_only_its_topic(store: hl.Store, tmp_path: Path) -> None:

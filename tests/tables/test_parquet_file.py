@@ -11,9 +11,8 @@ import pyarrow.parquet as pq
 import pytest
 
 import hybridlog as hl
-from hybridlog.columns.column_file import ColumnFile
+from hybridlog.columns.column_file import ColumnFile, ColumnFileWriter
 from hybridlog.columns.layout import Section, column_names, shape_folder
-from hybridlog.columns.parquet_file import ParquetFileWriter
 from hybridlog_storage.errors import StoreError
 from tests.damage import flip
 
@@ -40,7 +39,7 @@ def table() -> pa.Table:
 
 def write(path: Path, table: pa.Table, groups: int = 2) -> Section:
     rows = table.num_rows
-    writer = ParquetFileWriter(path, table.schema)
+    writer = ColumnFileWriter(path, table.schema)
     for _ in range(groups):
         writer.write(table)
     section = Section("id", "/a", 0, {"0": "d"}, rows * groups)

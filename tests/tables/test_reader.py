@@ -15,14 +15,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import hybridlog as hl
-from hybridlog.columns.column_file import ColumnFile, OpenFiles, TablePart
+from hybridlog.columns.column_file import ColumnFile, ColumnFileWriter, TablePart
 from hybridlog.columns.fields import FieldShape, joined, records_of
 from hybridlog.columns.layout import Section
-from hybridlog.columns.parquet_file import ParquetFileWriter
 from hybridlog.columns.tables import Tables
 from hybridlog.columns.topic_table import TopicTable
 from hybridlog.follow.follower import make_tables
-from hybridlog_storage.cache import Cache
 from tests.damage import flip
 from tests.some import in_turn
 from tests.tables.logs import decoded, table_of
@@ -58,14 +56,14 @@ def test_parts_are_merged(runs: list[list[tuple[int, int]]], size: int) -> None:
             seen.update(own)
             table = pa.table({"t": [t for t, _ in own], "seq": [seq for _, seq in own]})
             table = table.append_column("n", table["seq"]).cast(INTEGERS)
-            writer = ParquetFileWriter(Path(folder) / f"{number}.parquet", table.schema)
+            writer = ColumnFileWriter(Path(folder) / f"{number}.parquet", table.schema)
             for begin in range(0, len(own), size):
                 writer.write(table.slice(begin, size))
             writer.close([Section("r", "t", 0, {}, len(own))])
             parts += ColumnFile(writer.path).parts(0, len(own))
         if not parts:
             return
-        table_of = TopicTable(parts, OpenFiles(Cache()))
+        table_of = TopicTable(parts)
         for spans in (None, [(2, 4), (7, 8)]):
             want = [
                 k for k in sorted(seen) if spans is None or any(a <= k[0] < b for a, b in spans)

@@ -253,9 +253,9 @@ def test_whatever_fails_the_recording_goes_on(
     elif place == "publish":
         calls.fail(TableFolders, "_change", error)
     else:
-        from hybridlog.columns.parquet_file import ParquetFileWriter
+        from hybridlog.columns.column_file import ColumnFileWriter
 
-        calls.fail(ParquetFileWriter, place, error)
+        calls.fail(ColumnFileWriter, place, error)
     said = [(BASE + n, "/large" if n % 50 else "/small", varied(n)) for n in range(1500)]
     write_log(tmp_path / "log.mcap", said)
     assert store.record(tmp_path / "log.mcap", name="log").entry.status == "complete"
