@@ -15,7 +15,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Final, Literal, cast
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 from msgspec import UNSET, ValidationError, convert, structs, to_builtins
@@ -42,7 +42,6 @@ from hybridlog_storage.manifest import (
     Manifest,
     Source,
     free_name,
-    loss_of,
 )
 from hybridlog_storage.messages import EXPIRED, NOT_COPIED, REDUCED, Channel, schema_hash
 from hybridlog_storage.segments.gone_log import GoneLog, open_log
@@ -277,7 +276,7 @@ def describe(catalog: Catalog, inventory: Inventory, *, is_open: bool = False) -
     lost: list[dict[str, Any]] = []
     entry.stored_bytes = sum(size for _, _, size in entry.rows)
     for number, summary in inventory.summaries.items():
-        lost += summary.losses
+        lost += map(loss_values, summary.losses)
         entry.held[str(number)] = np.unique(summary.table.parts["channel"]).tolist()
         entry.digests[str(number)] = inventory.digest(number)
         entry.spans += spans_of(number, summary.table)
@@ -621,10 +620,10 @@ def listed(*segments: Sealed) -> Callable[[Manifest], Manifest]:
     return how
 
 
-def ended(end: Mapping[str, Any]) -> Callable[[Manifest], Manifest]:
-    """The change that ends a recording, by its `status` and `losses`."""
-    status = cast("Literal['complete', 'damaged', 'recovered']", end.get("status", "complete"))
-    losses = tuple(loss_of(row) for row in end.get("losses", ()))
+def ended(
+    status: Literal["complete", "damaged", "recovered"], losses: Sequence[truth.Loss] = ()
+) -> Callable[[Manifest], Manifest]:
+    """The change that ends a recording."""
 
     def how(now: Manifest) -> Manifest:
         return truth.replace(

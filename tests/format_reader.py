@@ -152,15 +152,7 @@ class Manifest:
         }
         self.logs = {one["number"]: one for one in said.get("files", ()) if one["kind"] == "log"}
         self.rows = [one for one in said.get("files", ()) if one["kind"] == "rows"]
-        empty = {
-            "topic": None, "count": None, "from": None, "to": None, "reason": "", "file": "",
-            "offset": None, "length": None,
-        }  # fmt: skip
-        words = {"first": "from", "last": "to"}
-        self.losses = [
-            {**empty, **{words.get(key, key): value for key, value in row.items()}}
-            for row in said.get("losses", ())
-        ]
+        self.losses = [*map(loss_of, said.get("losses", ()))]
         totals: dict[int, list[int]] = {}
         for log in self.logs.values():
             for channel, part in log.get("parts", {}).items():
@@ -170,6 +162,16 @@ class Manifest:
         for channel, about in said.get("channels", {}).items():
             have = [about.get("messages", 0), about.get("bytes", 0)]
             demand(have == totals.get(int(channel), [0, 0]), "the totals of a channel")
+
+
+def loss_of(said: Mapping[str, Any]) -> dict[str, Any]:
+    """A row of the loss ledger as entries have it."""
+    empty = {
+        "topic": None, "count": None, "from": None, "to": None, "reason": "", "file": "",
+        "offset": None, "length": None,
+    }  # fmt: skip
+    words = {"first": "from", "last": "to"}
+    return {**empty, **{words.get(key, key): value for key, value in said.items()}}
 
 
 # --- segments -------------------------------------------------------------------------
@@ -224,7 +226,9 @@ class Segment:
         assert table is not None
         self._table(table, start)
         self.about = self._json("hybridlog.recording")[0]
-        self.losses = [row for said in self._json("hybridlog.losses") for row in said["rows"]]
+        self.losses = [
+            loss_of(row) for said in self._json("hybridlog.losses") for row in said["rows"]
+        ]
 
     def _read(self, path: Path) -> bytes:
         data = path.read_bytes()

@@ -22,8 +22,7 @@ from hybridlog.cli.answers import write_answer
 from hybridlog_storage.catalog import CATALOG
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.messages import Channel, Schema
-from hybridlog_storage.segments.recovery import recover_segment
-from hybridlog_storage.segments.segment_check import damage_of
+from hybridlog_storage.segments.recovery import damage_of, recover_segment
 from hybridlog_storage.segments.segment_reader import SegmentReader
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places

@@ -43,7 +43,7 @@ from hybridlog_storage.manifest import File, Loss, Manifest, Note, Part, Source,
 from hybridlog_storage.manifest import replace as changed
 from hybridlog_storage.manifests import MANIFEST_OLD
 from hybridlog_storage.messages import Batch, Channel, Schema
-from hybridlog_storage.segments.segment_format import LOSSES_METADATA, json_metadata
+from hybridlog_storage.segments.segment_format import losses_record
 from hybridlog_storage.segments.segment_writer import RecordingWriter, SegmentSettings
 from tests import places
 from tests.damage import flip
@@ -52,10 +52,7 @@ TEXT = Schema("std_msgs/String", "ros1msg", b"string data\n")
 TOPICS = [Channel(topic, "ros1", TEXT) for topic in ("/a", "/b", "/c")]
 SECOND = 10**9
 PER_SEGMENT = 20
-LOSS = {
-    "cause": "queue", "count": 3, "file": "", "from": 5, "length": None, "offset": None,
-    "reason": "", "to": 6, "topic": "/a",
-}  # fmt: skip
+LOSS = Loss("queue", "/a", 3, 5, 6)
 
 
 def payload(number: int) -> bytes:
@@ -95,7 +92,7 @@ class Made:
         source = Source(path="/x", kind="test", bytes=5)
         tags = {"place": "lab"}
         places.write_in(self.path, Manifest(self.id, name, 77, source=source, tags=tags))
-        self.end: dict[str, Any] | None = None
+        self.has_ended = False
         writer = RecordingWriter(
             self.path,
             self.said,
@@ -108,16 +105,16 @@ class Made:
             writer.append(batch(range(PER_SEGMENT * number, PER_SEGMENT * (number + 1))), TOPICS)
             writer.flush()
             if number == 1:
-                writer.add_extra(json_metadata(LOSSES_METADATA, {"rows": [LOSS]}))
-        self.end = {"status": "complete", "losses": []}
+                writer.add_extra(losses_record([LOSS]))
+        self.has_ended = True
         writer.close()
         self.segments = [path for _, path in places.segments(directory.path, self.id)]
         assert len(self.segments) == segments
 
     def _announce(self, group: Any) -> None:
         self.change(listed(*group))
-        if self.end is not None:
-            self.change(ended(self.end))
+        if self.has_ended:
+            self.change(ended("complete"))
 
     def change(self, how: Callable[[Manifest], Manifest]) -> None:
         places.change_in(self.path, how)
@@ -215,7 +212,7 @@ def test_a_whole_recording(made: Made) -> None:
     entry = made.entry()
     check(entry)
     # What is noted within a segment is in the ledger.
-    assert entry.end["losses"] == [LOSS]
+    assert entry.end["losses"] == [loss_values(LOSS)]
     assert entry.stored_bytes == sum(path.stat().st_size for path in made.segments)
     assert entry.span == (0, 79 * SECOND)
     assert [(c.topic, c.stats.payload_bytes) for c in entry.channels] == [
@@ -240,9 +237,9 @@ def test_while_it_is_written_it_is_open(made: Made) -> None:
 
 
 def test_the_end_of_a_recording_is_in_its_manifest(made: Made) -> None:
-    row = {**loss_values(Loss("source damaged", file="a.bag", offset=5, length=7)), "reason": "x"}
+    row = Loss("source damaged", reason="x", file="a.bag", offset=5, length=7)
     known = made.manifest()
-    again = ended({"status": "damaged", "losses": [row]})(changed(known, status="open"))
+    again = ended("damaged", [row])(changed(known, status="open"))
     assert (again.status, again.losses[-1].file, again.losses[-1].reason) == (
         "damaged",
         "a.bag",

@@ -7,7 +7,9 @@ from collections import Counter
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybridlog.record.losses import Cause, Ledger, Loss, joined
+from hybridlog.entries import loss_values
+from hybridlog.record.losses import Cause, Ledger, joined
+from hybridlog_storage.manifest import Loss
 
 SECOND = 1_000_000_000
 notes = st.lists(
@@ -35,15 +37,15 @@ def test_rows_hold_all_that_was_noted(
     unknown = set()
     for one in said:
         if one is None:
-            rows.extend(ledger.take())
+            rows.extend(map(loss_values, ledger.take()))
             continue
         topic, cause, count, first, length = one
-        ledger.note(Loss(topic, cause, count, first=first * SECOND, last=(first + length) * SECOND))
+        ledger.note(Loss(cause, topic, count, first=first * SECOND, last=(first + length) * SECOND))
         if count is None:
             unknown.add((topic, cause.value))
         else:
             counted[topic, cause.value] += count
-    rows.extend(ledger.take(everything=True))
+    rows.extend(map(loss_values, ledger.take(everything=True)))
     assert ledger.take(everything=True) == []
     for found in (rows, joined(rows)):
         per_key: Counter[tuple[str, str]] = Counter()
@@ -72,13 +74,13 @@ def test_a_loss_that_goes_on_is_one_row() -> None:
     ledger = Ledger()
     rows = []
     for second in range(3600):
-        ledger.note(Loss("/scan", Cause.QUEUE, 3, second * SECOND, second * SECOND, "x"))
-        rows.extend(ledger.take())
+        ledger.note(Loss(Cause.QUEUE, "/scan", 3, second * SECOND, second * SECOND, "x"))
+        rows.extend(map(loss_values, ledger.take()))
     (row,) = joined(rows)
     assert (row["count"], row["from"], row["to"], row["reason"]) == (10_800, 0, 3599 * SECOND, "x")
     # What stops for a minute and begins again is another.
-    ledger.note(Loss("/scan", Cause.QUEUE, 1, first=4000 * SECOND, last=4000 * SECOND, detail="x"))
-    assert len(joined(rows + ledger.take())) == 2
+    ledger.note(Loss(Cause.QUEUE, "/scan", 1, first=4000 * SECOND, last=4000 * SECOND, reason="x"))
+    assert len(joined([*rows, *map(loss_values, ledger.take())])) == 2
 
 
 def test_rows_within_twelve_seconds_of_one_another_are_one() -> None:
@@ -86,8 +88,8 @@ def test_rows_within_twelve_seconds_of_one_another_are_one() -> None:
         ledger = Ledger()
         found = []
         for first in (0, SECOND + pause):
-            ledger.note(Loss("/scan", Cause.QUEUE, 1, first=first, last=first + SECOND))
-            found += ledger.take()
+            ledger.note(Loss(Cause.QUEUE, "/scan", 1, first=first, last=first + SECOND))
+            found += map(loss_values, ledger.take())
         return len(joined(found))
 
     assert rows(12 * SECOND) == 1
@@ -97,9 +99,9 @@ def test_rows_within_twelve_seconds_of_one_another_are_one() -> None:
 def test_what_the_user_wants_is_a_row_each_ten_seconds() -> None:
     ledger = Ledger()
     for last, count in ((0, 0), (10 * SECOND - 1, 0), (10 * SECOND, 1), (11 * SECOND, 0)):
-        ledger.note(Loss("/scan", Cause.THROTTLE, 1, first=last, last=last))
+        ledger.note(Loss(Cause.THROTTLE, "/scan", 1, first=last, last=last))
         assert len(ledger.take()) == count
-    assert [row["count"] for row in ledger.take(everything=True)] == [1]
+    assert [row.count for row in ledger.take(everything=True)] == [1]
 
 
 def test_rows_without_times_stay_as_they_are() -> None:

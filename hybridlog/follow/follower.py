@@ -125,12 +125,8 @@ class Follower:
         self._retry_at = 0.0
         self._indexed = 0
         self._gap: DatabaseError | None = None  # why the index has missed something
-        self._begin()
-
-    def _begin(self) -> None:
         from hybridlog.columns.table_writer import TableWriter  # loads pyarrow
 
-        entry, topics = self._entry, self._topics
         self._tables = TableWriter(self._directory.path, entry.id, entry.name, topics)
         self._damage = self._catalog.damage(entry.id)
         self._segments: dict[int, _Segment] = {}
@@ -169,7 +165,6 @@ class Follower:
             StoreError: Its files cannot be read now.
         """
         self._connect()
-        self._check_cut()
         manifest = self._directory.manifests.read(self._entry.id)
         listing = self._directory.listing(self._entry.id).choosing(manifest)
         with suppress(InterruptedError):
@@ -196,7 +191,6 @@ class Follower:
         try:
             self._retry_at = 0.0
             self._connect()
-            self._check_cut()
             self._entry, done = entry, 0
             for number in [n for n, _, _ in entry.spans if n not in self._ended]:
                 if (digest := entry.digests.get(str(number))) is not None:
@@ -325,22 +319,6 @@ class Follower:
         if segment.is_wanted and segment.sender is self._sender is not None:
             self._sender.ended[str(number)] = digest
         self._ended.add(number)
-
-    def _check_cut(self) -> None:
-        """Begin again at the first chunk if a full disk made the recorder take some back."""
-        opened = [segment.opened for segment in self._segments.values()]
-        if not any(one is not None and one.is_cut() for one in opened):
-            return
-        self._tables.discard()
-        self._begin()
-        self.messages = self._indexed = 0
-        if self._sender is not None:
-            with self._noting_failure():
-                self._sender.send(wait=True)
-                self._sender.messages = 0
-                state = IndexState(self._sender.database)
-                state.forget([self._entry.key])
-                state.begin(self._entry)
 
     # The database.
 

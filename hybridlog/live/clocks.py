@@ -17,11 +17,11 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import replace
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from hybridlog.live.sources.base import Sink
-from hybridlog.record.losses import Cause, Loss
+from hybridlog.record.losses import Cause
+from hybridlog_storage.manifest import Loss, replace
 
 if TYPE_CHECKING:
     from hybridlog_storage.messages import Channel
@@ -167,9 +167,9 @@ class SimulatedTime(Sink):
             self._recorder.lost(replace(loss, first=first, last=last))
 
         if self._held is None or not self._hold(
-            0, lambda now: report(now, now), lambda: report(loss.first, loss.last)
+            0, lambda now: report(now, now), lambda: self._recorder.lost(loss)
         ):
-            report(self.at(loss.first), self.at(loss.last))
+            report(self.at(loss.first or 0), self.at(loss.last or 0))
 
     def topic_came(self, topic: str, type_name: str) -> None:
         """See `Sink.topic_came`."""

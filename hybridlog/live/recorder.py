@@ -37,7 +37,7 @@ from hybridlog.maintenance.edit import remove_if
 from hybridlog.maintenance.keep import RetentionThread
 from hybridlog.maintenance.retention import Rules
 from hybridlog.query.times import format_duration, format_time
-from hybridlog.record.losses import Cause, Loss
+from hybridlog.record.losses import Cause
 from hybridlog.record.marks import CLOCK_SET, CONTRACT
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.completion import completed
@@ -50,7 +50,7 @@ from hybridlog_storage.errors import (
     StoreError,
     UsageError,
 )
-from hybridlog_storage.manifest import new_random
+from hybridlog_storage.manifest import Loss, new_random
 from hybridlog_storage.manifests import MANIFESTS
 from hybridlog_storage.messages import REDUCED, Channel, left_channel
 
@@ -362,7 +362,7 @@ class Recorder:
         lost: Counter[str] = Counter()
         with self._lock:
             for one in self._topics.values():
-                lost.update({cause.value: count for cause, count in one.lost.items()})
+                lost.update({str(cause): count for cause, count in one.lost.items()})
             shown = [one for one in self._topics.values() if one.tallies or one.is_present]
         topics = [one.look(elapsed, now_steady) for one in sorted(shown, key=attrgetter("topic"))]
         stored, stored_bytes = self._target.stored
@@ -675,9 +675,9 @@ class Recorder:
         return is_stored
 
     def _lose(self, recorded: _RecordedChannel, cause: Cause, detail: str, received: int) -> None:
-        self.lost(Loss(recorded.channel.topic, cause, 1, received, received, detail))
+        self.lost(Loss(cause, recorded.channel.topic, 1, received, received, detail))
 
-    def _count_lost(self, topic: str, cause: Cause, count: int) -> None:
+    def _count_lost(self, topic: str, cause: str, count: int) -> None:
         with self._lock:
             self._topic(topic).lost[cause] += count
 

@@ -22,13 +22,14 @@ import numpy as np
 from hybridlog.live.memory import MIN_USER_BUDGET, default_budget
 from hybridlog.live.policy import SMALL_BYTES
 from hybridlog.record.capture import Capture
-from hybridlog.record.losses import Cause, Ledger, Loss
+from hybridlog.record.losses import Cause, Ledger
 from hybridlog.record.recorder import RecordReport
 from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.errors import DatabaseError, DiskFullError, UsageError
+from hybridlog_storage.manifest import Loss
 from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD
 from hybridlog_storage.messages import Channel, LooseBatch, Schema
-from hybridlog_storage.segments.segment_format import LOSSES_METADATA, json_metadata
+from hybridlog_storage.segments.segment_format import losses_record
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 
 if TYPE_CHECKING:
@@ -354,13 +355,12 @@ class LiveRecording:
 
     def _close_once(self) -> RecordReport:
         try:
-            end = {"status": "complete", "losses": []}
             try:
                 if self.failure is not None:
                     raise self.failure
-                failure = self.capture.close(end)
+                failure = self.capture.close()
             except DiskFullError:  # as much as fits
-                failure = self.capture.close_truncated(end, self._cut_off())
+                failure = self.capture.close_truncated(self._cut_off())
         except BaseException:
             self.capture.abort()
             raise
@@ -374,7 +374,7 @@ class LiveRecording:
             time.monotonic() - self._started,
         )
 
-    def _cut_off(self) -> list[dict[str, Any]]:
+    def _cut_off(self) -> list[Loss]:
         """Rows of the ledger, with the messages that were taken but not written."""
         writer = self.capture.writer
         for channel, taken in self._taken.items():
@@ -385,7 +385,7 @@ class LiveRecording:
                 # The clock may have been set back since.
                 first, last = sorted((taken.first if written is None else written, taken.last))
                 detail = "the disk was full"
-                self.ledger.note(Loss(channel.topic, Cause.DISK, count, first, last, detail))
+                self.ledger.note(Loss(Cause.DISK, channel.topic, count, first, last, detail))
         return self.ledger.take(everything=True)
 
     def abort(self) -> None:
@@ -470,7 +470,7 @@ class LiveRecording:
     def _write_losses(self, *, everything: bool = False) -> None:
         rows = self.ledger.take(everything=everything)
         if rows:
-            self.capture.writer.add_extra(json_metadata(LOSSES_METADATA, {"rows": rows}))
+            self.capture.writer.add_extra(losses_record(rows))
 
     def _take(self) -> None:
         """Move queued messages into chunks."""

@@ -233,7 +233,7 @@ class TopicCounts:
     type: str = ""
     is_present: bool | None = None  # has publishers; None: has never had any
     tallies: list[Tally] = field(default_factory=list)
-    lost: Counter[Cause] = field(default_factory=Counter)
+    lost: Counter[str] = field(default_factory=Counter)
     _messages: int = 0
     _bytes: int = 0
     _usual: deque[float] = field(default_factory=lambda: deque(maxlen=_RATES))

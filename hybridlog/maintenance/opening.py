@@ -267,7 +267,7 @@ def recover(directory: StoreDirectory, recording: str, report: RepairReport) -> 
 
     def change(now: Manifest) -> Manifest:
         now = adopt(now)
-        return now if now.is_ended else ended({"status": "recovered"})(now)
+        return now if now.is_ended else ended("recovered")(now)
 
     directory.manifests.change(recording, change)
 

@@ -34,9 +34,9 @@ from hybridlog_storage.errors import (
     HybridlogError,
     UsageError,
 )
-from hybridlog_storage.manifest import Manifest, Source, loss_of, new_id
+from hybridlog_storage.manifest import Loss, Manifest, Source, new_id
 from hybridlog_storage.manifest import replace as replaced
-from hybridlog_storage.segments.segment_format import LOSSES_METADATA, json_metadata
+from hybridlog_storage.segments.segment_format import losses_record
 from hybridlog_storage.segments.segment_writer import RecordingWriter, SegmentSettings
 
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ class Capture:
             remote_segment_size(directory.settings.remote),
         )
         settings = replace(settings, segment_size=int(largest))
-        self._end: Mapping[str, Any] | None = None
+        self._end: Callable[[Manifest], Manifest] | None = None
         self._held = ExitStack()
         recording = new_id(name)
         with self._held:
@@ -157,24 +157,21 @@ class Capture:
         state = self.follower.state
         return max(self.writer.totals.messages - state.indexed, 0) if state.is_wanted else 0
 
-    def close(self, end: Mapping[str, Any]) -> DatabaseError | None:
-        """Complete the recording; `entry` is then complete, too.
+    def close(self, losses: Sequence[Loss] = ()) -> DatabaseError | None:
+        """Complete the recording, which is damaged if its source had `losses`.
 
-        Args:
-            end: The end of the recording: `status` and `losses`.
+        `entry` is then complete, too.
 
         Returns:
             Why the index is not complete, None when it is.
         """
         # From here on only the last group is sealed, which announces the end.
         self.writer.flush()
-        self._end = end
+        self._end = ended("damaged" if losses else "complete", losses)
         self.writer.close()
         return self._finish()
 
-    def close_truncated(
-        self, end: Mapping[str, Any], lost: Sequence[Mapping[str, Any]]
-    ) -> DatabaseError | None:
+    def close_truncated(self, lost: Sequence[Loss]) -> DatabaseError | None:
         """Complete the recording on a full disk.
 
         Returns:
@@ -183,28 +180,23 @@ class Capture:
         Raises:
             DiskFullError: No room for that either. Without any message, the recording is gone.
         """
-        self._end = end  # the segment holds the last losses
+        self._end = ended("complete")  # the segment holds the last losses
         try:
-            self.writer.close_truncated([json_metadata(LOSSES_METADATA, {"rows": lost})])
+            self.writer.close_truncated([losses_record(lost)])
         except DiskFullError:
             if not self.writer.written.total():
                 self.rollback()
                 raise
             if not self.writer.has_extras:  # or else the next look reads them in the segment
-                rows = tuple(map(loss_of, lost))
                 with suppress(DiskFullError):
-                    self._change(lambda now: replaced(now, losses=(*now.losses, *rows)))
+                    self._change(lambda now: replaced(now, losses=(*now.losses, *lost)))
             raise
         return self._finish()
 
     def _announce(self, group: Sequence[Sealed]) -> None:
         """List the segments of a group in the manifest before they get their final names."""
-        end = self._end
-        change = listed(*group)
-        if end is None:
-            self._change(change)
-        else:
-            self._change(lambda now: ended(end)(change(now)))
+        end, change = self._end, listed(*group)
+        self._change(change if end is None else lambda now: end(change(now)))
 
     def _change(self, how: Callable[[Manifest], Manifest]) -> None:
         while True:

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any
 
+from hybridlog_storage.manifest import Loss, replace
 from hybridlog_storage.times import span_of
 
 if TYPE_CHECKING:
@@ -56,67 +56,40 @@ class Cause(StrEnum):
     """They were stored, and their part of the store is missing or damaged."""
 
 
-@dataclass(frozen=True, slots=True)
-class Loss:
-    """Messages that are lost.
-
-    Attributes:
-        topic: Their topic; empty if unknown.
-        cause: The reason.
-        count: Number of messages; None if unknown.
-        first: Beginning of the loss, ns since the epoch, by the recorder's clock.
-        last: End of the loss, by the same clock, which may have gone back between them.
-        detail: Explanation for people: a publisher's name, a reason.
-    """
-
-    topic: str
-    cause: Cause
-    count: int | None
-    first: int
-    last: int
-    detail: str = ""
-
-
 class Ledger:
-    """Collects losses and returns them as rows. Thread safe."""
+    """Collects losses with their times, by the recorder's clock, which may have gone back between.
+
+    Thread safe.
+    """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._open: dict[tuple[str, Cause, str], dict[str, Any]] = {}  # rows that may still grow
+        self._open: dict[tuple[str, str, str], Loss] = {}  # rows that may still grow
 
     def note(self, loss: Loss) -> None:
         """Note lost messages."""
-        first, last = sorted((loss.first, loss.last))
-        row = {
-            "cause": loss.cause.value,
-            "count": loss.count,
-            "file": "",
-            "from": first,
-            "length": None,
-            "offset": None,
-            "reason": loss.detail,
-            "to": last,
-            "topic": loss.topic or None,
-        }
+        key = loss.topic, loss.cause, loss.reason
         with self._lock:
-            known = self._open.setdefault((loss.topic, loss.cause, loss.detail), row)
-            if known is not row:
-                known["from"], known["to"] = min(known["from"], first), max(known["to"], last)
-                known["count"] = _sum(known["count"], loss.count)
+            known = self._open.get(key)
+            count = loss.count if known is None else _sum(known.count, loss.count)
+            known = known or loss
+            times = known.first, known.last, loss.first, loss.last
+            span = [time for time in times if time is not None]
+            self._open[key] = replace(loss, count=count, first=min(span), last=max(span))
 
-    def take(self, *, everything: bool = False) -> list[dict[str, Any]]:
+    def take(self, *, everything: bool = False) -> list[Loss]:
         """The rows since the last call; the ledger forgets them.
 
         Args:
             everything: True to include rows that are written less often.
         """
         with self._lock:
-            ready = [
-                key
-                for key, row in self._open.items()
-                if everything or key[1] is not Cause.THROTTLE or row["to"] - row["from"] >= _SLOW_NS
-            ]
+            ready = [key for key, row in self._open.items() if everything or _is_due(row)]
             return [self._open.pop(key) for key in ready]
+
+
+def _is_due(row: Loss) -> bool:
+    return row.cause != Cause.THROTTLE or (row.last or 0) - (row.first or 0) >= _SLOW_NS
 
 
 def joined(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:

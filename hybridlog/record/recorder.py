@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from hybridlog_storage.errors import (
     SourceError,
     TopicError,
 )
+from hybridlog_storage.manifest import Loss
 from hybridlog_storage.messages import Batch, Channel
 from hybridlog_storage.ordering import distinct
 from hybridlog_storage.segments.attachments import Attachment
@@ -162,7 +163,7 @@ def record(
         copy = _Copy(source, capture.writer, options)
         copy.run(progress)
         _check_result(source, capture.writer, options)
-        failure = capture.close(_end_of(source))
+        failure = capture.close(_losses_of(source))
     except BaseException:
         # Remove a partial recording: the source still exists, the command can be repeated.
         capture.rollback()
@@ -301,22 +302,18 @@ def _check_result(source: Source, writer: RecordingWriter, options: RecordOption
         )
 
 
-def _end_of(source: Source) -> dict[str, Any]:
-    losses = [
-        {
-            "cause": "source damaged",
-            "file": text(damage.file.name),
-            "offset": damage.offset,
-            "length": damage.length,
-            "reason": damage.reason,
-            "count": damage.messages_lost,
-            "topic": None,
-            "from": None,
-            "to": None,
-        }
+def _losses_of(source: Source) -> list[Loss]:
+    return [
+        Loss(
+            "source damaged",
+            count=damage.messages_lost,
+            reason=damage.reason,
+            file=text(damage.file.name),
+            offset=damage.offset,
+            length=damage.length,
+        )
         for damage in source.damage
     ]
-    return {"status": "damaged" if losses else "complete", "losses": losses}
 
 
 def _identity(fingerprint: Fingerprint) -> dict[str, object]:

@@ -11,13 +11,14 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from hybridlog.entries import topic_types
+from hybridlog.entries import loss_values, topic_types
 from hybridlog.record.losses import Cause, joined
 from hybridlog.schema.codecs import codec_for
 from hybridlog.snapshot import UNFINISHED
 from hybridlog_storage.catalog import ChannelEntry, channel_entry, channel_totals
 from hybridlog_storage.disk.directory import is_stable
 from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.manifest import Loss
 from hybridlog_storage.segments.segment_file import OPEN_SUFFIX
 from hybridlog_storage.segments.walk import OpenSegment
 
@@ -154,7 +155,8 @@ def _losses(
     """The loss ledger: what sealed segments and flushed records say, and what is damaged."""
     before = sealed.end.get("losses", ())
     rows = [row for row in before if row["cause"] != Cause.SEGMENT]
-    yield from joined([*rows, *(row for one in segments.values() for row in one.losses)])
+    flushed = (loss_values(row) for one in segments.values() for row in one.losses)
+    yield from joined([*rows, *flushed])
     yield from (row for row in before if row["cause"] == Cause.SEGMENT)
     for number, segment in segments.items():
         for damage in segment.damaged:
@@ -167,6 +169,5 @@ def _damaged(
     number: int, reason: str, offset: int | None = None, length: int | None = None
 ) -> dict[str, Any]:
     """A row for an unknown number of messages at unknown times."""
-    place = {"file": f"{number:06d}{OPEN_SUFFIX}", "offset": offset, "length": length}
-    nothing = {"count": None, "topic": None, "from": None, "to": None}
-    return {"cause": Cause.SEGMENT.value, **place, "reason": reason, **nothing}
+    file = f"{number:06d}{OPEN_SUFFIX}"
+    return loss_values(Loss(Cause.SEGMENT, reason=reason, file=file, offset=offset, length=length))

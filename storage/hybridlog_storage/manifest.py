@@ -11,7 +11,7 @@ import re
 import secrets
 import time
 from collections.abc import Collection, Iterable, Mapping
-from typing import Annotated, Any, Final, Literal, TypeVar
+from typing import Annotated, Final, Literal, TypeVar
 
 from blake3 import blake3
 from msgspec import UNSET, Meta, Struct, UnsetType, json, structs
@@ -363,13 +363,6 @@ def digest_of(pieces: Iterable[bytes]) -> str:
     for piece in pieces:
         found.update(piece)
     return found.hexdigest()
-
-
-def loss_of(row: Mapping[str, Any]) -> Loss:
-    """A row of the loss ledger as a log has it."""
-    same = {name: row[name] for name in ("cause", "count", "reason", "offset", "length")}
-    topic, file = row["topic"] or "", row["file"] or ""
-    return Loss(first=row["from"], last=row["to"], topic=topic, file=file, **same)
 
 
 def with_totals(manifest: Manifest) -> Manifest:

@@ -107,15 +107,16 @@ def test_the_worst_topic_comes_first_and_silent_topics_before_all(tmp_path: Path
 def test_losses_stand_beside_the_topic(tmp_path: Path) -> None:
     with hl.open(tmp_path / "store", create=True, mongo="none") as store:
         with store.start("live") as live:
-            from hybridlog.record.losses import Cause, Loss
+            from hybridlog.record.losses import Cause
+            from hybridlog_storage.manifest import Loss
             from hybridlog_storage.messages import Channel
 
             channel = Channel("/a", "json", None, {})
             for n in range(20):
                 live.write(channel, b"{}", log_time=SECOND + n * MS)
             for cause, count in ((Cause.QUEUE, 3), (Cause.TRANSPORT, 4), (Cause.THROTTLE, 100)):
-                live.ledger.note(Loss("/a", cause, count, first=SECOND, last=SECOND))
-            live.ledger.note(Loss("/b", Cause.QUEUE, None, first=SECOND, last=SECOND))
+                live.ledger.note(Loss(cause, "/a", count, first=SECOND, last=SECOND))
+            live.ledger.note(Loss(Cause.QUEUE, "/b", None, first=SECOND, last=SECOND))
             live.write(Channel("/b", "json", None, {}), b"{}", log_time=SECOND)
         assert {one.topic: one.lost for one in store.check()} == {"/a": 7, "/b": None}
 

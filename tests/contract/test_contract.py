@@ -18,8 +18,9 @@ from hybridlog.contract import MAX_RULES, Contract, contract_of
 from hybridlog.contract.judge import broken
 from hybridlog.formats.yaml_values import MAX_BYTES
 from hybridlog.query.topics import matcher
-from hybridlog.record.losses import Cause, Loss
+from hybridlog.record.losses import Cause
 from hybridlog_storage.errors import UsageError
+from hybridlog_storage.manifest import Loss
 from hybridlog_storage.messages import Channel, Schema
 from tests.cli.running import run as process
 from tests.cli.within import answer as run
@@ -173,8 +174,8 @@ def play(store: hl.Store, sent: list[Sent], name: str, lost: int | None = 0) -> 
             payload = struct.pack("<3II d".replace(" ", ""), 0, sec, nsec, 0, one.x)
             live.write(channels[one.topic, one.type], payload, log_time=one.time)
         if lost != 0:
-            live.ledger.note(Loss("/scan", Cause.QUEUE, lost, first=START, last=START))
-            live.ledger.note(Loss("/scan", Cause.THROTTLE, 9, first=START, last=START))
+            live.ledger.note(Loss(Cause.QUEUE, "/scan", lost, first=START, last=START))
+            live.ledger.note(Loss(Cause.THROTTLE, "/scan", 9, first=START, last=START))
     return live.name
 
 

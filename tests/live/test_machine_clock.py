@@ -13,8 +13,9 @@ from hybridlog.live.clocks import MachineClock
 from hybridlog.live.policy import throttle_rule
 from hybridlog.live.recorder import RecorderOptions
 from hybridlog.query.times import format_duration
-from hybridlog.record.losses import Cause, Loss
+from hybridlog.record.losses import Cause
 from hybridlog.record.marks import MARKS
+from hybridlog_storage.manifest import Loss
 from hybridlog_storage.messages import Channel
 from tests.live.speaker import TEXT, Recorded, Speaker, text, text_channel
 
@@ -92,7 +93,7 @@ def test_a_clock_that_is_set_mid_recording(plain: hl.Store) -> None:
     for number, era in enumerate(eras):
         robot.clock.time = era
         if number:
-            robot.recorder.lost(Loss("/chatter", Cause.TRANSPORT, 1, first=NOW + YEAR, last=era))
+            robot.recorder.lost(Loss(Cause.TRANSPORT, "/chatter", 1, first=NOW + YEAR, last=era))
         robot.play(chatter, *words(20 * number, 20 * number + 20), step=0)
         robot.play(slow, *words(0, 20), step=SECOND // 25)
         robot.play(chatter, "then")

@@ -22,7 +22,7 @@ from hybridlog.live import recording as recording_module
 from hybridlog.live.policy import priority_rule, throttle_rule
 from hybridlog.live.recorder import Recorder, RecorderOptions
 from hybridlog.live.state import choose, read, running, summary_of
-from hybridlog.record.losses import Cause, Loss
+from hybridlog.record.losses import Cause
 from hybridlog.record.marks import MARKS
 from hybridlog_storage.disk import append_file, files
 from hybridlog_storage.errors import (
@@ -32,6 +32,7 @@ from hybridlog_storage.errors import (
     StoreError,
     UsageError,
 )
+from hybridlog_storage.manifest import Loss
 from hybridlog_storage.messages import SUPPLIED, Channel, Schema
 from hybridlog_storage.segments.segment_writer import RecordingWriter
 from tests import places
@@ -83,8 +84,8 @@ def test_what_is_received_is_stored_or_in_the_ledger(store: hl.Store) -> None:
     for number in range(100):
         robot.speaker.say(chatter, text(str(number)), SECOND + number * SECOND // 20)
         robot.speaker.say(scans, scan(number, 10), SECOND + number * SECOND // 20)
-    robot.recorder.lost(Loss("/chatter", Cause.TRANSPORT, 7, first=SECOND, last=2 * SECOND))
-    robot.recorder.lost(Loss("/tf", Cause.UNREADABLE, 3, SECOND, SECOND, "no type"))
+    robot.recorder.lost(Loss(Cause.TRANSPORT, "/chatter", 7, first=SECOND, last=2 * SECOND))
+    robot.recorder.lost(Loss(Cause.UNREADABLE, "/tf", 3, SECOND, SECOND, "no type"))
     state = robot.recorder.look()
     assert {t.topic: t.messages for t in state.topics} == {"/chatter": 100, "/scan": 100}
     rows = robot.rows()
@@ -392,7 +393,7 @@ def test_a_crash_loses_no_more_rows_than_messages(store: hl.Store, tmp_path: Pat
     for number in range(60):
         now = time.time_ns()
         robot.speaker.say(text_channel(), text(str(number)), now)
-        robot.recorder.lost(Loss("/scan", Cause.TRANSPORT, 1, now, now))
+        robot.recorder.lost(Loss(Cause.TRANSPORT, "/scan", 1, now, now))
         time.sleep(0.02)
     left = shutil.ignore_patterns("mongod*", "*.sock")
     shutil.copytree(store.directory.path, tmp_path / "left", ignore=left)

@@ -15,8 +15,9 @@ from hybridlog.follow import child
 from hybridlog.follow.child import Trigger
 from hybridlog.live import incidents
 from hybridlog.live.recorder import RecorderOptions
-from hybridlog.record.losses import Cause, Loss
+from hybridlog.record.losses import Cause
 from hybridlog.record.marks import MARKS
+from hybridlog_storage.manifest import Loss
 from hybridlog_storage.messages import Channel
 from tests.live.speaker import TEXT, Recorded, scan, scan_channel, text, text_channel
 
@@ -86,7 +87,7 @@ def span_s(store: hl.Store) -> float:
 @pytest.mark.mongo
 def test_the_last_seconds_stay_and_nothing_else(store: hl.Store) -> None:
     robot = Robot(store)
-    robot.recorder.lost(Loss("/scan", Cause.TRANSPORT, 4, time.time_ns(), time.time_ns()))
+    robot.recorder.lost(Loss(Cause.TRANSPORT, "/scan", 4, time.time_ns(), time.time_ns()))
     robot.run(RING_S)
     robot.run_until(lambda: ids(store)[0] and span_s(store) < RING_S + 0.9)
     seen = ids(store)

@@ -14,7 +14,8 @@ from hybridlog.live.clocks import clock_time
 from hybridlog.live.policy import throttle_rule
 from hybridlog.live.recorder import RecorderOptions
 from hybridlog.query.topics import matcher
-from hybridlog.record.losses import Cause, Loss
+from hybridlog.record.losses import Cause
+from hybridlog_storage.manifest import Loss
 from hybridlog_storage.messages import Channel, Schema
 from tests.calls import Calls
 from tests.limits import Limit
@@ -121,7 +122,7 @@ def test_a_loss_over_a_jump_is_a_span(store: hl.Store) -> None:
     simulation.tick(3)
     simulation.speaker.sink.lost(
         Loss(  # type: ignore[union-attr]
-            "/chatter", Cause.TRANSPORT, 2, first=first, last=simulation.now
+            Cause.TRANSPORT, "/chatter", 2, first=first, last=simulation.now
         )
     )
     assert simulation.end()[1] == [("/chatter", "transport", 2, 3 * SECOND, 100 * SECOND)]
@@ -133,7 +134,7 @@ def test_what_does_not_fit_before_the_clock_is_in_the_ledger(store: hl.Store) ->
         simulation.say(f"{number}" * 20_000)
     simulation.speaker.sink.lost(
         Loss(  # type: ignore[union-attr]
-            "/chatter", Cause.TRANSPORT, 3, first=simulation.now, last=simulation.now
+            Cause.TRANSPORT, "/chatter", 3, first=simulation.now, last=simulation.now
         )
     )
     simulation.tick(7)
@@ -171,7 +172,7 @@ def test_a_clock_that_is_not_wanted_gives_the_time_all_the_same(store: hl.Store)
     sink.expect(CLOCK)
     simulation.tick(5)
     simulation.say("a")
-    sink.lost(Loss("/clock", Cause.TRANSPORT, 1, first=0, last=0))
+    sink.lost(Loss(Cause.TRANSPORT, "/clock", 1, first=0, last=0))
     sink.topic_gone("/clock")
     assert simulation.recorder.silent() == []
     found, rows = simulation.end()

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import hybridlog as hl
 from hybridlog.live import LiveOptions, LiveRecording
-from hybridlog.record.losses import Cause, Loss
+from hybridlog.record.losses import Cause
+from hybridlog_storage.manifest import Loss
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.running.methods import LABEL, TAGS
 from tests.running.sequence import CHANNELS, SECOND, START, Known, Sent, messages
@@ -75,7 +76,7 @@ class Running:
     def lose(self) -> None:
         """Note three lost messages."""
         times = {"first": START + SECOND, "last": START + SECOND + 1}
-        self.recording.ledger.note(Loss("/said", Cause.TRANSPORT, 3, **times))
+        self.recording.ledger.note(Loss(Cause.TRANSPORT, "/said", 3, **times))
 
     def flushed(self, limit_s: float = 60) -> Known:
         """Wait until everything is in the files and the index; return what is there."""

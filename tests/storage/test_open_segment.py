@@ -13,10 +13,7 @@ from hybridlog_storage.mcap.mcap_content import RECORD_HEAD
 from hybridlog_storage.segments import walk
 from hybridlog_storage.segments.attachments import Attachment
 from hybridlog_storage.segments.compression import FilePart
-from hybridlog_storage.segments.segment_format import (
-    LOSSES_METADATA,
-    json_metadata,
-)
+from hybridlog_storage.segments.segment_format import losses_record
 from hybridlog_storage.segments.segment_reader import SegmentReader, SegmentSummary
 from hybridlog_storage.segments.segment_writer import RecordingWriter, SegmentSettings
 from hybridlog_storage.segments.walk import OpenSegment
@@ -44,7 +41,7 @@ class Written:
             writer.flush()
             if chunk == 1:
                 writer.add_extra(Metadata(name="calibration", metadata={"a": "b"}))
-                writer.add_extra(json_metadata(LOSSES_METADATA, {"rows": [LOSS]}))
+                writer.add_extra(losses_record([LOSS]))
             if chunk == 2:
                 content = FilePart(lambda at, size: (b"content" * 100)[at : at + size], 0, 700)
                 writer.add_extra(Attachment(1, 2, "a.txt", "text/plain", content))

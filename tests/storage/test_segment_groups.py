@@ -15,8 +15,9 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.records import Metadata
 
-from hybridlog.record.losses import Cause, Ledger, Loss
+from hybridlog.record.losses import Cause, Ledger
 from hybridlog_storage.errors import DiskFullError
+from hybridlog_storage.manifest import Loss
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.chunk import StoredChunk
 from hybridlog_storage.segments.recovery import recover_segment
@@ -24,7 +25,7 @@ from hybridlog_storage.segments.segment_file import Sealed, SegmentFile
 from hybridlog_storage.segments.segment_format import (
     LOSSES_METADATA,
     group_of,
-    json_metadata,
+    losses_record,
 )
 from hybridlog_storage.segments.segment_reader import SegmentReader
 from hybridlog_storage.segments.segment_writer import SegmentSettings
@@ -289,11 +290,11 @@ def test_losses_that_found_no_room_come_in_the_end(
     monkeypatch.setattr(SegmentFile, "add_metadata", add)
     for count in (16, 3):
         ledger = Ledger()
-        ledger.note(Loss("/a", Cause.TRANSPORT, count, 1, 2))
+        ledger.note(Loss(Cause.TRANSPORT, "/a", count, 1, 2))
         with suppress(DiskFullError):
-            made.writer.add_extra(json_metadata(LOSSES_METADATA, {"rows": ledger.take()}))
+            made.writer.add_extra(losses_record(ledger.take()))
     with pytest.raises(DiskFullError):
         made.writer.close()
     made.writer.close_truncated([])
     with SegmentReader(made.folder / "000000.mcap", 0) as reader:
-        assert {row["count"] for row in reader.summary().losses} == {16, 3}
+        assert {row.count for row in reader.summary().losses} == {16, 3}

@@ -26,7 +26,7 @@ from mcap.stream_reader import StreamReader
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk.append_file import BLOCK
 from hybridlog_storage.errors import DiskFullError, SegmentError, StoreError, UsageError
-from hybridlog_storage.manifest import replace
+from hybridlog_storage.manifest import Loss, replace
 from hybridlog_storage.messages import Batch, Channel, LooseBatch, Schema
 from hybridlog_storage.segments import chunk as chunk_module
 from hybridlog_storage.segments import segment_writer
@@ -34,13 +34,11 @@ from hybridlog_storage.segments.attachments import Attachment
 from hybridlog_storage.segments.chunk import StoredChunk
 from hybridlog_storage.segments.chunk_table import ChunkPlace
 from hybridlog_storage.segments.compression import FilePart
-from hybridlog_storage.segments.recovery import Recovered, recover_segment
-from hybridlog_storage.segments.segment_check import damage_of
+from hybridlog_storage.segments.recovery import Recovered, damage_of, recover_segment
 from hybridlog_storage.segments.segment_file import Sealed, SegmentFile
 from hybridlog_storage.segments.segment_format import (
-    LOSSES_METADATA,
     RECORDING_METADATA,
-    json_metadata,
+    losses_record,
     trailer_of,
 )
 from hybridlog_storage.segments.segment_reader import SegmentReader, SegmentSummary
@@ -57,10 +55,7 @@ RECORDING = {
     "source": {},
     "created": 1,
 }
-LOSS = {
-    "cause": "queue", "count": 3, "file": "", "from": 5, "length": None, "offset": None,
-    "reason": "", "to": 6, "topic": "/small",
-}  # fmt: skip
+LOSS = Loss("queue", "/small", 3, 5, 6)
 SCHEMA = Schema("std_msgs/String", "ros1msg", b"string data")
 CHANNELS = [
     Channel("/small", "ros1", SCHEMA, {"callerid": "/n"}, has_publish_time=False),
@@ -438,7 +433,7 @@ def sample(directory: Path) -> tuple[bytes, list[StoredChunk]]:
     writer.add_extra(Metadata("source", {"k": "v"}))
     writer.append(batch_of(rows[12:]), CHANNELS)
     writer.flush()
-    writer.add_extra(json_metadata(LOSSES_METADATA, {"rows": [LOSS]}))
+    writer.add_extra(losses_record([LOSS]))
     (path,) = writer.close()
     return path.read_bytes(), chunks
 

@@ -13,7 +13,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Final, Protocol, Self
 
-from hybridlog.record.losses import Cause, Loss
+from hybridlog.record.losses import Cause
+from hybridlog_storage.manifest import Loss
 
 if TYPE_CHECKING:
     from hybridlog_storage.messages import Channel

@@ -171,7 +171,7 @@ class ReplaySource(ThreadedSource):
             self._sink.say(detail)
             return
         now = time.time_ns()
-        self._sink.lost(Loss("", Cause.UNREADABLE, damage.messages_lost, now, now, detail))
+        self._sink.lost(Loss(Cause.UNREADABLE, "", damage.messages_lost, now, now, detail))
 
     # The messages.
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import accumulate
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -21,10 +21,13 @@ from mcap.opcode import Opcode
 from mcap.records import Channel as ChannelRecord
 from mcap.records import Header, McapRecord, Metadata
 from mcap.records import Schema as SchemaRecord
+from msgspec import Struct, to_builtins
+from msgspec.json import decode
 
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.lazy import RowType
+from hybridlog_storage.manifest import Loss
 from hybridlog_storage.mcap.mcap_content import (
     CHUNK_HEAD,
     MAGIC,
@@ -142,6 +145,27 @@ def json_of(record: Metadata) -> dict[str, object]:
     if not isinstance(value, dict):
         raise SegmentError(f"metadata record {record.name!r} is not a JSON object")
     return value
+
+
+class _Losses(Struct):
+    rows: list[Loss]
+
+
+def losses_record(rows: Sequence[Loss]) -> Metadata:
+    """The metadata record of rows of the loss ledger."""
+    return json_metadata(LOSSES_METADATA, {"rows": to_builtins(rows)})
+
+
+def losses_in(record: Metadata) -> list[Loss]:
+    """The rows of the loss ledger in a metadata record."""
+    try:
+        rows = decode(record.metadata["json"], type=_Losses).rows
+    except (KeyError, ValueError, RecursionError) as error:
+        raise SegmentError(f"a metadata record is damaged: {error!r}") from error
+    for row in rows:
+        if (row.first is None) != (row.last is None) or (row.first or 0) > (row.last or 0):
+            raise SegmentError("a metadata record is damaged: a loss ends before it begins")
+    return rows
 
 
 def metadata_record(record: Metadata, offset: int) -> bytes:

@@ -6,24 +6,22 @@ share a reader.
 
 from __future__ import annotations
 
-import json
 import os
 import stat
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self, TypedDict, cast
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, Metadata, MetadataIndex
-from msgspec import convert
 
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import SegmentError, exhausted
-from hybridlog_storage.manifest import Count, Nanoseconds, Text, Topic, hasher
+from hybridlog_storage.manifest import Loss, hasher
 from hybridlog_storage.mcap.mcap_content import (
     MAGIC,
     MAX_CHUNK_HEAD,
@@ -54,6 +52,7 @@ from hybridlog_storage.segments.segment_format import (
     RECORDING_METADATA,
     channel_of,
     json_of,
+    losses_in,
     messages_at,
     metadata_of,
     trailer_of,
@@ -88,7 +87,7 @@ class SegmentSummary:
     recording: dict[str, object]
     channels: dict[int, Channel]
     counts: dict[int, int]
-    losses: list[dict[str, Any]]
+    losses: list[Loss]
     attachments: list[AttachmentIndex]
     metadata: list[MetadataIndex]
     table: ChunkTable
@@ -186,13 +185,13 @@ class SegmentReader:
 
     def _summary(self, records: Summary, body: Buffer | None, start: int) -> SegmentSummary:
         recording: dict[str, object] | None = None
-        losses: list[dict[str, Any]] = []
+        losses: list[Loss] = []
         for index in records.metadata_indexes:
             if index.name == RECORDING_METADATA:
                 recording = json_of(self.metadata(index))
                 check_format(recording, self.path)
             elif index.name == LOSSES_METADATA:
-                losses += loss_rows(json_of(self.metadata(index)))
+                losses += losses_in(self.metadata(index))
         if recording is None:
             raise SegmentError(f"{self.path} is no segment of a hybridlog store.")
         table = self._table(body, start)
@@ -338,38 +337,6 @@ def check_format(recording: Mapping[str, object], path: Path) -> None:
             f"{path} is of format {version}, and this hybridlog knows format {FORMAT_VERSION}. "
             "Use the hybridlog that wrote it."
         )
-
-
-LossRow = TypedDict(
-    "LossRow",
-    {
-        "cause": Text,
-        "reason": Text,
-        "file": Text | None,
-        "topic": Topic | None,
-        "count": Count | None,
-        "offset": Count | None,
-        "length": Count | None,
-        "from": Nanoseconds | None,
-        "to": Nanoseconds | None,
-    },
-)
-"""A row of the loss ledger: `from` and `to` are log times, ns; None for what is unknown."""
-
-
-def loss_rows(value: Mapping[str, object]) -> list[dict[str, Any]]:
-    """Rows of the loss ledger, from the value of its metadata record, see `LossRow`."""
-    found = value.get("rows")
-    try:
-        json.dumps(found, ensure_ascii=False).encode()  # fails for halves of surrogate pairs
-        rows = cast("list[dict[str, Any]]", convert(found, list[LossRow]))
-    except (ValueError, RecursionError) as error:
-        raise SegmentError(f"a metadata record is damaged: {error!r}") from error
-    for row in rows:
-        begin, end = row["from"], row["to"]
-        if (begin is None) != (end is None) or (begin is not None and begin > end):
-            raise SegmentError("a metadata record is damaged: a loss ends before it begins")
-    return rows
 
 
 def open_chunk(record: memoryview) -> tuple[Buffer, ChunkHead]:

@@ -19,8 +19,8 @@ from mcap.records import Schema as SchemaRecord
 
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.manifest import Loss
 from hybridlog_storage.mcap.mcap_content import (
-    CHUNK_HEAD,
     HEAD,
     MAX_CHUNK_HEAD,
     RECORD_HEAD,
@@ -44,10 +44,11 @@ from hybridlog_storage.segments.segment_format import (
     Trailer,
     channel_of,
     json_of,
+    losses_in,
     metadata_of,
     trailer_of,
 )
-from hybridlog_storage.segments.segment_reader import SegmentReader, loss_rows, open_chunk
+from hybridlog_storage.segments.segment_reader import SegmentReader, open_chunk
 
 if TYPE_CHECKING:
     from hybridlog_storage.messages import Buffer, Channel
@@ -105,7 +106,7 @@ class Walk:
         self.schemas: dict[int, SchemaRecord] = {}
         self.chunks: list[WalkedChunk] = []
         self.table = TableBuilder()
-        self.losses: list[dict[str, Any]] = []
+        self.losses: list[Loss] = []
         self.attachments: list[AttachmentIndex] = []
         self.metadata: list[MetadataIndex] = []
         self._damaged: list[Damage] = []
@@ -178,7 +179,7 @@ class Walk:
         except SegmentError as error:
             raise SegmentError(f"a metadata record is damaged: {error}") from error
         if record.name == LOSSES_METADATA:
-            self.losses += loss_rows(json_of(record))
+            self.losses += losses_in(record)
         elif record.name == RECORDING_METADATA:
             self.recording = json_of(record)
         self.metadata.append(MetadataIndex(offset=at, length=end - at, name=record.name))
@@ -316,7 +317,6 @@ class OpenSegment(Walk):
 
     def _begin(self) -> None:
         super()._begin()
-        self._last = b""  # head of the last chunk
         self._flushed: Flushed | None = None
 
     @property
@@ -335,11 +335,7 @@ class OpenSegment(Walk):
         A read beside a write may see a part of it, and zeros in place of the rest. So what seems
         damaged is looked at again, and counts only if it is still the same.
         """
-        is_cut = self.is_cut()
-        if is_cut:
-            self._begin()
-        before = self.end, self.damaged
-        known = self.damaged
+        before, known = self.end, self.damaged
         self._read_on()
         for _ in range(_LOOKS):
             seen = self.damaged
@@ -350,21 +346,11 @@ class OpenSegment(Walk):
             self._read_on()
             if self.damaged == seen:
                 break
-        return is_cut or (self.end, self.damaged) != before
-
-    def is_cut(self) -> bool:
-        """True if the writer took chunks back that were read, on a full disk."""
-        self.reader.grow()
-        if self.reader.size < self.end:
-            return self.end > len(START)
-        return bool(self.chunks) and self._head_of_last() != self._last
-
-    def _head_of_last(self) -> bytes:
-        return bytes(self.reader.read(self.chunks[-1].offset, CHUNK_HEAD.size))
+        return (self.end, self.damaged) != (before, known)
 
     def _read_on(self) -> None:
         self.reader.grow()
-        size, end, known = self.reader.size, self.end, len(self.chunks)
+        size, end = self.reader.size, self.end
         try:
             self.go_on()
         except SegmentError:  # the writer has just cut the padding behind its last block
@@ -374,5 +360,3 @@ class OpenSegment(Walk):
             self.go_on()
         if self.end != end:
             self._flushed = None
-        if len(self.chunks) > known:
-            self._last = self._head_of_last()

@@ -501,7 +501,7 @@ def test_a_message_over_the_limit_ends_the_connection_and_is_counted(limit: Limi
     assert heard.payloads() == [bytes((1 << 20) - 13), b"2"]
     lost, outage = heard.losses
     assert (lost.topic, lost.cause, lost.count) == ("", Cause.UNREADABLE, 1)
-    assert "exceeds the limit" in lost.detail
+    assert "exceeds the limit" in lost.reason
     assert (outage.topic, outage.count) == ("/a", None)
     assert heard.said_of(f"announces a message of more than {1 << 20} bytes")
 

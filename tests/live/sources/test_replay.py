@@ -112,14 +112,14 @@ def test_what_cannot_be_read_is_a_row(name: str, messages: int) -> None:
     play(DATA / "damaged" / name, heard)
     assert len(heard.taken) == messages
     assert heard.ends == [""]
-    told = [lost.detail for lost in heard.losses] + heard.said
+    told = [lost.reason for lost in heard.losses] + heard.said
     assert any(name in line for line in told)
     for lost in heard.losses:
         assert (lost.topic, lost.cause) == ("", Cause.UNREADABLE)
         assert lost.count != 0
     if name == "tilt_trunc60.bag":
         assert heard.losses
-        assert any(", byte " in lost.detail for lost in heard.losses)
+        assert any(", byte " in lost.reason for lost in heard.losses)
 
 
 def test_times_and_numbers_are_those_of_the_log(tmp_path: Path) -> None:

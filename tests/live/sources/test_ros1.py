@@ -288,7 +288,7 @@ def test_a_publisher_that_dies_in_a_message_is_connected_again() -> None:
         sink.wait_said("/topic", "/node", "4 of 100 bytes", "connecting again")
     (loss,) = sink.losses
     assert (loss.cause, loss.count) == (Cause.CONNECTION, 1)
-    assert "4 of 100 bytes" in loss.detail
+    assert "4 of 100 bytes" in loss.reason
 
 
 def test_memory_grows_with_what_comes_and_not_with_what_is_announced() -> None:

@@ -194,7 +194,7 @@ def test_a_message_that_is_too_long_ends_the_connection(size: int) -> None:
     assert not pipe.alive
     (loss,) = pipe.sink.losses
     assert (loss.cause, loss.count) == (Cause.UNREADABLE, 1)
-    assert str(size) in loss.detail
+    assert str(size) in loss.reason
     pipe.hang_up()
 
 

@@ -86,7 +86,7 @@ def test_messages_and_events_reach_the_sink(
         "topic_type_hash": "RIHS01_x",
     }
     assert heard.came == [("/a", "std_msgs/msg/String")]
-    assert heard.losses == [Loss("/a", Cause.TRANSPORT, 3, 1, 2, "from ?[31m/n")]
+    assert heard.losses == [Loss(Cause.TRANSPORT, "/a", 3, 1, 2, "from ?[31m/n")]
     assert heard.said == ["ROS 2: a b"]
     assert heard.ends == []
 

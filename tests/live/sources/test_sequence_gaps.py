@@ -163,7 +163,7 @@ def test_foxglove_puts_close_gaps_into_few_rows() -> None:
     assert reported(heard) == 2 * 99
     assert len(heard.losses) < 20
     lost = heard.losses[0]
-    assert "header.seq" in lost.detail
+    assert "header.seq" in lost.reason
     assert lost.first == heard.taken[100].received
     assert lost.last in [taken.received for taken in heard.taken[101:]]
 

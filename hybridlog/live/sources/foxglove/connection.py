@@ -119,7 +119,7 @@ class Client:
                 return f"violates the websocket protocol ({problem})"
             now = time.time_ns()
             detail = "a message exceeds the limit of this source"
-            self._sink.lost(Loss("", Cause.UNREADABLE, 1, now, now, detail))
+            self._sink.lost(Loss(Cause.UNREADABLE, "", 1, now, now, detail))
             size = Session.max_bytes
             return f"announces a message of more than {size} bytes; is it a Foxglove server?"
         if problem is not None:
@@ -393,7 +393,7 @@ class Session(WSListener):
     def _ignored(self, what: str, detail: str = "too short for a message") -> None:
         """Note a lost message of an unknown topic."""
         now = time.time_ns()
-        self._sink.lost(Loss("", Cause.UNREADABLE, 1, now, now, detail))
+        self._sink.lost(Loss(Cause.UNREADABLE, "", 1, now, now, detail))
         are = "they are" if what.startswith("messages") else "it is"
         self._say(f"sends {what}; {are} ignored")
 
@@ -467,7 +467,7 @@ class Session(WSListener):
         since = self._missed.pop(topic, None)
         if since is not None:
             detail = "the connection was down; messages of this time are unknown"
-            self._sink.lost(Loss(topic, Cause.CONNECTION, None, since, time.time_ns(), detail))
+            self._sink.lost(Loss(Cause.CONNECTION, topic, None, since, time.time_ns(), detail))
         return subscription
 
     def _retire(self, channel_id: int) -> None:
@@ -508,7 +508,7 @@ class Session(WSListener):
         if gaps:
             gap = joined_gap(gaps)
             detail = "numbers are missing in header.seq"
-            self._sink.lost(Loss(topic, Cause.TRANSPORT, gap.missing, gap.first, gap.last, detail))
+            self._sink.lost(Loss(Cause.TRANSPORT, topic, gap.missing, gap.first, gap.last, detail))
 
     def end(self, *, is_stopped: bool) -> None:
         """End the session, as the source was stopped or the connection has ended."""

@@ -97,12 +97,12 @@ class Stream:
             # The kernel discards an unknown number of messages.
             self._sink.lost(
                 Loss(
-                    self._channel.topic,
                     Cause.CONNECTION,
+                    self._channel.topic,
                     None,
                     first=self._last,
                     last=time.time_ns(),
-                    detail=f"{self._publisher}: {self.failure}",
+                    reason=f"{self._publisher}: {self.failure}",
                 )
             )
             return False
@@ -198,7 +198,7 @@ class Stream:
         if size > self._limit:
             self.failure = f"it announced a message of {size} bytes; the limit is {self._limit}"
             detail = f"{self._publisher}: {self.failure}"
-            self._sink.lost(Loss(self._channel.topic, Cause.UNREADABLE, 1, now, now, detail))
+            self._sink.lost(Loss(Cause.UNREADABLE, self._channel.topic, 1, now, now, detail))
             return False
         begun = data[pos + 4 :]
         self._parts = [begun] if begun else []
@@ -222,12 +222,12 @@ class Stream:
         for gap in gaps:
             self._sink.lost(
                 Loss(
-                    self._channel.topic,
                     Cause.TRANSPORT,
+                    self._channel.topic,
                     gap.missing,
                     first=gap.first,
                     last=gap.last,
-                    detail=f"{self._publisher}: dropped in its queue",
+                    reason=f"{self._publisher}: dropped in its queue",
                 )
             )
 
@@ -239,7 +239,7 @@ class Stream:
         of = f" of {have + self._missing}" if self._missing else ""
         self.failure = f"it closed in the middle of a message, after {have}{of} bytes"
         detail = f"{self._publisher}: {self.failure}"
-        self._sink.lost(Loss(self._channel.topic, Cause.CONNECTION, 1, self._since, now, detail))
+        self._sink.lost(Loss(Cause.CONNECTION, self._channel.topic, 1, self._since, now, detail))
 
     def _wake_at(self, count: int) -> None:
         """Makes the kernel report the socket only when so many bytes are available.

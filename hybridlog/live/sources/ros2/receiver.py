@@ -116,7 +116,7 @@ class Receiver:
                 "last": int(last),
                 "detail": str(detail),
             } if cause in {*Cause} and all(0 <= n <= _MAX_INT for n in (count or 0, first, last)):
-                self._sink.lost(Loss(topic, Cause(cause), count, first, last, one_line(detail)))
+                self._sink.lost(Loss(Cause(cause), topic, count, first, last, one_line(detail)))
             case {"event": "say", "text": str(text)}:
                 self._sink.say(one_line(f"ROS 2: {text}"))
             case {"event": "bye"}:
@@ -150,7 +150,7 @@ class Receiver:
 def report_outage(sink: Sink, topic: str, since: int) -> None:
     """Reports that a topic was not recorded from some time, ns since the epoch, until now."""
     detail = "the ROS 2 child had ended"
-    sink.lost(Loss(topic, Cause.CONNECTION, None, since, max(since, time.time_ns()), detail))
+    sink.lost(Loss(Cause.CONNECTION, topic, None, since, max(since, time.time_ns()), detail))
 
 
 def _read(file: io.BufferedIOBase, size: int) -> bytes:
