@@ -301,7 +301,8 @@ class _JoinedSource(Source):
         self.damage.extend(replace(damage, file=part.path) for damage in inner.damage)
         self.remarks.extend(f"{part.path}: {remark}" for remark in inner.remarks)
         self._got += got
-        self._check_count(part.path, part.messages, got, found_before)
+        if part.messages is not None:
+            self.settle(part.messages, got, part.path, found_before)
 
     def _check_total(self) -> None:
         """Compare with the number of all messages in the metadata of a directory."""
@@ -311,21 +312,8 @@ class _JoinedSource(Source):
         if total is None or self._got + lost < total:
             for gap in self._log.gaps:
                 self.note(gap)
-        self._check_count(path / NAME, total, self._got, 0)
-
-    def _check_count(self, path: Path, total: int | None, got: int, found_before: int) -> None:
-        """Compare with a number of messages in the metadata."""
-        if total is None or got >= total:
-            return
-        found = self.damage[found_before:]
-        missing = total - got - sum(damage.messages_lost or 0 for damage in found)
-        unknown = [row for row, damage in enumerate(found) if damage.messages_lost is None]
-        if len(unknown) == 1:
-            row = found_before + unknown[0]
-            self.damage[row] = replace(self.damage[row], messages_lost=max(0, missing))
-        elif not unknown and missing > 0:
-            reason = f"the log's metadata lists {total} messages, {got} are there"
-            self.damage.append(Damage(path, None, None, reason, missing))
+        if total is not None:
+            self.settle(total, self._got, path / NAME)
 
     def _numbered(
         self, inner: Source, numbers: NDArray[np.int32], alike: Counter[tuple[object, ...]]

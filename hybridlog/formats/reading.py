@@ -8,7 +8,7 @@ file of which nothing can be read raises `SourceError`, when the source is opene
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from hashlib import blake2b
 from typing import TYPE_CHECKING, NamedTuple, Self
 
@@ -128,6 +128,24 @@ class Source(ABC):
             lost = None if lost is None or before is None else lost + before
         reason = f"{self._more_places} more places could not be read"
         self.damage[-1] = Damage(damage.file, None, None, reason, lost)
+
+    def settle(self, listed: int, got: int, file: Path | None = None, since: int = 0) -> None:
+        """Tell how many messages are missing of those that a file lists; None for all files.
+
+        They are of the damaged place whose number is unknown, if it is a single one, of those from
+        the row `since` on.
+        """
+        rows = range(since, len(self.damage))
+        missing = listed - got - sum(self.damage[row].messages_lost or 0 for row in rows)
+        if missing < 0:
+            return
+        unknown = [row for row in rows if self.damage[row].messages_lost is None]
+        for row in unknown:
+            lost = missing if len(unknown) == 1 else 0
+            self.damage[row] = replace(self.damage[row], messages_lost=lost)
+        if missing and len(unknown) != 1:
+            reason = f"the log lists {listed} messages, {got} are there"
+            self.note(Damage(file or self.path, None, None, reason, missing))
 
     @abstractmethod
     def batches(self) -> Iterator[Batch]:

@@ -313,7 +313,6 @@ def test_chunks_of_bags_are_bounded(tmp_path: Path) -> None:
         ("lz4", packed["lz4"], 2**32 - 1, "says 4294967295 bytes, there are 83886080"),
         ("bz2", packed["bz2"], 100, "says 100 bytes, it has more than 16777216"),
         ("bz2", packed["bz2"], 2**32 - 1, "bytes become more than"),
-        ("lz4", lz4.frame.compress(small * 200_000), len(small) * 200_000, "too many messages"),
         ("lz4", lz4.frame.compress(small), 100, f"says 100 bytes, there are {len(small)}"),
         ("bz2", bz2.compress(small), 2**32 - 1, f"there are {len(small)}"),
     ]

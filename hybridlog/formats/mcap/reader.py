@@ -69,8 +69,6 @@ class McapSource(Source):
         # For attachments, which outlive this reader.
         self._read: Callable[[int, int], bytes] | None = None
         self._given = 0
-        self._lost = 0
-        self._uncounted: list[Damage] = []  # what the totals at the end may count
         self._too_many = 0
         self._unpublished = 0
 
@@ -114,11 +112,7 @@ class McapSource(Source):
         if isinstance(item, ChunkContent):
             yield from self._content(item, offset)
         elif isinstance(item, mcap_content.Damage):
-            damage = Damage(self.path, item.offset, item.length, item.reason, item.messages)
-            if item.messages is None and self.message_count is not None:
-                self._uncounted.append(damage)
-            else:
-                self._note(damage)
+            self.note(Damage(self.path, item.offset, item.length, item.reason, item.messages))
         elif isinstance(item, records.Schema | records.Channel):
             self._definitions.add(item)
         elif isinstance(item, records.Metadata):
@@ -172,12 +166,8 @@ class McapSource(Source):
         self._given += len(rows)
         yield from split(replace(rows, channel=found))
 
-    def _note(self, damage: Damage) -> None:
-        self.note(damage)
-        self._lost += damage.messages_lost or 0
-
     def _tell(self, reason: str, lost: int, offset: int | None = None) -> None:
-        self._note(Damage(self.path, offset, None, reason, lost))
+        self.note(Damage(self.path, offset, None, reason, lost))
 
     def _end(self) -> None:
         self.bytes_read = self.size_bytes
@@ -191,16 +181,8 @@ class McapSource(Source):
                 "time is stored in its place"
             )
             self._tell(reason, 0)
-        missing = 0
         if self.message_count is not None:
-            missing = max(self.message_count - self._given - self._lost, 0)
-        if len(self._uncounted) == 1:
-            self._uncounted = [replace(self._uncounted[0], messages_lost=missing)]
-            missing = 0
-        for damage in self._uncounted:
-            self.note(damage)
-        if missing:
-            self._tell(f"{missing} more messages are counted in the summary than found", missing)
+            self.settle(self.message_count, self._given)
 
 
 def _time_range(summary: Summary) -> tuple[int, int] | None:

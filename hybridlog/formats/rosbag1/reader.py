@@ -1,18 +1,15 @@
 """Reads ROS 1 bags (format 2.0) from the start: also unindexed, cut and damaged ones.
 
 Records are read in the order of the file, without the index. Damage in a compressed chunk costs
-the rest of the chunk; elsewhere reading goes on at the next record. What was lost is counted by
-the chunk list at the end of the bag, or by the index records behind a chunk.
+that chunk; elsewhere reading goes on at the next record. What was lost is counted by the chunk
+list at the end of the bag, or by the index records behind a chunk.
 """
 
 from __future__ import annotations
 
 import bz2
-import re
 import struct
-from bisect import bisect_left
 from collections import Counter
-from dataclasses import dataclass, field
 from io import BytesIO
 from typing import TYPE_CHECKING, Any, BinaryIO, Final, NamedTuple
 
@@ -21,6 +18,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from hybridlog.formats.reading import (
+    BATCH_MESSAGES,
     TOO_MANY_CHANNELS,
     TOO_MANY_SILENT,
     Damage,
@@ -30,15 +28,12 @@ from hybridlog.formats.reading import (
 )
 from hybridlog.wording import listed
 from hybridlog_storage.errors import SourceError
-from hybridlog_storage.mcap.mcap_content import MIN_RECORDS
 from hybridlog_storage.messages import MAX_CHANNELS, MAX_PAYLOAD, Batch, Channel, Schema
 from hybridlog_storage.segments.compression import is_implausible
 
 if TYPE_CHECKING:
-    from collections.abc import Generator, Iterator
+    from collections.abc import Callable, Generator, Iterator
     from pathlib import Path
-
-    from numpy.typing import NDArray
 
 MAGIC: Final = b"#ROSBAG V2.0\n"
 
@@ -59,24 +54,18 @@ _UNPACKERS: Final[dict[bytes, Any]] = {
 }
 _UNDEFINED, _TOO_MANY = -1, -2  # in the place of a channel
 
+_NO_RECORD: Final = "bytes that are no record"
+
 _MAX_HEADER: Final = 1 << 20
 _OP: Final = b"\x04\0\0\0op="
 _LOOK_BACK: Final = 320  # most bytes in front of this field in a header that is searched for
-_MAX_INDEX: Final = 64 << 20  # of an index that is not where the bag header says
 _MAX_FOUND: Final = 4096  # longest header that is searched for
+_MAX_INDEX: Final = 64 << 20  # of an index that is not where the bag header says
 _WINDOW = 4 << 20  # bytes of messages outside of compressed chunks that are read at once
 _UNSTATED = 16 << 20  # bytes that a chunk may unpack to whatever its header says
 _STEP: Final = 256 << 10  # bytes that are searched or unpacked at once
 
-_USUAL: Final = re.compile(
-    rb"(?s)\x26\0\0\0"
-    rb"(?:\x04\0\0\0op=\x02|\x09\0\0\0conn=(....)|\x0d\0\0\0time=(........)){3}...."
-)
-"""The header of a message without further fields, in any order, and the length of its data."""
-_USUAL_BYTES: Final = 46
-_SORTED: Final = struct.Struct("<13s4x17s8xI").unpack_from
-_SORTED_NAMES: Final = b"\x26\0\0\0\x09\0\0\0conn=", b"\x04\0\0\0op=\x02\x0d\0\0\0time="
-"""The same in the order of rosbag: what is around the values, and the length of the data."""
+_VALUES: Final = b"\x09\0\0\0conn=", b"\x0d\0\0\0time="  # fields of a message: 4 and 8 bytes
 
 _u32 = struct.Struct("<I").unpack_from
 
@@ -122,80 +111,50 @@ def _parsed(header: bytes, start: int, end: int) -> _Record | None:
     return None
 
 
-class _Walk(NamedTuple):
-    """The messages at the beginning of some bytes.
+_Row = tuple[int, int, int, int]
+"""Of a message, begin and length of its payload, and the places of its connection and time."""
 
-    Attributes:
-        rows: Of each, begin and length of its payload, and the places of its connection and time.
-        connections: Connection records, and the number of messages before each.
-        end: The end of the last whole record.
+
+def walk(data: bytes, pos: int) -> tuple[list[_Row], int]:
+    """The messages from a place in some bytes on, a batch of them at most, and where they end.
+
+    Most headers are like the one before, but for their values.
     """
-
-    rows: list[tuple[int, int, int, int]]
-    connections: list[tuple[int, _Record]]
-    end: int
-
-    def without_wrong(self, data: bytes) -> int:
-        """Leave out a last message of wrong length: a record begins in it; returns the end."""
-        if self.rows and sum(self.rows[-1][:2]) == self.end:
-            start = self.rows[-1][0]
-            if _OP in data[start : self.end + len(_OP)]:
-                self.rows.pop()
-                return start
-        return self.end
-
-
-def walk(data: bytes, most: int) -> _Walk:
-    """Read the whole message and connection records at the beginning of some bytes."""
-    rows: list[tuple[int, int, int, int]] = []
-    connections: list[tuple[int, _Record]] = []
-    pos, size, u32, usual, in_order = 0, len(data), _u32, _USUAL.match, _SORTED
-    first, second = _SORTED_NAMES
-    while pos + 8 <= size and len(rows) < most:
-        start = pos + _USUAL_BYTES
+    rows: list[_Row] = []
+    size, u32 = len(data), _u32
+    unpack, length, conn, time = u32, size + 1, 0, 0
+    first = second = third = b""
+    while pos + 8 <= size and len(rows) < BATCH_MESSAGES:
+        start = pos + length
         if start <= size:
-            conn = time = 0
-            before, between, count = in_order(data, pos)
-            if before == first and between == second:
-                conn, time = pos + 13, pos + 34
-            elif (head := usual(data, pos)) is not None and head.end() == start:
-                conn, time = head.start(1), head.start(2)
-            if conn > 0 and time > 0:
+            before, between, behind, count = unpack(data, pos)
+            if before == first and between == second and behind == third:
                 if start + count > size:
                     break
-                rows.append((start, count, conn, time))
+                rows.append((start, count, pos + conn, pos + time))
                 pos = start + count
                 continue
-        body = pos + 4 + u32(data, pos)[0]
-        if body + 4 > size:
+        record = _record_in(data, pos)
+        if record is None or record.op != _MESSAGE:
             break
-        header, start = data[pos + 4 : body], body + 4
-        record = _parsed(header, start, start + u32(data, body)[0])
-        if record is None or record.end > size or record.op not in {_MESSAGE, _CONNECTION}:
-            break
-        if record.op == _CONNECTION:
-            connections.append((len(rows), record))
-        else:
-            conn, time = (
-                pos + 4 + header.rindex(field) + len(field)
-                for field in (b"\x09\0\0\0conn=", b"\x0d\0\0\0time=")
-            )
-            rows.append((start, record.end - start, conn, time))
-        pos = record.end
-    return _Walk(rows, connections, pos)
+        start = record.start
+        header = data[pos : start - 4]
+        conn, time = (header.rindex(name) + len(name) for name in _VALUES)
+        rows.append((start, record.end - start, pos + conn, pos + time))
+        (low, low_end), (high, high_end) = sorted([(conn, conn + 4), (time, time + 8)])
+        first, second, third = header[:low], header[low_end:high], header[high_end:]
+        form = f"<{low}s{low_end - low}x{len(second)}s{high_end - high}x{len(third)}sI"
+        unpack, length, pos = struct.Struct(form).unpack_from, start - pos, record.end
+    return rows, pos
 
 
-@dataclass(slots=True)
-class _Place:
-    """A chunk with its index records, or the bytes in its place."""
-
-    start: int
-    end: int  # of the chunk, as it says
-    got: int = 0  # messages read in it
-    indexed: int | None = None  # messages in its index records, None before the first one
-    reasons: list[str] = field(default_factory=list)
-    is_torn: bool = False  # some of its index records could not be read
-    is_cut: bool = False  # the file ends in it
+def _record_in(data: bytes, pos: int) -> _Record | None:
+    """The whole record at a place in some bytes; None without one."""
+    body = pos + 4 + _u32(data, pos)[0] if pos + 8 <= len(data) else len(data)
+    if body + 4 > len(data):
+        return None
+    record = _parsed(data[pos + 4 : body], body + 4, body + 4 + _u32(data, body)[0])
+    return record if record is not None and record.end <= len(data) else None
 
 
 class _Connection(NamedTuple):
@@ -204,6 +163,14 @@ class _Connection(NamedTuple):
     conn: int
     topic: bytes
     data: bytes
+
+    @classmethod
+    def of(cls, record: _Record, data: bytes) -> _Connection | None:
+        """The content of a record in some bytes; None of another kind."""
+        if record.op != _CONNECTION:
+            return None
+        content = data[record.start : record.end]
+        return cls(record.number(b"conn"), record.fields[b"topic"], content)
 
     def channel(self) -> Channel:
         """The channel of its messages."""
@@ -230,13 +197,12 @@ class Rosbag1Source(Source):
         self._fallback: dict[int, _Connection] = {}  # by the index of the bag
         self._numbers: dict[_Connection, int] = {}
         self._left_out: dict[int, Counter[int]] = {_UNDEFINED: Counter(), _TOO_MANY: Counter()}
-        self._chunks: list[tuple[int, int]] = []  # by the index: place and number of messages
-        self._index_pos = self._index_said = 0  # the place by the bag header, if it is another
+        self._index_pos = 0
+        self._cut: int | None = None  # where the rest of a file begins that was cut short
         self._got = 0
-        self._index_is_short = False
-        self._zeros: list[range] = []  # between records
-        self._passed = 0  # behind the header of the last record, whose length may be wrong
-        self._place: _Place | None = None
+        self._chunk_end = 0
+        self._chunk_got = self._chunk_listed = 0  # messages of a chunk, read and in its index
+        self._chunk_losses = 0  # of the chunks before
         try:
             self._file: BinaryIO = path.open("rb", buffering=1 << 16)
         except OSError as error:
@@ -277,64 +243,50 @@ class Rosbag1Source(Source):
                 "decrypt it with `rosbag decrypt` first"
             )
         self._index_pos = record.number(b"index_pos")
-        if self._index_pos and not self._reads_index(record):
-            self._find_index(record)
+        if self._index_pos:
+            self._read_index(record)
 
-    def _find_index(self, head: _Record) -> None:
-        """Read the index from another place: it moves if bytes before it are missing."""
-        start = max(head.end, self.size_bytes - _MAX_INDEX)
-        last = self._read(start, _MAX_INDEX).rfind(_OP + bytes([_INDEX_DATA]))
-        found = None if last < 0 else self._search(start + last)
-        if found is None:
-            return
-        said, self._index_pos = self._index_pos, found
-        if found != said and self._reads_index(head):
-            self._index_said = said
-            self._chunks = []  # their places are wrong
-        else:
-            self._index_pos = said
-
-    def _reads_index(self, head: _Record) -> bool:
-        """Read connections and chunk list; False if they are not complete."""
-        if self._index_pos > self.size_bytes:
-            return False
-        chunks: list[tuple[int, int]] = []
+    def _read_index(self, head: _Record) -> None:
+        """Read connections and chunk list; bytes lost or added before them have moved them."""
+        begin = self._index_pos
+        if begin > self.size_bytes or not self._is_sound(begin):
+            tail = max(head.end, self.size_bytes - _MAX_INDEX)
+            last = self._read(tail, _MAX_INDEX).rfind(_OP + bytes([_INDEX_DATA]))
+            begin = last if last < 0 else self._search(tail + last)
+        pos, count, chunks, connections = begin, 0, 0, 0
         times: list[int] = []
-        connections, pos = 0, self._index_pos
-        while pos < self.size_bytes:
+        while 0 <= pos < self.size_bytes:
             record = self._record(pos)
-            if record is None and pos > self._index_pos:  # zeros, as some recorders write them
-                end = self._search(pos) or self.size_bytes
-                if not self._are_zeros(pos, end):
-                    return False
-                pos = end
-                continue
             if record is None or record.end > min(self.size_bytes, record.start + MAX_PAYLOAD):
-                return False
+                pos = self._search(pos + 1)
+                continue
             data = self._read(record.start, record.end - record.start)
             if record.op == _CONNECTION:  # that in a chunk may be lost
                 connections += 1
                 conn = record.number(b"conn")
                 self._fallback[conn] = _Connection(conn, record.fields[b"topic"], data)
             elif record.op == _CHUNK_INFO:
+                chunks += 1
                 pairs = np.frombuffer(data, "<u4", len(data) // 8 * 2).reshape(-1, 2)
-                chunks.append((record.number(b"chunk_pos"), int(pairs[:, 1].sum(dtype=np.int64))))
+                count += int(pairs[:, 1].sum(dtype=np.int64))
                 times += record.time(b"start_time"), record.time(b"end_time")
             else:
-                return False
+                break
             pos = record.end
         wanted = head.number(b"conn_count"), head.number(b"chunk_count")
-        # An index truncated between two records is recognized by their number only.
-        self._index_is_short = connections < wanted[0] or len(chunks) < wanted[1]
-        if (connections, len(chunks)) != wanted:
-            return False
-        self._chunks = sorted(chunks)
-        # A bag without chunks has no list of messages.
-        if chunks or self._index_pos == head.end:
-            self.message_count = sum(count for _, count in chunks)
-        if self.message_count:
+        if pos != self.size_bytes or (connections, chunks) != wanted:
+            self._cut = self.size_bytes
+            return
+        if chunks or begin == head.end:  # a bag without chunks has no list of messages
+            self.message_count = count
+        if count:
             self.time_range = (min(times), max(times) + 1)
-        return True
+        if begin != self._index_pos:
+            reason = (
+                f"the bag header says that the index starts at {self._index_pos}, it starts at "
+                f"{begin}: bytes have been lost, added or changed"
+            )
+            self._tell(None, None, reason)
 
     # Records of the file.
 
@@ -368,11 +320,8 @@ class Rosbag1Source(Source):
         """True if a record starts at a position, or the file ends there."""
         return pos == self.size_bytes or self._plain_record(pos) is not None
 
-    def _are_zeros(self, pos: int, end: int) -> bool:
-        return 0 < end - pos <= _WINDOW and not self._read(pos, end - pos).strip(b"\0")
-
-    def _search(self, pos: int) -> int | None:
-        """First position at or behind `pos` that looks like a record."""
+    def _search(self, pos: int) -> int:
+        """The first position at or behind one that looks like a record; the end without any."""
         for start in range(pos, self.size_bytes, _STEP):
             data = self._read(start, _STEP + _LOOK_BACK + len(_OP))
             hit = data.find(_OP)
@@ -383,7 +332,7 @@ class Rosbag1Source(Source):
                     if is_long and self._is_believable(start + place):
                         return start + place
                 hit = data.find(_OP, hit + 1)
-        return None
+        return self.size_bytes
 
     def _is_believable(self, pos: int) -> bool:
         """True if what looks like a record is one.
@@ -407,176 +356,138 @@ class Rosbag1Source(Source):
                 pos = yield from self._step(pos)
                 self.bytes_read = min(pos, self.size_bytes)
         except OSError as error:
-            place = self._place_at(pos)
-            place.reasons.append(f"the system cannot read on: {error.strerror or error}")
+            self._tell(pos, None, f"the system cannot read on: {error.strerror or error}")
         self.bytes_read = self.size_bytes
-        was_cut = self._finish_place(self.size_bytes)
-        if (self._index_pos > self.size_bytes or self._index_is_short) and not was_cut:
-            reason = f"the file ends before the end of its index, which starts at {self._index_pos}"
-            lost = 0 if self._index_is_short else None
-            self._report(self.size_bytes, None, f"{reason}: it was cut short", lost)
-        if self._index_said:
-            told = sum(damage.messages_lost or 0 for damage in self.damage)
-            missing = max(0, (self.message_count or 0) - self._got - told)
-            reason = (
-                f"the bag header says that the index starts at {self._index_said}, it starts at "
-                f"{self._index_pos}: bytes have been lost, added or changed"
-            )
-            self._report(None, None, reason, missing)
-        self._report_rest()
+        self._end_chunk()
+        self._report()
 
     def _step(self, pos: int) -> Generator[Batch, None, int]:
         """Read one record, chunk or run of messages; returns the position behind it."""
         record = self._record(pos)
-        passed, self._passed = self._passed, 0
         if record is None:
-            return self._skip(pos, passed or pos)
+            return self._skip(pos)
         if record.op == _CHUNK:
             return (yield from self._chunk(pos, record))
         if record.end > min(self.size_bytes, record.start + MAX_PAYLOAD):
-            return self._skip(pos, record.start)
+            return self._skip(record.start)
         if record.op in {_MESSAGE, _CONNECTION}:
             return (yield from self._run(pos, record.end))
         if record.op == _INDEX_DATA:
-            place = self._place or self._place_at(pos)
-            place.indexed = (place.indexed or 0) + record.number(b"count")
-        elif record.op == _CHUNK_INFO:
-            self._finish_place(pos)
-        self._passed = record.start
+            self._chunk_listed += record.number(b"count")
         return record.end
 
     def _run(self, pos: int, end: int) -> Generator[Batch, None, int]:
         """Read messages outside of compressed chunks, the first of which ends at `end`."""
-        place = self._place_at(pos)
-        most = min(_WINDOW, place.end - pos) if place.end > pos else _WINDOW
+        most = min(_WINDOW, self._chunk_end - pos) if self._chunk_end > pos else _WINDOW
         data = self._read(pos, max(most, end - pos))
-        found = walk(data, len(data))
-        behind = pos + found.end
-        if not self._is_sound(behind):
-            behind = pos + found.without_wrong(data)
-        yield self._batch(data, found, place)
-        return behind
+        used = yield from self._content(data, lambda end: self._is_sound(pos + end))
+        return pos + used
 
-    def _skip(self, pos: int, start: int) -> int:
-        """Go from damage at `pos` to the first record at or behind `start`."""
-        found = self._search(start)
-        end = found or self.size_bytes
-        if self._chunks and self._are_zeros(pos, end) and not self._listed(pos, end):
-            self._zeros.append(range(pos, end))
-            return end
-        place = self._place_at(start)
-        place.is_torn = place.start < start and place.end <= start
-        place.is_cut = found is None
-        what = "bytes that are no record" if found else "the file ends in a record that starts"
-        place.reasons.append(f"{what} at byte {pos}")
+    def _content(self, data: bytes, is_end: Callable[[int], bool]) -> Generator[Batch, None, int]:
+        """Read messages and connections; returns where they end."""
+        rows: list[_Row] = []
+        pos, end = -1, 0
+        while end > pos:
+            more, end = walk(data, pos := end)
+            rows += more
+            record = _record_in(data, end)
+            if rows and record is None and not is_end(end):
+                start, length, *_ = rows[-1]
+                if _OP in data[start : start + length + len(_OP)]:
+                    rows.pop()  # its length is wrong: a record begins in it
+                    end = start
+            found = None if record is None else _Connection.of(record, data)
+            is_known = found is not None and self._meaning.get(found.conn, found) == found
+            if rows and (not is_known or len(rows) >= BATCH_MESSAGES):
+                yield self._batch(data, rows)
+                rows = []
+            if record is not None and found is not None:
+                self._meaning[found.conn] = found
+                end = record.end
         return end
 
-    # Chunks.
+    def _skip(self, start: int) -> int:
+        """Go from damage to the first record behind it."""
+        end = self._search(start)
+        if end == self.size_bytes and self.message_count is None:
+            self._cut = start
+        else:
+            self._tell(start, end - start, _NO_RECORD)
+        return end
 
     def _chunk(self, pos: int, record: _Record) -> Generator[Batch, None, int]:
         """Read a compressed chunk, or the beginning of another; returns the position behind it."""
-        self._finish_place(pos)
-        place = self._place = _Place(pos, record.end)
-        form, length = record.fields[b"compression"], record.end - record.start
+        self._end_chunk()
+        self._chunk_end, start, size = record.end, record.start, record.number(b"size")
+        form, length = record.fields[b"compression"], record.end - start
         if form not in _UNPACKERS:
             if form != b"none":
                 name = form.decode(errors="replace")
-                place.reasons.append(f"the chunk's compression {name!r} is not known")
-            if (size := record.number(b"size")) != length:
-                place.reasons.append(f"the chunk's header says {size} bytes, its record {length}")
-            return record.start
+                self._tell(pos, length, f"a chunk's compression {name!r} is not known")
+            elif size != length:
+                self._tell(pos, length, f"a chunk says {size} bytes, its record {length}")
+            return start
         try:
-            data, used = self._unpacked(record, place)
+            data, end = self._unpacked(record)
         except (OSError, EOFError, RuntimeError, ValueError) as error:
             if isinstance(error, OSError) and error.errno:  # of the system, not of the format
                 raise
-            place.reasons.append(f"the chunk cannot be unpacked: {error}")
-            if record.end <= self.size_bytes and self._is_sound(record.end):
-                return record.end
-            return self._skip(record.start, record.start)
-        place.end = record.start + used
-        most = MIN_RECORDS + used
-        found = walk(data, most + 1)
-        if len(found.rows) > most:
-            place.reasons.append("the chunk holds too many messages for its size")
-            return place.end
-        if found.end < len(data) and not place.is_cut:
-            place.reasons.append(f"bytes that are no record at byte {found.end} of the chunk")
-            found.without_wrong(data)
-        yield self._batch(data, found, place)
-        return self.size_bytes if place.is_cut else place.end
+            self._tell(pos, length, f"a chunk cannot be unpacked: {error}")
+            is_whole = record.end <= self.size_bytes and self._is_sound(record.end)
+            return record.end if is_whole else self._search(start)
+        used = yield from self._content(data, lambda end: end == len(data))
+        if record.end > self.size_bytes and end == self.size_bytes:
+            return end  # the file ends in it
+        self._chunk_end = end
+        if (end - start, len(data)) != (length, size):
+            reason = f"a chunk says {size} bytes, there are {len(data)}, and"
+            self._tell(pos, length, f"{reason} {length} compressed bytes, there are {end - start}")
+        elif used < len(data):
+            self._tell(pos, length, f"bytes that are no record at byte {used} of a chunk")
+        return end
 
-    def _unpacked(self, record: _Record, place: _Place) -> tuple[bytes, int]:
-        """Content of a chunk, also if its record states too few bytes, and compressed size."""
+    def _unpacked(self, record: _Record) -> tuple[bytes, int]:
+        """The content of a chunk and its end, whatever its record says; less if the file ends."""
         size, length = record.number(b"size"), record.end - record.start
         most = min(max(size, _UNSTATED), MAX_PAYLOAD)
-        # In a valid bag index records follow, so a little more is enough.
-        there = min(record.end, self.size_bytes) - record.start
-        end = min(record.start + there + max(there, 1 << 20), self.size_bytes)
+        stop = min(record.end + _UNSTATED, self.size_bytes)
         self._file.seek(record.start)
         pos, content = record.start, BytesIO()
         stream = _UNPACKERS[record.fields[b"compression"]]()
         while not stream.eof:
-            data = self._file.read(min(_STEP, end - pos)) if stream.needs_input else b""
+            data = self._file.read(min(_STEP, stop - pos)) if stream.needs_input else b""
             if stream.needs_input and not data:
                 if record.end < self.size_bytes:
                     raise ValueError("its compressed bytes end too early")
-                place.is_cut = True
-                place.reasons.append("the file ends in a chunk")
-                return content.getvalue(), pos - record.start
+                break
             pos += len(data)
             content.write(stream.decompress(data, _STEP))
             if content.tell() > most:
                 raise ValueError(f"its header says {size} bytes, it has more than {most}")
-            if is_implausible(content.tell(), there):
-                raise ValueError(f"its {there} bytes become more than {content.tell()}")
-        used = pos - len(stream.unused_data or b"") - record.start
-        if used != length:
-            place.reasons.append(
-                f"the chunk's record says {length} compressed bytes, there are {used}"
-            )
-        if size != content.tell():
-            place.reasons.append(
-                f"the chunk's header says {size} bytes, there are {content.tell()}"
-            )
-        return content.getvalue(), used
+            if is_implausible(content.tell(), length):
+                raise ValueError(f"its {length} bytes become more than {content.tell()}")
+        return content.getvalue(), pos - len(stream.unused_data or b"")
 
-    def _batch(self, data: bytes, found: _Walk, place: _Place) -> Batch:
-        """The messages of a run with a known channel."""
-        table = np.array(found.rows, np.int64).reshape(-1, 4)
-        count = len(table)
-        ids, stamps = np.empty(0, np.int64), np.empty((0, 2), np.int64)
-        if count:
-            words = sliding_window_view(np.frombuffer(data, np.uint8), 4)
-            ids = words[table[:, 2]].view("<u4")[:, 0].astype(np.int64)
-            stamps = np.stack([words[table[:, 3] + n].view("<u4")[:, 0] for n in (0, 4)], axis=1)
-        times = stamps[:, 0].astype(np.int64) * 10**9 + stamps[:, 1]
-        channel = np.empty(count, np.int32)
-        done = 0
-        for before, record in found.connections:
-            conn = record.number(b"conn")
-            meaning = _Connection(conn, record.fields[b"topic"], data[record.start : record.end])
-            if self._meaning.get(conn, meaning) != meaning:
-                # The id now has another meaning; earlier messages keep the old one.
-                channel[done:before] = self._channels(ids[done:before])
-                done = before
-            self._meaning[conn] = meaning
-        channel[done:] = self._channels(ids[done:])
-        place.got += count
-        self._got += count
-        batch = Batch(
-            data, table[:, 0], table[:, 1], channel, times, times, np.zeros(count, np.uint32)
+    def _batch(self, data: bytes, rows: list[_Row]) -> Batch:
+        """The messages that have a channel."""
+        table = np.array(rows, np.int64)
+        words = sliding_window_view(np.frombuffer(data, np.uint8), 4)
+        ids, seconds, rest = (
+            words[places].view("<u4")[:, 0].astype(np.int64)
+            for places in (table[:, 2], table[:, 3], table[:, 3] + 4)
         )
-        if not count or channel.min() >= 0:
+        times = seconds * 10**9 + rest
+        distinct, where = np.unique(ids, return_inverse=True)
+        channel = np.array([self._number(conn) for conn in distinct.tolist()], np.int32)[where]
+        self._got += len(rows)
+        self._chunk_got += len(rows)
+        zeros = np.zeros(len(rows), np.uint32)
+        batch = Batch(data, table[:, 0], table[:, 1], channel, times, times, zeros)
+        if channel.min() >= 0:
             return batch
         for number, counts in self._left_out.items():
             counts.update(ids[channel == number].tolist())
         return batch.take(channel >= 0)
-
-    def _channels(self, connection: NDArray[np.int64]) -> NDArray[np.int32]:
-        """Channel indexes of connection ids, negative for undefined ids or too many."""
-        ids, where = np.unique(connection, return_inverse=True)
-        return np.array([self._number(conn) for conn in ids.tolist()], np.int32)[where]
 
     def _number(self, conn: int) -> int:
         """Channel index of a connection with messages; equal ones share a channel."""
@@ -593,64 +504,51 @@ class Rosbag1Source(Source):
 
     # Losses.
 
-    def _place_at(self, pos: int) -> _Place:
-        """The place of `pos`: the current one unless its index covers all its messages."""
-        place = self._place
-        if place is None or (place.indexed is not None and place.indexed >= place.got):
-            self._finish_place(pos)
-            place = self._place = _Place(pos, pos)
-        return place
-
-    def _finish_place(self, pos: int) -> bool:
-        """Report the losses of the current place, which ends at `pos`; True if the file does."""
-        place, self._place = self._place, None
-        if place is None:
-            return False
-        if place.end > pos == self.size_bytes and not place.is_cut:
-            place.is_cut = True
-            place.reasons.append("the file ends in a chunk")
-        expected = None if place.is_torn else place.indexed
-        if self._chunks:
-            expected = self._listed(place.start, max(pos, place.start + 1))
-        lost = None if expected is None else max(0, expected - place.got)
-        if not place.reasons and lost:
-            place.reasons.append(f"its index lists {expected} messages, {place.got} are there")
-        if place.is_cut and not 0 < self._index_pos <= self.size_bytes:
-            lost = None  # the content behind the end is unknown
-        if place.reasons:
-            self._report(place.start, pos - place.start, "; ".join(place.reasons), lost)
-        return place.is_cut
-
-    def _listed(self, start: int, end: int) -> int:
-        """Number of messages in some bytes by the chunk list at the end of the bag."""
-        first, stop = (bisect_left(self._chunks, (pos, 0)) for pos in (start, end))
-        return sum(count for _, count in self._chunks[first:stop])
-
-    def _report(
-        self, offset: int | None, length: int | None, reason: str, lost: int | None
+    def _tell(
+        self, offset: int | None, length: int | None, reason: str, lost: int | None = None
     ) -> None:
         self.note(Damage(self.path, offset, length, reason, lost))
 
-    def _report_rest(self) -> None:
-        """Report messages without a channel and zeros, and add channels without messages."""
+    def _end_chunk(self) -> None:
+        """Count what the index records of a chunk list and it lacks."""
+        self._chunk_losses += max(0, self._chunk_listed - self._chunk_got)
+        self._chunk_got = self._chunk_listed = 0
+
+    def _report(self) -> None:
+        """Report the messages that are missing, and add channels without messages."""
+        odd = [one for one in self.damage if one.reason == _NO_RECORD]
+        if self._got == self.message_count and odd == self.damage != []:
+            self.damage.clear()
+            self.remarks.append(
+                f"{sum(one.length or 0 for one in odd)} bytes are no record, the first at byte "
+                f"{odd[0].offset}; by the index of the bag nothing is missing there"
+            )
+        if self.message_count is not None:
+            self.settle(self.message_count, self._got)
+        elif self._chunk_losses or not odd:
+            self.settle(self._got + self._chunk_losses, self._got)
+        if self._cut is None and self._chunk_end > self.size_bytes:
+            self._cut = self.size_bytes
+        if self._cut is not None:
+            reason, lost = "the file ends in a chunk or record", None
+            if self._index_pos and self.message_count is None:
+                reason = f"the index, which starts at {self._index_pos}, is not whole"
+                lost = 0 if self._index_pos <= self.size_bytes else None
+            length = self.size_bytes - self._cut
+            self._tell(self._cut, length, f"{reason}: the file was cut short", lost)
         undefined, too_many = self._left_out.values()
         if too_many:
-            self._report(None, None, TOO_MANY_CHANNELS, too_many.total())
+            self._tell(None, None, TOO_MANY_CHANNELS, too_many.total())
         if undefined:
             shown = listed(map(str, sorted(undefined)))
             reason = f"messages of connections that the bag does not define (id {shown})"
-            self._report(None, None, reason, undefined.total())
+            self._tell(None, None, reason, undefined.total())
         used = {connection.conn for connection in self._numbers} | set(too_many)
         silent = [
             self._number(conn) for conn in {**self._fallback, **self._meaning} if conn not in used
         ]
         if left_out := silent.count(_TOO_MANY):
-            self._report(None, None, f"{left_out} {TOO_MANY_SILENT}", 0)
-        if self._zeros:
-            self.remarks.append(
-                f"{sum(map(len, self._zeros))} bytes between records are zeros, the first at byte "
-                f"{self._zeros[0].start}; by the index of the bag nothing is missing there"
-            )
+            self._tell(None, None, f"{left_out} {TOO_MANY_SILENT}", 0)
 
 
 def _not_version_2(path: Path, magic: bytes) -> str:
