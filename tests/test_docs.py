@@ -1090,7 +1090,7 @@ def test_the_specification_names_what_there_is() -> None:
 
 def test_the_unit_for_systemd_starts_a_recorder() -> None:
     from hybridlog.cli.commands.record import record_command
-    from hybridlog.cli.record_choices import RecordChoices, check_choices
+    from hybridlog.cli.record_choices import RecordChoices
     from hybridlog.cli.record_live import recorder_options
 
     (unit,) = (fence for fence in fences(DOCS / "robot.md") if fence.language == "ini")
@@ -1099,7 +1099,7 @@ def test_the_unit_for_systemd_starts_a_recorder() -> None:
     assert (Path(program).name, command) == ("hybridlog", "record")
     with record_command.make_context("record", arguments) as context:
         choices = RecordChoices(**context.params)
-    check_choices(choices)
+    choices.check()
     assert recorder_options(choices).settings.segment_span_s == 60
     # It says that it is ready, and can be stopped while its own MongoDB still runs.
     assert (settings["Type"], settings["KillMode"]) == ("notify", "mixed")

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from itertools import chain, groupby, islice
@@ -18,7 +19,7 @@ import click
 from hybridlog.cli import output
 from hybridlog.cli.binder import PATH, option
 from hybridlog.cli.options import AsJson, Forced, Topics
-from hybridlog.cli.progress import Bar
+from hybridlog.cli.output import Bar
 from hybridlog.cli.render import ROWS_AT_ONCE, Column, print_table
 from hybridlog.cli.signals import if_stopped
 from hybridlog.formats import OUTPUTS, formats_of, is_directory, suffixes_of
@@ -126,20 +127,15 @@ class Tabular(Forced, AsJson):
         completeness: Callable[[], Completeness] | None = None,
         noun: str = "row",
     ) -> int:
-        """Print or write tables, at least one, all rows or nothing; returns the printed number."""
+        """Print or write tables, at least one, all rows or nothing; returns their number."""
         form, limit = self.to_form, self.limit
         if limit is not None or form == SCREEN:
             tables = _limited(tables, SCREEN_ROWS + 1 if limit is None else limit)
-        tables = _checked(tables, completeness)
         if form == SCREEN:
-            return _print_rows(tables, limit, noun)
-        with writing(self.output), Bar(form, quiet=self.output is None) as bar:
-            answer = _rows(_with_progress(tables, bar))
-            if OUTPUTS[form].content == "table":
-                answer.schema = schema()
-            OUTPUTS[form].write(answer, self.place)
-        output.notes(answer.notes)
-        return 0
+            return _print_rows(_checked(tables, completeness), limit, noun)
+        answer = _rows(tables)
+        answer.schema = schema() if OUTPUTS[form].content == "table" else None
+        return _write(answer, form, self.place, completeness)
 
 
 def form_of(path: Path, suffixes: Mapping[str, str]) -> str:
@@ -160,28 +156,36 @@ class Listing(Tabular):
     usual: ClassVar[tuple[str, str]] = SCREEN, SCREEN
     form: str | None = format_option(_LISTING_FORMATS, "")
 
-    def show(
-        self,
-        rows: Iterable[Any],
-        columns: Sequence[Column],
-        without: str = "",
-        plain: Callable[[Any], Any] = lambda row: row,
-    ) -> None:
+    def show(self, rows: Iterable[Any], columns: Sequence[Column], without: str = "") -> None:
         """Print or write rows; see `AsJson.show`."""
         limited = islice(rows, self.limit)
         if self.to_form != SCREEN:
-            self.answer(_tables_of(map(plain, limited)))
+            self.answer(_tables_of(limited))
         elif not print_table(columns, limited):
             output.remarks(filter(None, [without]))
         sys.stdout.flush()
 
 
-def _tables_of(rows: Iterable[Mapping[str, Any]]) -> Iterator[pa.Table]:
+def _tables_of(rows: Iterator[Mapping[str, Any]]) -> Iterator[pa.Table]:
+    """Rows as tables, at least one."""
     import pyarrow as pa
 
-    yield pa.Table.from_pylist(list(islice(rows, ROWS_AT_ONCE)))
-    while block := list(islice(rows, ROWS_AT_ONCE)):
-        yield pa.Table.from_pylist(block)
+    block = [*islice(rows, ROWS_AT_ONCE)]
+    names = [name for row in block[:1] for name in row]
+    yield pa.table({name: _column([row[name] for row in block]) for name in names})
+    while block := [*islice(rows, ROWS_AT_ONCE)]:
+        yield pa.table({name: _column([row[name] for row in block]) for name in names})
+
+
+def _column(values: list[Any]) -> pa.Array:
+    """Values as a column; as JSON if no type has them all exactly: great integers and fractions."""
+    import pyarrow as pa
+
+    try:
+        return pa.array(values)
+    except (pa.ArrowInvalid, OverflowError):
+        texts = [None if value is None else json.dumps(value) for value in values]
+        return pa.ExtensionArray.from_storage(pa.json_(), pa.array(texts))
 
 
 @contextmanager
@@ -211,36 +215,55 @@ def write_answer(
     """Write an answer, all or nothing; its counters are about what was written."""
     from hybridlog.formats.slices import IN_FORCE, payload_bytes
 
-    counters, written = query.counters, 0
-    counts = OUTPUTS[form].content in {"lines", "table"} and query.question.frame is None
+    counters, in_frame = query.counters, query.question.frame is not None
     answer = _answer_of(query, form, target, front or IN_FORCE, extras)
-    completeness = query.completeness if strict and query.question.frame is not None else None
-
-    def told(pieces: Iterable[_T]) -> Iterator[_T]:
-        nonlocal written
-        for piece in pieces:
-            yield piece
-            written += len(cast("Sized", piece)) if counts else 0
-            bar(counters.payload_bytes, output.counted(counters.messages, "message"))
-
-    for name in ("lines", "tables", "batches", "points", "messages"):
-        setattr(answer, name, _checked(told(getattr(answer, name)), completeness))
-    path = target if isinstance(target, Path) else None
-    size = payload_bytes(query) if path is not None and output.has_bars() else 0
-    with writing(path), Bar(form, size, quiet=path is None) as bar:
-        OUTPUTS[form].write(answer, target, **settings or {})
-    notes = answer.notes
+    completeness = query.completeness if strict and in_frame else None
+    size = payload_bytes(query) if isinstance(target, Path) and output.has_bars() else 0
+    about: Any = {"settings": settings, "counters": counters, "size": size}
+    written = _write(answer, form, target, completeness, **about)
+    notes = []
     if left_out := len(answer.unreadable):
         many = output.counted(left_out, "message")
         notes.append(f"{many} left out; the first: {answer.unreadable[0]}.")
     if answer.schema is not None:
         from hybridlog.frames.answer import json_columns
 
-        for name in json_columns(answer.schema):
-            notes.append(f"{name} has values of several types: it is written as JSON text.")
+        text = "has values of several types: it is written as JSON text."
+        notes += [f"{name} {text}" for name in json_columns(answer.schema)]
     output.notes(notes)
-    if counts:
+    if OUTPUTS[form].content in {"lines", "table"} and not in_frame:
         counters.messages = written + counters.reduced
+
+
+def _write(
+    answer: Answer,
+    form: str,
+    target: Target,
+    completeness: Callable[[], Completeness] | None,
+    *,
+    settings: Mapping[str, Any] | None = None,
+    counters: Counters | None = None,
+    size: int = 0,
+) -> int:
+    """Write an answer, all of it or nothing, with progress; gives the number of rows or lines."""
+    rows, path = 0, target if isinstance(target, Path) else None
+
+    def told(pieces: Iterable[_T]) -> Iterator[_T]:
+        nonlocal rows
+        for piece in pieces:
+            yield piece
+            rows += len(piece) if OUTPUTS[form].content in {"lines", "table"} else 0  # type: ignore[arg-type]
+            if counters is None:
+                bar(0, output.counted(rows, "row"))
+            else:
+                bar(counters.payload_bytes, output.counted(counters.messages, "message"))
+
+    for name in ("lines", "tables", "batches", "points", "messages"):
+        setattr(answer, name, _checked(told(getattr(answer, name)), completeness))
+    with writing(path), Bar(form, size, quiet=path is None) as bar:
+        OUTPUTS[form].write(answer, target, **settings or {})
+    output.notes(answer.notes)
+    return rows
 
 
 def _answer_of(
@@ -354,16 +377,6 @@ def _pictures(query: Query, form: str, target: Target, front: Front) -> Answer:
 
     answer.messages = images()
     return answer
-
-
-def _with_progress(tables: Iterable[pa.Table], bar: Bar) -> Iterator[pa.Table]:
-    """The same tables, while the bar counts their rows."""
-    done = rows = 0
-    for table in tables:
-        yield table
-        done += table.nbytes
-        rows += table.num_rows
-        bar(done, output.counted(rows, "row"))
 
 
 def _lines_of(table: pa.Table) -> Iterator[list[Line]]:

@@ -107,6 +107,12 @@ class Command(click.Command):
                     formatter.write_dl(found)
 
 
+def _completed(context: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
+    from hybridlog.cli.completion import complete
+
+    return complete(context, param, incomplete)
+
+
 def option(
     help: str,  # noqa: A002 - the word of click
     metavar: str | None = None,
@@ -132,6 +138,8 @@ def option(
             settings["multiple"], words = True, f"{help} Repeatable."
         elif (of := annotation.removesuffix(" | None")) in _TYPES:
             settings.setdefault("type", _TYPES[of])
+        if "type" not in settings:
+            settings["shell_complete"] = _completed
         spelled = [field, name or f"--{field.replace('_', '-')}", *([short] if short else [])]
         made = click.Option(spelled, help=words, metavar=metavar, **settings)
         made.__dict__.update({"section": section} if section else {})
@@ -152,6 +160,8 @@ def argument(
         if of.startswith("tuple["):
             of = of.removeprefix("tuple[").removesuffix(", ...]")
             settings.setdefault("nargs", -1)
+        if "type" not in settings and of not in _TYPES:
+            settings["shell_complete"] = _completed
         settings.setdefault("type", _TYPES.get(of))
         settings.setdefault("required", None if of == annotation else False)
         return click.Argument([field], help=help, metavar=metavar, **settings)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from contextlib import closing
-from functools import partial, wraps
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -19,95 +19,78 @@ if TYPE_CHECKING:
     from hybridlog.session import Session
     from hybridlog_storage.summary import RecordingSummary
 
-    _Complete = Callable[[click.Context, click.Parameter, str], list[str]]
-
 _TRANSFORMS: Final = 100
 """Messages of a topic that are read to complete frames."""
 
 
-def _of_store(complete: Callable[[Session, click.Context, str], Iterable[str]]) -> _Complete:
-    """A completion as click wants it; it gives no candidates where it fails."""
+def complete(context: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
+    """Candidates for a value, which its name in help tells; none where finding them fails."""
+    kind = re.match(r"[\w.,:=]*", str(param.metavar).lstrip("["))
+    find = _KINDS.get(kind[0].rstrip(".") if kind else "")
+    if find is None:
+        return []
+    from hybridlog_storage.lazy import import_numpy_late
 
-    @wraps(complete)
-    def found(context: click.Context, _: click.Parameter, incomplete: str) -> list[str]:
-        from hybridlog_storage.lazy import import_numpy_late
+    import_numpy_late()
+    from hybridlog.opened import OpenStore
+    from hybridlog.store import store_path
+    from hybridlog_storage.remote import directory_of
 
-        import_numpy_late()
-        from hybridlog.opened import OpenStore
-        from hybridlog.store import store_path
-        from hybridlog_storage.remote import directory_of
-
-        try:
-            value: Path | None = context.params.get("store")
-            # The shell has not expanded the tilde of the line that is being completed.
-            path = store_path(None if value is None else os.path.expanduser(value))  # noqa: PTH111
-            with closing(OpenStore(directory_of(path), "none", None)) as shared:
-                names = [*complete(shared.now(), context, incomplete)]
-        except (HybridlogError, OSError):
-            return []
-        return [name for name in names if name.startswith(incomplete)]
-
-    return found
-
-
-@_of_store
-def complete_recording(session: Session, _: click.Context, __: str) -> Iterable[str]:
-    """Names of recordings that begin with what was typed."""
-    return (one.name for one in session.look().summaries)
+    try:
+        value: Path | None = context.params.get("store")
+        # The shell has not expanded the tilde of the line that is being completed.
+        path = store_path(None if value is None else os.path.expanduser(value))  # noqa: PTH111
+        with closing(OpenStore(directory_of(path), "none", None)) as shared:
+            names = [*find(shared.now(), context, incomplete)]
+    except (HybridlogError, OSError):
+        return []
+    return [name for name in names if name.startswith(incomplete)]
 
 
-@_of_store
-def complete_tag(session: Session, _: click.Context, incomplete: str) -> Iterable[str]:
-    """Tags of recordings: keys, and values after the equals sign."""
+def _recordings(session: Session, context: click.Context, _: str) -> Iterable[str]:
+    """Names; where a recorder is meant, of recordings in progress."""
+    is_recorder = context.info_name in {"mark", "top"}
+    found = session.look().summaries
+    return (one.name for one in found if one.status == "open" or not is_recorder)
+
+
+def _tags(session: Session, _: click.Context, incomplete: str) -> Iterable[str]:
+    """Keys, and values after the equals sign."""
     tags = session.look().tags
     key, sign, _value = incomplete.partition("=")
     return sorted(f"{key}={value}" for value in tags.get(key, ())) if sign else sorted(tags)
 
 
-@_of_store
-def complete_type(session: Session, _: click.Context, incomplete: str) -> Iterable[str]:
+def _types(session: Session, _: click.Context, incomplete: str) -> Iterable[str]:
     """Types of messages, whole or by the name behind the package."""
     names = {*session.type_names().values()}
     return sorted(names | {name.rpartition("/")[2] for name in names if incomplete})
 
 
-@_of_store
-def complete_running(session: Session, _: click.Context, __: str) -> Iterable[str]:
-    """Names of recordings in progress that begin with what was typed."""
-    return (one.name for one in session.look().summaries if one.status == "open")
-
-
-@_of_store
-def complete_topic(session: Session, context: click.Context, incomplete: str) -> Iterable[str]:
-    """Topics that begin with what was typed; without a slash, short names as well.
-
-    A short name is offered when it stands for one topic only. With `--recording`, the
-    topics of those recordings are offered.
-    """
+def _topics(session: Session, context: click.Context, incomplete: str) -> Iterable[str]:
+    """Topics of the chosen recordings; of what has no slash, short names that stand for one."""
     topics_of = session.look().topics_of
     topics = {topic for one in _chosen(context, session) for topic in topics_of(one)}
-    return sorted({*topics, *(_short_names(topics) if incomplete else ())})
+    owners = Counter(
+        "/".join(parts[start:])
+        for parts in (topic.strip("/").split("/") for topic in topics)
+        for start in range(len(parts))
+    )
+    short = (name for name, count in owners.items() if count == 1)
+    return sorted({*topics, *(short if incomplete else ())})
 
 
-def complete_condition(
-    context: click.Context, param: click.Parameter, incomplete: str, space: str = " "
-) -> list[str]:
+def _conditions(
+    session: Session, context: click.Context, incomplete: str, space: str = " "
+) -> Iterable[str]:
     """Topics, with the colon and space that fields or a predicate follow; then its fields."""
-    if ":" in incomplete:
-        return complete_path(context, param, incomplete)
-    return [f"{topic}:{space}" for topic in complete_topic(context, param, incomplete)]
+    if ":" in incomplete or context.params.get("step") is not None:  # all topics of an alignment
+        return _fields(session, context, incomplete)
+    return (f"{topic}:{space}" for topic in _topics(session, context, incomplete))
 
 
-complete_field: Final = partial(complete_condition, space="")
-"""The same for a field, which follows without a space."""
-
-
-@_of_store
-def complete_path(session: Session, context: click.Context, incomplete: str) -> Iterable[str]:
-    """Fields of a topic, for the last name in a list or a predicate.
-
-    The topic is that before a colon; without, those of the command.
-    """
+def _fields(session: Session, context: click.Context, incomplete: str) -> Iterable[str]:
+    """Fields for the last name in a list or a predicate: of the topic before a colon, or of all."""
     from hybridlog.frames.names import SUMMARIES, is_summary
     from hybridlog.query.question import field_types
     from hybridlog.query.topics import resolve
@@ -134,8 +117,7 @@ def complete_path(session: Session, context: click.Context, incomplete: str) -> 
     return [f"{before}{name}" for name in names]
 
 
-@_of_store
-def complete_frame(session: Session, context: click.Context, _: str) -> Iterable[str]:
+def _frames(session: Session, context: click.Context, _: str) -> Iterable[str]:
     """Coordinate frames in the first transforms of the chosen recordings, or all."""
     from hybridlog.query.query import Query
     from hybridlog.query.question import Question
@@ -161,11 +143,14 @@ def _chosen(context: click.Context, session: Session) -> list[RecordingSummary]:
     return [*{one.topics: one for one in found}.values()]
 
 
-def _short_names(topics: set[str]) -> Iterator[str]:
-    """Short names that stand for one topic only: `scan` for `/robot/scan`."""
-    owners = Counter(
-        "/".join(parts[start:])
-        for parts in (topic.strip("/").split("/") for topic in topics)
-        for start in range(len(parts))
-    )
-    yield from (name for name, count in owners.items() if count == 1)
+_KINDS: Final[dict[str, Callable[[Session, click.Context, str], Iterable[str]]]] = {
+    **dict.fromkeys(("RECORDING", "A", "B"), _recordings),
+    **dict.fromkeys(("TOPIC", "TOPIC=AGE"), _topics),
+    **dict.fromkeys(("A,B.C", "PREDICATE"), _fields),
+    **dict.fromkeys(("FRAME", "TARGET", "SOURCE"), _frames),
+    "K=V": _tags,
+    "TYPE": _types,
+    "TOPIC:": _conditions,
+    "TOPIC:FIELD": partial(_conditions, space=""),
+}
+"""By the name of a value in help."""

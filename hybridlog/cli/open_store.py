@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from hybridlog.cli.output import counted, note, notes
-from hybridlog.cli.progress import Bar
+from hybridlog.cli.output import Bar, counted, note, notes
 from hybridlog.wording import listed
 from hybridlog_storage.errors import StoreError, WithoutMongoError
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,15 +13,6 @@ import click
 
 from hybridlog.cli import output
 from hybridlog.cli.binder import Amount, argument, option
-from hybridlog.cli.completion import (
-    complete_condition,
-    complete_frame,
-    complete_path,
-    complete_recording,
-    complete_tag,
-    complete_topic,
-    complete_type,
-)
 from hybridlog.cli.render import Column, print_table
 from hybridlog.formats import formats_of
 from hybridlog.query.choice import Choice
@@ -70,16 +61,10 @@ class AsJson:
 
     as_json: bool = option("Print JSON, for scripts.", name="--json")
 
-    def show(
-        self,
-        rows: Sequence[Any],
-        columns: Sequence[Column],
-        without: str = "",
-        plain: Callable[[Any], object] = lambda row: row,
-    ) -> None:
-        """Print rows as a table or as JSON (`plain` gives that of a row)."""
+    def show(self, rows: Iterable[Any], columns: Sequence[Column], without: str = "") -> None:
+        """Print rows as a table or as JSON; without any, a note."""
         if self.as_json:
-            output.print_json([plain(row) for row in rows])
+            output.print_json([*rows])
         elif not (output.is_quiet() or print_table(columns, rows)):
             output.notes(filter(None, [without]))
 
@@ -114,19 +99,13 @@ class Choosing:
         "Only this recording: name, id, the beginning of one, or a glob such as 'monday*'.",
         "RECORDING",
         short="-r",
-        shell_complete=complete_recording,
     )
-    tag: tuple[str, ...] = option(
-        "Only recordings with this tag; K alone is any value.", "K=V", shell_complete=complete_tag
-    )
-    has: tuple[str, ...] = option(
-        "Only recordings with this topic.", "TOPIC", shell_complete=complete_topic
-    )
+    tag: tuple[str, ...] = option("Only recordings with this tag; K alone is any value.", "K=V")
+    has: tuple[str, ...] = option("Only recordings with this topic.", "TOPIC")
     types: tuple[str, ...] = option(
         "Only recordings with messages of this type: sensor_msgs/Imu, Imu, or a glob.",
         "TYPE",
         name="--type",
-        shell_complete=complete_type,
     )
     during: tuple[str, str] | None = option(
         "Only recordings with a time in this range: ISO 8601, epoch seconds, now, start, end.",
@@ -145,7 +124,6 @@ class Choosing:
         "Only recordings with a message that satisfies this, such as 'scan: ranges.min < 0.5'.",
         "TOPIC: PREDICATE",
         name="--with",
-        shell_complete=complete_condition,
     )
 
     @property
@@ -181,15 +159,7 @@ def names_argument(
     return argument(
         f"{what}, as for --recording; without, {without}.",
         metavar,
-        shell_complete=complete_recording,
     )
-
-
-@dataclass(frozen=True, kw_only=True)
-class Named(Choosing):
-    """Options that choose recordings, whose names may be arguments, too."""
-
-    names: tuple[str, ...] = names_argument()  # type: ignore[misc]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -208,7 +178,7 @@ def topics(
     what: str = "Only this topic: full name, an unambiguous short one (scan), a glob, or re:REGEX.",
 ) -> Any:
     """The option that names topics."""
-    return option(what, "TOPIC", name="--topic", short="-t", shell_complete=complete_topic)
+    return option(what, "TOPIC", name="--topic", short="-t")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -229,9 +199,7 @@ class Topics(Ranged):
     where: ClassVar[tuple[str, ...]] = ()
     strict: ClassVar[bool] = False
     verbose: ClassVar[bool] = False
-    words: tuple[str, ...] = argument(
-        "Topics, as for --topic.", "[TOPIC]...", shell_complete=complete_topic
-    )
+    words: tuple[str, ...] = argument("Topics, as for --topic.", "[TOPIC]...")
     topic: tuple[str, ...] = topics()
     topic_type: tuple[str, ...] = option(
         "Also all topics of this type, such as LaserScan; a glob, too.", "TYPE"
@@ -273,7 +241,6 @@ class Filtered(Strict, Topics):
         "Only messages that satisfy this, such as 'ranges.min < 0.5 and scan_time > 0', or a "
         "MongoDB filter as JSON.",
         "PREDICATE",
-        shell_complete=complete_path,
     )
 
 
@@ -282,11 +249,6 @@ class Verbose:
     """The option of commands that can tell the cost of an answer."""
 
     verbose: bool = option("Say what the answer has cost.", short="-v")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Asking(Verbose, Filtered):
-    """Options of commands that answer about messages."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -373,7 +335,7 @@ def one_recording(
     metavar: str = "RECORDING",
 ) -> Any:
     """The argument that names one recording."""
-    return argument(what, metavar, shell_complete=complete_recording)
+    return argument(what, metavar)
 
 
 def tf_topic(**rules: Any) -> Any:
@@ -383,7 +345,6 @@ def tf_topic(**rules: Any) -> Any:
         "has them.",
         "TOPIC",
         name="--tf-topic",
-        shell_complete=complete_topic,
         **rules,
     )
 
@@ -396,7 +357,6 @@ class InFrame:
         "Points and poses in this frame, such as map, at the times of their headers.",
         "FRAME",
         name="--in-frame",
-        shell_complete=complete_frame,
     )
     tf_topic: tuple[str, ...] = tf_topic(needs=("frame",))
 

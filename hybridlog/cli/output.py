@@ -1,4 +1,4 @@
-"""Prints JSON and notes; writes sizes and times for people."""
+"""Prints JSON, notes and progress; writes sizes and times for people."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import textwrap
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import asdict, is_dataclass
-from typing import TYPE_CHECKING, TextIO
+from typing import TYPE_CHECKING, Self, TextIO
 
 from hybridlog import wording
+from hybridlog_storage.stopping import safe_point
 
 if TYPE_CHECKING:
     from rich.console import Console
-
-    from hybridlog.record.recorder import RecordReport
+    from rich.progress import Progress
 
 _manner = {"quiet": False, "as_json": False}
 
@@ -39,7 +39,7 @@ def is_quiet() -> bool:
 
 def has_bars() -> bool:
     """Whether the command shows its progress where there is a terminal."""
-    return not any(_manner.values())
+    return not any(_manner.values()) and sys.stderr.isatty()
 
 
 def console(*, error: bool = False) -> Console:
@@ -77,33 +77,21 @@ def cut(line: str, most: int = _MAX_LINE) -> str:
     return line if len(line) <= most else f"{line[: most - 1]}…"
 
 
-def say(text: str = "") -> None:
-    """A line of the answer, on standard output."""
-    print(printable(text))  # noqa: T201
-
-
 def quoted(text: str) -> str:
     """Typed text in quotes; bytes that are not UTF-8 are shown as escapes."""
     raw = text.encode("utf-8", "surrogateescape")
     return f"'{printable(raw.decode('utf-8', 'backslashreplace'))}'"
 
 
-def print_json(value: object, *, at_once: bool = False) -> None:
-    """Print a value as JSON; with `at_once` on a line."""
-    text = json.dumps(value, default=_plain, indent=None if at_once else 2, ensure_ascii=False)
-    print(text, flush=at_once)  # noqa: T201
+def folded(text: str, stream: TextIO | None = None) -> str:
+    """A line for standard error or another stream: a terminal shows it without broken words."""
+    text = printable(text)
+    return "\n".join(wrapped(text, screen_width())) if (stream or sys.stderr).isatty() else text
 
 
-def note(text: str) -> None:
-    """A line for the person, on standard error; who reads it may go, and the work goes on."""
-    with suppress(BrokenPipeError):
-        print(folded(text), file=sys.stderr)  # noqa: T201
-
-
-def remarks(lines: Iterable[str]) -> None:
-    """Notes that --quiet leaves out."""
-    if not is_quiet():
-        notes(lines)
+def say(text: str = "") -> None:
+    """A line of the answer, on standard output."""
+    print(printable(text))  # noqa: T201
 
 
 def tell(value: object, lines: Iterable[str], *, at_once: bool = False) -> None:
@@ -115,10 +103,22 @@ def tell(value: object, lines: Iterable[str], *, at_once: bool = False) -> None:
             print(folded(line, sys.stdout))  # noqa: T201
 
 
-def folded(text: str, stream: TextIO | None = None) -> str:
-    """A line for standard error or another stream: a terminal shows it without broken words."""
-    text = printable(text)
-    return "\n".join(wrapped(text, screen_width())) if (stream or sys.stderr).isatty() else text
+def print_json(value: object, *, at_once: bool = False) -> None:
+    """Print a value as JSON; with `at_once` on a line."""
+    text = json.dumps(value, default=_plain, indent=None if at_once else 2, ensure_ascii=False)
+    print(text, flush=at_once)  # noqa: T201
+
+
+def _plain(value: object) -> object:
+    if is_dataclass(value) and not isinstance(value, type):
+        return asdict(value)
+    return str(value)
+
+
+def note(text: str) -> None:
+    """A line for the person, on standard error; who reads it may go, and the work goes on."""
+    with suppress(BrokenPipeError):
+        print(folded(text), file=sys.stderr)  # noqa: T201
 
 
 def notes(lines: Iterable[str]) -> None:
@@ -127,17 +127,10 @@ def notes(lines: Iterable[str]) -> None:
         note(line)
 
 
-def stored(messages: int) -> str:
-    """A number of stored messages: `1 message is stored`."""
-    return f"{counted(messages, 'message')} {'is' if messages == 1 else 'are'} stored"
-
-
-def not_indexed(report: RecordReport) -> str:
-    """The sentence about messages that the index lacks, because it failed."""
-    return (
-        f"{report.failure} {stored(report.missed)} but not in the index; the next command that "
-        "opens the store catches up."
-    )
+def remarks(lines: Iterable[str]) -> None:
+    """Notes that --quiet leaves out."""
+    if not is_quiet():
+        notes(lines)
 
 
 def time_text(ns: int | None, step: int = 1) -> str:
@@ -164,7 +157,63 @@ def short_duration(ns: int) -> str:
     return format_duration(round(ns / step) * step)
 
 
-def _plain(value: object) -> object:
-    if is_dataclass(value) and not isinstance(value, type):
-        return asdict(value)
-    return str(value)
+class Bar:
+    """A bar with rate and remaining time; a context manager that removes it.
+
+    It appears at the first progress, on a terminal. Elsewhere there is nothing. The total is in
+    bytes, about; None if it is unknown, or each part tells its own.
+    """
+
+    def __init__(self, label: str, total: int | None = None, *, quiet: bool = False) -> None:
+        self._label, self._total = label, total
+        self._quiet = quiet or not has_bars()
+        self._bar: Progress | None = None
+
+    def __enter__(self) -> Self:
+        """The bar, which does not show yet."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Remove the bar."""
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar = None
+
+    def __call__(self, done: int, note: str = "", total: int | None = None) -> None:
+        """Set the number of finished bytes, and a note beside the bar."""
+        if self._quiet:
+            return
+        total = total or self._total
+        if self._bar is None:
+            self._bar = _progress(has_end=total is not None)
+            self._bar.add_task(_short(self._label), total=total, note="")
+            self._bar.start()
+        self._bar.update(self._bar.task_ids[0], completed=done, total=total, note=_short(note))
+
+    def part(self, recording: str, done: int, total: int) -> None:
+        """Report `done` of `total` bytes of a recording, until it is complete; a safe point."""
+        safe_point()
+        self(done, recording, max(total, 1))
+        if done >= total:
+            self.__exit__()
+
+
+def _progress(*, has_end: bool) -> Progress:
+    from rich import progress as rich
+
+    # Texts are names out of logs: they are never read as markup.
+    return rich.Progress(
+        rich.TextColumn("{task.description}", markup=False),
+        rich.BarColumn(bar_width=None),
+        *((rich.TaskProgressColumn(),) if has_end else ()),
+        rich.TransferSpeedColumn(),
+        *((rich.TextColumn("ETA"), rich.TimeRemainingColumn(compact=True)) if has_end else ()),
+        rich.TextColumn("{task.fields[note]}", markup=False),
+        console=console(error=True),
+        transient=True,
+        expand=True,
+    )
+
+
+def _short(text: str) -> str:
+    return cut(printable(text), 22)

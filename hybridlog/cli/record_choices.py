@@ -1,13 +1,16 @@
-"""The options of `hybridlog record`."""
+"""The options of `hybridlog record`, and what it tells of each recording."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, cast
 
 import click
 
+from hybridlog.cli import output
 from hybridlog.cli.binder import (
     SECONDS,
     SIZE,
@@ -17,7 +20,6 @@ from hybridlog.cli.binder import (
     option,
     parse_seconds,
 )
-from hybridlog.cli.completion import complete_topic
 from hybridlog.cli.options import (
     AsJson,
     Between,
@@ -26,6 +28,8 @@ from hybridlog.cli.options import (
     Quiet,
     cache_size,
 )
+from hybridlog.cli.render import Column, bytes_of, numbers
+from hybridlog.record.losses import losses_of
 from hybridlog.wording import parse_size
 from hybridlog_storage.errors import UsageError
 
@@ -33,14 +37,14 @@ if TYPE_CHECKING:
     from contextlib import AbstractContextManager
 
     from hybridlog.query.topics import TopicMatcher
+    from hybridlog.record.recorder import RecordReport
     from hybridlog.store import Store
+    from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.segments.segment_writer import SegmentSettings
 
-DEFAULT_CHUNK: Final = 2 << 20
+_CHUNK: Final = 2 << 20
 """Bytes of a chunk."""
-
-
-OF_ENVIRONMENT: Final = "ROS_MASTER_URI"
+_OF_ENVIRONMENT: Final = "ROS_MASTER_URI"
 """The master of ROS 1 that is meant without a URI."""
 _LIVE: Final = ("ros1", "ros2", "foxglove", "replay")
 """Parameters that name a source of live messages."""
@@ -97,7 +101,7 @@ class RecordChoices(Between, Latched, InStore, AsJson, Quiet):
         "names it.",
         "[URI]",
         is_flag=False,
-        flag_value=OF_ENVIRONMENT,
+        flag_value=_OF_ENVIRONMENT,
         excludes=_OF_LOGS,
     )
     ros2: bool = option("Record a running ROS 2 robot; needs rclpy.", excludes=_OF_LOGS)
@@ -138,14 +142,12 @@ class RecordChoices(Between, Latched, InStore, AsJson, Quiet):
         "At most this rate of messages, such as /camera 5Hz.",
         "TOPIC RATE",
         nargs=2,
-        shell_complete=complete_topic,
     )
     priority: tuple[tuple[str, str], ...] = _live(
         "low, normal or high: when more arrives than can be written, payloads of the lowest "
         "priority are dropped first.",
         "TOPIC WORD",
         nargs=2,
-        shell_complete=complete_topic,
     )
     budget: int | None = _live(
         "Size of payloads in memory; without, a sixteenth of all memory.",
@@ -192,9 +194,26 @@ class RecordChoices(Between, Latched, InStore, AsJson, Quiet):
     cache_size: int | None = cache_size()
 
     @property
+    def master(self) -> str | None:
+        """The URI of a ROS 1 master; None for that of the environment."""
+        return None if self.ros1 == _OF_ENVIRONMENT else self.ros1
+
+    @property
     def is_live(self) -> bool:
         """True when a source of live messages is given."""
         return self.ros2 or (self.ros1, self.foxglove, self.replay) != (None, None, None)
+
+    def check(self) -> None:
+        """Refuse parameters that do not fit together."""
+        if self.ros1 is not None and not self.ros1.strip():
+            raise UsageError("A ROS master's URI looks like http://host:11311; this one is empty.")
+        if not self.paths and not self.is_live:
+            raise UsageError(
+                "Nothing to record: give a log, or --ros1, --ros2, --foxglove URL or --replay FILE."
+            )
+        for path in self.paths if self.watch else ():
+            if not path.is_dir():
+                raise UsageError(f"--watch takes directories, and {path} is none.")
 
     def matchers(self) -> tuple[TopicMatcher | None, TopicMatcher | None]:
         """Matchers of topics and of those without documents; new at each call, since they count."""
@@ -203,7 +222,7 @@ class RecordChoices(Between, Latched, InStore, AsJson, Quiet):
         chosen = matcher(self.topics, self.exclude) if self.topics or self.exclude else None
         return chosen, matcher(self.no_index) if self.no_index else None
 
-    def segment_settings(self, chunk_size: int = DEFAULT_CHUNK) -> SegmentSettings:
+    def segment_settings(self, chunk_size: int = _CHUNK) -> SegmentSettings:
         """Chunks and compression."""
         from hybridlog_storage.segments.segment_writer import SegmentSettings
 
@@ -218,14 +237,90 @@ class RecordChoices(Between, Latched, InStore, AsJson, Quiet):
         return self.opened(create=True, cache_mb=self.cache_size, records=not self.is_live)
 
 
-def check_choices(choices: RecordChoices) -> None:
-    """Refuse parameters that do not fit together."""
-    if choices.ros1 is not None and not choices.ros1.strip():
-        raise UsageError("A ROS master's URI looks like http://host:11311; this one is empty.")
-    if not choices.paths and not choices.is_live:
-        raise UsageError(
-            "Nothing to record: give a log, or --ros1, --ros2, --foxglove URL or --replay FILE."
-        )
-    for path in choices.paths if choices.watch else ():
-        if not path.is_dir():
-            raise UsageError(f"--watch takes directories, and {path} is none.")
+# --- what is told of a recording ------------------------------------------------------
+
+
+def row_of(report: RecordReport, path: object) -> dict[str, Any]:
+    """What is told in JSON of each recording."""
+    entry = report.entry
+    stats = [channel.stats for channel in entry.channels]
+    return {
+        "path": str(path),
+        "kind": entry.source["kind"],
+        "id": entry.id,
+        "recording": entry.name,
+        "status": entry.status,
+        "tags": entry.tags,
+        "topics": len({c.topic for c in entry.channels}),
+        "messages": entry.messages,
+        "messages_indexed": report.indexed,
+        "messages_unreadable": sum(one.unreadable for one in stats),
+        "messages_surplus": sum(one.surplus for one in stats),
+        "messages_skipped": report.skipped,
+        "messages_latched": report.latched,
+        "attachments": entry.attachments,
+        "attachments_left_out": report.attachments_left_out,
+        "metadata_records": entry.metadata_records,
+        # A live source has no size of its own.
+        "bytes_in": entry.source["bytes"] or sum(one.payload_bytes for one in stats),
+        "bytes_stored": entry.stored_bytes,
+        "seconds": round(report.elapsed_s, 3),
+        "losses": losses_of(entry),
+        "damage": [{**asdict(d), "file": str(d.file)} for d in report.damage],
+        "not_indexed": {c.topic: c.unindexed for c in entry.channels if c.unindexed is not None},
+    }
+
+
+def fields_of(row: Mapping[str, Any]) -> list[tuple[str, object]]:
+    """What is told to people of one recording."""
+    cells = [(one, one.cell(row)) for one in COLUMNS]
+    return [(one.name, cell) for one, cell in cells if not (one.varies and cell == "0")]
+
+
+def _share(row: Mapping[str, Any], above: str, below: str, form: str) -> str:
+    return format(row[above] / (row[below] or inf), form)
+
+
+COLUMNS: Final = [
+    Column("recording"),
+    Column("source", lambda row: f"{row['path']} ({row['kind']})", order=1),
+    *numbers("topics", "messages"),
+    Column("left out", "messages_skipped", "right", varies=True),
+    Column("from before", "messages_latched", "right", varies=True),
+    Column("attachments", side="right", varies=True),
+    bytes_of("bytes in", "bytes_in", order=3),
+    bytes_of("stored", "bytes_stored"),
+    Column("ratio", lambda row: _share(row, "bytes_in", "bytes_stored", ".2f"), "right"),
+    Column("indexed", "messages_indexed", "right"),
+    Column("time", lambda row: f"{row['seconds']:.2f} s", "right"),
+    Column("messages/s", lambda row: _share(row, "messages", "seconds", ",.0f"), "right", order=2),
+]
+
+
+def remarks_on(recording: RecordingEntry) -> Iterator[str]:
+    """A line for each topic with messages whose fields are not all there, or not all they hold."""
+    for channel in recording.channels:
+        unreadable, surplus = channel.stats.unreadable, channel.stats.surplus
+        if channel.is_indexed and channel.reason is not None:
+            yield f"{channel.topic}: not indexed beyond time: {channel.reason}"
+        if unreadable:
+            unfit = output.unfit(unreadable)
+            yield f"{channel.topic}: {unfit}; stored, without fields in the index"
+        if surplus:
+            yield (
+                f"{channel.topic}: {output.counted(surplus, 'message')} with bytes left over "
+                "behind the last field; the fields are read"
+            )
+
+
+def not_indexed(report: RecordReport) -> str:
+    """The sentence about messages that the index lacks, because it failed."""
+    return (
+        f"{report.failure} {stored(report.missed)} but not in the index; the next command that "
+        "opens the store catches up."
+    )
+
+
+def stored(messages: int) -> str:
+    """A number of stored messages: `1 message is stored`."""
+    return f"{output.counted(messages, 'message')} {'is' if messages == 1 else 'are'} stored"

@@ -10,14 +10,20 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import asdict, replace
-from typing import TYPE_CHECKING, Any, Final
+from functools import partial
+from typing import TYPE_CHECKING, Final
 
 from hybridlog.cli import output
 from hybridlog.cli.app import DIFFERENT
-from hybridlog.cli.live_table import LiveTable, summary
+from hybridlog.cli.commands.top import LiveTable, summary
 from hybridlog.cli.options import parse_tags
-from hybridlog.cli.record_choices import DEFAULT_CHUNK, OF_ENVIRONMENT, RecordChoices
-from hybridlog.cli.record_summary import fields_of, remarks_on, row_of
+from hybridlog.cli.record_choices import (
+    RecordChoices,
+    fields_of,
+    not_indexed,
+    remarks_on,
+    row_of,
+)
 from hybridlog.cli.render import print_fields
 from hybridlog.cli.signals import handled, write_note
 from hybridlog.query.answers.lost import coverage, in_words
@@ -40,7 +46,8 @@ if TYPE_CHECKING:
     from hybridlog.live.state import RecorderState
     from hybridlog.record.recorder import RecordReport
 
-_MIN_CHUNK: Final = 1 << 19
+_CHUNKS: Final = 1 << 19, 2 << 20
+"""Least and usual bytes of a chunk."""
 _STATE_S = 1.0
 _FOLLOWER_S: Final = 5.0
 """To wait for the follower where a service manager, or another recording, waits."""
@@ -80,7 +87,8 @@ def _record(choices: RecordChoices) -> int:
     # Wrong options are found before a store is made.
     options = recorder_options(choices)
     sources = sources_of(choices)
-    display = _Display(as_json=choices.as_json)
+    table = LiveTable() if output.has_bars() else None
+    show = partial(_show, table=table, as_json=choices.as_json)
     reports: list[RecordReport] = []
     with ExitStack() as held:
         for source in sources:
@@ -90,13 +98,16 @@ def _record(choices: RecordChoices) -> int:
         with _stop_flag() as stop, frozen_objects():
             full = ""
             while True:
-                recorder = Recorder(store, sources, options, display.say)
+                recorder = Recorder(store, sources, options, _say)
                 recorder.start()
                 stop.leave = recorder.leave
                 if full:
-                    display.say(f"the manifest of {full} is full: {recorder.name} goes on")
-                with display.table or nullcontext(), _pinned_by_signal(recorder):
-                    _watch(recorder, stop, display)
+                    _say(f"the manifest of {full} is full: {recorder.name} goes on")
+                with table or nullcontext(), _pinned_by_signal(recorder):
+                    show(recorder.look())
+                    while not (stop.is_set or recorder.wait(0)):
+                        stop.wait(_STATE_S)
+                        show(recorder.look())
                 if stop.is_set or not recorder.is_full:
                     break
                 reports += recorder.stop(_FOLLOWER_S)
@@ -122,7 +133,7 @@ def _finish(
     broken: Sequence[Result],
 ) -> int:
     """Print what was recorded; returns the exit code of the worst problem."""
-    state = recorder.look()
+    state, reason = recorder.look(), recorder.reason
     unreached = [one.address for one in sources if not one.was_reached]
     failed = [one for one in reports if one.failure is not None]
     worst = {
@@ -133,12 +144,31 @@ def _finish(
         DIFFERENT: broken,
     }
     code = next((code for code, applies in worst.items() if applies), 0)
+    rows = [row_of(one, one.entry.source["path"]) for one in reports]
     if choices.as_json:
-        about = _as_dict(reports, state, recorder.reason)
-        about |= {"broken": [asdict(one) for one in broken], "exit_code": code}
+        about = {
+            "ended": reason,
+            "recordings": rows,
+            "messages_received": state.messages,
+            "bytes": state.stored_bytes,
+            # A cause without a number stands for an unknown number.
+            "lost": {cause: count or None for cause, count in state.lost.items()},
+            "topics": {
+                one.topic: {"received": one.messages, "lost": one.lost} for one in state.topics
+            },
+            "broken": [asdict(one) for one in broken],
+            "exit_code": code,
+        }
         output.print_json({"report": about}, at_once=True)
+    elif not rows:
+        output.remarks(["Nothing was stored."])
     elif not output.is_quiet():
-        _print(reports, state, recorder.reason)
+        entry = reports[-1].entry
+        let_go = f"{state.let_go}, by the ring" if state.let_go else ""
+        words = coverage(entry, losses_of(entry))
+        more = [("coverage", words), ("let go", let_go), ("ended", reason)]
+        received = ("received", state.messages)
+        print_fields([*fields_of(rows[-1]), received, *(one for one in more if one[1])])
     silent, unfitting = recorder.silent(), recorder.unfitting()
     output.remarks(f"{topic}: has a publisher that sent nothing" for topic in silent)
     output.remarks(f"no topic fits {text}" for text in unfitting)
@@ -152,36 +182,12 @@ def _finish(
     ]
     errors += (f"{one} was never reached, so nothing of it is recorded." for one in unreached)
     if recorder.stopped_for_disk and (choices.as_json or output.is_quiet()):
-        errors.append(recorder.reason)
+        errors.append(reason)
     losses = [row for one in reports for row in one.entry.end.get("losses", [])]
-    if rows := [row for row in losses if row["cause"] == Cause.UNREADABLE]:
-        errors.append(f"{in_words(rows)} that cannot be read; `hybridlog info --losses` lists them")
-    output.notes(f"hybridlog: {line}" for line in (*errors, *map(output.not_indexed, failed)))
+    if lost := [row for row in losses if row["cause"] == Cause.UNREADABLE]:
+        errors.append(f"{in_words(lost)} that cannot be read; `hybridlog info --losses` lists them")
+    output.notes(f"hybridlog: {line}" for line in (*errors, *map(not_indexed, failed)))
     return code
-
-
-def _print(reports: Sequence[RecordReport], state: RecorderState, reason: str) -> None:
-    if not reports:
-        output.note("Nothing was stored.")
-        return
-    entry = reports[-1].entry
-    row = {**row_of(reports[-1], entry.source["path"]), "bytes_in": state.stored_bytes}
-    let_go = f"{state.let_go}, by the ring" if state.let_go else ""
-    about = [("coverage", coverage(entry, losses_of(entry))), ("let go", let_go), ("ended", reason)]
-    fields = [*fields_of(row), ("received", state.messages)]
-    print_fields([*fields, *(pair for pair in about if pair[1])])
-
-
-def _as_dict(reports: Sequence[RecordReport], state: RecorderState, reason: str) -> dict[str, Any]:
-    return {
-        "ended": reason,
-        "recordings": [row_of(one, one.entry.source["path"]) for one in reports],
-        "messages_received": state.messages,
-        "bytes": state.stored_bytes,
-        # A cause without a number stands for an unknown number.
-        "lost": {cause: count or None for cause, count in state.lost.items()},
-        "topics": {one.topic: {"received": one.messages, "lost": one.lost} for one in state.topics},
-    }
 
 
 def recorder_options(choices: RecordChoices) -> RecorderOptions:
@@ -195,14 +201,17 @@ def recorder_options(choices: RecordChoices) -> RecorderOptions:
     chosen, no_index = choices.matchers()
     budget_bytes = choices.budget or default_budget()
     # Each topic of large messages has an open chunk, and all of them are to fit.
-    chunk_size = min(max(budget_bytes >> 8, _MIN_CHUNK), DEFAULT_CHUNK)
+    least, usual = _CHUNKS
     settings = replace(
-        choices.segment_settings(chunk_size),
+        choices.segment_settings(min(max(budget_bytes >> 8, least), usual)),
         segment_size=choices.split_size,
         segment_span_s=choices.split_duration,
     )
+    name = "ros1" if choices.ros1 is not None else "ros2" if choices.ros2 else "foxglove"
+    if choices.replay is not None:
+        name = choices.replay.stem or "replay"
     return RecorderOptions(
-        name=choices.name or _name(choices),
+        name=choices.name or name,
         tags=parse_tags(choices.set_tag),
         matcher=chosen,
         throttles=[throttle_rule(*one) for one in choices.throttle],
@@ -225,19 +234,13 @@ def recorder_options(choices: RecordChoices) -> RecorderOptions:
     )
 
 
-def _name(choices: RecordChoices) -> str:
-    if choices.replay is not None:
-        return choices.replay.stem or "replay"
-    return "ros1" if choices.ros1 is not None else "ros2" if choices.ros2 else "foxglove"
-
-
 def sources_of(choices: RecordChoices) -> list[LiveSource]:
     """The chosen sources; each imports the packages it needs."""
     found: list[LiveSource] = []
     if choices.ros1 is not None:
         from hybridlog.live.sources.ros1.source import Ros1Source
 
-        found.append(Ros1Source(None if choices.ros1 == OF_ENVIRONMENT else choices.ros1))
+        found.append(Ros1Source(choices.master))
     if choices.ros2:
         from hybridlog.live.sources.ros2.source import Ros2Source
 
@@ -251,19 +254,6 @@ def sources_of(choices: RecordChoices) -> list[LiveSource]:
 
         found.append(ReplaySource(choices.replay, speed=choices.speed))
     return found
-
-
-def _tell_left(messages: int) -> None:
-    if sys.stderr.isatty():
-        left = output.counted(messages, "message")
-        output.remarks([f"hybridlog: {left} left for tables and index; Ctrl-C leaves them"])
-
-
-def _watch(recorder: Recorder, stop: Flag, display: _Display) -> None:
-    display.state(recorder.look())
-    while not (stop.is_set or recorder.wait(0)):
-        stop.wait(_STATE_S)
-        display.state(recorder.look())
 
 
 @contextmanager
@@ -298,37 +288,37 @@ def _pinned_by_signal(recorder: Recorder) -> AbstractContextManager[object]:
     return handled(fire, [signal.SIGUSR1] if hasattr(signal, "SIGUSR1") else [])
 
 
-class _Display:
-    """Shows the progress: a table on a terminal, JSON for scripts."""
+# --- what is shown meanwhile ----------------------------------------------------------
 
-    def __init__(self, *, as_json: bool) -> None:
-        self._as_json = as_json
-        self.table: LiveTable | None = None
-        if output.has_bars() and sys.stderr.isatty():
-            self.table = LiveTable()
 
-    def say(self, text: str) -> None:
-        """Print a message of the recorder at once."""
-        from hybridlog.live.incidents import PINNED
+def _say(text: str) -> None:
+    """Print a message of the recorder at once."""
+    from hybridlog.live.incidents import PINNED
 
-        if output.is_quiet() and PINNED in text:  # no problem
-            return
+    if not (output.is_quiet() and PINNED in text):  # which is no problem
         output.note(f"hybridlog: {text}")
 
-    def state(self, state: RecorderState) -> None:
-        """Show the state, about once a second.
 
-        The watchdog of a service hears of it while what is received is written, too.
-        """
-        told = ["READY=1", f"STATUS={output.printable(summary(state))}"]
-        notify_service(*told, *(["WATCHDOG=1"] if state.stalled_s == 0 else ()))
-        if self.table is not None:
-            self.table.show(state)
-        elif self._as_json:
-            from hybridlog.live.state import summary_of
+def _tell_left(messages: int) -> None:
+    if sys.stderr.isatty():
+        left = output.counted(messages, "message")
+        output.remarks([f"hybridlog: {left} left for tables and index; Ctrl-C leaves them"])
 
-            with suppress(BrokenPipeError):  # who reads it may go; the recording goes on
-                output.print_json({"state": summary_of(state)}, at_once=True)
+
+def _show(state: RecorderState, table: LiveTable | None, *, as_json: bool) -> None:
+    """Show the state, about once a second: in a table on a terminal, as JSON for scripts.
+
+    The watchdog of a service hears of it while what is received is written, too.
+    """
+    told = ["READY=1", f"STATUS={output.printable(summary(state))}"]
+    notify_service(*told, *(["WATCHDOG=1"] if state.stalled_s == 0 else ()))
+    if table is not None:
+        table.show(state)
+    elif as_json:
+        from hybridlog.live.state import summary_of
+
+        with suppress(BrokenPipeError):  # who reads it may go; the recording goes on
+            output.print_json({"state": summary_of(state)}, at_once=True)
 
 
 def notify_service(*assignments: str) -> None:

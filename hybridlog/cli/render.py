@@ -7,13 +7,27 @@ import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain, islice, zip_longest
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-from hybridlog.cli.output import cut, printable, say, screen_width, size, time_text, wrapped
+from hybridlog.cli.output import (
+    cut,
+    printable,
+    say,
+    screen_width,
+    short_duration,
+    size,
+    time_text,
+    wrapped,
+)
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 ROWS_AT_ONCE = 10_000
 """Rows of a table that are laid out together."""
 _MIN_ROOM = 20  # characters of a folded value
+_BLOCKS = "▁▂▃▄▅▆▇█"
 
 Get = str | int | Callable[[Any], object]
 
@@ -27,6 +41,7 @@ class Column:
         side: Numbers stand on the right. Cells on the left may be folded between words, `whole`
             ones are not.
         short: Gives a shorter value, for a table that does not fit.
+        shown: Writes a value; None is not written.
         cut: Cells may be cut off to so many characters; 0 for no.
         order: Columns are left out in this order where there is no room; 0 for never.
         varies: It is left out where it is the same in all rows.
@@ -36,6 +51,7 @@ class Column:
     get: Get = ""
     side: Literal["left", "right", "whole"] = "left"
     short: Get | None = None
+    shown: Callable[[Any], str] | None = None
     cut: int = 0
     order: int = 0
     varies: bool = False
@@ -44,18 +60,20 @@ class Column:
         """The text for a row."""
         get = self.get if self.short is None or not short else self.short
         value = get(row) if callable(get) else row[self.name if get == "" else get]
-        if isinstance(value, float):
-            value = f"{value:.6g}"
-        return "" if value is None else printable(str(value))
+        if value is None:
+            return ""
+        if self.shown is not None:
+            return self.shown(value)
+        return printable(f"{value:.6g}" if isinstance(value, float) else str(value))
 
     def folded(self, cell: str, width: int) -> list[str]:
         """The lines of a cell."""
         return [cut(cell, width)] if self.cut or self.side != "left" else wrapped(cell, width)
 
 
-def numbers(*names: str) -> list[Column]:
+def numbers(*names: str, **how: Any) -> list[Column]:
     """Columns of numbers whose headings are the keys."""
-    return [Column(name, side="right") for name in names]
+    return [Column(name, side="right", **how) for name in names]
 
 
 def bytes_of(name: str, key: str, order: int = 0) -> Column:
@@ -67,24 +85,50 @@ def bytes_of(name: str, key: str, order: int = 0) -> Column:
     return Column(name, shown, "right", order=order)
 
 
-@dataclass(slots=True)
-class _Shape:
-    """The columns of a table that are shown, and their widths; `width` is that of the screen."""
+def rate_of(name: str, get: Get, order: int = 0) -> Column:
+    """A column of rates, in hertz."""
+    return Column(name, get, "right", shown="{:.2f}".format, order=order)
+
+
+def duration_of(name: str, get: Get, order: int = 0) -> Column:
+    """A column of lengths of time, of ns."""
+    return Column(name, get, "right", shown=lambda ns: short_duration(round(ns)), order=order)
+
+
+def times() -> list[Column]:
+    """Columns of `begin_ns` and `end_ns`; the short end has no day if it is that of the begin."""
+
+    def end(row: Mapping[str, int]) -> str:
+        begin, last = (time_text(row[name], 10**6) for name in ("begin_ns", "end_ns"))
+        return last.partition("T")[2] if begin[:10] == last[:10] else last
+
+    def begin(row: Mapping[str, int]) -> str:
+        return time_text(row["begin_ns"], 10**6)
+
+    return [
+        Column("begin", lambda row: time_text(row["begin_ns"]), "whole", begin),
+        Column("end", lambda row: time_text(row["end_ns"]), "whole", end),
+    ]
+
+
+class _Table(NamedTuple):
+    """The columns of a table that are shown, as wide as their cells."""
 
     columns: Sequence[Column]
     widths: list[int]
-    short: bool
-    width: int | None = None
+    short: bool = False
     folds: bool = False
+
+    @property
+    def width(self) -> int:
+        return sum(self.widths) + 2 * (len(self.widths) - 1)
 
     def cells(self, rows: Iterable[Any]) -> list[list[str]]:
         """The cells of rows; columns become as wide as they are."""
         found = [[one.cell(row, short=self.short) for one in self.columns] for row in rows]
-        if not self.folds:
-            self.widths = [
-                max(width, *map(len, cells))
-                for width, cells in zip(self.widths, zip(*found, strict=True), strict=False)
-            ] or self.widths
+        if found and not self.folds:
+            wide = (max(map(len, cells)) for cells in zip(*found, strict=True))
+            self.widths[:] = map(max, self.widths, wide)
         return found
 
     def lines(self, row: Sequence[str]) -> Iterator[str]:
@@ -98,57 +142,46 @@ class _Shape:
             )
             yield "  ".join(aligned).rstrip()
 
-    def room(self) -> int:
-        """Columns of the screen that the table leaves; files and pipes have room for all."""
-        taken = sum(self.widths) + 2 * (len(self.widths) - 1)
-        return 0 if self.width is None else self.width - taken
-
-    def narrow(self, rows: Sequence[Sequence[str]]) -> bool:
-        """Fold and cut cells until the table fits; False if a word would be broken."""
-        least = list(self.widths)
+    def narrowed(self, cells: Sequence[Sequence[str]], width: int) -> _Table | None:
+        """The table with folded and cut cells; None if a word would be broken."""
+        widths, least = list(self.widths), list(self.widths)
         for n, one in enumerate(self.columns):
-            words = [word for row in rows for word in (one.name, *row[n].split())]
             if one.cut:
                 least[n] = min(least[n], max(len(one.name), one.cut))
             elif one.side == "left":
-                least[n] = max(map(len, words), default=0)
-        self.folds = True
-        for _ in range(-self.room()):
-            place = max(
-                range(len(least)), key=lambda n: (self.widths[n] > least[n], self.widths[n])
-            )
-            if self.widths[place] <= least[place]:
-                return False
-            self.widths[place] -= 1
-        return True
+                words = (word for row in cells for word in row[n].split())
+                least[n] = max(map(len, chain([one.name], words)))
+        for _ in range(self.width - width):
+            place = max(range(len(least)), key=lambda n: (widths[n] > least[n], widths[n]))
+            if widths[place] <= least[place]:
+                return None
+            widths[place] -= 1
+        return self._replace(widths=widths, folds=True)
 
 
-def _shape(columns: Sequence[Column], block: Sequence[Any], width: int | None) -> _Shape | None:
+def _fitting(columns: Sequence[Column], block: Sequence[Any], width: int | None) -> _Table | None:
     """The widest table that fits a screen of that width (None: no screen); None if none does."""
     order = sorted((one for one in columns if one.order), key=lambda one: one.order)
     for without in range(len(order) + 1):
         left = [one for one in columns if one not in order[:without]]
         for short in (False, True):
-            found = _Shape(left, [len(one.name) for one in left], short, width)
-            cells = found.cells(block)
-            if found.room() >= 0:
-                return found
-        if found.narrow(cells):
-            return found
+            table = _Table(left, [len(one.name) for one in left], short)
+            cells = table.cells(block)
+            if width is None or table.width <= width:
+                return table
+        if width is not None and (narrow := table.narrowed(cells, width)) is not None:
+            return narrow
     return None
 
 
 def table_lines(columns: Sequence[Column], rows: Sequence[Any], width: int) -> list[str]:
     """The lines of a table, headings first; they are cut where no table fits the width."""
-    shape = _shape(columns, rows, width) or _Shape(columns, [0] * len(columns), short=True)
-    cells = [[one.name for one in shape.columns], *shape.cells(rows)]
-    return [cut(line, width) for line in chain.from_iterable(map(shape.lines, cells))]
+    table = _fitting(columns, rows, width) or _Table(columns, [0] * len(columns), short=True)
+    cells = [[one.name for one in table.columns], *table.cells(rows)]
+    return [cut(line, width) for line in chain.from_iterable(map(table.lines, cells))]
 
 
-def print_table(
-    columns: Sequence[Column],
-    rows: Iterable[Any],
-) -> bool:
+def print_table(columns: Sequence[Column], rows: Iterable[Any]) -> bool:
     """Print rows under headings; on a terminal that has no room for them, a block for each row.
 
     Prints nothing without rows, and returns False.
@@ -158,13 +191,13 @@ def print_table(
     """
     source = iter(rows)
     block = [*islice(source, ROWS_AT_ONCE)]
+    if len(block) < ROWS_AT_ONCE:
+        alike = [one for one in columns if one.varies and len({*map(one.cell, block)}) < 2]
+        columns = [one for one in columns if one not in alike]
     if not block:
         return False
-    is_all = len(block) < ROWS_AT_ONCE
-    alike = [one for one in columns if is_all and one.varies and len({*map(one.cell, block)}) < 2]
-    columns = [one for one in columns if one not in alike]
-    shape = _shape(columns, block, screen_width() if sys.stdout.isatty() else None)
-    if shape is None:
+    table = _fitting(columns, block, screen_width() if sys.stdout.isatty() else None)
+    if table is None:
         for number, row in enumerate(chain(block, source)):
             (_, title), *fields = ((one.name, one.cell(row)) for one in columns)
             if number:
@@ -172,11 +205,11 @@ def print_table(
             say(title)
             print_fields([pair for pair in fields if pair[1]], indent=2)
         return True
-    cells = [[one.name for one in shape.columns], *shape.cells(block)]
+    cells = [[one.name for one in table.columns], *table.cells(block)]
     while cells:
-        for line in chain.from_iterable(map(shape.lines, cells)):
+        for line in chain.from_iterable(map(table.lines, cells)):
             print(line)  # noqa: T201
-        cells = shape.cells(islice(source, ROWS_AT_ONCE))
+        cells = table.cells(islice(source, ROWS_AT_ONCE))
     return True
 
 
@@ -192,17 +225,23 @@ def print_fields(fields: Sequence[tuple[str, object]], indent: int = 0) -> None:
             say(f"{' ' * indent}{heading:<{width}}  {line}".rstrip())
 
 
-def times() -> list[Column]:
-    """Columns of `begin_ns` and `end_ns`; the short end has no day if it is that of the begin."""
+def sparkline(values: NDArray[np.float64]) -> str:
+    """A letter for each number, from the least to the greatest; a space for NaN."""
+    import numpy as np
 
-    def end(row: Mapping[str, int]) -> str:
-        begin, last = (time_text(row[name], 10**6) for name in ("begin_ns", "end_ns"))
-        return last.partition("T")[2] if begin[:10] == last[:10] else last
+    is_known = np.isfinite(values)
+    letters = np.full(len(values), " ")
+    if is_known.any():
+        # Halved, so that the range of the greatest numbers is finite, too.
+        known = values[is_known] / 2
+        low, high = known.min(), known.max()
+        share = (known - low) / (high - low) if high > low else np.full(len(known), 0.5)
+        steps = np.minimum(share * len(_BLOCKS), len(_BLOCKS) - 1)
+        letters[is_known] = np.array(list(_BLOCKS))[steps.astype(np.intp)]
+    return "".join(letters.tolist())
 
-    begin = Column(
-        "begin",
-        lambda row: time_text(row["begin_ns"]),
-        "whole",
-        lambda row: time_text(row["begin_ns"], 10**6),
-    )
-    return [begin, Column("end", lambda row: time_text(row["end_ns"]), "whole", end)]
+
+def densities(counts: NDArray[np.int64]) -> str:
+    """A letter for each count, from 0 to the greatest; a space for 0."""
+    steps, most = len(_BLOCKS), max(int(counts.max(initial=0)), 1)
+    return "".join(f" {_BLOCKS}"[-(-int(count) * steps // most)] for count in counts)

@@ -9,16 +9,24 @@ point. It is no `KeyboardInterrupt`, because libraries catch that.
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from types import FrameType
 from typing import Final, NoReturn
 
-from hybridlog.cli.output import printable
+from hybridlog.cli import output
 from hybridlog_storage import stopping
+from hybridlog_storage.errors import (
+    BucketError,
+    DatabaseError,
+    HybridlogError,
+    ResourceError,
+    StoreError,
+)
 
 SIGNALS: Final = tuple(
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
@@ -27,6 +35,11 @@ SIGNALS: Final = tuple(
 
 _SHOW_CURSOR: Final = "\r\x1b[K\x1b[?25h"
 """Clears the line of a progress bar."""
+
+_AWAY: Final = (BucketError, DatabaseError, ResourceError, StoreError)
+"""What may be over at a later look."""
+_LONGER: Final = 5
+"""Pause after such an error, as a multiple of the usual one."""
 
 _consequences: list[str | Callable[[], str]] = []
 
@@ -112,6 +125,45 @@ def ended_by_signal(end: Callable[[], object]) -> Iterator[None]:
         yield
 
 
+def watch(
+    place: object,
+    look: Callable[[], Iterable[HybridlogError]],
+    *,
+    pause_s: float = 2.0,
+    report: Callable[[HybridlogError], None] = lambda error: output.note(str(error)),
+) -> None:
+    """Call `look`, which acts and yields problems, again and again; a signal ends this normally.
+
+    A problem is reported once, as long as it lasts. While a place or a database is away, the pause
+    is longer.
+    """
+    if isinstance(sys.stdout, io.TextIOWrapper):  # a file and a pipe show each line at once
+        sys.stdout.reconfigure(line_buffering=True)
+    told: set[str] = set()  # problems that last
+    try:
+        with stopping.at_safe_points():
+            output.remarks([f"Watching {place}. Ctrl-C ends it."])
+            while True:
+                met, wait_s = set[str](), pause_s
+                try:
+                    for problem in look():
+                        met.add(str(problem))
+                        if str(problem) not in told:
+                            report(problem)
+                except _AWAY as error:
+                    # Ctrl-C may have ended a program that the other side needs.
+                    stopping.safe_point()
+                    wait_s = _LONGER * pause_s
+                    if str(error) not in told:
+                        report(error)
+                        output.note(f"The next try is in {wait_s:g} s.")
+                    met |= {*told, str(error)}
+                told = met
+                stopping.pause(wait_s)
+    except Stopped as stopped:
+        output.notes(filter(None, [stopped.consequence]))
+
+
 def undo_unfinished() -> None:
     """Take back what a command has not completed when it is stopped, such as files."""
     unfinished = sys.modules.get("hybridlog_storage.disk.unfinished")
@@ -142,5 +194,5 @@ def _leave(number: int, consequence: str) -> NoReturn:
     undo_unfinished()
     with contextlib.suppress(OSError, ValueError):
         clear = _SHOW_CURSOR if os.isatty(sys.stderr.fileno()) else ""
-        write_note(clear + printable(f"hybridlog: interrupted. {consequence}".rstrip()))
+        write_note(clear + output.printable(f"hybridlog: interrupted. {consequence}".rstrip()))
     os._exit(128 + number)

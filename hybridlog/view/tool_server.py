@@ -10,12 +10,20 @@ from inspect import Signature, signature
 from typing import TYPE_CHECKING, Any, Final
 
 from mcp.server import MCPServer
+from mcp.server.mcpserver import Context
 from mcp.server.mcpserver.exceptions import ToolError
-from mcp.types import CallToolResult, ImageContent, TextContent, ToolAnnotations
+from mcp.types import (
+    CallToolResult,
+    ImageContent,
+    InputRequiredResult,
+    TextContent,
+    ToolAnnotations,
+)
 
 from hybridlog import __version__
 from hybridlog.view import tools
 from hybridlog.view.sql_process import SqlProcess
+from hybridlog.wording import listed
 from hybridlog_storage.errors import HybridlogError
 from hybridlog_storage.stopping import GivenUpError, held, until_given_up
 
@@ -50,13 +58,26 @@ def serve(store: Store, seconds: float = MAX_SECONDS) -> None:
 
 def make_server(store: Store, seconds: float = MAX_SECONDS) -> MCPServer:
     """The server and its tools."""
-    server: MCPServer = MCPServer(
+    server = _Server(
         "hybridlog", instructions=_INSTRUCTIONS, version=__version__, log_level="ERROR"
     )
     answers = _Answers(store, seconds)
     for tool in tools.TOOLS:
         server.tool(annotations=_ONLY_READS, structured_output=False)(answers.served(tool))
     return server
+
+
+class _Server(MCPServer[Any]):
+    """A server that refuses arguments that a tool does not have; the package leaves them out."""
+
+    async def call_tool(
+        self, name: str, arguments: dict[str, Any], context: Context[Any, Any] | None = None
+    ) -> CallToolResult | InputRequiredResult:
+        for tool in (one for one in tools.TOOLS if one.__name__ == name):
+            _, *known = signature(tool).parameters
+            if unknown := [word for word in arguments if word not in known]:
+                raise ToolError(f"{name} takes {listed(known)}; not {listed(unknown)}.")
+        return await super().call_tool(name, arguments, context)
 
 
 class _Answers:

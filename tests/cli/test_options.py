@@ -61,10 +61,20 @@ def _set(row: dict[str, object]) -> dict[str, object]:
     return {name: value for name, value in row.items() if value is not None}
 
 
+def test_great_integers_beside_fractions(tmp_path: Path) -> None:
+    with hl.open(tmp_path / "s", create=True, mongo="none") as store, store.start("r") as recording:
+        recording.write(CHANNEL, b'{"whole": 9007199254740993, "half": 0.5}', log_time=1)
+    shown = answer("stats", "n", "-F", "csv", store=tmp_path / "s").out
+    assert "9007199254740993" in shown
+    rows = answer("stats", "n", "--json", store=tmp_path / "s").json
+    assert {row["field"]: row["max"] for row in rows} == {"half": 0.5, "whole": 9007199254740993}
+
+
 def test_what_needs_another_option(store: Path) -> None:
     for words, said in (
         (("keep", "--pin", "-r", "*", "--before", "1s"), "--before is for --at or --when"),
         (("record", "a.bag", "--settle", "3s"), "--settle is for --watch"),
+        (("fetch", "scan", "--in-frame", "x", "--count"), "exclude each other"),
     ):
         assert said in answer(*words, store=store, code=2).err
 

@@ -124,8 +124,10 @@ def test_a_log_that_gives_nothing_makes_no_store(tmp_path: Path) -> None:
     }
     for name, content in files.items():
         (tmp_path / name).write_bytes(content)
-        done = run("record", tmp_path / name, store=tmp_path / "s", code=3)
+        done = run("record", tmp_path / name, "--json", store=tmp_path / "s", code=3)
         assert name in done.err
+        (refused,) = done.json
+        assert (refused["path"], refused["exit_code"]) == (str(tmp_path / name), 3)
     run("record", *(tmp_path / name for name in files), store=tmp_path / "s", code=3)
     run("record", tmp_path, store=tmp_path / "s", code=3)
     assert not (tmp_path / "s").exists()

@@ -12,9 +12,9 @@ import pytest
 from click.testing import CliRunner
 
 import hybridlog as hl
-from hybridlog.cli import watching
 from hybridlog.cli.app import app
 from hybridlog.cli.signals import Stopped
+from hybridlog_storage import stopping
 from hybridlog_storage.errors import DatabaseError, HybridlogError
 from tests import places
 from tests.calls import Calls
@@ -116,7 +116,7 @@ def looks(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
                 raise Stopped(signal.SIGINT)
             step()
 
-        monkeypatch.setattr(watching, "pause", pause)
+        monkeypatch.setattr(stopping, "pause", pause)
 
     return set_steps
 

@@ -237,6 +237,7 @@ def test_what_a_follower_has_left_is_made_by_the_next_command(logs: Path, tmp_pa
     assert "tables and index are not complete: the next command makes the rest" in said
     (recording,) = report["recordings"]
     assert recording["messages_indexed"] < recording["messages"] == report["messages_received"]
+    assert recording["bytes_in"] > recording["messages"]
     assert run("ls", "--json", store=store).json[0]["status"] == "complete"
     assert "all is well" in run("verify", store=store).out
 

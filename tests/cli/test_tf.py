@@ -50,6 +50,10 @@ def test_times_without_a_transform(store: Path) -> None:
     assert one["x"] is not None
     assert other["x"] is None
     assert "1 time without a transform: after the last transform of base_link" in found.err
+    first = run(
+        *ROBOT, *("odom", "base_link", "--at", "+1s", "--at", "+99s", "-n", "1"), store=store
+    )
+    assert "without a transform" not in first.err
     held = run(*(*ROBOT, "odom", "base_link", "--at", "+7s", "--extrapolate", "5s"), store=store)
     assert json.loads(held.out)["x"] is not None
 

@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
-from hybridlog.cli import watching
 from hybridlog.cli.signals import Stopped
 from hybridlog.drawing.times import evenly, lane_of
 from hybridlog.schema.states import CAUSES, State, without_payload
 from hybridlog.view.context import Context
 from hybridlog.view.tools import recordings
+from hybridlog_storage import stopping
 from hybridlog_storage.errors import PayloadError
 from tests import places
 from tests.cli.running import run, started
@@ -185,7 +185,7 @@ def test_a_watch_goes_on_after_a_cut(
         if len(pauses) == 2:
             raise Stopped(signal.SIGINT)
 
-    monkeypatch.setattr(watching, "pause", pause)
+    monkeypatch.setattr(stopping, "pause", pause)
     server.left = 20_000
     words = ("copy", "driven", server.url(tmp_path / "lab"), "--ssh", server.ssh)
     told = answer(*words, "--watch", "--json", store=robots)

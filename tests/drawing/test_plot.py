@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hybridlog.cli.sparkline import densities, sparkline
+from hybridlog.cli.render import densities, sparkline
 from hybridlog.drawing.figure import MAX_LINES, Line, figure, lines
 from hybridlog.drawing.series import Series
 from hybridlog.query.answers.lost import lost_parts

@@ -149,6 +149,10 @@ def test_settings_name_no_path(demo_store: hl.Store, ask: Ask) -> None:
     assert ask("sql", query="select * from recordings").values["rows"][0][0] == "robot"
 
 
+def test_unknown_arguments_are_refused(ask: Ask) -> None:
+    assert "not wehre" in ask("fetch", topic="odom", wehre="x > 1").error
+
+
 def test_large_answers_are_cut(ask: Ask) -> None:
     told = ask("sql", query="select range, repeat('x', 1000) from range(1000000)").values
     assert told["more"]

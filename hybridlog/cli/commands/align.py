@@ -11,13 +11,7 @@ import click
 
 from hybridlog.cli.answers import Tabular, print_end
 from hybridlog.cli.binder import command, option
-from hybridlog.cli.completion import (
-    complete_condition,
-    complete_path,
-    complete_recording,
-    complete_topic,
-)
-from hybridlog.cli.options import Asking, InFrame, parse_fields, query_of
+from hybridlog.cli.options import Filtered, InFrame, Verbose, parse_fields, query_of
 from hybridlog.cli.output import remarks
 from hybridlog.query.choice import Choice
 from hybridlog_storage.errors import TopicError, UsageError
@@ -30,22 +24,13 @@ if TYPE_CHECKING:
 _BESIDE = ("asof", "nearest", "interpolate")
 
 
-def _complete_of_topic(
-    context: click.Context, param: click.Parameter, incomplete: str
-) -> list[str]:
-    """Fields with --step, else a topic and its fields."""
-    complete = complete_condition if context.params.get("step") is None else complete_path
-    return complete(context, param, incomplete)
-
-
 @dataclass(frozen=True, kw_only=True)
-class _Given(Asking, InFrame, Tabular):
+class _Given(Verbose, Filtered, InFrame, Tabular):
     needs_topic: ClassVar[bool] = True
     base: str | None = option(
         "The topic whose messages are the rows.",
         "TOPIC",
         name="--to",
-        shell_complete=complete_topic,
     )
     step: str | None = option(
         "Instead: rows at regular times, such as 100ms.", "DURATION", excludes=("base", "frame")
@@ -69,20 +54,17 @@ class _Given(Asking, InFrame, Tabular):
     where: tuple[str, ...] = option(  # type: ignore[misc]
         "Only messages of this topic that satisfy a predicate; with --step a predicate alone.",
         "TOPIC: PREDICATE",
-        shell_complete=_complete_of_topic,
     )
     beside: tuple[str, ...] = option(
         "With --to: the topics beside it are of these recordings, whose time may overlap: a "
         "second robot or recorder. As for --recording; '*' for all.",
         "RECORDING",
         needs=("base",),
-        shell_complete=complete_recording,
     )
     fields: tuple[str, ...] = option(
         "Only these fields of a topic, with commas between them; with --step of all topics, "
         "without their names.",
         "TOPIC: A,B.C",
-        shell_complete=_complete_of_topic,
     )
 
 

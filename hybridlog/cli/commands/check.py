@@ -16,7 +16,7 @@ from hybridlog.cli.options import (
     Topics,
     Verbose,
 )
-from hybridlog.cli.render import Column
+from hybridlog.cli.render import Column, duration_of, rate_of
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
@@ -72,12 +72,12 @@ def check_command(given: _Given) -> int:
             Column("recording", varies=True),
             Column("topic"),
             Column("messages", side="right"),
-            Column("Hz", lambda row: row["rate_hz"] and f"{row['rate_hz']:.2f}", "right", order=3),
-            Column("jitter", lambda row: _duration(row["jitter_ns"]), "right", order=2),
-            Column("longest gap", lambda row: _duration(row["gap_ns"]), "right"),
+            rate_of("Hz", "rate_hz", order=3),
+            duration_of("jitter", "jitter_ns", order=2),
+            duration_of("longest gap", "gap_ns"),
             Column("from", _gap_begin, "right", order=1),
-            Column("late", lambda row: _edge(row, "late_ns"), "right", order=6),
-            Column("early", lambda row: _edge(row, "early_ns"), "right", order=5),
+            duration_of("late", lambda row: _edge(row, "late_ns"), order=6),
+            duration_of("early", lambda row: _edge(row, "early_ns"), order=5),
             Column(
                 "lost",
                 lambda row: "?" if row["lost"] is None else row["lost"],
@@ -89,12 +89,8 @@ def check_command(given: _Given) -> int:
     return 0
 
 
-def _duration(ns: float | None) -> str:
-    return "" if ns is None else output.short_duration(round(ns))
-
-
-def _edge(row: Mapping[str, Any], name: str) -> str:
-    return "" if row["is_latched"] else _duration(row[name])
+def _edge(row: Mapping[str, Any], name: str) -> int | None:
+    return None if row["is_latched"] else row[name]
 
 
 def _gap_begin(row: Mapping[str, Any]) -> str:

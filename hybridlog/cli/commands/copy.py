@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Final
 from hybridlog.cli import options, output
 from hybridlog.cli.binder import Amount, argument, command, option
 from hybridlog.cli.options import AsJson, Choosing, InStore, Quiet
-from hybridlog.cli.progress import Bar
-from hybridlog.cli.signals import if_stopped
+from hybridlog.cli.output import Bar
+from hybridlog.cli.signals import if_stopped, watch
 from hybridlog.wording import parse_size
 from hybridlog_storage.errors import StoreError, TopicError, UsageError
 
@@ -74,8 +74,6 @@ def copy_command(given: _Copy) -> None:
         if_stopped("What arrived stays there: run the command again."),
     ):
         if given.watch:
-            from hybridlog.cli.watching import watch
-
             look = partial(_look, store, given, how, set[str]())
             watch(store.directory.place, look)
             return

@@ -12,7 +12,6 @@ from hybridlog.cli.answers import Listing
 from hybridlog.cli.app import DIFFERENT
 from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.commands.check import verdict
-from hybridlog.cli.completion import complete_topic
 from hybridlog.cli.options import Between, InStore, Quiet, one_recording, topics
 from hybridlog.cli.render import Column
 
@@ -21,9 +20,7 @@ from hybridlog.cli.render import Column
 class _Given(Between, InStore, Quiet, Listing):
     a: str = one_recording("A recording, as for --recording, or a glob for several together.", "A")
     b: str = one_recording("The same.", "B")
-    words: tuple[str, ...] = argument(
-        "Topics, as for --topic.", "[TOPIC]...", shell_complete=complete_topic
-    )
+    words: tuple[str, ...] = argument("Topics, as for --topic.", "[TOPIC]...")
     tolerance: str = option(
         "Numbers are equal that differ by at most this, such as 5%.", "SHARE", default="0"
     )

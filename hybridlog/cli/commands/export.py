@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import click
 
@@ -17,10 +18,12 @@ from hybridlog.cli.answers import (
     form_of,
     latched,
     write_answer,
+    write_bytes,
 )
 from hybridlog.cli.binder import argument, command, option
-from hybridlog.cli.lerobot import LEROBOT, Training, export_set
 from hybridlog.cli.options import Slices, Topics
+from hybridlog.cli.output import Bar
+from hybridlog.cli.signals import if_stopped
 from hybridlog.formats import OUTPUTS, formats_of, is_directory, suffixes_of
 from hybridlog_storage.disk.unfinished import undone
 from hybridlog_storage.errors import (
@@ -33,24 +36,60 @@ from hybridlog_storage.errors import (
 
 if TYPE_CHECKING:
     from hybridlog.query.query import Query
+    from hybridlog.store import Store
 
 _LOGS = formats_of("log")
 _FILES = formats_of("table", "lines", "video")
 """Formats with a file a topic."""
 
 
+_LEROBOT: Final = "lerobot"
+
+
+def _option(help: str, metavar: str | None = None, **settings: Any) -> Any:  # noqa: A002
+    return option(help, metavar, needs=(f"form={_LEROBOT}",), **settings)
+
+
 @dataclass(frozen=True, kw_only=True)
-class _Given(Topics, Slices, Training):
+class _Training:
+    """Options of training sets."""
+
+    features: Path | None = _option("Topics and fields, in YAML.", "FILE", name="--map")
+    propose_map: bool = _option(
+        "Write a map for the topics that are there to OUTPUT, and nothing else."
+    )
+    fps: int = _option("Frames a second.", "N", type=click.IntRange(1, 1000), default=30)
+    episodes_by: str = _option(
+        "An episode for each `recording`, `mark`, or interval of a predicate.",
+        "HOW",
+        default="recording",
+    )
+    task: str = _option("What the robot does, in words.", "TEXT", default="")
+    task_topic: str | None = _option(
+        "A topic of texts that say it, at the begin of each episode.", "TOPIC"
+    )
+    vcodec: Literal["h264", "av1"] = _option(
+        "Codec of the video.", type=click.Choice(["h264", "av1"]), default="h264"
+    )
+    on_gap: Literal["refuse", "drop", "hold"] = _option(
+        "Refuse an episode with a gap, cut it there, or keep the last value.",
+        type=click.Choice(["refuse", "drop", "hold"]),
+        default="refuse",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Given(Topics, Slices, _Training):
     target: Path = argument(
         "File (mcap, bag) or directory (rosbag2, lerobot, mp4, tables).", "OUTPUT"
     )
     form: str | None = option(
         f"Without: by the suffix ({', '.join(suffixes_of(_LOGS))}). One of "
-        f"{', '.join([*_LOGS, LEROBOT, *_FILES])}.",
+        f"{', '.join([*_LOGS, _LEROBOT, *_FILES])}.",
         "FORMAT",
         name="--format",
         short="-F",
-        type=click.Choice([*_LOGS, LEROBOT, *_FILES]),
+        type=click.Choice([*_LOGS, _LEROBOT, *_FILES]),
     )
     no_attachments: bool = option("Leave out attachments; they are in MCAP files only.")
 
@@ -73,10 +112,10 @@ def export_command(given: _Given) -> None:
         query = given.query(store)
         if not query.topics:
             raise UsageError(store.session.when_empty)
-        if form == LEROBOT:
+        if form == _LEROBOT:
             if split is not None:
                 raise UsageError("lerobot has --episodes-by in place of --split-by.")
-            export_set(store, query, target, given, force=force)
+            _export_set(store, query, target, given)
             return
         parts: Iterable[tuple[Path, Query]] = [(target, query)]
         if split is not None:
@@ -189,3 +228,70 @@ def pieces(
     for path, _ in found if is_directory is not None else ():
         check_room(path, force=force, is_directory=bool(is_directory))
     yield from found
+
+
+# --- training sets ---------------------------------------------------------------------
+
+
+def _export_set(store: Store, query: Query, target: Path, given: _Given) -> None:
+    """Write a training set, or propose a map for one, with rare topics in comments."""
+    if given.propose_map:
+        _propose_map(query, target, force=given.force)
+        return
+    if given.features is None:
+        raise UsageError(
+            "Name a map with --map FILE. `hybridlog export map.yaml --format lerobot "
+            "--propose-map` writes one to begin with."
+        )
+    if given.force and target.is_dir() and (target / "meta" / "info.json").exists():
+        shutil.rmtree(target)
+    done, counted = 0, output.counted
+    again = "The same command goes on with the episodes that are not finished."
+    with if_stopped(again), Bar(target.name) as bar:
+
+        def tell(name: str, frames: int) -> None:
+            nonlocal done
+            done += frames
+            bar(done, f"{name}: {counted(done, 'frame')}")
+
+        report = store.to_lerobot(
+            query,
+            given.features,
+            target,
+            fps=given.fps,
+            episodes_by=given.episodes_by,
+            task=given.task,
+            task_topic=given.task_topic,
+            codec=given.vcodec,
+            on_gap=given.on_gap,
+            progress=tell,
+        )
+    resumed = f", {report.resumed} of them from before" if report.resumed else ""
+    about = (
+        f"{report.path}: {counted(report.episodes, 'episode')}{resumed}, "
+        f"{counted(report.frames, 'frame')} at {given.fps} Hz, {output.size(report.bytes)}"
+    )
+    output.remarks([about])
+    said = {
+        "with a value older than usual": report.held,
+        "left out, where a topic has a gap": report.dropped,
+        "with an earlier picture, since its own cannot be shown": report.missing,
+    }
+    output.notes(f"{counted(number, 'frame')} {what}." for what, number in said.items() if number)
+    if report.lost:
+        lost = f"{counted(report.lost, 'message')} of these topics are lost in the episodes"
+        output.note(f"{lost}; meta/hybridlog.json says in which.")
+
+
+def _propose_map(query: Query, target: Path, *, force: bool) -> None:
+    from hybridlog.query.query import narrowed
+    from hybridlog.training.feature_map import nearly_empty, proposed
+
+    check_room(target, force=force)
+    empty = nearly_empty(narrowed(query, *proposed(query).topics))
+    left_out = (
+        f"# left out: {topic} has {output.counted(count, 'message')}\n"
+        for topic, count in empty.items()
+    )
+    write_bytes(target, "".join([proposed(query, empty).to_yaml(), *left_out]).encode())
+    output.remarks([f"{target}: look at it, then add --map {target}."])

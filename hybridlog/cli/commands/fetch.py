@@ -22,8 +22,7 @@ from hybridlog.cli.answers import (
     write_following,
 )
 from hybridlog.cli.binder import command, option
-from hybridlog.cli.completion import complete_path
-from hybridlog.cli.options import Asking, InFrame, Slices, parse_fields, query_of
+from hybridlog.cli.options import Filtered, InFrame, Slices, Verbose, parse_fields, query_of
 from hybridlog.formats import OUTPUTS, formats_of, is_directory
 from hybridlog_storage.errors import TopicError, UsageError
 from hybridlog_storage.stopping import at_safe_points
@@ -39,7 +38,7 @@ _FORMATS = formats_of()
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Choices(Asking, InFrame, Tabular, Slices):
+class _Choices(Verbose, Filtered, InFrame, Tabular, Slices):
     needs_topic: ClassVar[bool] = True
     formats: ClassVar[Sequence[str]] = _FORMATS
 
@@ -63,9 +62,7 @@ class _Choices(Asking, InFrame, Tabular, Slices):
         "beginning of --between, until the recordings end or Ctrl-C.",
         excludes=("as_json", "output", "reverse", "count", "strict", "frame"),
     )
-    fields: str | None = option(
-        "Only these fields, with commas between them.", "A,B.C", shell_complete=complete_path
-    )
+    fields: str | None = option("Only these fields, with commas between them.", "A,B.C")
     within: str | None = option(
         "Greatest distance in time of messages of other topics in --where "
         "'/odom: twist.twist.linear.x > 0.5'.",
@@ -84,7 +81,7 @@ class _Choices(Asking, InFrame, Tabular, Slices):
         "DURATION",
         needs=("where",),
     )
-    count: bool = option("Only print how many.", excludes=("output", "form", "split"))
+    count: bool = option("Only print how many.", excludes=("output", "form", "split", "frame"))
     form: str | None = format_option(_FORMATS)
     output: Path | None = output_option(
         "Write to this file (raw: a directory; png and jpg: a directory, or one picture)"

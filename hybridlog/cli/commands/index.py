@@ -11,11 +11,10 @@ import click
 
 from hybridlog.cli import output
 from hybridlog.cli.binder import SOME_SECONDS, argument, command, option
-from hybridlog.cli.completion import complete_topic
 from hybridlog.cli.options import AsJson, Choosing, InStore, Quiet, cache_size
-from hybridlog.cli.progress import Bar
+from hybridlog.cli.output import Bar
 from hybridlog.cli.render import Column, bytes_of, numbers, print_table
-from hybridlog.cli.signals import if_stopped
+from hybridlog.cli.signals import if_stopped, watch
 from hybridlog.wording import listed
 from hybridlog_storage.errors import StoreError, UsageError
 
@@ -36,7 +35,7 @@ class _Shared(InStore, AsJson, Quiet):
 
 @dataclass(frozen=True, kw_only=True)
 class _List(_Shared):
-    topic: str | None = argument("A topic; without, all.", "[TOPIC]", shell_complete=complete_topic)
+    topic: str | None = argument("A topic; without, all.", "[TOPIC]")
 
 
 @command(_List, "list", to=index_command)
@@ -49,7 +48,7 @@ def list_(given: _List) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class _Fields(_Shared):
-    topic: str = argument("A topic.", "TOPIC", shell_complete=complete_topic)
+    topic: str = argument("A topic.", "TOPIC")
     field: tuple[str, ...] = argument(
         "Its fields, the most selective first.", "FIELD...", required=True
     )
@@ -140,9 +139,7 @@ def rebuild(given: _Rebuild) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class _Arrays(_Shared):
-    topic: tuple[str, ...] = argument(
-        "Topics.", "TOPIC...", required=True, shell_complete=complete_topic
-    )
+    topic: tuple[str, ...] = argument("Topics.", "TOPIC...", required=True)
     off: bool = option("Make their tables without arrays again.")
 
 
@@ -193,8 +190,6 @@ def watch_command(given: _Watch) -> None:
     For a server into whose store robots copy. While MongoDB is unavailable, it tries again.
     Several may watch one store.
     """
-    from hybridlog.cli.watching import watch
-
     with given.opened(require_database=True) as store:
         look = partial(_look, store)
         watch(store.directory.path, look, pause_s=given.every)

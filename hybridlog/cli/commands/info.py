@@ -1,10 +1,11 @@
-"""`hybridlog info`: recordings and topics, or a segment file."""
+"""`hybridlog info`: recordings, one thing about them, or a segment file."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import asdict, dataclass
+from fnmatch import fnmatchcase
 from operator import itemgetter
 from pathlib import Path
 from shlex import quote
@@ -13,33 +14,30 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from hybridlog.cli import options, output
+from hybridlog.cli.answers import check_room, writing
 from hybridlog.cli.binder import command, option
 from hybridlog.cli.commands.keep import pin_cells
 from hybridlog.cli.commands.ls import recording_dict, status_text, with_misfits
-from hybridlog.cli.info_parts import (
-    attachment_as_dict,
-    show_attachments,
-    show_losses,
-    show_sizes,
-    show_tables,
-    show_topics,
+from hybridlog.cli.options import AsJson, Choosing, Forced, InStore, names_argument, query_of
+from hybridlog.cli.render import (
+    Column,
+    bytes_of,
+    densities,
+    duration_of,
+    numbers,
+    print_fields,
+    print_table,
 )
-from hybridlog.cli.options import (
-    AsJson,
-    Choosing,
-    Forced,
-    InStore,
-    names_argument,
-    query_of,
-)
-from hybridlog.cli.render import Column, numbers, print_fields, print_table
 from hybridlog.query.answers.lost import coverage, line_of
 from hybridlog.query.topics import resolve
 from hybridlog.record.losses import losses_of
-from hybridlog_storage.errors import SegmentError, StoreError
+from hybridlog.wording import listed
+from hybridlog_storage.errors import SegmentError, StoreError, TopicError, UsageError
 
 if TYPE_CHECKING:
     from hybridlog.attachments import StoredAttachment, StoredMetadata
+    from hybridlog.query.query import Query
+    from hybridlog.query.question import RecordedChannel
     from hybridlog.store import Store
     from hybridlog_storage.catalog import RecordingEntry
 
@@ -48,7 +46,8 @@ _MAX_DRAWN = 20  # recordings with sparklines; for more, reading their chunk tab
 _DRAWN_TIMES = 1 << 18  # see `density`: little is read for a sparkline
 _LETTERS = 40  # of the coverage bar
 _DRAWN = 20  # letters of a sparkline
-_OVER_TIME = "over time"
+_MAX_NAMES = 5  # recordings in a note
+_READABLE = {"ros1msg", "ros2msg", "ros2idl", "jsonschema"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,36 +96,28 @@ def info_command(given: _Given) -> None:
     Options show one thing instead: the definition of a topic, losses, sizes, attachments.
     """
     if len(given.names) == 1 and _is_segment(given.names[0]):
-        show_segment(Path(given.names[0]), as_json=given.as_json)
+        _show_segment(Path(given.names[0]), given)
         return
     with given.opened(snapshot=True) as store:
         if given.losses:
-            if given.topic:
-                resolve(given.topic, store.topics())  # refuses a name that fits no topic
-            show_losses([*given.recordings_in(store)], given.topic, given)
+            _show_losses(store, given)
         elif given.topic:
             query = query_of(store, given.topic, given.choice)
-            if given.tables:
-                show_tables(store, query)
-            else:
-                show_topics(store, query, as_json=given.as_json)
+            (_show_tables if given.tables else _show_topics)(store, query, given)
         elif given.sizes is not None:
-            sizes = store.sizes(given.recordings_in(store))
-            show_sizes(sizes, given.sizes, given, store.session.when_empty)
+            _show_sizes(store, given.sizes, given)
         elif given.attachments or given.attachment is not None:
-            entries = given.recordings_in(store)
-            found = [one for entry in entries for one in store.attachments(entry)]
-            show_attachments(found, given.attachment, given.output, given, force=given.force)
+            _show_attachments(store, given)
         else:
-            _show(store, given)
+            _show_recordings(store, given)
 
 
-def _show(store: Store, given: _Given) -> None:
+# --- recordings -----------------------------------------------------------------------
+
+
+def _show_recordings(store: Store, given: _Given) -> None:
     entries = [with_misfits(store, entry) for entry in given.recordings_in(store)]
-    found = [
-        _as_dict(store, entry, _videos(store, entry) if number < _MAX_DRAWN else {})
-        for number, entry in enumerate(entries)
-    ]
+    found = [_as_dict(store, one, with_videos=n < _MAX_DRAWN) for n, one in enumerate(entries)]
     if given.as_json:
         output.print_json(found)
         return
@@ -136,31 +127,21 @@ def _show(store: Store, given: _Given) -> None:
         if number:
             output.say()
         drawn = sys.stdout.isatty() and len(entries) <= _MAX_DRAWN
-        _print_recording(entry, about, store, _sparklines(store, entry) if drawn else {})
+        _show_recording(store, entry, about, _sparklines(store, entry) if drawn else {})
 
 
-def _is_segment(what: str) -> bool:
-    """True for the path of a file; names and ids of recordings have no slash."""
-    looks = "/" in what or what.endswith((".mcap", ".mcap.open", ".bag", ".db3"))
-    return looks and Path(what).exists()
+def _show_recording(
+    store: Store, entry: RecordingEntry, about: dict[str, Any], drawn: Mapping[str, str]
+) -> None:
+    print_fields(_fields(store, entry, about))
+    if about["channels"]:
+        output.say()
+        over_time = Column("over time", lambda c: drawn.get(c["topic"]), "whole", order=1)
+        columns = [*_CHANNELS, *([over_time] if drawn else []), Column("note", _channel_note)]
+        print_table(columns, sorted(about["channels"], key=itemgetter("topic")))
 
 
-def _videos(store: Store, entry: RecordingEntry) -> dict[str, dict[str, Any]]:
-    """Codec and key frames of video topics, by topic; none of those that cannot be read."""
-    from hybridlog.arrays import is_video_type
-
-    found: dict[str, dict[str, Any]] = {}
-    for topic in dict.fromkeys(one.topic for one in entry.channels if is_video_type(one.type)):
-        from hybridlog.query.answers.video import summary_of
-
-        try:
-            found[topic] = summary_of(store.session, entry.id, topic)
-        except SegmentError as error:
-            output.note(f"{entry.name}: {error}")
-    return found
-
-
-def _as_dict(store: Store, entry: RecordingEntry, videos: Mapping[str, Any]) -> dict[str, Any]:
+def _as_dict(store: Store, entry: RecordingEntry, *, with_videos: bool) -> dict[str, Any]:
     from hybridlog.entries import summary_of
     from hybridlog.query.periods import mean_rate
     from hybridlog.schema.states import shown_channels
@@ -171,7 +152,7 @@ def _as_dict(store: Store, entry: RecordingEntry, videos: Mapping[str, Any]) -> 
         attachments, metadata = store.attachments(entry), store.metadata(entry)
     except SegmentError as error:
         output.note(f"{entry.name}: {error}")
-    losses = losses_of(entry)
+    losses, videos = losses_of(entry), _videos(store, entry) if with_videos else {}
     return {
         **recording_dict(summary_of(entry)),
         "chunks": entry.chunks,
@@ -179,7 +160,7 @@ def _as_dict(store: Store, entry: RecordingEntry, videos: Mapping[str, Any]) -> 
         "losses": losses,
         "marks": entry.marks,
         "pins": entry.pins,
-        "attachments": [attachment_as_dict(each) for each in attachments],
+        "attachments": [*map(_attachment_dict, attachments)],
         "metadata_records": [each._asdict() for each in metadata],
         "channels": [
             {
@@ -206,80 +187,83 @@ def _as_dict(store: Store, entry: RecordingEntry, videos: Mapping[str, Any]) -> 
     }
 
 
-def _print_recording(
-    entry: RecordingEntry, about: dict[str, Any], store: Store, drawn: Mapping[str, str]
-) -> None:
+def _videos(store: Store, entry: RecordingEntry) -> dict[str, dict[str, Any]]:
+    """Codec and key frames of video topics, by topic; none of those that cannot be read."""
+    from hybridlog.arrays import is_video_type
+
+    found: dict[str, dict[str, Any]] = {}
+    for topic in dict.fromkeys(one.topic for one in entry.channels if is_video_type(one.type)):
+        from hybridlog.query.answers.video import summary_of
+
+        try:
+            found[topic] = summary_of(store.session, entry.id, topic)
+        except SegmentError as error:
+            output.note(f"{entry.name}: {error}")
+    return found
+
+
+def _fields(store: Store, entry: RecordingEntry, about: dict[str, Any]) -> list[tuple[str, object]]:
+    """What is told to people of a recording."""
     from hybridlog.entries import summary_of
     from hybridlog.query.times import format_duration
 
-    status = status_text(summary_of(entry))
+    status, source = status_text(summary_of(entry)), entry.source["kind"]
     if entry.status == "open":
         status += f"; `hybridlog top {quote(entry.name)}` shows it"
-    source = entry.source["kind"]
     if entry.source["bytes"]:
         source += f", {output.size(entry.source['bytes'])}"
     if entry.source["path"]:
         source = f"{entry.source['path']} ({source})"
     first, last = about["first_ns"], about["last_ns"]
-    print_fields(
-        [
-            ("recording", entry.name),
-            ("id", entry.id),
-            ("status", status),
-            ("source", source),
-            ("start", output.time_text(first)),
-            ("last", output.time_text(last)),
-            ("duration", "-" if first is None else format_duration(last - first)),
-            ("messages", entry.messages),
-            (
-                "stored",
-                f"{output.size(entry.stored_bytes)} in {output.counted(entry.segments, 'segment')}"
-                f", {output.counted(entry.chunks, 'chunk')}",
-            ),
-            *_coverage(entry, about["coverage"]),
-            *(("", line_of(loss)) for loss in about["losses"]),
-            *(("tag", f"{key}={value}") for key, value in sorted(entry.tags.items())),
-            *(("note", note["text"]) for note in entry.notes),
-            *(
-                ("pin", f"{pin['id']}: {', '.join(filter(None, pin_cells(pin)))}")
-                for pin in entry.pins
-            ),
-            *(
-                (
-                    "attachment",
-                    f"{one['name']} "
-                    f"({', '.join(filter(None, (one['media_type'], output.size(one['bytes']))))})",
-                )
-                for one in about["attachments"]
-            ),
-            *(
-                ("metadata", f"{one['name']} ({', '.join(one['values'])})")
-                for one in about["metadata_records"]
-            ),
-            ("index", store.shared.index.place),
-        ]
+    segments, chunks = (
+        output.counted(getattr(entry, f"{what}s"), what) for what in ("segment", "chunk")
     )
-    if about["channels"]:
-        output.say()
-        over_time = Column(_OVER_TIME, lambda c: drawn.get(c["topic"]), "whole", order=1)
-        columns = [*_CHANNELS[:-1], *([over_time] if drawn else []), _CHANNELS[-1]]
-        print_table(columns, sorted(about["channels"], key=itemgetter("topic")))
+    bar = _coverage_bar(entry)
+    return [
+        ("recording", entry.name),
+        ("id", entry.id),
+        ("status", status),
+        ("source", source),
+        ("start", output.time_text(first)),
+        ("last", output.time_text(last)),
+        ("duration", "-" if first is None else format_duration(last - first)),
+        ("messages", entry.messages),
+        ("stored", f"{output.size(entry.stored_bytes)} in {segments}, {chunks}"),
+        *([("coverage", bar)] if bar else ()),
+        ("" if bar else "coverage", about["coverage"]),
+        *(("", line_of(loss)) for loss in about["losses"]),
+        *(("tag", f"{key}={value}") for key, value in sorted(entry.tags.items())),
+        *(("note", note["text"]) for note in entry.notes),
+        *(("pin", f"{pin['id']}: {', '.join(filter(None, pin_cells(pin)))}") for pin in entry.pins),
+        *(
+            ("attachment", f"{one['name']} ({', '.join(filter(None, _about(one)))})")
+            for one in about["attachments"]
+        ),
+        *(
+            ("metadata", f"{one['name']} ({', '.join(one['values'])})")
+            for one in about["metadata_records"]
+        ),
+        ("index", store.shared.index.place),
+    ]
 
 
-def _coverage(entry: RecordingEntry, words: str) -> list[tuple[str, str]]:
-    """The row about coverage; on a terminal with a bar."""
+def _about(attachment: Mapping[str, Any]) -> tuple[str, str]:
+    return attachment["media_type"], output.size(attachment["bytes"])
+
+
+def _coverage_bar(entry: RecordingEntry) -> str:
+    """When something is lost, in letters on a terminal."""
     if entry.span is None or not sys.stdout.isatty():
-        return [("coverage", words)]
+        return ""
     from hybridlog.query.answers.lost import lost_parts
     from hybridlog.record.losses import extent_of
 
     lost = lost_parts(entry, extent_of(entry), _LETTERS).tolist()
-    return [("coverage", "".join("░" if one else "█" for one in lost)), ("", words)]
+    return "".join("░" if one else "█" for one in lost)
 
 
 def _sparklines(store: Store, entry: RecordingEntry) -> dict[str, str]:
     """Messages of each topic over time; none without any, or if they cannot be read."""
-    from hybridlog.cli.sparkline import densities
     from hybridlog.drawing.times import evenly, lane_of
     from hybridlog.record.losses import extent_of
 
@@ -311,7 +295,7 @@ def _skew_text(channel: Mapping[str, Any]) -> str:
     return "?" if channel["unset_stamps"] is None else "-"
 
 
-def channel_note(channel: Mapping[str, Any]) -> str:
+def _channel_note(channel: Mapping[str, Any]) -> str:
     """Remarks on the messages of a topic, such as that they are latched or expired."""
     from hybridlog.query.latching import depth_of
     from hybridlog.schema.states import State, state_of
@@ -350,13 +334,21 @@ _CHANNELS = [
     Column("type", _kind, short=lambda channel: _kind(channel).rpartition("/")[2]),
     Column("messages", side="right"),
     Column("Hz", lambda c: "-" if c["rate_hz"] is None else f"{c['rate_hz']:.2f}", "right"),
-    Column("payload", lambda c: output.size(c["payload_bytes"]), "right", order=2),
+    bytes_of("payload", "payload_bytes", order=2),
     Column("log - header", _skew_text, "right", order=3),
-    Column("note", channel_note),
 ]
 
 
-def show_segment(path: Path, *, as_json: bool) -> None:
+# --- a segment file -------------------------------------------------------------------
+
+
+def _is_segment(what: str) -> bool:
+    """True for the path of a file; names and ids of recordings have no slash."""
+    looks = "/" in what or what.endswith((".mcap", ".mcap.open", ".bag", ".db3"))
+    return looks and Path(what).exists()
+
+
+def _show_segment(path: Path, given: _Given) -> None:
     """Print the summary of a sealed segment."""
     from hybridlog_storage.segments.segment_reader import SegmentReader
 
@@ -368,8 +360,7 @@ def show_segment(path: Path, *, as_json: bool) -> None:
     stem = path.name.split(".")[0]
     try:
         with SegmentReader(path, int(stem) if stem.isdecimal() else 0) as reader:
-            summary = reader.summary()
-            bytes_all = reader.size
+            summary, size = reader.summary(), reader.size
     except SegmentError as error:
         raise StoreError(
             f"{path} is no whole segment of a store. Of a log, `hybridlog record "
@@ -387,14 +378,14 @@ def show_segment(path: Path, *, as_json: bool) -> None:
     ]
     about: dict[str, Any] = {
         "segment": str(path),
-        "bytes": bytes_all,
+        "bytes": size,
         "recording": summary.recording,
         "first_ns": min((place.first for place in chunks), default=None),
         "last_ns": max((place.last for place in chunks), default=None),
         "chunks": len(chunks),
         "channels": channels,
     }
-    if as_json:
+    if given.as_json:
         output.print_json(about)
         return
     print_fields(
@@ -404,7 +395,7 @@ def show_segment(path: Path, *, as_json: bool) -> None:
             ("id", summary.recording.get("id")),
             ("start", output.time_text(about["first_ns"])),
             ("last", output.time_text(about["last_ns"])),
-            ("bytes", output.size(bytes_all)),
+            ("bytes", output.size(size)),
             ("chunks", len(chunks)),
             ("messages", sum(summary.counts.values())),
         ]
@@ -412,3 +403,279 @@ def show_segment(path: Path, *, as_json: bool) -> None:
     output.say()
     kind = Column("type", short=lambda channel: (channel["type"] or "").rpartition("/")[2])
     print_table([Column("topic"), kind, *numbers("messages", "chunks")], channels)
+
+
+# --- topics ---------------------------------------------------------------------------
+
+
+def _show_topics(store: Store, query: Query, given: _Given) -> None:
+    """Print the definition and the fields of topics, those of each type once."""
+    from hybridlog.query.query import channels_of
+
+    seen: dict[tuple[str, str], dict[str, Any]] = {}
+    for recorded in channels_of(query):
+        schema = recorded.channel.schema
+        key = recorded.channel.topic, recorded.recording.id if schema is None else repr(schema)
+        if key not in seen:
+            seen[key] = _topic_dict(store, recorded)
+        seen[key]["recordings"].append(recorded.recording.name)
+    if not seen:
+        raise TopicError(f"No chosen recording has {' or '.join(query.topics)}.")
+    if given.as_json:
+        output.print_json(list(seen.values()))
+        return
+    for number, item in enumerate(seen.values()):
+        if number:
+            output.say()
+        encoding = f"{item['message_encoding']}, {item['schema_encoding'] or 'no schema'}"
+        output.say(f"{item['topic']}  {item['type'] or '(no type)'}  ({encoding})")
+        for line in (item["definition"] or "").splitlines():
+            output.say(line)
+        if item["not_indexed"]:
+            output.say(f"not indexed: {item['not_indexed']}")
+        if item["arrays"]:
+            output.say("Its tables have long arrays, not only their summaries.")
+        if item["fields"]:
+            output.say()
+            if item["observed"]:
+                output.say("No definition fixes the fields. The first messages have these:")
+            asked = Column("asked as", "path" if item["observed"] else _asked_as)
+            print_table([Column("field", "path"), Column("type"), asked], item["fields"])
+
+
+def _topic_dict(store: Store, recorded: RecordedChannel) -> dict[str, Any]:
+    from hybridlog.query.answers.infer_fields import infer_fields
+
+    channel, codec = recorded.channel, recorded.codec
+    schema, text = channel.schema, None
+    if schema is not None and schema.encoding in _READABLE:
+        text = bytes(schema.data).decode("utf-8", "replace")
+    fields: list[dict[str, object]] = [
+        {"path": p.path, "type": p.type, "array": p.array} for p in codec.paths()
+    ]
+    observed = codec.indexed and not fields
+    if observed:
+        fields = infer_fields(store.query([channel.topic], [recorded.recording.id]))
+    return {
+        "topic": channel.topic,
+        "type": schema.name if schema is not None else None,
+        "message_encoding": channel.message_encoding,
+        "schema_encoding": schema.encoding if schema is not None else None,
+        "definition": text,
+        "recordings": [],
+        "not_indexed": codec.reason,
+        "observed": observed,
+        "arrays": channel.topic in store.directory.settings.arrays,
+        "fields": fields,
+    }
+
+
+def _asked_as(field: dict[str, Any]) -> str:
+    path, kind = str(field["path"]), str(field["type"])
+    if "[" in kind and kind.startswith(("int", "uint", "float", "bool")):
+        return f"{path}.min, {path}.max, {path}.mean, {path}.n"
+    return path
+
+
+def _show_tables(store: Store, query: Query, _: _Given) -> None:
+    """Print the Parquet files with the rows of a topic, and SQL for DuckDB."""
+    from hybridlog.maintenance.tables import missing
+    from hybridlog.query.query import channels_of
+    from hybridlog.record.marks import MARKS
+    from hybridlog.snapshot import UNFINISHED
+
+    topic, *others = query.topics
+    if others:
+        raise UsageError(f"--tables is about one topic: name one of {listed(query.topics)}.")
+    channels = channels_of(query)
+    recordings = {one.recording.id: one.recording for one in channels}.values()
+    ended = [one for one in recordings if one.status not in UNFINISHED]
+    going = [one.name for one in recordings if one.status in UNFINISHED]
+    found = _tables_of(store, query, [one for one in channels if one.recording in ended])
+    tables = store.session.tables
+    lacking = [one.name for one in ended if topic in missing(store.directory, one, tables)]
+    shown = ((*one["files"], "", f"{one['statement']};", "") for one in found)
+    output.tell({"tables": found, "missing": lacking}, [line for each in shown for line in each])
+    marks = sum(len(one.marks) for one in recordings) if topic == MARKS else 0
+    without = {
+        f"{listed(lacking, _MAX_NAMES)}, whose rows are missing: `hybridlog verify --repair` "
+        "makes them again": lacking,
+        f"{listed(going)}: rows are added when a recording ends": going,
+        f"{output.counted(marks, 'mark')} that somebody set: no table has them, `hybridlog sql` "
+        "has": marks,
+    }
+    output.notes(f"Without {what}." for what, applies in without.items() if applies)
+
+
+def _tables_of(
+    store: Store, query: Query, channels: Collection[RecordedChannel]
+) -> list[dict[str, Any]]:
+    """Folders with rows of a topic in some recordings: files, rows, statement."""
+    from glob import escape
+
+    from hybridlog.columns.folders import files_of
+    from hybridlog.columns.layout import type_prefix
+
+    (topic,), recordings = query.topics, {one.recording.id for one in channels}
+    schemas = [one.channel.schema for one in channels]
+    prefixes = {type_prefix("" if schema is None else schema.name) for schema in schemas}
+    where = f"topic = {_quoted(topic)}"
+    if query.question.recordings is not None:
+        where += f" and recording in ({', '.join(map(_quoted, sorted(recordings)))})"
+    folders: dict[Path, dict[str, Any]] = {}
+    for file in files_of(store.directory.path, prefixes) if prefixes else ():
+        own = (one for one in file.about.sections if one.topic == topic and one.id in recordings)
+        if rows := sum(one.rows for one in own):
+            folder = file.path.parent
+            found = folders.setdefault(folder, {"folder": str(folder), "rows": 0, "files": []})
+            found["rows"] += rows
+            found["files"].append(str(file.path))
+            files = _quoted(f"{escape(str(folder))}/*.parquet")
+            # The only texts in it are quoted, and nothing is run here.
+            found["statement"] = f"select * from {files} where {where}"  # noqa: S608
+    return list(folders.values())
+
+
+def _quoted(text: str) -> str:
+    return "'" + text.replace("'", "''") + "'"
+
+
+# --- losses and sizes -----------------------------------------------------------------
+
+
+def _show_losses(store: Store, given: _Given) -> None:
+    """Print what is missing of topics, from when to when, and why."""
+    from hybridlog.query.topics import matcher
+
+    if given.topic:
+        resolve(given.topic, store.topics())  # refuses a name that fits no topic
+    fits = matcher(given.topic) if given.topic else None
+    entries = [*given.recordings_in(store)]
+    rows = [
+        {"recording": entry.name, **loss}
+        for entry in entries
+        for loss in losses_of(entry)
+        if fits is None or (loss.get("topic") is not None and fits(loss["topic"]))
+    ]
+    named = output.counted(len(entries), "recording")
+    without = f"Nothing is missing from {named}, as far as the ledger knows."
+    given.show(rows, _LOSSES[len(entries) == 1 :], without)
+    if running := [entry.name for entry in entries if entry.status == "open"]:
+        output.note(f"Still being recorded, so later losses are to come: {listed(running)}.")
+
+
+def _span(loss: Mapping[str, Any]) -> int | None:
+    begin, end = loss.get("from"), loss.get("to")
+    return None if begin is None or end is None else end - begin
+
+
+_LOSSES = [
+    Column("recording"),
+    Column("topic", lambda loss: loss.get("topic") or "any"),
+    Column("cause"),
+    Column("messages", lambda loss: "unknown" if loss["count"] is None else loss["count"], "right"),
+    Column("from", lambda loss: output.short_time(loss.get("from")), "whole"),
+    duration_of("for", _span),
+    Column("detail", lambda loss: ": ".join(filter(None, (loss.get("file"), loss.get("reason"))))),
+]
+
+
+def _show_sizes(store: Store, by: str, given: _Given) -> None:
+    """Print the bytes by `recording`, by `topic`, or by `both`."""
+    sizes = store.sizes(given.recordings_in(store))
+    found = {"recording": sizes.by_recording, "topic": sizes.by_topic}.get(by, lambda: sizes.rows)()
+    total, *rows = (
+        {name: value for name, value in asdict(one).items() if value != ""}
+        | {"total_bytes": one.total_bytes}
+        for one in (sizes.total, *found)
+    )
+    if given.as_json:
+        output.print_json({"rows": rows, "total": total})
+        return
+    names = [Column("recording"), Column("topic", lambda row: row.get("topic", "(no topic)"))]
+    names = [one for one in names if by in {one.name, "both"}]
+    last = total | {one.name: "" for one in names[1:]} | {names[0].name: "total"}
+    columns = [column for column in _SIZES if column.name != "fields" or total["column_bytes"]]
+    given.show([*rows, last] if rows else [], [*names, *columns], store.session.when_empty)
+
+
+_SIZES = [
+    Column("messages", side="right", order=1),
+    bytes_of("payload", "payload_bytes", order=2),
+    bytes_of("segments", "segment_bytes"),
+    bytes_of("fields", "column_bytes"),
+    bytes_of("tables", "table_bytes"),
+    bytes_of("MongoDB", "index_bytes"),
+    bytes_of("total", "total_bytes"),
+]
+
+
+# --- attachments ----------------------------------------------------------------------
+
+
+def _show_attachments(store: Store, given: _Given) -> None:
+    """List attachments, print the one that is named or fits a glob, or write some into files."""
+    there = [one for entry in given.recordings_in(store) for one in store.attachments(entry)]
+    found, name = there, given.attachment
+    if name is not None:
+        found = [one for one in there if one.name == name]
+        found = found or [one for one in there if fnmatchcase(one.name, name)]
+        if not found:
+            names = listed(output.quoted(one.name) for one in there)
+            raise TopicError(f"There is no attachment {output.quoted(name)}. There are: {names}.")
+    if given.output is not None:
+        is_one = name is not None and len(found) == 1
+        _write_attachments(found, given.output, is_one=is_one, force=given.force)
+    elif name is None or given.as_json:
+        given.show([*map(_attachment_dict, found)], _ATTACHMENTS, "There are no attachments.")
+    elif len(found) > 1:
+        raise UsageError(
+            f"{len(found)} attachments have this name: -o DIR writes each of them into a file."
+        )
+    elif sys.stdout.isatty() and not found[0].media_type.startswith("text/"):
+        raise UsageError(f"{found[0].name} may be no text: name a file with -o.")
+    else:
+        for piece in found[0].pieces():
+            sys.stdout.buffer.write(piece)
+
+
+def _write_attachments(
+    found: list[StoredAttachment], target: Path, *, is_one: bool, force: bool
+) -> None:
+    """Write one attachment to a file, or each into a directory under a name made from its own."""
+    from hybridlog.attachments import file_names
+
+    paths = [target]
+    if target.is_dir() or not is_one:
+        paths = [target / name for name in file_names(found)]
+    for path in paths:
+        check_room(path, force=force)
+    if paths != [target]:
+        try:
+            target.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UsageError(f"{target} cannot be made: {error.strerror}.") from error
+    for attachment, path in zip(found, paths, strict=True):
+        with writing(path):
+            attachment.save(path)
+        output.note(f"{path}: {output.size(attachment.size)}")
+
+
+def _attachment_dict(attachment: StoredAttachment) -> dict[str, Any]:
+    """An attachment as JSON."""
+    return {
+        "recording": attachment.recording,
+        "name": attachment.name,
+        "media_type": attachment.media_type,
+        "bytes": attachment.size,
+        "log_time_ns": attachment.log_time_ns,
+        "create_time_ns": attachment.create_time_ns,
+    }
+
+
+_ATTACHMENTS = [
+    Column("attachment", "name"),
+    Column("media type", "media_type"),
+    bytes_of("size", "bytes"),
+    Column("log time", lambda row: output.time_text(row["log_time_ns"] or None)),
+]

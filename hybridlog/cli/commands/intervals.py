@@ -11,7 +11,7 @@ import click
 from hybridlog.cli import output
 from hybridlog.cli.answers import Listing, answering
 from hybridlog.cli.binder import command, option
-from hybridlog.cli.options import Asking, parse_fields
+from hybridlog.cli.options import Filtered, Verbose, parse_fields
 from hybridlog.cli.render import Column, times
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ _OF_A_PREDICATE = ("length", "max_gap", "state")
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Given(Asking, Listing):
+class _Given(Verbose, Filtered, Listing):
     needs_topic: ClassVar[bool] = True
     changes: str | None = option(
         "Instead: when these fields changed.", "A,B.C", excludes=("gaps", *_OF_A_PREDICATE)

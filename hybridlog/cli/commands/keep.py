@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from hybridlog.cli import output
 from hybridlog.cli.binder import command, option
-from hybridlog.cli.completion import complete_condition, complete_topic
 from hybridlog.cli.options import AsJson, Choosing, InStore, Quiet, query_of
-from hybridlog.cli.progress import Bar
+from hybridlog.cli.output import Bar
 from hybridlog.cli.render import Column
 from hybridlog.cli.signals import if_stopped
 from hybridlog.wording import listed
@@ -33,7 +32,6 @@ class _Given(Choosing, InStore, AsJson, Quiet):
         "before later ones. With --pin: TOPIC alone, to pin only this topic.",
         "TOPIC=AGE",
         short="-t",
-        shell_complete=complete_topic,
     )
     never_tag: tuple[str, ...] = option(
         "Nothing of recordings with this tag goes; K alone is any value.", "K=V"
@@ -56,7 +54,6 @@ class _Given(Choosing, InStore, AsJson, Quiet):
         "With --pin: whenever this held, such as 'scan: ranges.min < 0.5', or around "
         "messages of a topic alone, or of marks.",
         "TOPIC: PREDICATE",
-        shell_complete=complete_condition,
         needs=("pin",),
     )
     before: str = option(

@@ -26,9 +26,9 @@ def ls_command(given: _Given) -> None:
     """List the recordings."""
     with given.opened() as store:
         recordings = given.recordings_in(store.snapshot()).summaries
-    found = [*recordings]
+    found = [recording_dict(one) if given.as_json else one for one in recordings]
     without = "" if store.repairs.unreadable else store.directory.when_empty
-    given.show(found, RECORDINGS, without, recording_dict)
+    given.show(found, RECORDINGS, without)
 
 
 def _note(entry: RecordingSummary) -> str:

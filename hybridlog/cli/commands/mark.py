@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 from hybridlog.cli import options, output
 from hybridlog.cli.binder import argument, command, option
-from hybridlog.cli.completion import complete_running
 from hybridlog.cli.options import InStore, Quiet
 from hybridlog_storage.errors import StoreError, UsageError
 
@@ -20,7 +19,6 @@ class _Given(InStore, Quiet):
         "Only this recorder (id or name of its recording, or the beginning of the id).",
         "RECORDING",
         short="-r",
-        shell_complete=complete_running,
     )
     text: str = argument("What happened.", "TEXT")
     tags: tuple[str, ...] = option("Add KEY=VALUE to it.", "K=V", name="--set-tag")

@@ -13,8 +13,7 @@ import click
 from hybridlog.cli import output
 from hybridlog.cli.answers import answering, check_room, form_of, write_bytes
 from hybridlog.cli.binder import command, option
-from hybridlog.cli.completion import complete_path
-from hybridlog.cli.options import Asking, Forced, parse_fields
+from hybridlog.cli.options import Filtered, Forced, Verbose, parse_fields
 from hybridlog.cli.render import Column, print_table
 from hybridlog_storage.errors import UsageError
 
@@ -30,12 +29,11 @@ _SIZE = re.compile(r"(\d{2,4})x(\d{2,4})")
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Given(Asking, Forced):
+class _Given(Verbose, Filtered, Forced):
     needs_topic: ClassVar[bool] = True
     fields: str | None = option(
         "Fields that are numbers (ranges.min, position[2]), or messages with numbers.",
         "A,B.C",
-        shell_complete=complete_path,
     )
     output: Path | None = option(
         "Write a picture (.png, .svg, .pdf); - is standard output. Without: a line of text for "
@@ -110,7 +108,7 @@ def _ends(series: Series) -> tuple[str, str]:
 
 
 def _line(line: Line, width: int = _LETTERS) -> str:
-    from hybridlog.cli.sparkline import sparkline
+    from hybridlog.cli.render import sparkline
 
     return sparkline(line.series.by_column(width))
 

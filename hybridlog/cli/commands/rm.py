@@ -12,7 +12,7 @@ import click
 from hybridlog.cli import output
 from hybridlog.cli.binder import command, option
 from hybridlog.cli.commands.ls import RECORDINGS
-from hybridlog.cli.options import InStore, Named, Quiet, names_argument, recordings_of
+from hybridlog.cli.options import Choosing, InStore, Quiet, names_argument, recordings_of
 from hybridlog.cli.render import print_table
 from hybridlog.cli.signals import if_stopped
 from hybridlog.wording import listed
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Given(Named, InStore, Quiet):
+class _Given(Choosing, InStore, Quiet):
     names: tuple[str, ...] = names_argument(  # type: ignore[misc]
         what="These recordings", without="those that the options choose"
     )

@@ -7,20 +7,18 @@ from typing import ClassVar
 
 from hybridlog.cli.answers import Listing, answering
 from hybridlog.cli.binder import command, option
-from hybridlog.cli.completion import complete_path
-from hybridlog.cli.options import Asking, parse_fields
+from hybridlog.cli.options import Filtered, Verbose, parse_fields
 from hybridlog.cli.render import Column
 
 _NAMES = ("count", "nan", "infinite", "min", "max", "mean", "std")
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Given(Asking, Listing):
+class _Given(Verbose, Filtered, Listing):
     needs_topic: ClassVar[bool] = True
     fields: str | None = option(
         "Only these fields, also summaries and arrays; without, all that are numbers.",
         "A,B.C",
-        shell_complete=complete_path,
     )
 
 

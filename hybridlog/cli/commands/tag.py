@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 from hybridlog.cli import options, output
 from hybridlog.cli.binder import argument, command, option
-from hybridlog.cli.completion import complete_recording
 from hybridlog.cli.options import AsJson, Choosing, InStore, Quiet, recordings_of
 from hybridlog.query.choice import Choice
 from hybridlog_storage.errors import UsageError
@@ -18,7 +17,6 @@ class _Given(Choosing, InStore, AsJson, Quiet):
         "A recording, as for --recording, unless options choose; and tags to set. Without "
         "tags, show them.",
         "[RECORDING] [KEY=VALUE]...",
-        shell_complete=complete_recording,
     )
     remove: tuple[str, ...] = option("Remove this tag.", "KEY")
 

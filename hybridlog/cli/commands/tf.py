@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, ClassVar
 
 from hybridlog.cli.answers import SCREEN, Tabular
 from hybridlog.cli.binder import argument, command, option
-from hybridlog.cli.completion import complete_frame
 from hybridlog.cli.options import Strict, Topics, Verbose, tf_topic, topics
-from hybridlog.cli.output import remarks, short_duration
-from hybridlog.cli.render import Column, print_table
+from hybridlog.cli.output import remarks
+from hybridlog.cli.render import Column, duration_of, print_table, rate_of
 from hybridlog.wording import counted, listed
 from hybridlog_storage.errors import IncompleteError, UsageError
 from hybridlog_storage.times import END
@@ -34,13 +33,10 @@ if TYPE_CHECKING:
 @dataclass(frozen=True, kw_only=True)
 class _Given(Strict, Verbose, Topics, Tabular):
     words: ClassVar[tuple[str, ...]] = ()  # type: ignore[misc]
-    target: str | None = argument(
-        "The frame of the results.", "[TARGET]", shell_complete=complete_frame
-    )
+    target: str | None = argument("The frame of the results.", "[TARGET]")
     source: str | None = argument(
         "The frame to transform from; with -t, without, that of the topic's messages.",
         "[SOURCE]",
-        shell_complete=complete_frame,
     )
     at: tuple[str, ...] = option(
         "At this time.", "TIME", needs=("target",), excludes=("step", "topic", "between")
@@ -108,8 +104,10 @@ def _show_transforms(given: _Given, target: str, trees: Trees, query: Query | No
         source = frames[0] if source is None and len(frames) == 1 and frames[0] else source
     if source is None:
         raise UsageError("A transform has two frames: name TARGET and SOURCE.")
-    found = trees.lookup(topic, target, source, stamps, log_time, extrapolate=extrapolate)
-    if len(found) == 1 and found.missing:
+    shown = slice(given.limit)  # reasons are about the rows that are given
+    asked_at = stamps[shown], log_time[shown]
+    found = trees.lookup(topic, target, source, *asked_at, extrapolate=extrapolate)
+    if len(stamps) == len(found) == 1 and found.missing:
         tree.transform(target, source, int(stamps[0]), extrapolate=extrapolate)
     given.answer([found.to_arrow()])
     sys.stdout.flush()
@@ -172,7 +170,7 @@ _FRAMES = [
         lambda row: row[2] and ("static" if row[2].is_static else len(row[2].stamps)),
         "right",
     ),
-    Column("Hz", lambda row: row[2] and row[2].rate_hz and f"{row[2].rate_hz:.2f}", "right"),
-    Column("longest gap", lambda row: row[4] and short_duration(row[4][1] - row[4][0]), "right"),
+    rate_of("Hz", lambda row: row[2] and row[2].rate_hz),
+    duration_of("longest gap", lambda row: row[4] and row[4][1] - row[4][0]),
     Column("from", lambda row: row[4] and f"{(row[4][0] - row[3]) / 1e9:+.3f}s", "right"),
 ]

@@ -1,20 +1,21 @@
-"""`hybridlog top`: watches a running recorder."""
+"""`hybridlog top`: watches a running recorder; the state of a recorder as a table."""
 
 from __future__ import annotations
 
 import sys
+import textwrap
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final, Self
 
 from hybridlog.cli import output
 from hybridlog.cli.binder import argument, command, option
-from hybridlog.cli.completion import complete_field, complete_running
 from hybridlog.cli.options import AsJson, InStore
 from hybridlog.cli.render import Column, numbers, table_lines
 from hybridlog.cli.signals import Stopped
+from hybridlog.record.losses import Cause
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.stopping import at_safe_points
 
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from hybridlog.store import Store
 
 _EVERY_S = 1.0
+_SHORT = 60  # characters of a reason
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,12 +32,10 @@ class _Given(InStore, AsJson):
     recording: str | None = argument(
         "One of several recorders: id or name of its recording, or the beginning of the id.",
         "[RECORDING]",
-        shell_complete=complete_running,
     )
     field: tuple[str, ...] = option(
         "Least, mean and greatest of a field in the last seconds, such as scan:ranges.min.",
         "TOPIC:FIELD",
-        shell_complete=complete_field,
     )
     window: str = option(
         "The time that --field covers, up to now.", "TIME", name="--last", default="5s"
@@ -50,7 +50,6 @@ def top_command(given: _Given) -> None:
 
     Without a terminal, and without --json, the state is shown once.
     """
-    from hybridlog.cli.live_table import LiveTable, drawn
     from hybridlog.live.state import choose, states, summary_of
     from hybridlog.query.times import parse_duration
     from hybridlog.store import store_path
@@ -63,9 +62,7 @@ def top_command(given: _Given) -> None:
     name = recorder
     on_screen = not given.as_json and sys.stdout.isatty() and not given.once
     with suppress(Stopped), at_safe_points(), ExitStack() as held:
-        opened = None
-        if fields:
-            opened = held.enter_context(given.opened())
+        opened = held.enter_context(given.opened()) if fields else None
         table = held.enter_context(LiveTable(error=False)) if on_screen else None
         for state in states(directory, recorder, _EVERY_S):
             name = state.name
@@ -78,7 +75,7 @@ def top_command(given: _Given) -> None:
             elif table is not None:
                 table.show(state, below)
             else:
-                for line in drawn(state, width=width, below=below):
+                for line in _drawn(state, width=width, below=below):
                     output.say(line)
             if given.once or not (given.as_json or on_screen):
                 return
@@ -110,14 +107,8 @@ def _values(
         (topic, *others) = resolve([name], topics)
         if others:
             raise UsageError(f"{name!r} fits several topics: name one.")
-        row = {
-            "topic": topic,
-            "field": field,
-            "n": 0,
-            "least": None,
-            "mean": None,
-            "greatest": None,
-        }
+        row: dict[str, Any] = {"topic": topic, "field": field, "n": 0}
+        row |= dict.fromkeys(("least", "mean", "greatest"))
         with suppress(UsageError):  # nothing has come yet
             (one, *_) = store.query([topic], [recording]).between(since).stats(field)
             row |= {"n": one.count, "least": one.min, "mean": one.mean, "greatest": one.max}
@@ -125,4 +116,101 @@ def _values(
     return found
 
 
-_FIELDS = [Column("topic"), Column("field"), *numbers("n", "least", "mean", "greatest")]
+_FIELDS: Final = [Column("topic"), Column("field"), *numbers("n", "least", "mean", "greatest")]
+
+
+class LiveTable:
+    """The state as a table that updates in place; a context manager that removes it at the end."""
+
+    def __init__(self, *, error: bool = True) -> None:
+        from rich.live import Live
+
+        self._live = Live(
+            console=output.console(error=error), auto_refresh=False, transient=True, screen=False
+        )
+
+    def __enter__(self) -> Self:
+        """Begin to draw."""
+        self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Remove the table."""
+        self._live.stop()
+
+    def show(self, state: RecorderState, below: Sequence[str] = ()) -> None:
+        """Draw a state, with lines below it."""
+        from rich.text import Text
+
+        size = self._live.console.size
+        lines = _drawn(state, width=size.width, height=size.height - 1, below=below)
+        self._live.update(Text("\n".join(lines), overflow="crop", no_wrap=True), refresh=True)
+
+
+def _drawn(
+    state: RecorderState, *, width: int, height: int | None = None, below: Sequence[str] = ()
+) -> list[str]:
+    """A state as the lines of a table of topics, with others below it."""
+    # Broken between its parts only.
+    whole = summary(state).replace(" ", "\N{NO-BREAK SPACE}").replace("·\N{NO-BREAK SPACE}", "· ")
+    ends = [line.replace("\N{NO-BREAK SPACE}", " ") for line in textwrap.wrap(whole, width)]
+    below = [*(f"{topic} is silent" for topic in state.silent), *below]
+    below = [line for each in below for line in textwrap.wrap(output.printable(each), width)]
+    topics = state.topics
+    rows = len(topics) if height is None else max(height - 1 - len(ends) - len(below), 4)
+    if len(topics) > rows:
+        # Those with losses first, then those with most bytes; a line tells of the others.
+        first = sorted(topics, key=lambda t: (-t.lost, -t.bytes_per_s, t.topic))[: rows - 1]
+        shown = {topic.topic for topic in first}
+        topics = [topic for topic in topics if topic.topic in shown]
+    name = Column("topic", lambda topic: _cut(output.printable(topic.topic), width // 2), "whole")
+    lines = table_lines(
+        [name, *(one for one in _COLUMNS if any(map(one.cell, topics)))], topics, width
+    )
+    if left := len(state.topics) - len(topics):
+        lines.append(f"… and {output.counted(left, 'more topic')}")
+    return [*lines, *ends, *below]
+
+
+def _optional(value: float | None) -> str:
+    return "" if value is None else f"{value:.1f}"
+
+
+_COLUMNS: Final = [
+    Column("Hz", lambda topic: f"{topic.hz:.1f}", "right"),
+    Column("usual", lambda topic: _optional(topic.expected_hz), "right", order=2),
+    Column("MB/s", lambda topic: f"{topic.bytes_per_s / 1e6:.2f}", "right", order=3),
+    Column("jitter ms", lambda topic: _optional(topic.jitter_ms), "right", order=1),
+    Column("messages", lambda topic: topic.messages, "right"),
+    Column("thinned", lambda topic: topic.thinned or "", "right", order=4),
+    Column("lost", lambda topic: topic.lost or "", "right"),
+]
+
+
+def _cut(name: str, room: int) -> str:
+    """A name without its middle if it is too long: both ends tell topics apart."""
+    if len(name) <= room:
+        return name
+    end = room // 2
+    return f"{name[: max(room - end - 1, 0)]}…{name[-end:]}"
+
+
+def summary(state: RecorderState) -> str:
+    """One line for the whole recorder."""
+    reason = state.index_failure.partition("\n")[0].partition(". ")[0].rstrip(".")
+    why = f": {output.cut(output.printable(reason), _SHORT)}" if reason else ""
+    parts = [
+        f"{state.elapsed_s:.0f} s",
+        f"{state.hz:.0f} messages/s",
+        f"{output.size(state.bytes_per_s)}/s",
+        f"{output.size(state.stored_bytes)} stored",
+        f"memory {100 * state.filled:.0f} %",
+        f"index {state.lag} behind{why}" if state.lag or why else "index up to date",
+        f"{output.size(state.free_bytes)} free",
+    ]
+    causes = {cause: count for cause, count in state.lost.items() if cause != Cause.THROTTLE}
+    if causes:
+        # A cause without a number stands for an unknown number.
+        named = [f"{cause} {count or 'unknown'}" for cause, count in sorted(causes.items())]
+        parts.append(f"lost {sum(causes.values()) or 'unknown'} ({', '.join(named)})")
+    return " · ".join(parts)

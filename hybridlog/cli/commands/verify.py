@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 from hybridlog.cli import output
 from hybridlog.cli.binder import command, option
-from hybridlog.cli.options import AsJson, InStore, Named, Quiet, recordings_of
-from hybridlog.cli.progress import Bar
+from hybridlog.cli.options import AsJson, Choosing, InStore, Quiet, names_argument, recordings_of
+from hybridlog.cli.output import Bar
 from hybridlog.wording import listed
 from hybridlog_storage.errors import DatabaseError, TopicError, WithoutMongoError
 
@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Given(Named, InStore, AsJson, Quiet):
+class _Given(Choosing, InStore, AsJson, Quiet):
+    names: tuple[str, ...] = names_argument()  # type: ignore[misc]
     repair: bool = option("Mend what can be mended without losing anything; list the rest.")
     new_id: bool = option(
         "With --repair: the store is a copy, give it an id of its own, with the index at --mongo.",
