@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Collection, Generator, Iterator, Sequence
+from collections.abc import Collection, Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, TypeAlias
 
@@ -143,66 +143,34 @@ FASTEST: Final = 100.0
 
 
 class PlaybackClock:
-    """Log time during a playback. It stands still at first.
-
-    Args:
-        position: Log time, ns.
-        speed: Seconds of log time a second; limited to `SLOWEST` and `FASTEST`.
-        monotonic_ns: The clock of the machine, ns.
+    """Log time, ns, during a playback; it stands still until it runs.
 
     Attributes:
-        speed: As above.
+        speed: Seconds of log time a second.
         is_running: The time runs.
     """
 
-    def __init__(
-        self,
-        position: int,
-        speed: float = 1.0,
-        monotonic_ns: Callable[[], int] = time.monotonic_ns,
-    ) -> None:
-        self.speed = limited(speed, 1.0)
-        self.is_running = False
-        self._monotonic_ns = monotonic_ns
-        self._position = position
-        self._since = monotonic_ns()
+    def __init__(self, position: int, speed: float) -> None:
+        self.speed, self.is_running = 1.0, False
+        self._position = self._since = 0
+        self.set(position, speed=speed)
 
     @property
     def position(self) -> int:
         """Log time now, ns."""
-        if not self.is_running:
-            return self._position
-        return self._position + int((self._monotonic_ns() - self._since) * self.speed)
+        passed = time.monotonic_ns() - self._since if self.is_running else 0
+        return self._position + int(passed * self.speed)
 
-    def play(self) -> None:
-        """Let the time run."""
-        self.set(self.position)
-        self.is_running = True
+    def set(
+        self, position: int | None = None, *, runs: bool | None = None, speed: float = math.nan
+    ) -> None:
+        """Go to a log time, ns, run or stand still, and change the speed, within its limits.
 
-    def pause(self) -> None:
-        """Let the time stand still."""
-        self.set(self.position)
-        self.is_running = False
-
-    def set(self, position: int) -> None:
-        """Go to a log time, ns; the time runs on from there, or stands still."""
-        self._position, self._since = position, self._monotonic_ns()
-
-    def set_speed(self, speed: float) -> None:
-        """Run faster or slower; what is no number changes nothing."""
-        self.set(self.position)
-        self.speed = limited(speed, self.speed)
-
-    def wait_for(self, position: int, seconds: float) -> None:
-        """Go back to a log time, ns, if the running clock is more than some seconds ahead."""
-        if self.is_running and self.position - position > seconds * self.speed * 1e9:
-            self.set(position)
-
-    def seconds_until(self, position: int) -> float:
-        """Seconds until the running clock shows a log time, ns; not negative."""
-        return max(position - self.position, 0) / self.speed / 1e9
-
-
-def limited(speed: float, otherwise: float) -> float:
-    """A speed between `SLOWEST` and `FASTEST`; `otherwise` if it is no number."""
-    return otherwise if math.isnan(speed) else min(max(speed, SLOWEST), FASTEST)
+        What is not given stays; so does the speed if it is NaN.
+        """
+        self._position = self.position if position is None else position
+        self._since = time.monotonic_ns()
+        if runs is not None:
+            self.is_running = runs
+        if not math.isnan(speed):
+            self.speed = min(max(speed, SLOWEST), FASTEST)

@@ -1,9 +1,8 @@
 """A Foxglove WebSocket server that plays a log to its clients.
 
 All clients share one playback, as the protocol has it: a pause or a seek of one is for all.
-One task plays. It obeys the requests of clients one after the other, and between two of them it
-sends what is due. It waits for the slowest client: the log time then runs slower, and no
-message is dropped. Only subscribed topics are read.
+Requests of clients and what is due are sent in turns. The playback waits for the slowest client:
+the log time then runs slower, and no message is dropped. Only subscribed topics are read.
 """
 
 from __future__ import annotations
@@ -12,37 +11,20 @@ import asyncio
 import contextlib
 import secrets
 import time
-from collections.abc import Callable, Collection, Coroutine, Sequence
+from collections.abc import AsyncIterator, Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 
 from hybridlog.live.sources.foxglove.protocol import SUBPROTOCOLS
 from hybridlog.view.loopback import Admission, listen
+from hybridlog.view.playback import protocol
 from hybridlog.view.playback.played import PlaybackClock
-from hybridlog.view.playback.protocol import (
-    Control,
-    Level,
-    Request,
-    RequestError,
-    Status,
-    Subscribe,
-    SubscribeGraph,
-    Unsubscribe,
-    advertise,
-    connection_graph,
-    message_data,
-    parse,
-    playback_state,
-    server_info,
-    status,
-    time_now,
-)
 from hybridlog_storage.errors import HybridlogError
 
 if TYPE_CHECKING:
@@ -56,7 +38,6 @@ if TYPE_CHECKING:
 _WITH_PLAYBACK: Final = SUBPROTOCOLS[0]
 _MAX_CLIENTS: Final = 32
 _MAX_REQUEST: Final = 8 << 20  # bytes; subscriptions to 65,535 channels take 3 MB
-_MAX_WAITING: Final = 64  # requests; then clients have to wait
 _MAX_SENT: Final = 1 << 20  # bytes of payload between two looks at requests
 _TICK_S: Final = 1 / 30  # between two messages with the time
 _STEP_S: Final = 0.002  # of waiting, at least, so that many messages are sent at once
@@ -95,11 +76,6 @@ class _Client:
         """Send a message and wait until the client takes it, if it is slow."""
         with contextlib.suppress(ConnectionClosed):  # its own task ends with it
             await self.connection.send(message)
-
-    async def send_state(self, state: bytes) -> None:
-        """Send what the playback does, if the client's protocol has that."""
-        if self.connection.subprotocol == _WITH_PLAYBACK:
-            await self.send(state)
 
 
 class _Reading:
@@ -140,14 +116,7 @@ class _Reading:
 
 
 class PlaybackServer:
-    """Plays a log to Foxglove clients.
-
-    Args:
-        log: The messages.
-        name: What clients call the server.
-        options: How they are played.
-        say: Takes lines for the user who has started the server.
-    """
+    """Plays a log to Foxglove clients, under a name; `say` takes lines for the user."""
 
     def __init__(
         self, log: PlayedLog, name: str, options: PlaybackOptions, say: Callable[[str], None]
@@ -160,7 +129,9 @@ class PlaybackServer:
         self._session = secrets.token_hex(8)
         self._topics = {each.id: each.channel.topic for each in log.channels}
         self._clients: list[_Client] = []
-        self._requests: asyncio.Queue[tuple[_Client, Request | None]] = asyncio.Queue(_MAX_WAITING)
+        self._turn = asyncio.Lock()
+        self._waiting = 0  # for their turn
+        self._asked = asyncio.Event()
         self._executor = ThreadPoolExecutor(1, "hybridlog-playback")
         self._refused: set[str] = set()
         self._reading: _Reading | None = None
@@ -174,19 +145,22 @@ class PlaybackServer:
         self._clock_sent_s = 0.0  # when clients were told the time
         self._has_begun = self._options.is_paused
         self._has_ended = False
-        self._read(())
+        self._read()
 
     async def run(self, stop: asyncio.Event, ready: Callable[[int], None]) -> None:
-        """Serve until stopped.
-
-        Args:
-            stop: Set to end this; clients are told goodbye.
-            ready: Called with the port when clients can connect.
-
-        Raises:
-            UsageError: The port is taken.
-        """
-        server = await self._listen()
+        """Serve until stopped, and say goodbye; `ready` gets the port when clients can connect."""
+        protocols: Sequence[Subprotocol] = SUBPROTOCOLS  # type: ignore[assignment]
+        server = await serve(
+            self._serve,
+            sock=listen(self._options.port),
+            subprotocols=protocols,
+            process_request=self._check,
+            compression=None,
+            max_size=_MAX_REQUEST,
+            ping_interval=_PING_S,
+            ping_timeout=_PING_S,
+            close_timeout=_CLOSE_S,
+        )
         playing = asyncio.create_task(self._play())
         stopping = asyncio.create_task(stop.wait())
         try:
@@ -199,22 +173,9 @@ class PlaybackServer:
             playing.cancel()
             stopping.cancel()
             await asyncio.gather(playing, stopping, return_exceptions=True)
-            self._read(())
+            self._clients.clear()
+            self._read()
             self._executor.shutdown()
-
-    async def _listen(self) -> Server:
-        protocols: Sequence[Subprotocol] = SUBPROTOCOLS  # type: ignore[assignment]
-        return await serve(
-            self._serve,
-            sock=listen(self._options.port),
-            subprotocols=protocols,
-            process_request=self._check,
-            compression=None,
-            max_size=_MAX_REQUEST,
-            ping_interval=_PING_S,
-            ping_timeout=_PING_S,
-            close_timeout=_CLOSE_S,
-        )
 
     # Clients.
 
@@ -234,151 +195,140 @@ class PlaybackServer:
 
     async def _serve(self, connection: ServerConnection) -> None:
         """Serve a client until it goes."""
-        client = _Client(connection)
-        info = server_info(self._name, self._session, self._log.begin, self._log.end)
-        await client.send(info)
-        await client.send(advertise(self._log.channels))
+        client, log = _Client(connection), self._log
+        await client.send(protocol.server_info(self._name, self._session, log.begin, log.end))
+        await client.send(protocol.advertise(log.channels))
         self._clients.append(client)
         try:
-            await client.send_state(self._state())
+            await self._send_state([client])
             async for message in connection:
-                try:
-                    request = parse(message)
-                except RequestError as error:
-                    await client.send(status(Level.ERROR, str(error)))
-                else:
-                    await self._requests.put((client, request))
+                async with self._in_turn():
+                    await self._obey(client, message)
+                self._asked.set()
         except ConnectionClosed:
             pass  # it has gone without a farewell
         finally:
             self._clients.remove(client)
-            await self._requests.put((client, None))
+            async with self._in_turn():
+                if self._clients:
+                    self._read()
+                else:
+                    self._rewind()
+
+    @contextlib.asynccontextmanager
+    async def _in_turn(self) -> AsyncIterator[None]:
+        """One after the other; where messages cannot be read, the playback pauses and says so."""
+        self._waiting += 1
+        try:
+            await self._turn.acquire()
+        finally:
+            self._waiting -= 1
+        try:
+            yield
+        except HybridlogError as error:
+            self._clock.set(runs=False)
+            self._read(())
+            self._say(str(error))
+            await self._broadcast(protocol.status(protocol.ERROR, str(error)))
+            await self._send_state(self._clients)
+        finally:
+            self._turn.release()
 
     async def _broadcast(self, message: str | bytes) -> None:
         await asyncio.gather(*(client.send(message) for client in self._clients))
 
-    async def _broadcast_state(self, *, seek: int | None = None, request: bytes = b"") -> None:
-        state = self._state(seek=seek, request=request)
-        await asyncio.gather(*(client.send_state(state) for client in self._clients))
-
-    def _state(self, *, seek: int | None = None, request: bytes = b"") -> bytes:
-        """A message with the state of the playback, perhaps after a seek to a log time."""
-        doing = Status.PLAYING if self._clock.is_running else Status.PAUSED
+    async def _send_state(
+        self, clients: Sequence[_Client], *, seek: int | None = None, request: bytes = b""
+    ) -> None:
+        """Tell clients whose protocol has it what the playback does, perhaps after a seek."""
+        state = protocol.PLAYING if self._clock.is_running else protocol.PAUSED
         if self._has_ended:
-            doing = Status.ENDED
+            state = protocol.ENDED
         position = min(self._clock.position, self._log.end) if seek is None else seek
-        return playback_state(
-            doing, position, self._clock.speed, did_seek=seek is not None, request=request
+        message = protocol.playback_state(
+            state, position, self._clock.speed, did_seek=seek is not None, request=request
         )
+        told = [one for one in clients if one.connection.subprotocol == _WITH_PLAYBACK]
+        await asyncio.gather(*(client.send(message) for client in told))
 
-    # The task that plays.
-
-    async def _play(self) -> None:
-        """Obey requests, and send what is due, until cancelled."""
-        while True:
-            try:
-                async with asyncio.timeout(self._seconds_to_wait()):
-                    client, request = await self._requests.get()
-            except TimeoutError:
-                pass
-            else:
-                await self._guarded(self._obey(client, request))
-            await self._guarded(self._send_due())
-
-    async def _guarded(self, work: Coroutine[object, object, None]) -> None:
-        """Pause where messages cannot be read, and say so."""
+    async def _obey(self, client: _Client, message: str | bytes) -> None:
         try:
-            await work
-        except HybridlogError as error:
-            self._clock.pause()
-            self._read(())
-            self._say(str(error))
-            await self._broadcast(status(Level.ERROR, str(error)))
-            await self._broadcast_state()
-
-    def _seconds_to_wait(self) -> float | None:
-        """Seconds until something is to be sent; None if nothing is."""
-        if not self._clock.is_running:
-            return None
-        if self._next is None:
-            return _TICK_S
-        return min(max(self._clock.seconds_until(self._next), _STEP_S), _TICK_S)
-
-    async def _obey(self, client: _Client, request: Request | None) -> None:
-        if request is None:
-            if not self._clients:
-                self._rewind()
-            else:
-                self._read_subscribed()
-        elif isinstance(request, Subscribe):
+            request = protocol.parse(message)
+        except protocol.RequestError as error:
+            await client.send(protocol.status(protocol.ERROR, str(error)))
+            return
+        if isinstance(request, protocol.Subscribe):
             await self._subscribe(client, request)
-        elif isinstance(request, Unsubscribe):
+        elif isinstance(request, protocol.Unsubscribe):
             ended = set(request.subscriptions)
             own = client.subscriptions
             client.subscriptions = {c: s for c, s in own.items() if s not in ended}
-            self._read_subscribed()
-        elif isinstance(request, SubscribeGraph):
-            await client.send(connection_graph(self._log.channels))
-        elif isinstance(request, Control):
+            self._read()
+        elif isinstance(request, protocol.SubscribeGraph):
+            await client.send(protocol.connection_graph(self._log.channels))
+        elif isinstance(request, protocol.Control):
             await self._control(request)
 
-    async def _subscribe(self, client: _Client, request: Subscribe) -> None:
+    async def _subscribe(self, client: _Client, request: protocol.Subscribe) -> None:
         """Begin subscriptions with the messages that are current now."""
-        new = []
-        taken = set(client.subscriptions.values())
+        new = set()
         for each in request.subscriptions:
             number, channel = each.id, each.channel
             if channel not in self._topics:
-                await client.send(status(Level.ERROR, f"there is no channel {channel}"))
-            elif channel in client.subscriptions or number in taken:
+                text = f"there is no channel {channel}"
+                await client.send(protocol.status(protocol.ERROR, text))
+            elif channel in client.subscriptions or number in client.subscriptions.values():
                 text = f"there is a subscription {number}, or one to channel {channel}"
-                await client.send(status(Level.WARNING, text))
+                await client.send(protocol.status(protocol.WARNING, text))
             else:
                 client.subscriptions[channel] = number
-                new.append(channel)
-        self._read_subscribed()
-        await self._send_current([client], set(new))
+                new.add(channel)
+        self._read()
+        await self._send_current([client], new)
         if new and not self._has_begun:
             self._has_begun = True
-            self._clock.play()
-            await self._broadcast_state()
+            self._clock.set(runs=True)
+            await self._send_state(self._clients)
 
-    async def _control(self, request: Control) -> None:
+    async def _control(self, request: protocol.Control) -> None:
         """Play, pause, seek or change the speed, for all clients."""
         self._has_begun = True
-        self._clock.set_speed(request.speed)
         seek = request.seek
         if seek is not None:
             seek = min(max(seek, self._log.begin), self._log.end)
             self._has_ended = False
-        if request.plays and not self._has_ended:
-            self._clock.play()
-            if self._reading is None:  # after an error, or nothing is subscribed
-                self._read_subscribed()
-        else:
-            self._clock.pause()
-        if seek is None:
-            await self._broadcast_state(request=request.id)
-        else:
+        self._clock.set(runs=request.plays and not self._has_ended, speed=request.speed)
+        if seek is not None:
             await self._go_to(seek, request.id)
+            return
+        if self._clock.is_running and self._reading is None:
+            self._read()  # after an error
+        await self._send_state(self._clients, request=request.id)
 
     async def _go_to(self, position: int, request: bytes = b"") -> None:
         """Set the clock to a log time, and show what is current there."""
         self._sent = position - 1
         self._clock.set(position)
-        await self._broadcast_state(seek=position, request=request)
-        await self._broadcast(time_now(position))
-        self._read_subscribed()
+        await self._send_state(self._clients, seek=position, request=request)
+        await self._broadcast(protocol.time_now(position))
+        self._read()
         await self._send_current(self._clients, set(self._topics))
 
-    async def _send_current(self, clients: Sequence[_Client], channels: Collection[int]) -> None:
-        """Send the messages of channels that are current to their subscribers among clients."""
-        wanted = {c for client in clients for c in client.subscriptions if c in channels}
-        topics = sorted({self._topics[channel] for channel in wanted})
-        reading = _Reading(self._log.current(topics, self._sent), self._executor)
-        while await reading.next_time() is not None:
-            batch, _ = reading.take(self._sent)
-            await self._send(clients, batch, wanted)
+    # Messages.
+
+    async def _play(self) -> None:
+        """Send what is due, until cancelled."""
+        while True:
+            async with self._in_turn():
+                await self._send_due()
+            seconds = _TICK_S if self._clock.is_running else None
+            if seconds is not None and self._next is not None:
+                ahead = (self._next - self._clock.position) / self._clock.speed / 1e9
+                seconds = min(max(ahead, _STEP_S), _TICK_S)
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(seconds):
+                    await self._asked.wait()
+            self._asked.clear()
 
     async def _send_due(self) -> None:
         """Send all messages until the time of the clock."""
@@ -388,21 +338,20 @@ class PlaybackServer:
         self._next = await self._next_time()
         while self._next is not None:
             # Messages of the same time belong together, even if others wait.
-            if self._next > self._sent and not self._requests.empty():
-                break
             now = max(self._clock.position, self._sent)
-            if self._next > now:
+            if self._next > now or (self._next > self._sent and self._waiting):
                 break
             assert self._reading is not None
             batch, self._sent = self._reading.take(now)
             await self._send(self._clients, batch, self._topics)
-            self._clock.wait_for(self._sent, _LATE_S)
+            if self._clock.position - self._sent > _LATE_S * self._clock.speed * 1e9:
+                self._clock.set(self._sent)
             self._next = await self._next_time()
         last = self._log.end if self._next is None else self._next - 1
         self._sent = max(self._sent, min(self._clock.position, last))
         if self._sent > before and time.monotonic() - self._clock_sent_s > _TICK_S:
             self._clock_sent_s = time.monotonic()
-            await self._broadcast(time_now(self._sent))
+            await self._broadcast(protocol.time_now(self._sent))
         await self._go_on()
 
     async def _next_time(self) -> int | None:
@@ -416,36 +365,45 @@ class PlaybackServer:
             if self._options.loops:
                 await self._go_to(self._log.begin)
                 return
-            self._clock.pause()
-            self._clock.set(self._log.end)
+            self._clock.set(self._log.end, runs=False)
             self._has_ended = True
-            await self._broadcast(time_now(self._log.end))
-            await self._broadcast_state()
+            await self._broadcast(protocol.time_now(self._log.end))
+            await self._send_state(self._clients)
             return
         then = self._log.next_covered(self._sent)
         if then > self._sent:
             self._sent = then - 1
             self._clock.set(then)
-            await self._broadcast_state()
+            await self._send_state(self._clients)
+
+    async def _send_current(self, clients: Sequence[_Client], channels: Collection[int]) -> None:
+        """Send the messages of channels that are current to their subscribers among clients."""
+        wanted = {c for client in clients for c in client.subscriptions if c in channels}
+        topics = sorted({self._topics[channel] for channel in wanted})
+        reading = _Reading(self._log.current(topics, self._sent), self._executor)
+        while await reading.next_time() is not None:
+            batch, _ = reading.take(self._sent)
+            await self._send(clients, batch, wanted)
 
     async def _send(
         self, clients: Sequence[_Client], batch: Batch, channels: Collection[int]
     ) -> None:
         """Send messages to the subscribers of their channels."""
-        await asyncio.gather(*(self._send_to(client, batch, channels) for client in clients))
+        rows = [*zip(batch.channel.tolist(), batch.log_time.tolist(), strict=True)]
 
-    async def _send_to(self, client: _Client, batch: Batch, channels: Collection[int]) -> None:
-        own = {c: s for c, s in client.subscriptions.items() if c in channels}
-        rows = zip(batch.channel.tolist(), batch.log_time.tolist(), strict=True)
-        for row, (channel, log_time) in enumerate(rows):
-            if channel in own:
-                await client.send(message_data(own[channel], log_time, batch.payload(row)))
+        async def send(client: _Client) -> None:
+            own = {c: s for c, s in client.subscriptions.items() if c in channels}
+            for row, (channel, log_time) in enumerate(rows):
+                if channel in own:
+                    message = protocol.message_data(own[channel], log_time, batch.payload(row))
+                    await client.send(message)
 
-    def _read_subscribed(self) -> None:
-        """Read the subscribed topics behind what is sent already."""
-        self._read({self._topics[c] for client in self._clients for c in client.subscriptions})
+        await asyncio.gather(*map(send, clients))
 
-    def _read(self, topics: Collection[str]) -> None:
+    def _read(self, topics: Collection[str] | None = None) -> None:
+        """Read topics, by default the subscribed ones, behind what is sent already."""
+        if topics is None:
+            topics = {self._topics[c] for client in self._clients for c in client.subscriptions}
         if self._reading is not None:
             self._reading.close()
             self._reading = None
