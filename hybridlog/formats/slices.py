@@ -1,14 +1,11 @@
-"""Slices: parts of a recording as files of their own, and those in the user's cache."""
+"""Slices: parts of a recording as files of their own."""
 
 from __future__ import annotations
 
 import hashlib
-import os
 import pickle
 import threading
-import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
@@ -17,8 +14,7 @@ from hybridlog.attachments import extras_of
 from hybridlog.formats import OUTPUTS
 from hybridlog.formats.answer import Answer
 from hybridlog.query.planner import Planner
-from hybridlog_storage.disk.files import user_directory
-from hybridlog_storage.errors import UsageError
+from hybridlog_storage.disk.unfinished import Unfinished, scratch_directory
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -88,59 +84,29 @@ def write_mcap(query: Query, path: Path) -> None:
 
 
 MAX_BYTES: Final = 16 << 30
-"""Bytes that the files in the cache may have together."""
-
-_NAME_DIGITS = 16
-_NAME_LENGTH = 50  # characters; a file name has 255 bytes at most
-_writing = threading.Lock()  # one at a time: they would compete for the disk
+"""Bytes of the files of slices that are kept beside the latest one."""
 
 
-def cached_slice(query: Query, name: str, write: Callable[[Query, Path], None]) -> Path:
-    """The MCAP file of a slice in `hybridlog/slices` of the user's cache.
+class SliceFiles:
+    """The MCAP files of slices that others read by ranges, as long as this object lives.
 
-    It is written, all or nothing, if there is none; those that are unused for longest make room for
-    it. A file is the same, byte for byte, whenever it is written again for the same state of the
-    recordings. Several threads and processes may use the same directory. A slice larger than all
-    files may be together raises UsageError. The file is called `name`, and its digest.
+    A file is the same, byte for byte, whenever it is written for the same state of the recordings.
     """
-    directory = user_directory("XDG_CACHE_HOME", ".cache", "slices") / "slices"
-    path = directory / f"{name[:_NAME_LENGTH]}-{fingerprint(query)[:_NAME_DIGITS]}.mcap"
-    if not _use(path):
-        with _writing:
-            if not _use(path):
-                _make_room(directory, payload_bytes(query))
-                write(query, path)
-    return path
 
+    def __init__(self) -> None:
+        self._folder: Unfinished | None = None
+        self._files: dict[str, Path] = {}
+        self._writing = threading.Lock()  # one at a time: they would compete for the disk
 
-def _use(path: Path) -> bool:
-    """Note that a file is used now; False if there is none."""
-    try:
-        os.utime(path, ns=(time.time_ns(), path.stat().st_mtime_ns))
-    except FileNotFoundError:
-        return False
-    return True
-
-
-def _make_room(directory: Path, size: int) -> None:
-    """Remove the files that are unused for longest, until `size` bytes fit."""
-    if size > MAX_BYTES:
-        raise UsageError(
-            f"This slice has about {size / 1e9:.0f} GB, and at most {MAX_BYTES / 1e9:.0f} GB are "
-            "kept: choose fewer topics or less time."
-        )
-    try:
-        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsageError(f"{directory} cannot be made: {error.strerror}.") from error
-    files = []
-    for path in directory.iterdir():
-        with suppress(FileNotFoundError):  # another process has removed it
-            about = path.lstat()
-            files.append((about.st_atime_ns, about.st_size, path))
-    total = sum(length for _, length, _ in files) + size
-    for _, length, path in sorted(files):
-        if total <= MAX_BYTES:
-            break
-        path.unlink(missing_ok=True)
-        total -= length
+    def get(self, query: Query) -> tuple[Path, str]:
+        """The file of a slice, which is written if there is none, and the digest of its content."""
+        digest = fingerprint(query)
+        with self._writing:
+            if digest not in self._files:
+                self._folder = self._folder or scratch_directory()
+                path = self._folder.path / f"{digest}.mcap"
+                write_mcap(query, path)
+                while sum(one.stat().st_size for one in self._files.values()) > MAX_BYTES:
+                    self._files.pop(next(iter(self._files))).unlink()
+                self._files[digest] = path
+            return self._files[digest], digest

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import base64
 import io
-import threading
-from collections.abc import Iterator
 from copy import copy
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,10 +13,11 @@ from mcap.reader import NonSeekingReader
 from starlette.testclient import TestClient
 
 import hybridlog as hl
-from hybridlog.formats.slices import cached_slice, write_mcap
+from hybridlog.formats.slices import SliceFiles, write_mcap
 from hybridlog.view.loopback import Admission
 from hybridlog.view.server import make_app
 from tests.independent import Seen, read_bag, read_mcap
+from tests.limits import Limit
 from tests.view.conftest import PORT, TOKEN, served
 from tests.waiting import at_once
 
@@ -33,14 +32,6 @@ S = 10**9
 def seen(demo_store: hl.Store) -> list[Seen]:
     """The bag as the `rosbags` package reads it."""
     return read_bag(demo_store.directory.path.parent / "robot.bag")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    with pytest.MonkeyPatch.context() as patch:
-        path = tmp_path_factory.mktemp("cache")
-        patch.setenv("XDG_CACHE_HOME", str(path))
-        yield path / "hybridlog" / "slices"
 
 
 @pytest.fixture(scope="module")
@@ -63,19 +54,14 @@ def test_a_slice_is_the_one_of_the_command_line(
     assert typed.content == app.get("slice.mcap", params=wanted).content
 
 
-def test_the_bytes_are_the_same_when_the_file_was_lost(app: TestClient, cache: Path) -> None:
+def test_the_bytes_are_the_same_when_the_file_had_to_go(app: TestClient, limit: Limit) -> None:
+    limit(slices_bytes=0)
     url = "slice.mcap?recording=robot&topic=/odom"
-    first = app.get(url)
-    (file,) = cache.glob(f"robot-{first.headers['etag'][1:-1]}.mcap")
-    written = file.stat().st_mtime_ns
-    assert app.get(url).content == first.content
-    assert file.stat().st_mtime_ns == written, "it is written once"
-    file.unlink()
+    first, other = app.get(url), app.get("slice.mcap?recording=robot&topic=/tf")
     again = app.get(url)
-    assert again.content == first.content
-    assert again.headers["etag"] == first.headers["etag"]
-    other = app.get("slice.mcap?recording=robot&topic=/tf")
-    assert other.headers["etag"] != first.headers["etag"]
+    assert again.content == first.content != other.content
+    assert again.headers["etag"] == first.headers["etag"] != other.headers["etag"]
+    assert again.headers["last-modified"] != "", "it is a file"
 
 
 def test_a_data_loader_gets_what_the_manifest_says(
@@ -195,26 +181,14 @@ def test_a_page_of_foxglove_reads_ranges(demo_store: hl.Store, page: Page) -> No
         assert content_range.startswith("bytes 0-7/")
 
 
-def test_a_slice_is_written_once_and_wholly(demo_store: hl.Store) -> None:
-    query = demo_store.query(["/odom"])
-    writers = []
-    together = threading.Barrier(4)
-
-    def write(query: hl.Query, path: Path) -> None:
-        writers.append(path)
-        write_mcap(query, path)
+def test_a_slice_is_written_once(demo_store: hl.Store) -> None:
+    query, files = demo_store.query(["/odom"]), SliceFiles()
+    found: list[tuple[int, str]] = []
 
     def get() -> None:
-        together.wait()
-        cached_slice(copy(query), "once", write)
+        path, digest = files.get(copy(query))
+        found.append((path.stat().st_ino, digest))
 
     at_once(*[get] * 4)
-    assert len(writers) == 1
-    assert len(read_mcap(writers[0])) == query.count()
-
-    def fail(query: hl.Query, path: Path) -> None:
-        raise OSError("no")
-
-    with pytest.raises(OSError, match="no"):
-        cached_slice(demo_store.query(["/tf"]), "wholly", fail)
-    assert cached_slice(demo_store.query(["/tf"]), "wholly", write).exists()
+    assert len({*found}) == 1
+    assert len(read_mcap(files.get(query)[0])) == query.count()

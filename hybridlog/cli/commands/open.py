@@ -17,16 +17,17 @@ from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.options import Filtered, Forced, Served
 from hybridlog.cli.signals import ended_by_signal
 from hybridlog.wording import listed
+from hybridlog_storage.disk.unfinished import scratch_directory
 from hybridlog_storage.errors import HybridlogError, MissingDependencyError
 
 if TYPE_CHECKING:
     from hybridlog.query.query import Query
-    from hybridlog.store import Store
     from hybridlog.view.playback.server import PlaybackServer
 
 _WEBSOCKET: Final = "websocket"
 _PLAYED: Final = (f"viewer={_WEBSOCKET}",)
 _PORT: Final = 8765
+_NAME_LENGTH: Final = 50  # characters; a file name has 255 bytes at most
 _PLAY: Final = "`hybridlog open websocket` plays to the one in the browser"
 
 
@@ -56,7 +57,7 @@ class _Given(Filtered, Forced, Served):
         type=click.Choice([*sorted(_VIEWERS), _WEBSOCKET]),
     )
     path: Path | None = option(
-        "Write the slice to this MCAP file; without, into the user's cache.",
+        "Write the slice to this MCAP file, which stays; without, to one that does not.",
         "FILE",
         name="--output",
         short="-o",
@@ -85,33 +86,28 @@ def open_command(given: _Given) -> None:
     if given.viewer == _WEBSOCKET:
         _play(given)
         return
+    from hybridlog.attachments import extras_of
+
     program = _find(given.viewer)
+    folder = None if given.path is not None else scratch_directory()
     with given.opened(snapshot=True) as store:
         query = given.query(store)
-        path = _written(store, query, given)
+        path = given.path
+        if folder is not None:
+            ids = query.recordings
+            name = store.entry(ids[0]).name if len(ids) == 1 else "slice"
+            path = folder.path / f"{name[:_NAME_LENGTH]}.mcap"
+        assert path is not None
+        write_answer(query, "mcap", path, extras=extras_of(query.session, query.question))
         opened = f"{path}: {output.size(path.stat().st_size)}, opened with {program}"
         output.remarks([*query.remarks(is_empty=False), opened])
     ended = subprocess.run(  # noqa: S603
         [program, *_VIEWERS[given.viewer][1], path.absolute()], check=False
     )
+    if folder is not None:
+        folder.remove()
     if ended.returncode:
         raise HybridlogError(f"{program} ended with exit code {ended.returncode}.")
-
-
-def _written(store: Store, query: Query, given: _Given) -> Path:
-    """The slice as an MCAP file."""
-    from hybridlog.attachments import extras_of
-    from hybridlog.formats.slices import cached_slice
-
-    def write(query: Query, path: Path) -> None:
-        write_answer(query, "mcap", path, extras=extras_of(query.session, query.question))
-
-    if given.path is None:
-        ids = query.recordings
-        name = store.entry(ids[0]).name if len(ids) == 1 else "slice"
-        return cached_slice(query, name, write)
-    write(query, given.path)
-    return given.path
 
 
 def _find(viewer: str) -> str:

@@ -1,7 +1,7 @@
 """Selections as MCAP for other viewers: files to read by ranges, and data for a remote data loader.
 
-A file is written into the user's cache when it is first asked for, and served from there. The
-data of the loader is made while it is sent, and nothing is kept.
+A file is written when it is first asked for, and goes with the server. The data of the loader is
+made while it is sent, and nothing is kept.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from starlette.responses import FileResponse
 
-from hybridlog.formats.slices import cached_slice, fingerprint, write_mcap
+from hybridlog.formats.slices import fingerprint
 from hybridlog.query.choice import Choice
 from hybridlog.query.predicate.tokens import MAX_TEXT
 from hybridlog.query.query import channels_of, spans_of
@@ -38,10 +38,8 @@ _MEDIA_TYPE: Final = "application/octet-stream"
 def slice_file(context: Context, params: RequestParams) -> Response:
     """A selection as an MCAP file; ranges of it can be asked for."""
     query = _query(context, params)
-    path = cached_slice(query, _name(context, query), write_mcap)
-    # The name has the digest of the question and of the state of its recordings.
-    etag = path.stem.rpartition("-")[2]
-    return FileResponse(path, headers={"ETag": f'"{etag}"'}, media_type=_MEDIA_TYPE)
+    path, digest = context.slices.get(query)
+    return FileResponse(path, headers={"ETag": f'"{digest[:16]}"'}, media_type=_MEDIA_TYPE)
 
 
 def manifest(context: Context, params: RequestParams) -> dict[str, Any]:
