@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from hybridlog.query.answers.interval_queries import IntervalQueries
 from hybridlog.query.periods import GAP_PERIODS, usual_period
 from hybridlog.query.planner import match_times
 from hybridlog.query.question import Question
-from hybridlog_storage.errors import ResourceError, SegmentError, TopicError, UsageError
+from hybridlog_storage.errors import ResourceError, SegmentError, TopicError
 from hybridlog_storage.times import BEGIN, END, placed
 
 if TYPE_CHECKING:
@@ -151,26 +151,21 @@ class Matches:
         """Its memory, bytes."""
         return self._times.nbytes + self._seqs.nbytes + self._held.nbytes
 
-    def ticks(self, span: Span, pixels: int) -> dict[str, Any]:
-        """The pixels with matches; the picture is of log time `[begin, end)`, ns, not empty.
+    def ticks(self, edges: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Of each pixel with matches, the log time of the first one, ns, and their number.
 
-        `width` is the log time of a pixel, ns. `pixels` are their numbers from 0, int64[n],
-        `counts` the matches in each, `first` the log time of the first one, ns since the epoch.
+        The edges of the pixels are those of `aligned`.
         """
-        width = _pixel_width(span, pixels)
-        found = self._times[slice(*np.searchsorted(placed(self._times), span))]
-        place, begins, counts = np.unique(
-            (placed(found) - span[0]) // width, return_index=True, return_counts=True
-        )
-        return {"width": width, "pixels": place, "counts": counts, "first": found[begins]}
+        begins = np.searchsorted(placed(self._times), edges)
+        counts = np.diff(begins)
+        return placed(self._times)[begins[:-1][counts > 0]], counts[counts > 0]
 
-    def bands(self, span: Span, pixels: int) -> NDArray[np.int64]:
+    def bands(self, span: Span, width: int) -> NDArray[np.int64]:
         """The intervals in which the predicate holds, joined where a picture cannot tell.
 
-        They are int64[n, 2], begin and end, ns since the epoch, in order; at most one more than
-        pixels. Those less than a pixel apart are one.
+        They are int64[n, 2], begin and end, ns since the epoch, in order. Those less than the log
+        time of a pixel apart are one.
         """
-        width = _pixel_width(span, pixels)
         low = int(np.searchsorted(self._held[:, 1], span[0], "right"))
         high = int(np.searchsorted(self._held[:, 0], span[1]))
         found: NDArray[np.int64] = np.clip(self._held[low:high], *span)
@@ -215,11 +210,3 @@ def _bounded(found: Iterable[RowBatch]) -> Iterator[RowBatch]:
                 "write a narrower predicate."
             )
         yield one
-
-
-def _pixel_width(span: Span, pixels: int) -> int:
-    """Log time of a pixel, ns; the last pixels may lie behind the span."""
-    begin, end = span
-    if pixels < 1 or end <= begin:
-        raise UsageError("A picture is at least one pixel wide, and its end is after its begin.")
-    return -(-(end - begin) // pixels)

@@ -7,7 +7,7 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from hybridlog.drawing.times import Match, Matches
+from hybridlog.drawing.times import Match, Matches, aligned
 from hybridlog_storage.errors import ResourceError
 from tests.limits import Limit
 
@@ -27,15 +27,13 @@ def test_ticks_count_each_match_once(drive: Drive) -> None:
     times = [one.time for one in matching(drive)]
     whole = BASE, times[-1] + 1
     for pixels, span in ((1, whole), (97, whole), (500, (times[10], times[90])), (8, (0, BASE))):
-        found = matches.ticks(span, pixels)
-        inside = [time for time in times if span[0] <= time < span[1]]
-        want = Counter((time - span[0]) // found["width"] for time in inside)
-        assert dict(zip(found["pixels"].tolist(), found["counts"].tolist(), strict=True)) == want
-        assert found["first"].tolist() == [
-            min(t for t in inside if (t - span[0]) // found["width"] == pixel)
-            for pixel in sorted(want)
-        ]
-        assert found["width"] * pixels >= span[1] - span[0]
+        edges = aligned(span, pixels)
+        first, counts = matches.ticks(edges)
+        want = Counter(int(np.searchsorted(edges, time, "right")) for time in times)
+        shown = {pixel: many for pixel, many in want.items() if 0 < pixel < len(edges)}
+        assert counts.tolist() == [shown[pixel] for pixel in sorted(shown)]
+        parts = [(int(edges[pixel - 1]), int(edges[pixel])) for pixel in sorted(shown)]
+        assert first.tolist() == [min(t for t in times if a <= t < b) for a, b in parts]
     assert len(times) > 500
 
 
@@ -44,13 +42,13 @@ def test_bands_are_the_intervals_as_far_as_pixels_tell(drive: Drive) -> None:
     span = BASE + 1234, int(drive.times[-1]) + 10 * MS
     exact = [(i.begin_ns, i.end_ns) for i in query.between(*span).intervals()]
     assert len(exact) > 5
-    assert Matches(query).bands(span, 5000).tolist() == [list(one) for one in exact]
+    assert Matches(query).bands(span, 1).tolist() == [list(one) for one in exact]
     alternating = drive.store.topic("drive").where("on == true")
     exact_width = int(drive.times[0]), int(drive.times[100])  # of 10 ms, as the bands' distance
     for pixels, picture in ((1, span), (10, span), (300, span), (100, exact_width)):
         all_of_it = [(i.begin_ns, i.end_ns) for i in alternating.between(*picture).intervals()]
-        found = Matches(alternating).bands(picture, pixels).tolist()
         width = -(-(picture[1] - picture[0]) // pixels)
+        found = Matches(alternating).bands(picture, width).tolist()
         want: list[list[int]] = []
         for begin, end in all_of_it:
             if want and begin - want[-1][1] < width:
@@ -59,7 +57,7 @@ def test_bands_are_the_intervals_as_far_as_pixels_tell(drive: Drive) -> None:
                 want.append([begin, end])
         assert found == want
         assert len(found) <= pixels + 1
-    assert Matches(query).bands((0, BASE - 1), 7).tolist() == []
+    assert Matches(query).bands((0, BASE - 1), 7 * MS).tolist() == []
 
 
 def test_bands_last_until_the_recording_ends(drive: Drive) -> None:

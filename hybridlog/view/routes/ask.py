@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from contextlib import closing, suppress
 from typing import TYPE_CHECKING, Any, Final
 
-from hybridlog.drawing.times import Match, Matches
+from hybridlog.drawing.times import Match, Matches, aligned
 from hybridlog.query.predicate.completion import complete
 from hybridlog.query.predicate.tokens import MAX_TEXT
 from hybridlog.query.topics import resolve
@@ -39,16 +39,15 @@ def matches(context: Context, params: RequestParams) -> dict[str, Any]:
     """The matches in a range by pixel, and the bands in which the predicate holds."""
     question = _question(context, params)
     start = start_of(question.recording)
-    span, pixels = params.span(start), params.pixels()
+    span = params.span(start)
+    edges = aligned(span, params.pixels())
     matching = _matches(context, question)
-    found, in_force = matching.ticks(span, pixels), matching.bands(span, pixels)
+    first, counts = matching.ticks(edges)
+    bands = matching.bands(span, int(edges[1] - edges[0]))
     return {
-        "begin": span[0] - start,
-        "width": found["width"],
-        "pixels": found["pixels"].tolist(),
-        "counts": found["counts"].tolist(),
-        "first": (found["first"] - start).tolist(),
-        "bands": (in_force - start).tolist(),
+        "first": (first - start).tolist(),
+        "counts": counts.tolist(),
+        "bands": (bands - start).tolist(),
     }
 
 
