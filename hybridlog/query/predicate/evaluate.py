@@ -240,24 +240,29 @@ class _Objects:
 
     def there(self, target: Field) -> Iterator[_Values]:
         """The messages that have a field, or may have it."""
+        rows: tuple[list[int], list[int]] = [], []
         for row, message in enumerate(self._messages):
             for found in self._at(message, target):
-                yield _Values(None if found is _HIDDEN else (), np.array([row]))
+                rows[found is _HIDDEN].append(row)
+        yield _Values((), np.array(rows[0], np.intp))
+        yield _Values(None, np.array(rows[1], np.intp))
 
     def elements(self, node: Condition) -> Iterator[_Values]:
         """The values of a field that are no lists, the elements of lists, and nulls."""
         alike: dict[tuple[Any, bool], tuple[list[Any], list[int]]] = defaultdict(lambda: ([], []))
+        hidden: list[int] = []
         for row, message in enumerate(self._messages):
             for found in self._at(message, node.field):
-                if found is _HIDDEN or self._is_left(found, node.field.names):
-                    yield _Values(None, np.array([row]))
+                if found is _HIDDEN or (self._left and self._is_left(found, node.field.names)):
+                    hidden.append(row)
                     continue
-                for value in _flat(found):
+                for value in _flat(found) if isinstance(found, list) else (found,):
                     if not isinstance(value, Mapping | bytes):  # which equal nothing
                         # A null is one here: what is missing is not there.
                         values, rows = alike[_type_of(value), isinstance(found, list)]
                         values.append(repaired_text(value) if isinstance(value, str) else value)
                         rows.append(row)
+        yield _Values(None, np.array(hidden, np.intp))
         for (kind, is_element), (values, rows) in alike.items():
             array = np.array(values, object) if kind is None else pa.array(values, kind)
             yield _Values(array, np.array(rows, np.intp), is_element)
@@ -284,13 +289,14 @@ class _Objects:
             yield value
             return
         part, rest = parts[0], parts[1:]
-        name = str(part)
-        if self._is_left(value, path) and (rest or name not in cast("Mapping[str, Any]", value)):
-            yield _HIDDEN
+        if self._left and self._is_left(value, path):
+            inside = cast("Mapping[str, object]", value)
+            yield _HIDDEN if rest else inside.get(str(part), _HIDDEN)
         elif isinstance(part, Slice):
             if isinstance(value, list):
                 yield from self._reached(value[part.begin : part.end], rest, path)
         elif isinstance(value, Mapping):
+            name = str(part)
             if name in value:
                 yield from self._reached(value[name], rest, f"{path}.{name}" if path else name)
         elif isinstance(value, list) and isinstance(part, int):
@@ -302,13 +308,13 @@ class _Objects:
 
     def _is_left(self, value: object, path: str) -> bool:
         """True for the summary of an array that is gone."""
-        if not isinstance(value, Mapping) or not self._left or not path:
+        if not isinstance(value, Mapping) or not path:
             return False
         return path in self.types.arrays if self.types.known else {"n"} <= value.keys() <= _SUMMARY
 
 
 def _flat(value: object) -> Iterator[object]:
-    """A value that is no list; of a list, the elements, also of lists in it, in their order."""
+    """The elements of a list, also those of lists in it, in their order."""
     left = [value]
     while left:
         value = left.pop()
