@@ -22,7 +22,7 @@ def all_imports() -> dict[str, list[Import]]:
     return {name: imports_of(path, name) for name, path in MODULES.items()}
 
 
-HEAVY = ("mcap", "numpy", "pandas", "pyarrow", "pymongo", "rich", "rosbags", "zstandard")
+HEAVY = ("mcap", "numpy", "pandas", "pyarrow", "pymongo", "rosbags", "zstandard")
 """What no command may load before it needs it."""
 
 # Where each third-party package may be imported: a module, or a package and all below it.
@@ -101,7 +101,6 @@ ALLOWED = {
     "pymongo": ("hybridlog_storage.mongo.database",),
     "re2": ("hybridlog.query.predicate.tokens",),
     "rclpy": ("hybridlog.live.sources.ros2.child.middleware",),
-    "rich": ("hybridlog.cli",),
     "rosbags": (
         "hybridlog.formats.rosbag1.writer",
         "hybridlog.formats.rosbag2.writer",

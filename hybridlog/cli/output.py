@@ -6,17 +6,15 @@ import json
 import shutil
 import sys
 import textwrap
-from collections.abc import Iterable
+import threading
+import time
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, is_dataclass
-from typing import TYPE_CHECKING, Self, TextIO
+from typing import Final, Self, TextIO
 
 from hybridlog import wording
 from hybridlog_storage.stopping import safe_point
-
-if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.progress import Progress
 
 _manner = {"quiet": False, "as_json": False}
 
@@ -25,6 +23,7 @@ unfit = wording.unfit
 size = wording.size
 
 _MAX_LINE = 100  # characters of a note, an attachment and the like
+_REDRAW_S: Final = 0.1
 
 
 def begin(given: object) -> None:
@@ -40,13 +39,6 @@ def is_quiet() -> bool:
 def has_bars() -> bool:
     """Whether the command shows its progress where there is a terminal."""
     return not any(_manner.values()) and sys.stderr.isatty()
-
-
-def console(*, error: bool = False) -> Console:
-    """A console for a terminal."""
-    from rich.console import Console
-
-    return Console(file=sys.stderr if error else sys.stdout, highlight=False)
 
 
 def screen_width() -> int:
@@ -117,7 +109,9 @@ def _plain(value: object) -> object:
 
 def note(text: str) -> None:
     """A line for the person, on standard error; who reads it may go, and the work goes on."""
-    with suppress(BrokenPipeError):
+    with suppress(BrokenPipeError), _drawing:
+        for one in _shown:
+            one.erase()
         print(folded(text), file=sys.stderr)  # noqa: T201
 
 
@@ -157,8 +151,52 @@ def short_duration(ns: int) -> str:
     return format_duration(round(ns / step) * step)
 
 
+class Drawn:
+    """Lines at the end of a terminal that are drawn anew; a context manager that removes them.
+
+    Notes appear above them. The terminal cuts lines that are too long for it.
+    """
+
+    def __init__(self, *, error: bool = True) -> None:
+        self._stream = sys.stderr if error else sys.stdout
+        self._count = 0
+
+    def __enter__(self) -> Self:
+        """Nothing is drawn yet."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Remove the lines."""
+        self.erase()
+
+    def draw(self, lines: Sequence[str]) -> None:
+        """Draw lines in place of the last ones."""
+        with _drawing:
+            self.erase()
+            self._write("\x1b[?25l\x1b[?7l" + "\n".join(lines) + "\x1b[?7h")
+            self._count = len(lines)
+            _shown[:] = [self]
+
+    def erase(self) -> None:
+        """Remove the lines until they are drawn again."""
+        with _drawing:
+            if self._count:
+                up = f"\x1b[{self._count - 1}A" if self._count > 1 else ""
+                self._write(f"\r{up}\x1b[J\x1b[?25h")
+            self._count = 0
+
+    def _write(self, text: str) -> None:
+        with suppress(BrokenPipeError):
+            self._stream.write(text)
+            self._stream.flush()
+
+
+_drawing = threading.RLock()
+_shown: list[Drawn] = []
+
+
 class Bar:
-    """A bar with rate and remaining time; a context manager that removes it.
+    """A line with bar, rate and remaining time; a context manager that removes it.
 
     It appears at the first progress, on a terminal. Elsewhere there is nothing. The total is in
     bytes, about; None if it is unknown, or each part tells its own.
@@ -166,8 +204,8 @@ class Bar:
 
     def __init__(self, label: str, total: int | None = None, *, quiet: bool = False) -> None:
         self._label, self._total = label, total
-        self._quiet = quiet or not has_bars()
-        self._bar: Progress | None = None
+        self._line = None if quiet or not has_bars() else Drawn()
+        self._begin = self._next = 0.0
 
     def __enter__(self) -> Self:
         """The bar, which does not show yet."""
@@ -175,20 +213,26 @@ class Bar:
 
     def __exit__(self, *_: object) -> None:
         """Remove the bar."""
-        if self._bar is not None:
-            self._bar.stop()
-            self._bar = None
+        self._begin = self._next = 0.0
+        if self._line is not None:
+            self._line.erase()
 
     def __call__(self, done: int, note: str = "", total: int | None = None) -> None:
         """Set the number of finished bytes, and a note beside the bar."""
-        if self._quiet:
+        now, total = time.monotonic(), total or self._total
+        if self._line is None or now < self._next:
             return
-        total = total or self._total
-        if self._bar is None:
-            self._bar = _progress(has_end=total is not None)
-            self._bar.add_task(_short(self._label), total=total, note="")
-            self._bar.start()
-        self._bar.update(self._bar.task_ids[0], completed=done, total=total, note=_short(note))
+        self._begin, self._next = self._begin or now, now + _REDRAW_S
+        rate = done / (now - self._begin or 1)
+        texts = [_short(self._label), f"{size(rate)}/s", _short(note)]
+        if total:
+            share = min(done / total, 1)
+            minutes, seconds = divmod(int((total - done) / rate) if 0 < done < total else 0, 60)
+            texts[1:1] = ["", f"{share:.0%}"]
+            texts.insert(-1, f"ETA {minutes:02}:{seconds:02}")
+            room = max(screen_width() - len(" ".join(texts)) - 1, 0)
+            texts[1] = f"{'━' * int(share * room):<{room}}"
+        self._line.draw([" ".join(texts)])
 
     def part(self, recording: str, done: int, total: int) -> None:
         """Report `done` of `total` bytes of a recording, until it is complete; a safe point."""
@@ -196,23 +240,6 @@ class Bar:
         self(done, recording, max(total, 1))
         if done >= total:
             self.__exit__()
-
-
-def _progress(*, has_end: bool) -> Progress:
-    from rich import progress as rich
-
-    # Texts are names out of logs: they are never read as markup.
-    return rich.Progress(
-        rich.TextColumn("{task.description}", markup=False),
-        rich.BarColumn(bar_width=None),
-        *((rich.TaskProgressColumn(),) if has_end else ()),
-        rich.TransferSpeedColumn(),
-        *((rich.TextColumn("ETA"), rich.TimeRemainingColumn(compact=True)) if has_end else ()),
-        rich.TextColumn("{task.fields[note]}", markup=False),
-        console=console(error=True),
-        transient=True,
-        expand=True,
-    )
 
 
 def _short(text: str) -> str:

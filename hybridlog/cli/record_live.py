@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 
 from hybridlog.cli import output
 from hybridlog.cli.app import DIFFERENT
-from hybridlog.cli.commands.top import LiveTable, summary
+from hybridlog.cli.commands.top import draw, summary
 from hybridlog.cli.options import parse_tags
 from hybridlog.cli.record_choices import (
     RecordChoices,
@@ -87,7 +87,7 @@ def _record(choices: RecordChoices) -> int:
     # Wrong options are found before a store is made.
     options = recorder_options(choices)
     sources = sources_of(choices)
-    table = LiveTable() if output.has_bars() else None
+    table = output.Drawn() if output.has_bars() else None
     show = partial(_show, table=table, as_json=choices.as_json)
     reports: list[RecordReport] = []
     with ExitStack() as held:
@@ -305,7 +305,7 @@ def _tell_left(messages: int) -> None:
         output.remarks([f"hybridlog: {left} left for tables and index; Ctrl-C leaves them"])
 
 
-def _show(state: RecorderState, table: LiveTable | None, *, as_json: bool) -> None:
+def _show(state: RecorderState, table: output.Drawn | None, *, as_json: bool) -> None:
     """Show the state, about once a second: in a table on a terminal, as JSON for scripts.
 
     The watchdog of a service hears of it while what is received is written, too.
@@ -313,7 +313,7 @@ def _show(state: RecorderState, table: LiveTable | None, *, as_json: bool) -> No
     told = ["READY=1", f"STATUS={output.printable(summary(state))}"]
     notify_service(*told, *(["WATCHDOG=1"] if state.stalled_s == 0 else ()))
     if table is not None:
-        table.show(state)
+        draw(state, table)
     elif as_json:
         from hybridlog.live.state import summary_of
 

@@ -23,7 +23,7 @@ from tests.json_schemas import misfit, schema_of, schemas
 from .running import COMMAND, complete, environment, run
 
 ROOT = Path(__file__).parents[2]
-HEAVY = {"numpy", "pandas", "pyarrow", "pymongo", "rosbags", "mcap", "zstandard", "rich"}
+HEAVY = {"numpy", "pandas", "pyarrow", "pymongo", "rosbags", "mcap", "zstandard"}
 
 LISTED = """
 import atexit, os, sys
@@ -258,7 +258,7 @@ def test_the_only_store_below_the_folder(words: str, code: int, said: str, tmp_p
 
 
 UNNEEDED = {
-    *("PIL", "asyncio", "bson", "pandas", "pyarrow", "pydantic", "pymongo", "rich", "rosbags"),
+    *("PIL", "asyncio", "bson", "pandas", "pyarrow", "pydantic", "pymongo", "rosbags"),
     *("picows", "subprocess", "typer", "websockets"),
 }
 

@@ -88,7 +88,7 @@ def test_a_bar_with_rate_and_remaining_time_and_then_the_table(logs: Path, tmp_p
     bars = plain(shown).split("\r")
     assert any(re.search(r"robot\.bag ━.* \d+% .*B/s ETA \d\d:\d\d \d+ messages", b) for b in bars)
     # The bar goes away; the table stays.
-    last = plain(shown[shown.rindex("\x1b[2K") :])
+    last = plain(shown[shown.rindex("\x1b[J") :])
     assert "━" not in last
     assert re.search(r"indexed\s+\d+", last)
 

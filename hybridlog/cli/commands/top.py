@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 import textwrap
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final
 
 from hybridlog.cli import output
 from hybridlog.cli.binder import argument, command, option
@@ -63,7 +64,7 @@ def top_command(given: _Given) -> None:
     on_screen = not given.as_json and sys.stdout.isatty() and not given.once
     with suppress(Stopped), at_safe_points(), ExitStack() as held:
         opened = held.enter_context(given.opened()) if fields else None
-        table = held.enter_context(LiveTable(error=False)) if on_screen else None
+        table = held.enter_context(output.Drawn(error=False)) if on_screen else None
         for state in states(directory, recorder, _EVERY_S):
             name = state.name
             values, width = [], output.screen_width()
@@ -73,9 +74,9 @@ def top_command(given: _Given) -> None:
             if given.as_json:
                 output.print_json({**summary_of(state), "fields": values}, at_once=True)
             elif table is not None:
-                table.show(state, below)
+                draw(state, table, below)
             else:
-                for line in _drawn(state, width=width, below=below):
+                for line in _lines_of(state, width=width, below=below):
                     output.say(line)
             if given.once or not (given.as_json or on_screen):
                 return
@@ -119,35 +120,13 @@ def _values(
 _FIELDS: Final = [Column("topic"), Column("field"), *numbers("n", "least", "mean", "greatest")]
 
 
-class LiveTable:
-    """The state as a table that updates in place; a context manager that removes it at the end."""
-
-    def __init__(self, *, error: bool = True) -> None:
-        from rich.live import Live
-
-        self._live = Live(
-            console=output.console(error=error), auto_refresh=False, transient=True, screen=False
-        )
-
-    def __enter__(self) -> Self:
-        """Begin to draw."""
-        self._live.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Remove the table."""
-        self._live.stop()
-
-    def show(self, state: RecorderState, below: Sequence[str] = ()) -> None:
-        """Draw a state, with lines below it."""
-        from rich.text import Text
-
-        size = self._live.console.size
-        lines = _drawn(state, width=size.width, height=size.height - 1, below=below)
-        self._live.update(Text("\n".join(lines), overflow="crop", no_wrap=True), refresh=True)
+def draw(state: RecorderState, table: output.Drawn, below: Sequence[str] = ()) -> None:
+    """Draw a state as a table, with lines below it."""
+    width, height = shutil.get_terminal_size()
+    table.draw(_lines_of(state, width=width, height=height - 1, below=below))
 
 
-def _drawn(
+def _lines_of(
     state: RecorderState, *, width: int, height: int | None = None, below: Sequence[str] = ()
 ) -> list[str]:
     """A state as the lines of a table of topics, with others below it."""
