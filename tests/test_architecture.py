@@ -298,7 +298,7 @@ def test_starting_loads_nothing_heavy(start: str) -> None:
 @pytest.mark.parametrize(
     ("modules", "heavy"),
     [
-        ("hybridlog.demo.tour", "numpy rosbags pandas pyarrow"),
+        ("hybridlog.cli.commands.demo", "numpy rosbags pandas pyarrow"),
         ("hybridlog.formats.log_set", "rosbags yaml sqlite3 lz4 pandas pyarrow pymongo"),
         (
             "hybridlog.formats, hybridlog.query.times, hybridlog.query.topics, "

@@ -303,31 +303,25 @@ class Slices(Latched, Forced):
         needs=("output", "target"),
         excludes=("at", "follow", "reverse"),
     )
-    storage: str | None = option(
-        "For rosbag2: the storage of the bag; without, mcap.",
+    storage: str = option(
+        "For rosbag2: the storage of the bag.",
         type=click.Choice(["mcap", "sqlite3"]),
+        default="mcap",
+        needs=("form=rosbag2",),
     )
-    file_size: int | None = option(
-        "For rosbag2: begin a new file at so many bytes of payload, such as 500MB; without, 2GiB.",
+    file_size: int = option(
+        "For rosbag2: begin a new file at so many bytes of payload, such as 500MB.",
         "SIZE",
         type=Amount(parse_size, "1B"),
+        default="2GiB",
+        needs=("form=rosbag2",),
     )
 
     def settings(self, form: str) -> dict[str, Any]:
         """Arguments of the writer of a format; refuses options that do nothing in it."""
-        logs, is_bag = formats_of("log"), form == "rosbag2"
-        fits = {
-            "original_times": form in logs,
-            "storage": is_bag,
-            "file_size": is_bag,
-        }
-        for name, does_fit in fits.items():
-            if getattr(self, name) and not does_fit:
-                raise UsageError(
-                    f"--{name.replace('_', '-')} does nothing in {form}: leave it out."
-                )
-        settings = {"storage": self.storage or "mcap", "max_file": self.file_size}
-        return {name: value for name, value in settings.items() if is_bag and value is not None}
+        if self.original_times and form not in formats_of("log"):
+            raise UsageError(f"--original-times does nothing in {form}: leave it out.")
+        return {"storage": self.storage, "max_file": self.file_size} if form == "rosbag2" else {}
 
 
 def one_recording(

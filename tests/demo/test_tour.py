@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from hybridlog.demo import tour
+from hybridlog import demo
+from hybridlog.cli.commands import demo as tour
 from hybridlog_storage.errors import UsageError
 
 # Stands in for each command, so that the tour alone is under test.
@@ -30,16 +31,17 @@ def fake(code: str, command: str) -> list[str]:
 
 def pretend(monkeypatch: pytest.MonkeyPatch, *, fail: str = "") -> None:
     code = FAKE.replace("FAIL", repr(fail))
-    monkeypatch.setattr(tour.Step, "argv", property(lambda step: fake(code, step.command)))
+    monkeypatch.setattr(tour, "program", lambda typed: fake(code, typed))
 
 
 def test_every_command_is_whole() -> None:
-    programs = [shlex.split(step.command) for step in tour.steps()]
-    for step, words in zip(tour.steps(), programs, strict=True):
-        assert step.argv[:2] == [sys.executable, "-P"]
-        assert step.argv[-len(words) + 1 :] == words[1:]
+    programs = [shlex.split(typed) for typed in tour.STEPS.values()]
+    for typed, words in zip(tour.STEPS.values(), programs, strict=True):
+        argv = tour.program(typed)
+        assert argv[:2] == [sys.executable, "-P"]
+        assert argv[-len(words) + 1 :] == words[1:]
         assert words[0] in {"hybridlog", "python"}
-        assert (step.argv[2:4] == ["-m", "hybridlog"]) == (words[0] == "hybridlog")
+        assert (argv[2:4] == ["-m", "hybridlog"]) == (words[0] == "hybridlog")
     compile(programs[-1][2], "<snippet>", "exec")
     verbs = [words[1] for words in programs if words[0] == "hybridlog"]
     assert verbs[:3] == ["record", "ls", "info"]
@@ -52,8 +54,8 @@ def test_a_good_tour(
     assert tour.run(tmp_path / "new") == 0
     out, err = capfd.readouterr()
     assert err == ""
-    for step in tour.steps():
-        assert f"$ {step.command}" in out
+    for typed in tour.STEPS.values():
+        assert f"$ {typed}" in out
     # What a command prints stands below the command.
     assert out.index("$ hybridlog record") < out.index("recorded") < out.index("$ hybridlog ls")
     assert (tmp_path / "new" / "robot.bag").stat().st_size < 8_000_000
@@ -84,7 +86,7 @@ def test_the_real_tour_answers_as_the_simulation_counted(
     code = tour.run(tmp_path / "real")
     out, err = capfd.readouterr()
     assert code == 0, err
-    counted = json.loads(Path(tour.__file__).with_name("robot.json").read_text("utf-8"))
+    counted = json.loads(Path(demo.__file__).with_name("robot.json").read_text("utf-8"))
     shown = [part.partition("\n$ ")[2].splitlines()[1:] for part in out.split("\n# ")[1:]]
     closings, near, errors = ([line for line in part if line] for part in shown[3:6])
     assert closings == [str(counted["gripper_closings"])]

@@ -78,7 +78,7 @@ def test_the_command_and_what_fits_into_no_bag(tmp_path: Path) -> None:
     assert {one.suffix for one in bag.iterdir()} == {".db3", ".yaml"}
     for other in (("--storage", "mcap"), ("--file-size", "1MB")):
         said = run("export", tmp_path / "x.mcap", *other, store=store, code=2).err
-        assert f"{other[0]} does nothing in mcap: leave it out." in said
+        assert f"{other[0]} is for rosbag2" in said
     said = run("fetch", "tf", "-F", "csv", "--original-times", store=store, code=2).err
     assert "--original-times does nothing in csv" in said
     run("export", tmp_path / "x", "-F", "rosbag2", "--file-size", "0", store=store, code=2)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import signal
 import sys
-from code import InteractiveConsole
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -83,83 +82,62 @@ def sql_command(given: _Given) -> None:
             run(query or "")
 
 
-class _Prompt(InteractiveConsole):
-    """Reads statements, which end with a semicolon, and completes their words.
+def _run_prompt(connection: SqlConnection, run: Callable[[str], None]) -> None:
+    """Read statements, which end with a semicolon, and run them, until Ctrl-D.
 
-    Ctrl-C stops a query, or clears what was typed; Ctrl-D ends the prompt.
+    Ctrl-C stops a query, or clears what was typed.
     """
-
-    def __init__(self, connection: SqlConnection, run: Callable[[str], None]) -> None:
-        super().__init__()
-        self._connection = connection
-        self._run = run
-        self._found: list[str] = []
-
-    def raw_input(self, prompt: str = "") -> str:
-        line = input(prompt)
-        if not self.buffer and line.strip().rstrip(";").lower() in _ENDS:
-            raise EOFError
-        return line
-
-    def runsource(self, source: str, *_: object) -> bool:
-        """Answer a statement; True if more of it is to come."""
-        text = source.strip()
-        if text.rstrip(";").lower() in _HELP:
-            output.say(_HINT)
-        elif text and not text.endswith(";"):
-            return True
-        elif text:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    output.note(_HINT)
+    lines: list[str] = []
+    with _line_editing(connection, lines):
+        while True:
             try:
-                with at_safe_points():
-                    self._run(source)
+                lines.append(input("...> " if lines else "sql> "))
+                text = "\n".join(lines).strip()
+                word = text.rstrip(";").lower()
+                if word in _ENDS:
+                    return
+                if word in _HELP:
+                    output.say(_HINT)
+                elif text.endswith(";"):
+                    try:
+                        with at_safe_points():
+                            run(text)
+                    except KeyboardInterrupt:
+                        output.note("The query was stopped.")
+                elif text:
+                    continue
+            except EOFError:
+                output.note("")
+                return
             except HybridlogError as error:
                 output.notes(str(error).splitlines())
             except KeyboardInterrupt:
-                output.note("The query was stopped.")
-        return False
-
-    def complete(self, text: str, state: int) -> str | None:
-        """A candidate for the word before the cursor, as `readline` asks for it."""
-        if state == 0:
-            import readline
-
-            from hybridlog.sql.names import candidates
-
-            self._found = []
-            with suppress(HybridlogError):
-                line = "\n".join([*self.buffer, readline.get_line_buffer()])
-                self._found = candidates(
-                    self._connection.names(), self._connection.schema, line, text
-                )
-        return self._found[state] if state < len(self._found) else None
-
-
-def _run_prompt(connection: SqlConnection, run: Callable[[str], None]) -> None:
-    """Read statements and run them, until Ctrl-D."""
-    prompt = _Prompt(connection, run)
-    sys.ps1, sys.ps2 = "sql> ", "...> "
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    with _line_editing(prompt):
-        hint = _HINT
-        while True:
-            try:
-                prompt.interact(hint, "")
-                return
-            except KeyboardInterrupt:  # while it handled another one
-                prompt.resetbuffer()
-                hint = ""
+                output.note("")
+            lines.clear()
 
 
 @contextmanager
-def _line_editing(prompt: _Prompt) -> Iterator[None]:
-    """Line editing with history, where Python has it."""
+def _line_editing(connection: SqlConnection, lines: Sequence[str]) -> Iterator[None]:
+    """Line editing with history and completion, where Python has it."""
     try:
         import readline
     except ImportError:
         yield
         return
     from hybridlog.index.consent import state_directory
-    from hybridlog.sql.names import DELIMITERS
+    from hybridlog.sql.names import DELIMITERS, candidates
+
+    found: list[str] = []
+
+    def complete(text: str, state: int) -> str | None:
+        if state == 0:
+            found.clear()
+            with suppress(HybridlogError):
+                line = "\n".join([*lines, readline.get_line_buffer()])
+                found[:] = candidates(connection.names(), connection.schema, line, text)
+        return found[state] if state < len(found) else None
 
     path: Path | None = None
     with suppress(HybridlogError, OSError):
@@ -169,7 +147,7 @@ def _line_editing(prompt: _Prompt) -> Iterator[None]:
             readline.read_history_file(path)
     readline.set_history_length(_MAX_HISTORY)
     readline.set_completer_delims(DELIMITERS)
-    readline.set_completer(prompt.complete)
+    readline.set_completer(complete)
     readline.parse_and_bind("tab: complete")
     try:
         yield
