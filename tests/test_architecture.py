@@ -140,7 +140,7 @@ DISTRIBUTIONS = {
 
 # Modules of ours that only some may import when the program runs.
 WIRED_BY = {
-    "hybridlog_storage.mongo.mongod": ("hybridlog.cli.installed", "hybridlog.index.access"),
+    "hybridlog_storage.mongo.mongod": ("hybridlog.index.access",),
     "hybridlog.store": ("hybridlog", "hybridlog.cli", "hybridlog.store"),
 }
 

@@ -81,14 +81,6 @@ class _LazyGroup(click.Group):
             formatter.write_dl([(f"{code:>3}", meaning) for code, meaning in EXIT_CODES.items()])
 
 
-def _print_installed(context: click.Context, _: click.Parameter, wanted: bool) -> None:  # noqa: FBT001
-    if wanted:
-        from hybridlog.cli.installed import print_installed
-
-        print_installed()
-        context.exit()
-
-
 @click.group(
     name="hybridlog",
     cls=_LazyGroup,
@@ -98,14 +90,6 @@ def _print_installed(context: click.Context, _: click.Parameter, wanted: bool) -
     epilog="The store is --store, else HYBRIDLOG_STORE, else ./hybridlog-store.",
 )
 @click.version_option(__version__, message="hybridlog %(version)s", help="Print the version.")
-@click.option(
-    "--installed",
-    is_flag=True,
-    is_eager=True,
-    expose_value=False,
-    callback=_print_installed,
-    help="Print versions of everything, and what is missing for which command.",
-)
 def app() -> None:
     """Record what a robot says, and ask it.
 

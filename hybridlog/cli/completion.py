@@ -7,7 +7,6 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterable
 from contextlib import closing
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -80,13 +79,11 @@ def _topics(session: Session, context: click.Context, incomplete: str) -> Iterab
     return sorted({*topics, *(short if incomplete else ())})
 
 
-def _conditions(
-    session: Session, context: click.Context, incomplete: str, space: str = " "
-) -> Iterable[str]:
+def _conditions(session: Session, context: click.Context, incomplete: str) -> Iterable[str]:
     """Topics, with the colon and space that fields or a predicate follow; then its fields."""
     if ":" in incomplete or context.params.get("step") is not None:  # all topics of an alignment
         return _fields(session, context, incomplete)
-    return (f"{topic}:{space}" for topic in _topics(session, context, incomplete))
+    return (f"{topic}: " for topic in _topics(session, context, incomplete))
 
 
 def _fields(session: Session, context: click.Context, incomplete: str) -> Iterable[str]:
@@ -151,6 +148,5 @@ _KINDS: Final[dict[str, Callable[[Session, click.Context, str], Iterable[str]]]]
     "K=V": _tags,
     "TYPE": _types,
     "TOPIC:": _conditions,
-    "TOPIC:FIELD": partial(_conditions, space=""),
 }
 """By the name of a value in help."""

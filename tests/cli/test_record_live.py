@@ -183,14 +183,8 @@ def test_a_recorder_is_visited(logs: Path, tmp_path: Path) -> None:
         until_it_speaks(process)
         # By name, by the beginning of the id, and by nothing at all.
         run("mark", "gripper slipped", "--set-tag", "trial=7", "-r", "first drive", store=store)
-        state = run(
-            "top", "first d", "--json", "--once", "--field", "base/scan:ranges.min", store=store
-        ).json
+        state = run("top", "first d", "--json", "--once", store=store).json
         assert state["messages"] > 0
-        (field,) = state["fields"]
-        assert field["topic"] == "/base/scan"
-        if field["n"]:
-            assert field["least"] <= field["mean"] <= field["greatest"]
         shown = run("top", store=store).out
         assert "/imu/data" in shown
         assert "messages/s" in shown

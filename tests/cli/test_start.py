@@ -6,7 +6,6 @@ import re
 import subprocess
 import sys
 import tomllib
-from importlib import metadata
 from pathlib import Path
 from typing import cast
 
@@ -15,7 +14,6 @@ import pytest
 
 from hybridlog.cli.app import COMMANDS, GROUPS, app
 from hybridlog.cli.binder import PATH
-from hybridlog.cli.installed import NEEDED_FOR
 from hybridlog.cli.main import EXIT_CODES
 from hybridlog_storage.disk.directory import StoreDirectory
 from tests.json_schemas import misfit, schema_of, schemas
@@ -102,29 +100,11 @@ def test_version() -> None:
     assert run("--version").out == f"hybridlog {__version__}\n"
 
 
-def test_what_is_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A package whose metadata is not there is missing, and the cure is named."""
-    shown = run("--installed").out
-    assert re.match(r"hybridlog \S+, Python 3\S+, ", shown)
-    assert re.search(r"\nMongoDB: \d+\.\d+\.\d+ \(/.*mongod\)\n", shown)
-    for name in ("mcap", "pyarrow", "rosbags", "duckdb", "matplotlib"):
-        assert f"{name} {metadata.version(name)}" in shown
-    assert "pip install" not in shown
+def test_every_extra_is_named() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert {*NEEDED_FOR} == {*project["optional-dependencies"]} - {"all", "bench", "dev"}
     (listed,) = re.findall(r"Extras: (.+), or `all`", (ROOT / "README.md").read_text())
-    assert {*re.findall(r"`(\w+)`", listed)} == {*NEEDED_FOR}
-    found = metadata.version
-
-    def version(name: str) -> str:
-        if name == "duckdb":
-            raise metadata.PackageNotFoundError(name)
-        return found(name)
-
-    monkeypatch.setattr(metadata, "version", version)
-    shown = run("--installed", HYBRIDLOG_MONGOD=str(tmp_path / "none")).out
-    assert re.search(r"pip install \S.*\[sql\]", shown)
-    assert "which is not a program that can be run" in shown
+    extras = {*project["optional-dependencies"]} - {"all", "bench", "dev"}
+    assert extras <= {*re.findall(r"`([^`]+)`", listed)}
 
 
 @pytest.mark.parametrize(
@@ -149,7 +129,6 @@ def test_completion(store: Path) -> None:
     assert complete(f"fetch --store {store} --recording t") == ["torn"]
     assert complete(f"info --losses --store {store} -t /base/s") == ["/base/scan"]
     assert complete(f"record --store {store} --throttle /base/s") == ["/base/scan"]
-    assert complete(f"top --store {store} --field /base/s") == ["/base/scan:"]
     assert complete(f"mark x --store {store} -r r") == []  # nothing is recorded now
     assert "--between" in complete("fetch --be")
     assert complete(f"ls --store {store} --tag p") == ["place"]
@@ -163,7 +142,6 @@ def test_completion(store: Path) -> None:
         "scan:range_min"
     ]
     assert complete(f"align --store {store} scan --step 1s --fields range_mi") == ["range_min"]
-    assert complete(f"top --store {store} --field scan:range_mi") == ["scan:range_min"]
     assert "scan_time" in complete(f"fetch --store {store} scan --fields scan")
     assert "ranges,scan_time" in complete(f"stats --store {store} scan --fields ranges,scan")
     assert complete(f"fetch --store {store} -t scan --where range_m") == ["range_min", "range_max"]

@@ -5,41 +5,30 @@ from __future__ import annotations
 import shutil
 import sys
 import textwrap
-import time
-from collections.abc import Sequence
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 from hybridlog.cli import output
 from hybridlog.cli.binder import argument, command, option
-from hybridlog.cli.options import AsJson, InStore
-from hybridlog.cli.render import Column, numbers, table_lines
+from hybridlog.cli.options import Place
+from hybridlog.cli.render import Column, table_lines
 from hybridlog.cli.signals import Stopped
 from hybridlog.record.losses import Cause
-from hybridlog_storage.errors import UsageError
 from hybridlog_storage.stopping import at_safe_points
 
 if TYPE_CHECKING:
     from hybridlog.live.state import RecorderState
-    from hybridlog.store import Store
 
 _EVERY_S = 1.0
 _SHORT = 60  # characters of a reason
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Given(InStore, AsJson):
+class _Given(Place):
     recording: str | None = argument(
         "One of several recorders: id or name of its recording, or the beginning of the id.",
         "[RECORDING]",
-    )
-    field: tuple[str, ...] = option(
-        "Least, mean and greatest of a field in the last seconds, such as scan:ranges.min.",
-        "TOPIC:FIELD",
-    )
-    window: str = option(
-        "The time that --field covers, up to now.", "TIME", name="--last", default="5s"
     )
     once: bool = option("Show it once and end.")
     as_json: bool = option("A line of JSON a second, for scripts.", name="--json")
@@ -52,31 +41,22 @@ def top_command(given: _Given) -> None:
     Without a terminal, and without --json, the state is shown once.
     """
     from hybridlog.live.state import choose, states, summary_of
-    from hybridlog.query.times import parse_duration
     from hybridlog.store import store_path
     from hybridlog_storage.remote import directory_of
 
-    fields = [_field(text) for text in given.field]
-    span = parse_duration(given.window)
     directory = directory_of(store_path(given.store))
     (recorder,) = choose(directory, [] if given.recording is None else [given.recording])
     name = recorder
     on_screen = not given.as_json and sys.stdout.isatty() and not given.once
-    with suppress(Stopped), at_safe_points(), ExitStack() as held:
-        opened = held.enter_context(given.opened()) if fields else None
-        table = held.enter_context(output.Drawn(error=False)) if on_screen else None
+    with suppress(Stopped), at_safe_points(), output.Drawn(error=False) as table:
         for state in states(directory, recorder, _EVERY_S):
             name = state.name
-            values, width = [], output.screen_width()
-            if opened is not None:
-                values = _values(opened, recorder, state, fields, span)
-            below = table_lines(_FIELDS, values, width) if values else []
             if given.as_json:
-                output.print_json({**summary_of(state), "fields": values}, at_once=True)
-            elif table is not None:
-                draw(state, table, below)
+                output.print_json(summary_of(state), at_once=True)
+            elif on_screen:
+                draw(state, table)
             else:
-                for line in _lines_of(state, width=width, below=below):
+                for line in _lines_of(state, output.screen_width()):
                     output.say(line)
             if given.once or not (given.as_json or on_screen):
                 return
@@ -84,59 +64,21 @@ def top_command(given: _Given) -> None:
             output.note(f"{name} has ended.")
 
 
-def _field(text: str) -> tuple[str, str]:
-    """The topic and the field."""
-    topic, sign, path = text.rpartition(":")
-    if not sign or not topic or not path or path.startswith("$"):
-        raise UsageError(f"--field takes TOPIC:FIELD, such as scan:ranges.min, not {text!r}.")
-    return topic, path
-
-
-def _values(
-    store: Store,
-    recording: str,
-    state: RecorderState,
-    fields: Sequence[tuple[str, str]],
-    span: int,
-) -> list[dict[str, Any]]:
-    """Least, mean and greatest of each field in the last seconds, of what is flushed."""
-    from hybridlog.query.topics import resolve
-
-    since, topics = time.time_ns() - span, [topic.topic for topic in state.topics]
-    found = []
-    for name, field in fields:
-        (topic, *others) = resolve([name], topics)
-        if others:
-            raise UsageError(f"{name!r} fits several topics: name one.")
-        row: dict[str, Any] = {"topic": topic, "field": field, "n": 0}
-        row |= dict.fromkeys(("least", "mean", "greatest"))
-        with suppress(UsageError):  # nothing has come yet
-            (one, *_) = store.query([topic], [recording]).between(since).stats(field)
-            row |= {"n": one.count, "least": one.min, "mean": one.mean, "greatest": one.max}
-        found.append(row)
-    return found
-
-
-_FIELDS: Final = [Column("topic"), Column("field"), *numbers("n", "least", "mean", "greatest")]
-
-
-def draw(state: RecorderState, table: output.Drawn, below: Sequence[str] = ()) -> None:
-    """Draw a state as a table, with lines below it."""
+def draw(state: RecorderState, table: output.Drawn) -> None:
+    """Draw a state as a table."""
     width, height = shutil.get_terminal_size()
-    table.draw(_lines_of(state, width=width, height=height - 1, below=below))
+    table.draw(_lines_of(state, width, height - 1))
 
 
-def _lines_of(
-    state: RecorderState, *, width: int, height: int | None = None, below: Sequence[str] = ()
-) -> list[str]:
+def _lines_of(state: RecorderState, width: int, height: int | None = None) -> list[str]:
     """A state as the lines of a table of topics, with others below it."""
     # Broken between its parts only.
     whole = summary(state).replace(" ", "\N{NO-BREAK SPACE}").replace("·\N{NO-BREAK SPACE}", "· ")
     ends = [line.replace("\N{NO-BREAK SPACE}", " ") for line in textwrap.wrap(whole, width)]
-    below = [*(f"{topic} is silent" for topic in state.silent), *below]
-    below = [line for each in below for line in textwrap.wrap(output.printable(each), width)]
+    for topic in state.silent:
+        ends += textwrap.wrap(output.printable(f"{topic} is silent"), width)
     topics = state.topics
-    rows = len(topics) if height is None else max(height - 1 - len(ends) - len(below), 4)
+    rows = len(topics) if height is None else max(height - 1 - len(ends), 4)
     if len(topics) > rows:
         # Those with losses first, then those with most bytes; a line tells of the others.
         first = sorted(topics, key=lambda t: (-t.lost, -t.bytes_per_s, t.topic))[: rows - 1]
@@ -148,7 +90,7 @@ def _lines_of(
     )
     if left := len(state.topics) - len(topics):
         lines.append(f"… and {output.counted(left, 'more topic')}")
-    return [*lines, *ends, *below]
+    return [*lines, *ends]
 
 
 def _optional(value: float | None) -> str:
