@@ -29,7 +29,6 @@ from hybridlog.cli.options import (
     cache_size,
 )
 from hybridlog.cli.render import Column, bytes_of, numbers
-from hybridlog.record.losses import losses_of
 from hybridlog.wording import parse_size
 from hybridlog_storage.errors import UsageError
 
@@ -237,11 +236,10 @@ class RecordChoices(Between, Latched, InStore, AsJson, Quiet):
         return self.opened(create=True, cache_mb=self.cache_size, records=not self.is_live)
 
 
-# --- what is told of a recording ------------------------------------------------------
-
-
 def row_of(report: RecordReport, path: object) -> dict[str, Any]:
     """What is told in JSON of each recording."""
+    from hybridlog.record.losses import losses_of
+
     entry = report.entry
     stats = [channel.stats for channel in entry.channels]
     return {

@@ -288,9 +288,6 @@ def _pinned_by_signal(recorder: Recorder) -> AbstractContextManager[object]:
     return handled(fire, [signal.SIGUSR1] if hasattr(signal, "SIGUSR1") else [])
 
 
-# --- what is shown meanwhile ----------------------------------------------------------
-
-
 def _say(text: str) -> None:
     """Print a message of the recorder at once."""
     from hybridlog.live.incidents import PINNED

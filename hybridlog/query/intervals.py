@@ -33,7 +33,10 @@ Span = tuple[int, int]
 MAX_PIECES = 10_000_000
 """Maximum number of intervals that `Intervals.cut` makes."""
 _ROWS_PER_BATCH = 10_000  # intervals whose columns become Python numbers together
-_NONE = np.empty((0, 3), np.int64)
+
+
+def _no_rows() -> NDArray[np.int64]:
+    return np.empty((0, 3), np.int64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,7 +224,7 @@ class Intervals:
         """
 
         def extended(name: str, rows: Rows) -> Rows:
-            known = np.append(times.get(name, _NONE[:, 0]), END)
+            known = np.append(times.get(name, _no_rows()[:, 0]), END)
             end = known[np.searchsorted(known[:-1], rows[:, 1])]
             return np.stack([rows[:, 0], end, rows[:, 2]], axis=1)
 
@@ -235,7 +238,7 @@ class Intervals:
         """
 
         def counted(name: str, rows: Rows) -> Rows:
-            places = np.searchsorted(times.get(name, _NONE[:, 0]), rows[:, :2])
+            places = np.searchsorted(times.get(name, _no_rows()[:, 0]), rows[:, :2])
             return np.stack([rows[:, 0], rows[:, 1], places[:, 1] - places[:, 0]], axis=1)
 
         return self._each(counted)
@@ -293,7 +296,7 @@ class Intervals:
 
     def of_recording(self, recording: str) -> NDArray[np.int64]:
         """Covered time of one recording: int64[n, 2], begin and end, disjoint, in order."""
-        return joined(self._rows.get(recording, _NONE))[:, :2]
+        return joined(self._rows.get(recording, _no_rows()))[:, :2]
 
     def to_pandas(self) -> pd.DataFrame:
         """A frame: `recording`, `begin`, `end` (UTC, ns), `duration`, `messages`."""
@@ -320,7 +323,7 @@ class Intervals:
     def _all(self) -> tuple[NDArray[np.intp], Rows]:
         """All intervals in order, and the place of the recording of each in `recordings`."""
         if self._columns is None:
-            rows = np.concatenate([_NONE, *self._rows.values()])
+            rows = np.concatenate([_no_rows(), *self._rows.values()])
             codes = np.repeat(np.arange(len(self._rows)), [*map(len, self._rows.values())])
             order = np.lexsort((rows[:, 1], codes, rows[:, 0]))
             self._columns = codes[order], rows[order]

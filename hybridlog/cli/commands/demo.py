@@ -7,10 +7,10 @@ import shutil
 import subprocess
 import sys
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 from typing import Final
 
+from hybridlog import demo
 from hybridlog.cli.binder import argument, command
 from hybridlog_storage.errors import NO_SPACE, DiskFullError, UsageError
 
@@ -80,7 +80,7 @@ def run(directory: Path) -> int:
             raise UsageError(f"{path} exists already; remove it or choose another directory")
     try:
         directory.mkdir(parents=True, exist_ok=True)
-        (directory / BAG).write_bytes(files("hybridlog.demo").joinpath(BAG).read_bytes())
+        shutil.copyfile(Path(demo.__file__).with_name(BAG), directory / BAG)
     except OSError as error:
         if error.errno in NO_SPACE:
             raise DiskFullError(f"no space left in {directory}; choose another disk") from error

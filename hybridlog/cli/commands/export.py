@@ -230,9 +230,6 @@ def pieces(
     yield from found
 
 
-# --- training sets ---------------------------------------------------------------------
-
-
 def _export_set(store: Store, query: Query, target: Path, given: _Given) -> None:
     """Write a training set, or propose a map for one, with rare topics in comments."""
     if given.propose_map:

@@ -28,9 +28,7 @@ from hybridlog.cli.render import (
     print_fields,
     print_table,
 )
-from hybridlog.query.answers.lost import coverage, line_of
 from hybridlog.query.topics import resolve
-from hybridlog.record.losses import losses_of
 from hybridlog.wording import listed
 from hybridlog_storage.errors import SegmentError, StoreError, TopicError, UsageError
 
@@ -112,9 +110,6 @@ def info_command(given: _Given) -> None:
             _show_recordings(store, given)
 
 
-# --- recordings -----------------------------------------------------------------------
-
-
 def _show_recordings(store: Store, given: _Given) -> None:
     entries = [with_misfits(store, entry) for entry in given.recordings_in(store)]
     found = [_as_dict(store, one, with_videos=n < _MAX_DRAWN) for n, one in enumerate(entries)]
@@ -143,7 +138,9 @@ def _show_recording(
 
 def _as_dict(store: Store, entry: RecordingEntry, *, with_videos: bool) -> dict[str, Any]:
     from hybridlog.entries import summary_of
+    from hybridlog.query.answers.lost import coverage
     from hybridlog.query.periods import mean_rate
+    from hybridlog.record.losses import losses_of
     from hybridlog.schema.states import shown_channels
 
     attachments: list[StoredAttachment] = []
@@ -205,6 +202,7 @@ def _videos(store: Store, entry: RecordingEntry) -> dict[str, dict[str, Any]]:
 def _fields(store: Store, entry: RecordingEntry, about: dict[str, Any]) -> list[tuple[str, object]]:
     """What is told to people of a recording."""
     from hybridlog.entries import summary_of
+    from hybridlog.query.answers.lost import line_of
     from hybridlog.query.times import format_duration
 
     status, source = status_text(summary_of(entry)), entry.source["kind"]
@@ -339,9 +337,6 @@ _CHANNELS = [
 ]
 
 
-# --- a segment file -------------------------------------------------------------------
-
-
 def _is_segment(what: str) -> bool:
     """True for the path of a file; names and ids of recordings have no slash."""
     looks = "/" in what or what.endswith((".mcap", ".mcap.open", ".bag", ".db3"))
@@ -403,9 +398,6 @@ def _show_segment(path: Path, given: _Given) -> None:
     output.say()
     kind = Column("type", short=lambda channel: (channel["type"] or "").rpartition("/")[2])
     print_table([Column("topic"), kind, *numbers("messages", "chunks")], channels)
-
-
-# --- topics ---------------------------------------------------------------------------
 
 
 def _show_topics(store: Store, query: Query, given: _Given) -> None:
@@ -540,12 +532,10 @@ def _quoted(text: str) -> str:
     return "'" + text.replace("'", "''") + "'"
 
 
-# --- losses and sizes -----------------------------------------------------------------
-
-
 def _show_losses(store: Store, given: _Given) -> None:
     """Print what is missing of topics, from when to when, and why."""
     from hybridlog.query.topics import matcher
+    from hybridlog.record.losses import losses_of
 
     if given.topic:
         resolve(given.topic, store.topics())  # refuses a name that fits no topic
@@ -608,9 +598,6 @@ _SIZES = [
     bytes_of("MongoDB", "index_bytes"),
     bytes_of("total", "total_bytes"),
 ]
-
-
-# --- attachments ----------------------------------------------------------------------
 
 
 def _show_attachments(store: Store, given: _Given) -> None:

@@ -25,8 +25,6 @@ from hybridlog.cli.record_choices import (
 )
 from hybridlog.cli.render import print_fields, print_table
 from hybridlog.cli.signals import if_stopped, watch
-from hybridlog.query.answers.lost import coverage
-from hybridlog.record.losses import losses_of
 from hybridlog.wording import listed
 from hybridlog_storage.errors import (
     AlreadyRecordedError,
@@ -368,6 +366,9 @@ def _told(path: Path, report: RecordReport) -> int:
         output.note(f"{path}: {left} from before the time range did not fit in memory.")
     output.remarks((*remarks_on(entry), *report.remarks))
     if report.damage:
+        from hybridlog.query.answers.lost import coverage
+        from hybridlog.record.losses import losses_of
+
         code = SourceDamagedError.exit_code
         output.note(
             f"{path} is damaged: {stored(entry.messages)}; "

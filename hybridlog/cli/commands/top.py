@@ -14,7 +14,6 @@ from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.options import Place
 from hybridlog.cli.render import Column, table_lines
 from hybridlog.cli.signals import Stopped
-from hybridlog.record.losses import Cause
 from hybridlog_storage.stopping import at_safe_points
 
 if TYPE_CHECKING:
@@ -118,6 +117,8 @@ def _cut(name: str, room: int) -> str:
 
 def summary(state: RecorderState) -> str:
     """One line for the whole recorder."""
+    from hybridlog.record.losses import Cause
+
     reason = state.index_failure.partition("\n")[0].partition(". ")[0].rstrip(".")
     why = f": {output.cut(output.printable(reason), _SHORT)}" if reason else ""
     parts = [
