@@ -29,7 +29,7 @@ from hybridlog.columns.fields import (
 )
 from hybridlog.columns.layout import OWN_COLUMNS
 from hybridlog.schema.arrow_columns import structs
-from hybridlog.schema.arrow_types import Array, is_list, is_summary, plain_values
+from hybridlog.schema.arrow_types import Array, is_summary, plain_values
 from hybridlog.schema.index_bodies import MAX_BYTES
 from hybridlog.schema.objects import document_cells
 from hybridlog_storage.messages import Batch, Left
@@ -116,19 +116,6 @@ def _summaries_in(
             yield path, column
         elif pa.types.is_struct(field.type):
             yield from _summaries_in(column, path)
-
-
-def summarised_in(columns: Array, above: tuple[str, ...] = ()) -> Iterator[str]:
-    """Dotted paths of the arrays of which a summary is left."""
-    if is_list(columns.type):
-        yield from summarised_in(columns.flatten(), above)
-    elif pa.types.is_struct(columns.type):
-        for field, column in zip(columns.type, columns.flatten(), strict=True):
-            path = (*above, original_name(field))
-            if not has_summaries(field):
-                yield from summarised_in(column, path)
-            elif column.null_count < len(column):
-                yield ".".join(path)
 
 
 def documents(columns: Array, *, typed: bool, summaries: bool = True) -> list[dict[str, Any]]:

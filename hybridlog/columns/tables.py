@@ -273,14 +273,11 @@ class Tables:
         if not self.can_have(recording, topic):
             return None
         with self._lock:
-            place = parts_folder(self._root, recording.id)
-            known = self._sealed.setdefault(recording.id, _Folders(place, self._cache))
-            known.look()
-            for folder in known.of(self._types_of(recording, topic)):
-                folder.look(recording)
-            rows = self._rows_in(known, recording, topic)
-            while len(self._sealed) > _MAX_RUNNING:
+            place = _Folders(parts_folder(self._root, recording.id), self._cache)
+            place = self._sealed.setdefault(recording.id, place)
+            if len(self._sealed) > _MAX_RUNNING:
                 self._sealed.popitem(last=False)
+            rows = self._look(recording, [topic], place)[topic]
         try:
             table = self._table(recording, topic, rows)
         except StoreError:
@@ -290,22 +287,24 @@ class Tables:
         return table
 
     def _look(
-        self, recording: RecordingEntry, topics: Collection[str]
+        self, recording: RecordingEntry, topics: Collection[str], place: _Folders | None = None
     ) -> dict[str, list[TopicRows]]:
         """The rows of topics in files, after a look at the folders of those that lack some."""
+        place = place or self._folders
         with self._lock:
             types = set[str]()
             for topic in topics:
                 own = self._types_of(recording, topic)
-                rows = self._rows_in(self._folders, recording, topic)
+                rows = self._rows_in(place, recording, topic)
                 if not own <= self._looked_at or not self._is_whole(recording, topic, rows):
                     types |= own
             if types:
-                self._folders.look()
-                for folder in self._folders.of(types):
+                place.look()
+                for folder in place.of(types):
                     folder.look(recording)
+            if place is self._folders:
                 self._looked_at |= types
-            return {one: self._rows_in(self._folders, recording, one) for one in topics}
+            return {one: self._rows_in(place, recording, one) for one in topics}
 
     def _rows_in(self, folders: _Folders, recording: RecordingEntry, topic: str) -> list[TopicRows]:
         """The rows of a topic in the files of some folders that were looked at."""

@@ -59,6 +59,7 @@ class LeftFields(Objects):
 
     def arrow(self) -> pa.StructArray:
         """The messages as an Arrow array; arrays of which only a summary is left are null."""
+        from hybridlog.columns.fields import records_of
         from hybridlog.columns.left_rows import documents
         from hybridlog.schema.arrow_columns import objects_array
         from hybridlog.schema.arrow_types import converted
@@ -66,32 +67,22 @@ class LeftFields(Objects):
         if not self.is_typed:
             found = documents(self._columns, typed=False, summaries=False)
             return objects_array(found, self.wanted())
-        return converted(self._records(()), self._empty.arrow().type, drops=True)
+        return converted(records_of(self._columns), self._empty.arrow().type, drops=True)
 
     def columns(self) -> pa.StructArray:
         """The messages as columns of tables."""
         return self._columns
 
-    def summarised(self) -> pa.StructArray:
-        """The messages as an Arrow array; those arrays are summaries of which one is left."""
-        from hybridlog.columns.left_rows import summarised_in
-
-        return self._records({*summarised_in(self._columns)})
-
-    def _records(self, summarised: Collection[str]) -> pa.StructArray:
-        """The fields; arrays at some paths are summaries."""
-        from hybridlog.columns.fields import records_of
-
-        return records_of(self._columns, lambda path: ".".join(path) in summarised)
-
     def statistics(self, paths: Iterable[str]) -> dict[str, pa.Array[Any]]:
         """`n`, `min`, `max` or `mean` of arrays by path (`ranges.min`), of those that have one."""
+        from hybridlog.columns.fields import names_of, records_of
         from hybridlog.schema.arrow_types import part_of_summary
 
         made = {}
         for path in paths:
-            array, _, what = path.rpartition(".")
-            found = part_of_summary(self._records({array}), array.split("."), what)
+            *array, what = names_of(path)
+            records = records_of(self._columns, (*array,).__eq__)
+            found = part_of_summary(records, array, what)
             if found is not None:
                 made[path] = found
         return made
