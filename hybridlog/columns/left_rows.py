@@ -31,7 +31,7 @@ from hybridlog.columns.layout import OWN_COLUMNS
 from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.arrow_types import Array, is_summary, plain_values
 from hybridlog.schema.index_bodies import MAX_BYTES
-from hybridlog.schema.objects import document_cells
+from hybridlog.schema.objects import plain_cells
 from hybridlog_storage.messages import Batch, Left
 
 if TYPE_CHECKING:
@@ -124,7 +124,7 @@ def documents(columns: Array, *, typed: bool, summaries: bool = True) -> list[di
     They are the fields of a struct array. With `typed`, a definition fixes the width of integers.
     Without `summaries`, there are no arrays of which only a summary is left.
     """
-    cells = partial(document_cells, typed=typed, whole=not summaries)
+    cells = partial(plain_cells, typed=typed)
     found = plain_values(records_of(columns), cells)
     if not summaries:
         return found

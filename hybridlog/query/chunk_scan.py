@@ -414,7 +414,7 @@ def matches(part: Part, channel: RecordedChannel, batch: Batch, seq: NDArray[np.
     times = batch.log_time[rows], seq[rows], batch.publish_time[rows]
     found = None if left else verdict_of(part, channel, decoded.arrow(), *times)
     if found is None or found.open.any():
-        plain = decoded.plain(whole=False)
+        plain = decoded.plain()
         if any(map(is_meta, predicate.fields())):
             meta = meta_array(structs({}, len(rows)), channel, *times).to_pylist()
             plain = [{**one, **own} for one, own in zip(plain, meta, strict=True)]

@@ -80,14 +80,13 @@ class Decoded:
 
         return records_array(self.records)
 
-    def plain(self, *, whole: bool = True) -> list[dict[str, object]]:
+    def plain(self) -> list[dict[str, object]]:
         """The messages as plain values: dict, list, str, bytes, bool, int, float, None.
 
         A field that a message lacks is not there. Times and durations are integer nanoseconds.
-        Without `whole`, protobuf's `bytes` are `{"n": length}`.
         """
         if not isinstance(self.records, Records):
-            return self.records.plain(whole=whole)
+            return self.records.plain()
         from hybridlog.schema.arrow_types import plain_values
 
         return plain_values(self.arrow())

@@ -51,7 +51,7 @@ class LeftFields(Objects):
         """Select messages."""
         return LeftFields(self._columns.filter(rows), self.fields, self._empty)
 
-    def plain(self, *, whole: bool) -> list[dict[str, object]]:
+    def plain(self) -> list[dict[str, object]]:
         """The messages as plain values, long arrays and bytes as summaries."""
         from hybridlog.columns.left_rows import documents
 

@@ -38,17 +38,13 @@ _INT64_MIN, _INT64_MAX = -(1 << 63), (1 << 63) - 1
 _LONG = frozenset(("int64", "uint32", "uint64"))
 
 
-def document_cells(array: pa.Array[Any], *, typed: bool, whole: bool) -> list[Any] | None:
-    """Cells of an array as plain values and index documents have them, for `plain_values`.
+def plain_cells(array: pa.Array[Any], *, typed: bool) -> list[Any] | None:
+    """Cells of an array as plain values have them, for `plain_values`.
 
-    With `typed`, a definition fixes the width of integers. Bytes are `{"n": length}`
-    without `whole`.
+    With `typed`, a definition fixes the width of integers.
     """
-    from hybridlog.schema.arrow_types import is_bytes, is_time, lengths_of
+    from hybridlog.schema.arrow_types import is_bytes, is_time
 
-    if is_bytes(array.type) and not whole:
-        counted = zip(lengths_of(array).tolist(), array.is_valid().to_pylist(), strict=True)
-        return [{"n": Int64(n)} if there else None for n, there in counted]
     if is_bytes(array.type):
         return cast("list[Any]", array.to_pylist())
     if is_time(array.type):
@@ -79,7 +75,7 @@ class Objects:
         """True if a definition fixes the types of the fields."""
         return False
 
-    def plain(self, *, whole: bool) -> list[dict[str, object]]:
+    def plain(self) -> list[dict[str, object]]:
         """The messages as plain values; see `Decoded.plain`."""
         return [cast("dict[str, object]", top(value)) for value in self.values]
 
@@ -87,7 +83,7 @@ class Objects:
         """The messages as an Arrow array; see `Decoded.arrow`."""
         from hybridlog.schema.arrow_columns import objects_array
 
-        return objects_array(self.plain(whole=True), self.wanted())
+        return objects_array(self.plain(), self.wanted())
 
     def wanted(self) -> list[list[str]] | None:
         """The wanted paths as the names they consist of."""
@@ -98,7 +94,7 @@ class Objects:
     def bodies(self, array_limit: int, max_bytes: int) -> Iterator[Bodies]:
         """As of `document.bodies`."""
         found: dict[int | str, tuple[list[int], list[bytes]]] = {}
-        for row, value in enumerate(self.plain(whole=False)):
+        for row, value in enumerate(self.plain()):
             body = _body_of(value, array_limit, max_bytes)
             rows, parts = found.setdefault(body if isinstance(body, str) else len(body), ([], []))
             rows.append(row)
@@ -134,9 +130,9 @@ def _indexed(value: Plain, limit: int, depth: int) -> object:
         raise PayloadError(f"it is nested deeper than {MAX_DEPTH}")
     if isinstance(value, dict):
         return {_key(k): _indexed(v, limit, depth + 1) for k, v in value.items()}
+    if isinstance(value, bytes) or (isinstance(value, list) and len(value) > limit):
+        return _summary(value)
     if isinstance(value, list):
-        if len(value) > limit:
-            return _summary(value)
         return [_indexed(v, limit, depth + 1) for v in value]
     if isinstance(value, str):
         return repaired_text(value)
@@ -149,9 +145,9 @@ def _key(key: str) -> str:
     return repaired_text(key).replace("\0", "\N{REPLACEMENT CHARACTER}")
 
 
-def _summary(values: list[Plain]) -> dict[str, object]:
+def _summary(values: list[Plain] | bytes) -> dict[str, object]:
     found: dict[str, object] = {"n": Int64(len(values))}
-    summary = summary_of(values)
+    summary = None if isinstance(values, bytes) else summary_of(values)
     if summary is None:
         return found
     if not summary.has[0]:

@@ -27,7 +27,7 @@ from hybridlog.schema.arrow_types import plain_values
 from hybridlog.schema.codec import ObjectCodec
 from hybridlog.schema.column import top_level_names
 from hybridlog.schema.definition import MAX_DEFINITION, FieldPath
-from hybridlog.schema.objects import Objects, document_cells
+from hybridlog.schema.objects import Objects, plain_cells
 from hybridlog_storage.errors import DefinitionError, PayloadError
 
 if TYPE_CHECKING:
@@ -131,9 +131,9 @@ class _Messages(Objects):
 
     descriptor: Descriptor | None = None
 
-    def plain(self, *, whole: bool) -> list[dict[str, object]]:
+    def plain(self) -> list[dict[str, object]]:
         """The fields that are set, or that do not track whether they are."""
-        cells = partial(document_cells, typed=True, whole=whole)
+        cells = partial(plain_cells, typed=True)
         parts = (slice(at, at + _PART) for at in range(0, len(self.values), _PART))
         return [one for part in parts for one in plain_values(self._arrow(part), cells)]
 
