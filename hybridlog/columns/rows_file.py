@@ -16,7 +16,7 @@ import pyarrow as pa
 
 from hybridlog.columns.column_file import ColumnFile, ColumnFileWriter
 from hybridlog.columns.fields import FieldShape
-from hybridlog.columns.layout import Section, table_schema_of
+from hybridlog.columns.layout import Section
 from hybridlog.columns.left_rows import digest_in, with_rows
 from hybridlog.columns.rows import as_table, columns_from, piece_of
 from hybridlog.index.indexing import ChunkIndexer
@@ -42,7 +42,6 @@ RESTORE: Final = " Restore it from a copy; `hybridlog verify` shows what is affe
 _GROUP_BYTES: Final = 4 << 20  # of a row group in memory
 _LEVEL: Final = 3  # of zstd: 9 takes 1 to 5 % less, for much more time
 _MAX_OPEN = 8  # files of different columns: each row group of them waits in memory
-_Kind = tuple[str, str, bool]  # topic, hash of its definition, whether messages are reduced
 
 
 class RowsFile(ColumnFile):
@@ -148,20 +147,16 @@ class RowsWriter:
         self._front = front
         self._version = version
         self._indexer = ChunkIndexer(folder.name)
-        self._shapes: dict[_Kind, FieldShape] = {}
-        self._open: dict[tuple[_Kind, pa.Schema], _OpenFile] = {}
+        self._shape = FieldShape()
+        self._open: dict[tuple[str, pa.Schema], _OpenFile] = {}  # by topic and columns
         self.names: list[str] = []
         """Names of the files, the first one first."""
 
     def add(self, chunk: StoredChunk) -> None:
         """Add the messages of a chunk."""
         for messages in self._indexer.messages_in([chunk], self._channels):
-            channel = messages.channel
-            is_reduced = isinstance(messages.codec, LeftCodec)
-            kind = channel.topic, table_schema_of(channel), is_reduced
-            table = _table(messages, self._shapes.setdefault(kind, FieldShape()))
-            file = self._file(kind, table.schema)
-            file.tables.append(table)
+            table = _table(messages, self._shape)
+            self._file(messages.channel.topic, table.schema).tables.append(table)
         for file in self._open.values():  # between chunks: none is in two row groups
             if sum(one.nbytes for one in file.tables) >= _GROUP_BYTES:
                 file.flush()
@@ -177,8 +172,8 @@ class RowsWriter:
         for file in self._open.values():
             file.writer.discard()
 
-    def _file(self, kind: _Kind, schema: pa.Schema) -> _OpenFile:
-        found = self._open.get((kind, schema))
+    def _file(self, topic: str, schema: pa.Schema) -> _OpenFile:
+        found = self._open.get((topic, schema))
         if found is None:
             if len(self._open) >= _MAX_OPEN:
                 self._finish(self._open.pop(next(iter(self._open))))
@@ -186,7 +181,7 @@ class RowsWriter:
             front = b"" if self.names else self._front
             self.names.append(name)
             writer = ColumnFileWriter(self._folder / name, schema, level=_LEVEL, front=front)
-            found = self._open[kind, schema] = _OpenFile(kind[0], writer)
+            found = self._open[topic, schema] = _OpenFile(topic, writer)
         return found
 
     def _finish(self, file: _OpenFile) -> None:
