@@ -139,13 +139,14 @@ class LeftCodec(Codec):
                 if reason is not None:
                     bad.setdefault(reason, []).append(row)
             there = error.is_null().to_numpy(zero_copy_only=False)
-            parts.append(fields_in(found.filter(error.is_null())))
+            parts.append(fields_in(found if there.all() else found.filter(there)))
             rows.append(own[there])
             has_surplus = found.field("ref").field("surplus").to_numpy(zero_copy_only=False)
             surplus.append(own[has_surplus])
         order = np.argsort(good := np.concatenate([no_rows(), *rows]))
         empty = self.original.columns(b"", no_rows(), no_rows(), fields)
-        columns = joined(parts).take(order) if parts else structs({}, 0)
+        columns = joined(parts) if parts else structs({}, 0)
+        columns = columns.take(order) if len(parts) > 1 else columns
         records = LeftFields(columns, fields, empty)
         return Decoded(good[order], records, unreadable(bad), np.sort(np.concatenate(surplus)))
 
