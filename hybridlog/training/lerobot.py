@@ -33,7 +33,7 @@ from hybridlog_storage.errors import PayloadError, UsageError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike, NDArray
 
     from hybridlog.query.query import Query
     from hybridlog.training.feature_map import FeatureMap
@@ -376,8 +376,9 @@ def _stats(array: NDArray[Any]) -> dict[str, list[Any]]:
     return {name: value.tolist() for name, value in found.items()}
 
 
-def _colour_stats(counts: NDArray[np.int64]) -> dict[str, list[Any]]:
+def _colour_stats(occurring: ArrayLike) -> dict[str, list[Any]]:
     """Statistics of colours from 0 to 1, of how often each value occurs in them."""
+    counts = np.asarray(occurring, np.int64)
     levels, total = np.arange(256) / 255, counts.sum(1)
     mean = counts @ levels / total
     rows = {

@@ -6,7 +6,7 @@ import json
 import shutil
 from collections.abc import Mapping
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -77,29 +77,22 @@ class WrittenEpisode:
         place: Its directory.
         about: Name, recording, begin and end, task, losses.
         length: Number of frames.
-        counts: int64[3, 256] by camera: how often each value occurs in a colour.
+        counts: 3 x 256 by camera: how often each value occurs in a colour.
         pixels: Rows and columns by camera.
     """
 
     place: Path
     about: dict[str, Any]
     length: int
-    counts: dict[str, NDArray[np.int64]] = field(default_factory=dict)
-    pixels: dict[str, tuple[int, int]] = field(default_factory=dict)
+    counts: dict[str, list[list[int]]]
+    pixels: dict[str, list[int]]
 
     @classmethod
     def read(cls, place: Path) -> WrittenEpisode | None:
         """The episode in a directory; None if it is not whole."""
         if not (place / _ABOUT).exists():
             return None
-        value = json.loads((place / _ABOUT).read_text())
-        return cls(
-            place,
-            value["about"],
-            value["length"],
-            {name: np.array(rows, np.int64) for name, rows in value["counts"].items()},
-            {name: (size[0], size[1]) for name, size in value["pixels"].items()},
-        )
+        return cls(place, **json.loads((place / _ABOUT).read_text()))
 
     def vectors(self) -> dict[str, NDArray[np.float32]]:
         """The features: float32[n, width] by name."""
@@ -123,7 +116,7 @@ def write_episode(
         "begin_ns": begin,
         "end_ns": end,
         "task": _task(session, episode, options),
-        "names": episode.names,
+        "names": {name: [*columns] for name, columns in episode.names.items()},
         "held": episode.held,
         "lost": lost.messages,
         "is_lost_exact": lost.is_exact,
@@ -142,14 +135,11 @@ def write_episode(
                     about["missing"][topic] = about["missing"].get(topic, 0) + shown
                 video.add(picture, shown)
             video.finish(f"{episode.name}: {topic}")
-        counts[name], pixels[name] = video.counts.tolist(), video.size
+        counts[name], pixels[name] = video.counts.tolist(), [*video.size]
     np.savez(place / _VECTORS, **episode.vectors)  # type: ignore[arg-type]
-    length = len(episode.times)
-    value = {"about": about, "length": length, "counts": counts, "pixels": pixels}
+    value = {"about": about, "length": len(episode.times), "counts": counts, "pixels": pixels}
     write_text(place / _ABOUT, json.dumps(value))
-    written = WrittenEpisode.read(place)
-    assert written is not None
-    return written
+    return WrittenEpisode(place, about, len(episode.times), counts, pixels)
 
 
 def _task(session: Session, episode: Episode, options: LerobotOptions) -> str:
