@@ -30,6 +30,7 @@ from hybridlog.columns.fields import (
 from hybridlog.columns.layout import OWN_COLUMNS
 from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.arrow_types import Array, is_summary, plain_values
+from hybridlog.schema.codec import payload_alone
 from hybridlog.schema.index_bodies import MAX_BYTES
 from hybridlog.schema.objects import plain_cells
 from hybridlog_storage.messages import Batch, Left
@@ -154,8 +155,7 @@ def reduced(codec: Codec, payload: bytes) -> bytes:
     """What stays of a message under pressure: its row, as an Arrow stream."""
     fields, error, surplus = structs({}, 1), None, False
     if codec.indexed:
-        start = np.zeros(1, np.int64)
-        decoded = codec.columns(payload, start, start + len(payload))
+        decoded = codec.columns_of(payload_alone(payload))
         surplus = len(decoded.surplus) > 0
         if decoded.unreadable:
             error = decoded.unreadable[0].reason

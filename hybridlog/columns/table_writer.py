@@ -37,7 +37,7 @@ from hybridlog.columns.layout import (
 )
 from hybridlog.columns.rows import Piece, as_table, columns_from, piece_of
 from hybridlog.schema.arrow_columns import structs
-from hybridlog.schema.codec import no_rows
+from hybridlog.schema.codec import NO_MESSAGES
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.left import LeftFields
 from hybridlog.schema.states import State, encoding_of, state_of
@@ -83,8 +83,8 @@ class _Topic:
         self.points = PointColumns() if arrays and is_cloud(whole) else None
         reserved = RESERVED if self.points is None else RESERVED | {POINTS}
         self.shape = FieldShape(arrays=arrays, reserved=reserved)
-        codec, none = codec_for(whole), no_rows()
-        decoded = codec.columns(b"", none, none) if codec.indexed else None
+        codec = codec_for(whole)
+        decoded = codec.columns_of(NO_MESSAGES) if codec.indexed else None
         self.none = structs({}, 0) if decoded is None else self.shape.columns(decoded.arrow())
         """No fields, with the columns that the definition fixes."""
         self.rows = 0

@@ -309,8 +309,9 @@ class Counters:
 
 @lru_cache(maxsize=256)
 def _arrow_type(codec: Codec, fields: frozenset[str] | None) -> Any:
-    none = np.empty(0, np.int64)
-    return codec.columns(b"", none, none, fields).arrow().type
+    from hybridlog.schema.codec import NO_MESSAGES
+
+    return codec.columns_of(NO_MESSAGES, fields).arrow().type
 
 
 def windows_in(windows: NDArray[np.int64] | None, bounds: Span | None) -> NDArray[np.int64]:

@@ -1,6 +1,6 @@
 """Codecs: payloads of any encoding as columns.
 
-A codec has one method for many messages, `columns`. Arrow arrays, plain objects and index
+A codec has one method for many messages, `columns_of`. Arrow arrays, plain objects and index
 documents are made from its result, in one way for all encodings.
 """
 
@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 import numpy as np
 
 from hybridlog.schema.column import STAMP, Records
 from hybridlog_storage.errors import DefinitionError, PayloadError
+from hybridlog_storage.messages import Batch
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
@@ -23,12 +24,23 @@ if TYPE_CHECKING:
 
     from hybridlog.schema.definition import FieldPath
     from hybridlog.schema.objects import Objects
-    from hybridlog_storage.messages import Batch, Buffer
+    from hybridlog_storage.messages import Buffer
 
 
 def no_rows() -> NDArray[np.intp]:
     """No row."""
     return np.empty(0, np.intp)
+
+
+def payload_alone(payload: bytes) -> Batch:
+    """A message of which only the payload matters."""
+    none = np.zeros(1, np.int64)
+    size = none + len(payload)
+    return Batch(payload, none, size, none.astype(np.int32), none, none, none.astype(np.uint32))
+
+
+NO_MESSAGES: Final = payload_alone(b"").take(no_rows())
+"""From them follow the types of fields."""
 
 
 @dataclass(slots=True)
@@ -105,22 +117,12 @@ class Codec(ABC):
         return []
 
     @abstractmethod
-    def columns(
-        self,
-        buffer: Buffer,
-        offset: NDArray[np.int64],
-        length: NDArray[np.int64],
-        fields: Collection[str] | None = None,
-    ) -> Decoded:
-        """Decode messages at `offset` (int64[n]) of `length` bytes (int64[n]) in a buffer.
+    def columns_of(self, batch: Batch, fields: Collection[str] | None = None) -> Decoded:
+        """Decode messages of one channel, with or without their payloads.
 
         `fields` are dotted paths of those wanted, each with all below it; None for all. Without a
         definition it raises DefinitionError.
         """
-
-    def columns_of(self, batch: Batch, fields: Collection[str] | None = None) -> Decoded:
-        """Decode messages of one channel, with or without their payloads; see `columns`."""
-        return self.columns(batch.buffer, batch.offset, batch.length, fields)
 
     @abstractmethod
     def decode(self, payload: Buffer) -> object:
@@ -135,11 +137,11 @@ class OpaqueCodec(Codec):
     def __init__(self, reason: str) -> None:
         self.reason = reason
 
-    def columns(self, *_: Any, **__: Any) -> NoReturn:
+    def columns_of(self, *_: Any, **__: Any) -> NoReturn:
         """Refuses with DefinitionError."""
         raise DefinitionError(f"cannot be decoded: {self.reason}. `.raw` has the bytes")
 
-    decode = columns
+    decode = columns_of
 
 
 class ObjectCodec(Codec):
@@ -151,19 +153,13 @@ class ObjectCodec(Codec):
 
         return Objects(values, fields)
 
-    def columns(
-        self,
-        buffer: Buffer,
-        offset: NDArray[np.int64],
-        length: NDArray[np.int64],
-        fields: Collection[str] | None = None,
-    ) -> Decoded:
-        """Decode messages; see `Codec.columns`."""
+    def columns_of(self, batch: Batch, fields: Collection[str] | None = None) -> Decoded:
+        """Decode messages; see `Codec.columns_of`."""
         rows: list[int] = []
         objects: list[Any] = []
         bad: dict[str, list[int]] = {}
-        view = memoryview(buffer)
-        places = zip(offset.tolist(), length.tolist(), strict=True)
+        view = memoryview(batch.buffer)
+        places = zip(batch.offset.tolist(), batch.length.tolist(), strict=True)
         for row, (start, size) in enumerate(places):
             try:
                 objects.append(self.decode(view[start : start + size]))

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
-from hybridlog.schema.codec import Codec, Decoded, no_rows, unreadable
+from hybridlog.schema.codec import NO_MESSAGES, Codec, Decoded, no_rows, unreadable
 from hybridlog.schema.column import Records
 from hybridlog.schema.objects import Objects
 from hybridlog.schema.states import CAUSES, State
@@ -107,18 +107,8 @@ class LeftCodec(Codec):
         """The fields of the messages."""
         return self.original.paths()
 
-    def columns(
-        self,
-        buffer: Buffer,
-        offset: NDArray[np.int64],
-        length: NDArray[np.int64],
-        fields: Collection[str] | None = None,
-    ) -> Decoded:
-        """No messages, since none has a payload; see `Codec.columns`."""
-        return self.original.columns(buffer, offset, length, fields)
-
     def columns_of(self, batch: Batch, fields: Collection[str] | None = None) -> Decoded:
-        """The fields that are left; see `Codec.columns`."""
+        """The fields that are left; see `Codec.columns_of`."""
         from hybridlog.columns.fields import joined
         from hybridlog.columns.left_rows import fields_in, with_rows
         from hybridlog.schema.arrow_columns import structs
@@ -127,7 +117,7 @@ class LeftCodec(Codec):
             batch = with_rows(batch)
         places = batch.left
         if places is None:
-            return self.columns(b"", no_rows(), no_rows(), fields)
+            return self.original.columns_of(NO_MESSAGES, fields)
         parts: list[pa.StructArray] = []
         rows: list[NDArray[np.intp]] = []
         bad: dict[str, list[int]] = {}
@@ -144,7 +134,7 @@ class LeftCodec(Codec):
             has_surplus = found.field("ref").field("surplus").to_numpy(zero_copy_only=False)
             surplus.append(own[has_surplus])
         order = np.argsort(good := np.concatenate([no_rows(), *rows]))
-        empty = self.original.columns(b"", no_rows(), no_rows(), fields)
+        empty = self.original.columns_of(NO_MESSAGES, fields)
         columns = joined(parts) if parts else structs({}, 0)
         columns = columns.take(order) if len(parts) > 1 else columns
         records = LeftFields(columns, fields, empty)

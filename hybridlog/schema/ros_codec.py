@@ -28,12 +28,10 @@ from hybridlog_storage.errors import DefinitionError, PayloadError
 if TYPE_CHECKING:
     from collections.abc import Collection
 
-    import numpy as np
-    from numpy.typing import NDArray
     from rosbags.interfaces.typing import FieldDesc, Typesdict
 
     from hybridlog.schema.codec import Decoded
-    from hybridlog_storage.messages import Buffer, Schema
+    from hybridlog_storage.messages import Batch, Buffer, Schema
 
 _MAX_UNROLLED = 10_000
 """Most elements of fixed arrays of strings and messages that rosbags unrolls into code."""
@@ -73,16 +71,10 @@ class RosCodec(Codec):
                 return self._objects.decode(self._readers(None).message_in(payload))
             raise
 
-    def columns(
-        self,
-        buffer: Buffer,
-        offset: NDArray[np.int64],
-        length: NDArray[np.int64],
-        fields: Collection[str] | None = None,
-    ) -> Decoded:
-        """Decode messages; see `Codec.columns`."""
+    def columns_of(self, batch: Batch, fields: Collection[str] | None = None) -> Decoded:
+        """Decode messages; see `Codec.columns_of`."""
         reader = self._readers(None if fields is None else frozenset(fields))
-        decoded = reader.read(buffer, offset, length)
+        decoded = reader.read(batch.buffer, batch.offset, batch.length)
         for bad in decoded.unreadable:
             bad.reason = f"the payload does not fit {self._name}: {bad.reason}"
         return decoded

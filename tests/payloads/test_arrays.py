@@ -30,6 +30,7 @@ from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
 from tests.cli.within import answer
 from tests.damage import flip
+from tests.indexed import batch_of
 from tests.payloads.logs import (
     BASE,
     CLOUD,
@@ -353,8 +354,7 @@ def test_points_are_those_of_the_messages(
     payload = bytes(TYPES.serialize_cdr(message, CLOUD))
     good = cloud([("w", 0, 8, 1)], 8, np.arange(3.0).tobytes())
     codec = codec_for(standard_channel(CLOUD))
-    sizes = np.array([len(good), len(payload)])
-    records = codec.columns(good + payload, np.cumsum(sizes) - sizes, sizes).arrow()
+    records = codec.columns_of(batch_of(good, payload)).arrow()
     maker = PointColumns()
     columns = maker.with_points(FieldShape(arrays=True).columns(records), records)
     found = columns.field("points")

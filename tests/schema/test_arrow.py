@@ -6,7 +6,6 @@ import json
 import math
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pytest
 from hypothesis import given, settings
@@ -14,15 +13,14 @@ from hypothesis import strategies as st
 
 from hybridlog.schema.codec import Codec, Decoded
 from hybridlog.schema.codecs import codec_for
-from hybridlog_storage.messages import Batch, Channel, Schema
+from hybridlog_storage.messages import Channel, Schema
+from tests.indexed import batch_of
 
 JSON = codec_for(Channel("/t", "json", None))
 
 
 def decoded_of(codec: Codec, payloads: list[bytes], fields: set[str] | None = None) -> Decoded:
-    length = np.array([len(p) for p in payloads], np.int64)
-    data, offset, none = b"".join(payloads), np.cumsum(length) - length, np.zeros(len(length))
-    return codec.columns_of(Batch(data, offset, length, none, none, none, none), fields)
+    return codec.columns_of(batch_of(*payloads), fields)
 
 
 def arrow_of(codec: Codec, payloads: list[bytes], fields: set[str] | None = None) -> Any:

@@ -10,7 +10,6 @@ import sys
 from typing import Any
 
 import bson
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -24,11 +23,6 @@ from hybridlog_storage.errors import DefinitionError, PayloadError
 from hybridlog_storage.messages import Channel, Schema
 from tests.indexed import batch_of, groups_of, index_fields
 from tests.schema.test_document import assert_same_but_for_rounded_means, document_of
-
-
-def joined(payloads: list[bytes]) -> tuple[bytes, np.ndarray, np.ndarray]:  # type: ignore[type-arg]
-    length = np.array([len(p) for p in payloads], np.int64)
-    return b"".join(payloads), np.cumsum(length) - length, length
 
 
 def bodies_of(codec: Codec, payloads: list[bytes]) -> list[bytes | str]:
@@ -92,8 +86,7 @@ def test_arrays_without_elements() -> None:
     wanted = {"a": [], "b": 7, "c": [], "d": [], "e": [], "f": inner, "g": [], "h": -3}
     assert index_fields(codec, payload) == wanted
     for count in (1, 20):
-        length = np.full(count, len(payload))
-        found = codec.columns(payload * count, np.arange(count) * len(payload), length)
+        found = codec.columns_of(batch_of(*[payload] * count))
         table = pa.Table.from_struct_array(found.arrow())
         stream = io.BytesIO()
         pq.write_table(table, stream)
@@ -134,7 +127,7 @@ def test_what_cannot_be_read_is_opaque_and_says_why(
     with pytest.raises(DefinitionError, match="raw"):
         codec.decode(b"abc")
     with pytest.raises(DefinitionError):
-        codec.columns(*joined([b"abc"]))
+        codec.columns_of(batch_of(b"abc"))
 
 
 def test_objects_of_hostile_definitions() -> None:
@@ -434,7 +427,7 @@ def test_protobuf_rules() -> None:
     assert "child.child" not in types
     assert types["_id_"] == "int32"
     wanted = {"stamp", "double_3", "int32_1"}
-    records = codec.columns(*joined([payload, b""]), wanted).arrow()
+    records = codec.columns_of(batch_of(payload, b""), wanted).arrow()
     stamps = records.field("stamp").view("int64").to_pylist()
     assert stamps == [1_700_000_000_000_000_005, None]
     assert [len(row) for row in records.field("double_3").to_pylist()] == [33, 0]
