@@ -30,7 +30,7 @@ from hybridlog_storage.mcap.mcap_content import (
     read_record,
 )
 from hybridlog_storage.mcap.mcap_scan import Scan
-from hybridlog_storage.segments.attachments import Attachment
+from hybridlog_storage.segments.attachments import Attachment, reader_of
 from tests.data import DATA, needs_data
 from tests.independent import write_mcap
 from tests.work import calls_in
@@ -42,8 +42,12 @@ if TYPE_CHECKING:
 CONFORMANCE = DATA / "mcap-conformance" / "data"
 
 
+def scan_of(data: bytes, **options: Any) -> Scan:
+    return Scan(lambda at, size: data[at : at + size], len(data), **options)
+
+
 def items_of(data: bytes, **options: Any) -> list[tuple[int, object]]:
-    return list(Scan(io.BytesIO(data), len(data), **options).items())
+    return list(scan_of(data, **options).items())
 
 
 def messages_of(content: ChunkContent) -> Iterator[Message]:
@@ -92,7 +96,7 @@ def test_conformance() -> None:
         )
         wanted = [record for record in official if not isinstance(record, skipped)]
         assert list(records_of(items_of(data))) == wanted, path.name
-        summary = Scan(io.BytesIO(data), len(data)).summary
+        summary = scan_of(data).summary
         theirs = make_reader(io.BytesIO(data)).get_summary()
         assert summary is None or theirs is not None
         if theirs is not None and summary is not None:
@@ -351,16 +355,16 @@ def test_a_wrong_summary_spoils_no_good_file() -> None:
 
 def test_a_damaged_summary_is_none() -> None:
     data = written()
-    assert Scan(io.BytesIO(data), len(data)).summary is not None
+    assert scan_of(data).summary is not None
     for at in range(parts_of(data)[1] + 13, len(data) - 8):
         bad = bytearray(data)
         bad[at] ^= 0x41
-        assert Scan(io.BytesIO(bytes(bad)), len(data)).summary is None
+        assert scan_of(bytes(bad)).summary is None
     for start in (0, 8, 12, 1 << 63, (1 << 64) - 1):
         bad = bytearray(data)
         struct.pack_into("<Q", bad, len(data) - 28, start)
         assert payloads(items_of(bytes(bad))) == ALL
-    assert Scan(io.BytesIO(MAGIC), 8).summary is None
+    assert scan_of(MAGIC).summary is None
 
 
 def test_memory_stays_bounded_over_a_long_file(tmp_path: Path) -> None:
@@ -373,7 +377,7 @@ def test_memory_stays_bounded_over_a_long_file(tmp_path: Path) -> None:
     with path.open("rb") as file:
         tracemalloc.start()
         try:
-            items = Scan(file, size).items()
+            items = Scan(reader_of(file.fileno()), size).items()
             rows = sum(len(i.batch) for _, i in items if isinstance(i, ChunkContent))
             _, peak = tracemalloc.get_traced_memory()
         finally:

@@ -31,7 +31,6 @@ from hybridlog_storage.times import END, span_of
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
-    from typing import BinaryIO
 
     from mcap.summary import Summary
     from numpy.typing import NDArray
@@ -55,30 +54,22 @@ class McapSource(Source):
     def __init__(self, path: Path) -> None:
         super().__init__(path, kind="MCAP", profile="", files=[path])
         try:
-            self._file: BinaryIO = path.open("rb")
+            with path.open("rb") as file:
+                # Attachments outlive this reader.
+                self._items = self._open(reader_of(file.fileno()))
         except OSError as error:
             raise cannot_open(path, error) from error
-        try:
-            self._items = self._open()
-        except OSError as error:
-            self._file.close()
-            raise cannot_open(path, error) from error
-        except BaseException:
-            self._file.close()
-            raise
-        # For attachments, which outlive this reader.
-        self._read: Callable[[int, int], bytes] | None = None
         self._given = 0
         self._too_many = 0
         self._unpublished = 0
 
-    def _open(self) -> Iterator[tuple[int, Item]]:
-        if self._file.read(len(MAGIC)) != MAGIC:
+    def _open(self, read: Callable[[int, int], bytes]) -> Iterator[tuple[int, Item]]:
+        if read(0, len(MAGIC)) != MAGIC:
             raise SourceError(
                 f"{self.path}: not an MCAP file, it does not start with the bytes of one; "
                 "check that the file was copied whole"
             )
-        scan = Scan(self._file, self.size_bytes, MAX_CHUNK)
+        scan = Scan(read, self.size_bytes, MAX_CHUNK)
         self._definitions = _Definitions(self.channels, scan.summary)
         if scan.summary is not None and scan.summary.statistics is not None:
             self.message_count = scan.summary.statistics.message_count
@@ -95,8 +86,7 @@ class McapSource(Source):
 
     def close(self) -> None:
         """Close the file."""
-        self._file.close()
-        self._read = None
+        self._items = iter(())
 
     def batches(self) -> Iterator[Batch]:
         """Yield all readable messages once, in file order."""
@@ -115,11 +105,8 @@ class McapSource(Source):
             self.note(Damage(self.path, item.offset, item.length, item.reason, item.messages))
         elif isinstance(item, records.Schema | records.Channel):
             self._definitions.add(item)
-        elif isinstance(item, records.Metadata):
+        elif isinstance(item, records.Metadata | Attachment):
             self.extras.append(item)
-        elif isinstance(item, Attachment):
-            self._read = self._read or reader_of(self._file.fileno())
-            self.extras.append(replace(item, data=item.data.through(self._read)))
 
     def _content(self, content: ChunkContent, offset: int) -> Iterator[Batch]:
         """Yield the messages of one chunk or run, split where a definition changes."""

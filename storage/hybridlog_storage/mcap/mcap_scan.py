@@ -7,7 +7,7 @@ reading goes on at the next chunk of the summary, or where plausible records fol
 from __future__ import annotations
 
 from contextlib import suppress
-from typing import TYPE_CHECKING, BinaryIO, Final, TypeAlias
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 from mcap.opcode import Opcode
 from mcap.records import McapRecord
@@ -46,9 +46,11 @@ from hybridlog_storage.segments.compression import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from mcap.summary import Summary
+
+    from hybridlog_storage.messages import Buffer
 
 _DATA_END: Final = RECORD_HEAD.pack(Opcode.DATA_END, 4)
 _CODECS: Final = frozenset({"", "zstd", "lz4"})
@@ -73,16 +75,18 @@ Item: TypeAlias = McapRecord | Attachment | ChunkContent | Damage
 
 
 class Scan:
-    """One MCAP file, read forward in bounded memory; its position is moved.
+    """One MCAP file, read forward in bounded memory; `read` takes an offset and a length.
 
     Chunks of more than `limit` uncompressed bytes count as damage. `summary` is None if it is
     missing, as in a file that was not closed, or damaged.
     """
 
-    def __init__(self, file: BinaryIO, size: int, limit: int = MAX_UNCOMPRESSED) -> None:
-        self._file = file
+    def __init__(
+        self, read: Callable[[int, int], Buffer], size: int, limit: int = MAX_UNCOMPRESSED
+    ) -> None:
+        self._read = read
         self._limit = limit
-        self._bytes = RecordFile(self._read, size, _WINDOW)
+        self._bytes = RecordFile(lambda *place: memoryview(read(*place)), size, _WINDOW)
         self.summary: Summary | None = None
         self._stop = self._read_summary()  # end of the data by the summary
         self._chunked = self.summary is not None and bool(self.summary.chunk_indexes)
@@ -90,10 +94,6 @@ class Scan:
         self._needs_crc = False  # messages have no checksum of their own
         self._is_damaged = False
         self._is_closed = False  # or damage tells that it is not
-
-    def _read(self, offset: int, length: int) -> memoryview:
-        self._file.seek(offset)
-        return memoryview(self._file.read(length))
 
     def _read_summary(self) -> int | None:
         end = self._bytes.size - TAIL

@@ -131,10 +131,6 @@ class FilePart:
         """Some of its bytes, as a part of the same file."""
         return FilePart(self._read, self._start + start, size)
 
-    def through(self, read: Callable[[int, int], Buffer]) -> FilePart:
-        """The same part, read in another way."""
-        return FilePart(read, self._start, self._size)
-
     def read(self, size: int = -1) -> bytes:
         """The next bytes: at most `size`, all without it; none at the end."""
         left = self._size - self._at
