@@ -70,14 +70,16 @@ def decompress(
     try:
         if compression == "zstd" and zstandard.frame_content_size(data) == uncompressed_size:
             return _decompressor(get_ident()).decompress(data, allow_extra_data=False)
-        return _joined(decompress_pieces(compression, data), uncompressed_size)
+        view = memoryview(data)
+        part = FilePart(lambda at, size: view[at : at + size], 0, len(view))
+        return _joined(decompress_pieces(compression, part), uncompressed_size)
     except MemoryError as error:
         raise SegmentError(f"there is no memory for its {uncompressed_size} bytes") from error
     except zstandard.ZstdError as error:
         raise SegmentError(f"its {compression} data is damaged ({error})") from error
 
 
-def _joined(pieces: Iterator[bytes | memoryview], size: int) -> memoryview:
+def _joined(pieces: Iterator[bytes], size: int) -> memoryview:
     """The content of a frame that does not say its size, or of several."""
     out, filled = memoryview(bytearray(size)), 0
     for piece in pieces:
@@ -109,9 +111,9 @@ def is_implausible(uncompressed_size: int, size: int) -> bool:
 
 
 class FilePart:
-    """A part of a file that is read piece by piece.
+    """A part of a file, or of memory, that is read piece by piece.
 
-    `read` takes an offset and a length. All of its `size` bytes are in the file.
+    `read` takes an offset and a length. All of its `size` bytes are there.
     """
 
     def __init__(self, read: Callable[[int, int], Buffer], start: int, size: int) -> None:
@@ -139,15 +141,15 @@ class FilePart:
         return data
 
 
-def decompress_pieces(compression: str, data: Buffer | FilePart) -> Iterator[bytes | memoryview]:
+def decompress_pieces(compression: str, data: FilePart) -> Iterator[bytes]:
     """Decompress in pieces of up to 256 KiB, in memory independent of the size.
 
     Pieces before damage are intact. A missing end is no error.
     """
-    if isinstance(data, FilePart):
-        data = data.again()
+    data = data.again()
     if compression == "":
-        yield from _slices(data)
+        while piece := data.read(_PIECE):
+            yield piece
         return
     check_size(compression, 0, len(data))
     try:
@@ -171,28 +173,17 @@ def checked_frame(data: Buffer) -> bytes:
     return _compressor(get_ident(), 1, check=True).compress(data)
 
 
-def _slices(data: Buffer | FilePart) -> Iterator[bytes | memoryview]:
-    if isinstance(data, FilePart):
-        while piece := data.read(_PIECE):
-            yield piece
-    else:
-        view = memoryview(data)
-        yield from (view[at : at + _PIECE] for at in range(0, len(view), _PIECE))
-
-
-def _zstd_pieces(data: Buffer | FilePart) -> Iterator[bytes]:
-    # Of a file, a reader needs only `read`.
-    source = cast("IO[bytes]", data) if isinstance(data, FilePart) else memoryview(data)
+def _zstd_pieces(data: FilePart) -> Iterator[bytes]:
+    source = cast("IO[bytes]", data)  # of which a reader needs only `read`
     whole = _decompressor(get_ident())
     reader = whole.stream_reader(source, read_across_frames=True, closefd=False)
     while piece := reader.read(_PIECE):
         yield piece
 
 
-def _lz4_pieces(data: Buffer | FilePart) -> Iterator[bytes]:
+def _lz4_pieces(data: FilePart) -> Iterator[bytes]:
     frame = lz4.frame.LZ4FrameDecompressor()
-    for taken in _slices(data):
-        rest: Buffer = taken
+    while rest := data.read(_PIECE):
         while rest:
             piece: bytes = frame.decompress(rest, max_length=_PIECE)
             while piece or not (frame.eof or frame.needs_input):
