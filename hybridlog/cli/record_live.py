@@ -263,19 +263,17 @@ def _stop_flag() -> Iterator[_Stop]:
     Flushed chunks stay, and the next command on the store seals them. While all is sealed and the
     follower is waited for, a signal leaves that.
     """
-    with _Stop() as stopped:
+    stopped = _Stop()
 
-        def stop(number: int) -> None:
-            if not stopped.leave() and stopped.is_set:
-                write_note(
-                    "\nhybridlog: stopped. Flushed chunks stay; the next command seals them."
-                )
-                os._exit(128 + number)
-            stopped.number = number
-            stopped.set()
+    def stop(number: int) -> None:
+        if not stopped.leave() and stopped.is_set:
+            write_note("\nhybridlog: stopped. Flushed chunks stay; the next command seals them.")
+            os._exit(128 + number)
+        stopped.number = number
+        stopped.set()
 
-        with handled(stop):
-            yield stopped
+    with handled(stop):
+        yield stopped
 
 
 def _pinned_by_signal(recorder: Recorder) -> AbstractContextManager[object]:

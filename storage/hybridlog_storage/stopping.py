@@ -12,15 +12,14 @@ something is read next, by `check_wanted`, or while it waits for a lock, by `hel
 
 from __future__ import annotations
 
-import os
-import select
 import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from queue import Empty, SimpleQueue
 from types import FrameType
-from typing import NoReturn, Self
+from typing import NoReturn
 
 Action = Callable[[], NoReturn]
 """Raises the exception that stops the work."""
@@ -28,41 +27,33 @@ _POLL_S = 0.05
 
 
 class Flag:
-    """An event for signal handlers: `set` takes no lock, unlike that of `threading.Event`.
+    """An event for signal handlers: they may interrupt its own methods, unlike an `Event`'s.
 
-    Only the main thread may wait for it. A context manager.
+    Only one thread may wait for it.
     """
 
     def __init__(self) -> None:
         self.is_set = False
-        self._reading, self._writing = os.pipe()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        os.close(self._reading)
-        os.close(self._writing)
+        self._calls: SimpleQueue[None] = SimpleQueue()
 
     def set(self) -> None:
         """Set it, and wake the waiting thread."""
-        if not self.is_set:
-            self.is_set = True
-            os.write(self._writing, b"\0")
+        self.is_set = True
+        self._calls.put(None)
 
     def wait(self, seconds: float) -> bool:
         """Wait until it is set, for at most so long; return whether it is."""
-        poll = select.poll()
-        poll.register(self._reading, select.POLLIN)
-        poll.poll(max(seconds, 0) * 1000)
+        if not self.is_set:
+            with suppress(Empty):
+                self._calls.get(timeout=max(seconds, 0))
         return self.is_set
 
 
 class _Block:
     """The outermost block that is stopped at safe points only."""
 
-    def __init__(self, flag: Flag) -> None:
-        self.flag = flag
+    def __init__(self) -> None:
+        self.flag = Flag()
         self.thread = threading.get_ident()
         self.action: Action | None = None
         self.is_anywhere = False
@@ -82,8 +73,8 @@ def at_safe_points() -> Iterator[None]:
     if _block is not None or threading.current_thread() is not threading.main_thread():
         yield
         return
-    with Flag() as flag, _delayed_interrupt():
-        block = _block = _Block(flag)
+    with _delayed_interrupt():
+        block = _block = _Block()
         try:
             yield
         finally:
