@@ -21,7 +21,7 @@ from hybridlog.live.sources.ros2.child.definitions import Definition, Definition
 from hybridlog.live.sources.ros2.child.middleware import VARIABLES, Offer, Profile
 from hybridlog.live.sources.ros2.child.outbox import MAX_PAYLOAD, Outbox
 from hybridlog.live.sources.ros2.child.topics import Topics
-from hybridlog.live.sources.ros2.receiver import Receiver
+from hybridlog.live.sources.ros2.source import Receiver
 from tests.imports import ROOT, imports_of
 from tests.limits import Limit
 from tests.live.sources.heard import Heard
