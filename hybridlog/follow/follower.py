@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any, Final
 
 from hybridlog.columns.recording_logs import RecordingRows
@@ -38,6 +37,7 @@ from hybridlog_storage.segments.chunk_table import places_of
 from hybridlog_storage.segments.gone_log import open_log
 from hybridlog_storage.segments.walk import OpenSegment
 from hybridlog_storage.settings import read_settings
+from hybridlog_storage.stopping import Flag
 
 if TYPE_CHECKING:
     from hybridlog.maintenance.report import Progress
@@ -394,8 +394,7 @@ class FollowerThread(Follower):
         self._interval_s = interval_s
         self._ended_as: RecordingEntry | None = None
         self._crash: BaseException | None = None
-        # No event: a thread that is interrupted in `set` may leave it locked forever.
-        self._calls: SimpleQueue[None] = SimpleQueue()
+        self._over = Flag()
         self._thread = threading.Thread(target=self._run, name="hybridlog-index", daemon=True)
         self._thread.start()
 
@@ -410,17 +409,14 @@ class FollowerThread(Follower):
     def abandon(self) -> None:
         """Stop it."""
         self.is_stopped = True
-        self._calls.put(None)
+        self._over.set()
         self._thread.join()
 
     def _run(self) -> None:
         try:
-            while not self.is_stopped:
-                try:
-                    self._calls.get(timeout=self._interval_s)
-                except Empty:
-                    with suppress(StoreError):  # the next look or `finish` sees it
-                        self.follow()
+            while not self._over.wait(self._interval_s):
+                with suppress(StoreError):  # the next look or `finish` sees it
+                    self.follow()
             if self._ended_as is not None:
                 self.is_stopped = False
                 with suppress(StoreError, DiskFullError):  # or else they are written when logs go

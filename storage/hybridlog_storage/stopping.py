@@ -41,11 +41,11 @@ class Flag:
         self.is_set = True
         self._calls.put(None)
 
-    def wait(self, seconds: float) -> bool:
-        """Wait until it is set, for at most so long; return whether it is."""
+    def wait(self, seconds: float | None) -> bool:
+        """Wait until it is set, for at most so long unless that is None; return whether it is."""
         if not self.is_set:
             with suppress(Empty):
-                self._calls.get(timeout=max(seconds, 0))
+                self._calls.get(timeout=None if seconds is None else max(seconds, 0))
         return self.is_set
 
 
