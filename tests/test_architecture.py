@@ -71,7 +71,7 @@ ALLOWED = {
         "hybridlog_storage.disk.directory",
         "hybridlog_storage.manifest",
         "hybridlog_storage.remote.store",
-        "hybridlog_storage.segments.segment_reader",
+        "hybridlog_storage.segments.segment_format",
         "hybridlog_storage.settings",
         "hybridlog_storage.summary",
     ),
