@@ -41,7 +41,11 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 # A machine that is busy is no defect of what is tested, however long an example takes.
 settings.register_profile(
-    "any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow]
+    "any machine",
+    max_examples=40,
+    deadline=None,
+    database=None,
+    suppress_health_check=list(HealthCheck),
 )
 settings.load_profile("any machine")
 

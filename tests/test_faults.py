@@ -124,7 +124,7 @@ def test_a_killed_recorder_loses_nothing_that_was_written(
     run("record", robot, "--quiet", "--name", "whole", store=path, code=0)
     whole = bytes_of(path, "whole")
     rng = random.Random(3)
-    moments = sorted([0, 1, whole - 1, *(rng.randrange(whole) for _ in range(3))])
+    moments = sorted([0, 1, whole - 1, *(rng.randrange(whole) for _ in range(2))])
     torn = 0
     for number, moment in enumerate(moments):
         name = f"torn{number}"
@@ -147,7 +147,7 @@ def test_a_killed_recorder_loses_nothing_that_was_written(
                 assert have == spoken[topic][: len(have)], (name, topic)
             assert store.verify([name]).findings == []
             store.remove(name)
-    assert torn >= 3
+    assert torn >= 2
     with hl.open(path, require_database=True) as store:
         assert content(fetched(store, "whole")) == Counter(
             m for part in spoken.values() for m in part

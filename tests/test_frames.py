@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hybridlog.frames import answer
@@ -131,7 +131,6 @@ def test_types_of_columns() -> None:
     assert all(not cell.flags.writeable for name in ("cov", "ranges") for cell in frame[name])
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     st.lists(st.lists(st.tuples(st.integers(-3, 3), st.integers(0, 2)), max_size=5), max_size=5),
     st.sampled_from([1, 5, 1 << 31]),
@@ -281,7 +280,6 @@ def test_the_common_type_of_numbers(one: str, other: str, kind: pa.DataType) -> 
 INTEGERS = st.integers(-(1 << 63), (1 << 64) - 1)
 
 
-@settings(max_examples=200, deadline=None)
 @given(st.lists(st.lists(INTEGERS | st.floats(allow_nan=False), min_size=1), min_size=1))
 def test_no_number_is_rounded(parts: list[list[float]]) -> None:
     arrays = [values_array(part) for part in parts]

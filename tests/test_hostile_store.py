@@ -22,6 +22,7 @@ from hybridlog_storage.errors import HybridlogError, StoreError
 from hybridlog_storage.mongo.mongod import EmbeddedMongod
 from tests import places
 from tests.cli.running import run
+from tests.some import in_turn
 from tests.waiting import wait_for
 
 pytestmark = pytest.mark.mongo("embedded")
@@ -232,8 +233,7 @@ def planted(template: Path, tmp_path: Path, name: str, target: Path) -> Path:
 KINDS = [*FILES, *FOLDERS, *TABLES]
 
 
-@pytest.mark.parametrize("leads", ["out", "to nothing"])
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("kind", "leads"), in_turn(KINDS, ["out", "to nothing"]))
 def test_a_place_that_leads_elsewhere(
     template: Path, tmp_path: Path, server: str, bag: Path, kind: str, leads: str
 ) -> None:

@@ -1089,7 +1089,7 @@ def test_whatever_happens_happens(machine: type[Machine], is_bag: bool) -> None:
 @pytest.mark.parametrize(
     ("examples", "steps"),
     [
-        (4, 20),
+        (2, 20),
         pytest.param(60, 30, marks=[pytest.mark.exhaustive, pytest.mark.timeout(3600)]),
     ],
 )
@@ -1101,7 +1101,7 @@ def test_the_store_is_its_model(machine: type[Machine], examples: int, steps: in
             stateful_step_count=steps,
             deadline=None,
             phases=(Phase.generate,),
-            derandomize=examples == 4,
+            derandomize=examples == 2,
             suppress_health_check=list(HealthCheck),
         ),
     )

@@ -131,7 +131,7 @@ def calls_of(tmp_path: Path, sync: str, monkeypatch: pytest.MonkeyPatch) -> int:
 def test_a_power_cut_while_recording(
     tmp_path: Path, sync: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    try_cuts(tmp_path, sync, monkeypatch, cuts=12, fates=3)
+    try_cuts(tmp_path, sync, monkeypatch, cuts=5, fates=2)
 
 
 def test_a_segment_of_the_last_group_that_a_power_cut_took(

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import hybridlog as hl
@@ -184,7 +184,6 @@ def test_what_is_refused(logs: Logs) -> None:
         base.between("2001-01-01", "2001-01-02").stats()
 
 
-@settings(max_examples=200, deadline=None)
 @given(
     st.lists(
         st.lists(

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 import hybridlog as hl
@@ -103,7 +103,6 @@ class ApproximateTime:
 times = st.lists(st.integers(0, 60).map(lambda n: 10 * n), max_size=12).map(sorted)
 
 
-@settings(max_examples=100)
 @given(
     st.lists(times, min_size=2, max_size=4),
     st.none() | st.integers(0, 100),

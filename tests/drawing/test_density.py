@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -74,7 +74,6 @@ SPANS = st.tuples(
 
 
 @given(span=SPANS, pixels=st.integers(1, 300), number=st.integers(0, 299))
-@settings(max_examples=40)
 def test_pixels_have_what_queries_count(
     store: hl.Store, span: tuple[int, int], pixels: int, number: int
 ) -> None:
@@ -93,7 +92,6 @@ def test_pixels_have_what_queries_count(
 
 
 @given(span=SPANS, pixels=st.sampled_from([1, 9, 250, 2000]))
-@settings(max_examples=40)
 def test_zooming_and_panning_change_nothing(span: tuple[int, int], pixels: int) -> None:
     edges = aligned(span, pixels)
     widths = np.diff(edges)

@@ -13,7 +13,7 @@ from typing import Any, cast
 import numpy as np
 import pyarrow as pa
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import hybridlog as hl
@@ -118,7 +118,6 @@ def _number(draw: st.DrawFn, kind: int) -> float:
     return draw(st.integers(least, least + 2**bits - 1))
 
 
-@settings(max_examples=60)
 @given(layouts())
 def test_clouds_of_any_layout(made: tuple[Any, list[dict[str, Any]]]) -> None:
     message, wanted = made

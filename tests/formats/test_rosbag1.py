@@ -13,7 +13,7 @@ from pathlib import Path
 
 import lz4.frame
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from rosbags.rosbag1 import Reader, Writer
 
@@ -165,7 +165,6 @@ def test_cut_anywhere_in_the_index(first: int) -> None:
         assert damage, cut
 
 
-@settings(max_examples=250, deadline=None)
 @given(compression=st.sampled_from(sorted(CASES)), data=st.data())
 def test_cut_anywhere(compression: str, data: st.DataObject) -> None:
     whole, expected = CASES[compression]
@@ -186,7 +185,6 @@ def test_cut_anywhere(compression: str, data: st.DataObject) -> None:
         assert total(found) + sum(filter(None, lost)) == total(expected)
 
 
-@settings(max_examples=250, deadline=None)
 @given(
     compression=st.sampled_from(sorted(CASES)),
     place=st.integers(0, 1 << 20),
@@ -211,7 +209,6 @@ def test_one_flipped_byte(compression: str, place: int, value: int) -> None:
     assert len(times) <= total(expected)
 
 
-@settings(max_examples=150, deadline=None)
 @given(st.binary(max_size=400))
 def test_any_bytes(data: bytes) -> None:
     head = CASES["none"][0][:4117]

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 import zstandard
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
@@ -143,7 +143,6 @@ def test_no_room_to_unpack(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
         open_source(folder)
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.text(max_size=60) | st.sampled_from(["!!python/object:os.system x", "&a [*a]"]))
 def test_metadata_is_untrusted(text: str) -> None:
     with pytest.raises(YamlError):
@@ -294,7 +293,6 @@ def test_everything_before_the_damage_is_read(
     assert f"rows from id {len(times) + 1} on cannot be read: SQLite says" in damage[0].reason
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.lists(st.tuples(st.integers(100, 1 << 18), st.integers(0, 255)), max_size=40))
 def test_random_damage_is_never_fatal(
     tmp_path_factory: pytest.TempPathFactory, changes: list[tuple[int, int]]
@@ -313,7 +311,6 @@ def test_random_damage_is_never_fatal(
         return
 
 
-@settings(max_examples=80, deadline=None)
 @given(st.data())
 def test_cut_anywhere(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
     path = tmp_path_factory.mktemp("db") / "a.db3"

@@ -13,7 +13,7 @@ import pyarrow.feather
 import pyarrow.ipc
 import pyarrow.parquet as pq
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hybridlog.formats.answer import Answer
@@ -195,7 +195,6 @@ def without_nan(value: object) -> object:
     return [without_nan(item) for item in value] if isinstance(value, list) else value
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.lists(nested, max_size=6), st.integers(0, 3))
 def test_json_text_is_what_json_reads(rows: list[dict[str, object]], cut: int) -> None:
     array = pa.array(rows, SCHEMA).slice(cut)

@@ -219,7 +219,7 @@ def test_an_interruption_at_any_instant_leaves_the_file_or_nothing(
         steps = interrupted(0, write, name, target)
     whole = contents(target)
     outcomes = set()
-    for at in [*range(1, steps, max(1, steps // 25)), steps]:
+    for at in [*range(1, steps, max(1, steps // 8)), steps]:
         place = tmp_path / str(at)
         place.mkdir()
         interrupted(at, write, name, place / "out")

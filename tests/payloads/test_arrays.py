@@ -15,7 +15,7 @@ import polars as pl
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
@@ -320,7 +320,6 @@ _FIELD = st.tuples(
 )
 
 
-@settings(max_examples=200)
 @given(
     layout=st.lists(_FIELD, max_size=5),
     step=st.integers(0, 40),

@@ -61,7 +61,7 @@ def log_of(store: Path, messages: list[tuple[int, bytes, int, int]]) -> tuple[Pa
 
 
 @given(messages=MESSAGES, kind=st.sampled_from(["expired", "elsewhere"]))
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 def test_a_log_and_its_rows_say_the_same(
     messages: list[tuple[int, bytes, int, int]], kind: str
 ) -> None:

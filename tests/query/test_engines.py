@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -399,17 +399,14 @@ def check(world: World, question: dict[str, Any]) -> None:
                     ], way
 
 
-relaxed = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow, HealthCheck.data_too_large]
-
-
-@settings(max_examples=15, suppress_health_check=relaxed)
+@settings(max_examples=15)
 @given(question=questions())
 def test_tables_and_chunks_answer_as_a_loop_does(world: World, question: dict[str, Any]) -> None:
     check(world, question)
 
 
 @pytest.mark.exhaustive
-@settings(max_examples=1500, suppress_health_check=relaxed)
+@settings(max_examples=1500)
 @given(question=questions())
 def test_three_thousand_questions(world: World, question: dict[str, Any]) -> None:
     check(world, question)

@@ -60,7 +60,7 @@ def test_every_command_has_a_rule() -> None:
 @pytest.mark.parametrize(
     "mongo", ["", pytest.param(NONE, marks=pytest.mark.slow)], ids=["mongodb", "without"]
 )
-@pytest.mark.parametrize("one", EVERY, ids=_id)
+@asked_in_turn(EVERY)
 def test_at_rest(
     running: Running, one: Asked, mongo: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -79,7 +79,7 @@ def test_at_rest(
 @asked_in_turn([rules[0] for rules in COMMANDS.values()], every=4)
 def test_in_a_process_of_its_own(running: Running, one: Asked, tmp_path: Path) -> None:
     words, out = place_for(one.words, tmp_path / "out")
-    done = run(*words, store=running.path, code=one.code)
+    done = run(*words, store=running.path, code=one.code, before=lambda: None)
     found = one.read(Answer(done.out, done.err, done.code), out)
     wanted = one.right(running.flushed())
     assert same(found, wanted), (found, wanted, done.err)
@@ -109,7 +109,7 @@ def test_while_segments_are_sealed(
     running: Running, one: Asked, tmp_path: Path, seen: list[dict[str, int]]
 ) -> None:
     """A command is of one state: what it sees at its end is what it has answered about."""
-    with running.writing(16, 0.004) as writing:
+    with running.writing(8, 0.004) as writing:
         asked = 0
         while writing.is_alive() or not asked:
             words, out = place_for(one.words, tmp_path / "out")

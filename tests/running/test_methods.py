@@ -138,7 +138,7 @@ MAX_BEHIND_S = 2.0
 def test_each_call_while_segments_are_sealed(running: Running, mongo: str | None) -> None:
     """Each answer is a beginning of the sequence, without a gap, and at most 2 s short."""
     with hl.open(running.path, mongo=mongo) as store:
-        with running.writing(250, 0.02) as writing:
+        with running.writing(100, 0.02) as writing:
             while writing.is_alive():
                 for name, call in CALLS.items():
                     begun = time.monotonic()

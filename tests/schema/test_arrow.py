@@ -8,7 +8,7 @@ from typing import Any
 
 import pyarrow as pa
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hybridlog.schema.codec import Codec, Decoded
@@ -90,7 +90,6 @@ JSON_VALUES = st.recursive(
 )
 
 
-@settings(max_examples=300, deadline=None)
 @given(st.lists(st.dictionaries(st.sampled_from("xyz"), JSON_VALUES), min_size=1, max_size=5))
 def test_any_json_is_exact(rows: list[dict[str, Any]]) -> None:
     records = arrow_of(JSON, [json.dumps(row).encode() for row in rows])

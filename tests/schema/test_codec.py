@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from bson.int64 import Int64
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hybridlog.schema.codec import Codec
@@ -171,7 +171,6 @@ plain = st.recursive(
 )
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.lists(st.dictionaries(st.sampled_from("abcd"), plain), max_size=5))
 def test_json_is_indexed_as_it_stands(values: list[dict[str, Any]]) -> None:
     payloads = [json.dumps(v).encode() for v in values]

@@ -6,7 +6,7 @@ import contextlib
 import time
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -483,7 +483,6 @@ TOKENS = st.sampled_from(
 )
 
 
-@settings(max_examples=400, deadline=None, database=None)
 @given(
     st.lists(TOKENS, max_size=40),
     st.sampled_from(["", " "]),
@@ -498,7 +497,6 @@ def test_nothing_but_one_error_comes_of_garbage(tokens, glue, encoding):
     paths(found)
 
 
-@settings(max_examples=100, deadline=None, database=None)
 @given(st.binary(max_size=200), st.sampled_from(["ros1msg", "ros2msg", "ros2idl"]))
 def test_bytes_that_are_no_text(data, encoding):
     with contextlib.suppress(DefinitionError):

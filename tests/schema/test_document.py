@@ -9,7 +9,7 @@ import bson
 import numpy as np
 import pytest
 from bson.int64 import Int64
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hybridlog.schema.column import Arrays, Column, Records, Scalars, Strings, take
@@ -157,7 +157,6 @@ def check(kind: tuple[Any, ...], rows: list[Any], **options: int) -> None:
         assert_same_but_for_rounded_means(document_of(body), reference(kind, row))
 
 
-@settings(max_examples=150, deadline=None)
 @given(st.data())
 def test_any_type_any_values(data: st.DataObject) -> None:
     fields = data.draw(st.dictionaries(st.sampled_from("stuvwxyz"), types, max_size=5))
@@ -165,7 +164,6 @@ def test_any_type_any_values(data: st.DataObject) -> None:
     check(kind, data.draw(st.lists(value_of(kind), min_size=1, max_size=8)))
 
 
-@settings(max_examples=50, deadline=None)
 @given(st.data())
 def test_a_body_does_not_depend_on_the_batch(data: st.DataObject) -> None:
     kind = ("message", data.draw(st.dictionaries(st.sampled_from("stuvwxyz"), types, max_size=5)))

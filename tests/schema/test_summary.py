@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hybridlog.schema.column import Scalars
@@ -47,7 +47,6 @@ def bits(summary: Summary) -> list[bytes]:
     return [b"".join(c[i].tobytes() for c in columns) for i in range(len(summary.n))]
 
 
-@settings(max_examples=150, deadline=None)
 @given(ragged())
 def test_against_exact_arithmetic(case: tuple[str, list[list[Any]]]) -> None:
     dtype, rows = case
@@ -69,7 +68,6 @@ def test_against_exact_arithmetic(case: tuple[str, list[list[Any]]]) -> None:
         assert abs(Fraction(found.mean[i].item()) - mean) <= bound
 
 
-@settings(max_examples=150, deadline=None)
 @given(ragged())
 def test_a_row_does_not_depend_on_the_others(case: tuple[str, list[list[Any]]]) -> None:
     dtype, rows = case

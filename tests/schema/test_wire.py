@@ -6,7 +6,7 @@ import struct
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.serde import SerdeError
 
@@ -150,9 +150,6 @@ class Values:
         return np.frombuffer(self.random.bytes(count * dtype.itemsize), dtype).copy()
 
 
-CASE = settings(
-    max_examples=100, deadline=None, suppress_health_check=[HealthCheck.too_slow], database=None
-)
 SHAPES = {
     "seed": st.integers(0, 2**32),
     "rows": st.sampled_from([1, 2, 15, 40]),
@@ -195,14 +192,12 @@ def supported(text: str, wire: str) -> bool:
     return True
 
 
-@CASE
 @given(text=definitions("ros1"), **SHAPES)
 def test_random_types_in_ros1(text, seed, rows, most, even):
     if supported(text, "ros1"):
         check_batch(*_three(make(text, "ros1", seed, rows, most, even), "ros1"))
 
 
-@CASE
 @given(text=definitions("cdr"), big=st.booleans(), **SHAPES)
 def test_random_types_in_cdr_of_both_byte_orders(text, big, seed, rows, most, even):
     check_batch(*_three(make(text, "cdr", seed, rows, most, even, big=big), "cdr"))
@@ -235,7 +230,6 @@ def pick(records, message_type, chosen, prefix=""):
 
 
 @pytest.mark.parametrize("wire", ["ros1", "cdr"])
-@CASE
 @given(data=st.data(), **SHAPES)
 def test_a_choice_of_fields_is_a_part_of_all_fields(wire, data, seed, rows, most, even):
     text = data.draw(definitions(wire))
@@ -276,7 +270,6 @@ def garble(payload: bytes, random) -> bytes:
 
 
 @pytest.mark.parametrize("wire", ["ros1", "cdr"])
-@CASE
 @given(data=st.data(), **SHAPES)
 def test_garbled_payloads_are_sorted_out_and_never_read_beyond(wire, data, seed, rows, most, even):
     text = data.draw(definitions(wire))

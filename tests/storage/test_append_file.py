@@ -70,7 +70,7 @@ def without(patch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("refusal", [never, at_opening, at_writing, in_steps, without])
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     parts=st.lists(
         st.lists(

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.records import Metadata
@@ -115,7 +115,6 @@ MESSAGE = st.tuples(
 )
 
 
-@settings(max_examples=40, deadline=None)
 @given(
     batches=st.lists(st.lists(MESSAGE, max_size=60), max_size=8),
     flushes=st.booleans(),

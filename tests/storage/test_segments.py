@@ -148,7 +148,7 @@ def messages_in(path: Path) -> list[tuple[str, int, bytes]]:
         ]
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(
     st.sampled_from([1 << 20, 2 << 20, 8 << 20]),
     st.lists(
@@ -691,7 +691,7 @@ def test_a_segment_that_lost_its_metadata_is_not_thrown_away(tmp_path: Path) -> 
     assert summary.recording["segment"] == 0
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.data())
 def test_a_full_disk_costs_nothing_that_was_told_of(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject

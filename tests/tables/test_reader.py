@@ -11,7 +11,7 @@ from typing import Any
 
 import pyarrow as pa
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import hybridlog as hl
@@ -45,7 +45,6 @@ keys = st.lists(st.tuples(st.integers(0, 9), st.integers(0, 99)), max_size=20, u
 
 
 @given(runs=st.lists(keys.map(sorted), max_size=4), size=st.integers(1, 5))
-@settings(deadline=None)
 def test_parts_are_merged(runs: list[list[tuple[int, int]]], size: int) -> None:
     """Those of several files, in the order of the log, whatever their times are."""
     seen: set[tuple[int, int]] = set()

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 import numpy as np
 import pyarrow as pa
 import pytest
-from hypothesis import HealthCheck, Phase, example, given, settings
+from hypothesis import Phase, example, given, settings
 from hypothesis import strategies as st
 
 from hybridlog.columns.left_rows import reduced
@@ -245,8 +245,6 @@ even_paths = [
 SLOW = settings(
     max_examples=15,
     phases=[Phase.explicit, Phase.generate],  # to shrink takes minutes
-    deadline=None,
-    suppress_health_check=[HealthCheck.too_slow],
     derandomize=True,
 )
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, example, given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from hybridlog.query.predicate.evaluate import on_objects
@@ -487,9 +487,7 @@ def holds(question: Question, document: Document) -> bool:
     raise AssertionError(question)
 
 
-@settings(
-    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True
-)
+@settings(derandomize=True)
 @given(st.lists(documents, min_size=5, max_size=40), st.lists(questions, min_size=5, max_size=15))
 def test_messages_answer_as_the_language_says(docs: list[Document], asked: list[Question]) -> None:
     types = {**TYPES, "z": "any"}
