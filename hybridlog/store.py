@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
 from copy import copy
 from functools import partial
 from pathlib import Path
@@ -17,7 +16,6 @@ from typing import (
     cast,
 )
 
-from hybridlog.index import consent
 from hybridlog.index.access import again_if_lost
 from hybridlog.index.of_store import Index
 from hybridlog.maintenance.report import Progress, RepairReport
@@ -36,11 +34,9 @@ from hybridlog_storage.errors import (
 from hybridlog_storage.remote import address_of, directory_of
 from hybridlog_storage.settings import (
     EMBEDDED,
-    NAME,
     NONE,
     cache_mb_from_environment,
     checked_cache_mb,
-    is_uri,
 )
 
 if TYPE_CHECKING:
@@ -148,12 +144,8 @@ def open_store(
 def _created(where: Path, mongo: str | None, cache_mb: int | None) -> StoreDirectory:
     """The directory of a store, made if there is none."""
     own = None if mongo in {None, EMBEDDED} else mongo
-    is_new = not os.path.lexists(where / NAME)
     directory = StoreDirectory.create(where, mongo=own, cache_mb=cache_mb)
     directory.check_writable()
-    if is_new and is_uri(own):
-        with suppress(StoreError):  # without a home directory, each command must name it again
-            consent.trust(directory.settings.store_id, own)
     return directory
 
 

@@ -2,66 +2,23 @@
 
 from __future__ import annotations
 
+import os
 import socket
-import stat
 import threading
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from hybridlog.index import consent
-from hybridlog_storage.errors import DatabaseError, StoreError
-from hybridlog_storage.settings import StoreSettings, write_settings
+from hybridlog.index import access
+from hybridlog_storage.errors import DatabaseError
+from hybridlog_storage.mongo.database import Database
+from hybridlog_storage.settings import NAME, StoreSettings, is_own, write_settings
 from tests import places
 from tests.cli.running import run
+from tests.other_user import needs_root
 
 pytestmark = pytest.mark.mongo("embedded")
-
-STORE = Path("some/store")
-URI = "mongodb://me@lab-server/robots?tls=true"
-
-
-@pytest.fixture(autouse=True)
-def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
-    return tmp_path / "state" / "hybridlog"
-
-
-def test_a_server_has_to_be_agreed_to(state: Path) -> None:
-    settings = StoreSettings("a", URI)
-    with pytest.raises(DatabaseError, match=r"mongodb://lab-server/robots\b.*") as caught:
-        consent.trusted_uri(settings, STORE)
-    assert "name it once by `--mongo URI`" in str(caught.value)
-    assert "me@" not in str(caught.value)
-    consent.trust("a", URI)
-    assert consent.trusted_uri(settings, STORE) == URI
-    for other in (StoreSettings("b", URI), StoreSettings("a", URI.replace("lab", "evil"))):
-        with pytest.raises(DatabaseError):
-            consent.trusted_uri(other, STORE)
-
-
-def test_what_is_agreed_to_is_kept_private_and_without_a_password(state: Path) -> None:
-    consent.trust("a", URI.replace("me@", "me:hunter2@"))
-    assert consent.is_trusted("a", URI)
-    (file,) = (state / "trusted").iterdir()
-    assert file.read_bytes() == b""
-    assert stat.S_IMODE((state / "trusted").stat().st_mode) == 0o700
-    file.rename(state / "other")
-    assert not consent.is_trusted("a", URI)
-    file.symlink_to(state / "other")
-    assert not consent.is_trusted("a", URI)
-
-
-def test_a_home_that_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "file").touch()
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
-    with pytest.raises(StoreError, match="trusted"):
-        consent.trust("a", URI)
-    assert not consent.is_trusted("a", URI)
-
-
-# --- the commands ---
 
 
 class Listener:
@@ -95,11 +52,12 @@ def listener() -> Iterator[Listener]:
 
 
 @pytest.fixture
-def foreign(tmp_path: Path, listener: Listener) -> Path:
+def foreign(tmp_path: Path, listener: Listener, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A store of somebody else's that leads to a server."""
     store = tmp_path / "foreign"
     places.root(store).mkdir(parents=True)
     write_settings(store, StoreSettings("f0", listener.uri))
+    monkeypatch.setattr(access, "is_own", lambda _: False)
     return store
 
 
@@ -115,31 +73,49 @@ def foreign(tmp_path: Path, listener: Listener) -> Path:
     ],
     ids=" ".join,
 )
-def test_no_command_connects_without_consent(
+def test_no_command_connects_to_the_server_of_another_owner(
     foreign: Path, listener: Listener, command: tuple[str, ...]
 ) -> None:
     done = run(*command, store=foreign, code=None)
     assert listener.visits == 0
     if command[0] in {"verify", "index"}:
         assert done.code == 6
-        assert "name it once by `--mongo URI`" in done.err
+        assert "name it by `--mongo URI`" in done.err
 
 
-@pytest.mark.parametrize("way", ["option", "variable"])
-def test_what_was_named_once_is_used(foreign: Path, listener: Listener, way: str) -> None:
+@pytest.mark.parametrize("way", ["option", "variable", "owner"])
+def test_what_is_named_or_owned_is_used(
+    foreign: Path, listener: Listener, way: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     extra = ["--mongo", listener.uri] if way == "option" else []
     env = {"HYBRIDLOG_MONGO_URI": listener.uri} if way == "variable" else {}
+    if way == "owner":
+        monkeypatch.setattr(access, "is_own", is_own)
     run("verify", *extra, store=foreign, code=6, **env)
     assert listener.visits > 0
-    before = listener.visits
-    done = run("verify", store=foreign, code=6)
-    assert listener.visits > before
-    assert "--mongo" not in done.err
 
 
-def test_another_server_that_is_named_agrees_to_nothing(foreign: Path, listener: Listener) -> None:
-    run("verify", "--mongo", "mongodb://127.0.0.1:1/y", store=foreign, code=6)
-    assert listener.visits == 0
-    assert not consent.is_trusted("f0", listener.uri)
-    run("verify", store=foreign, code=6)
-    assert listener.visits == 0
+@needs_root
+def test_a_store_belongs_to_the_owner_of_its_settings(tmp_path: Path) -> None:
+    write_settings(tmp_path, StoreSettings("a"))
+    assert is_own(tmp_path)
+    os.chown(tmp_path / NAME, 12345, -1)
+    assert not is_own(tmp_path)
+
+
+@pytest.mark.parametrize("is_named", [True, False])
+def test_the_password_goes_only_to_a_server_that_was_named(
+    tmp_path: Path, is_named: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An unpacked store is its user's own, and may come from anybody."""
+    uri, given = "mongodb://me@127.0.0.1:1/x", list[str]()
+    write_settings(tmp_path, StoreSettings("a", uri))
+
+    def connect(uri: str, **_: object) -> None:
+        given.append(uri)
+        raise DatabaseError("no")
+
+    monkeypatch.setattr(Database, "connect", connect)
+    env = {"HYBRIDLOG_MONGO_PASSWORD": "hunter2"}
+    run("verify", *(["--mongo", uri] if is_named else []), store=tmp_path, code=6, **env)
+    assert {*given} == {uri.replace("me@", "me:hunter2@") if is_named else uri}

@@ -24,6 +24,7 @@ from hybridlog_storage.settings import (
     MIN_CACHE_MB,
     NAME,
     NONE,
+    is_own,
     with_password,
     without_password,
 )
@@ -106,7 +107,6 @@ class IndexAccess:
         self._directory = shared.directory
         self.cache_mb = cache_mb
         self._progress = progress
-        self._uri: str | None = None
         self._mongod: EmbeddedMongod | None = None
         self._database: Database | None = None
         self._owns = False  # the index is of the store at this place, not of a copy elsewhere
@@ -207,7 +207,7 @@ class IndexAccess:
     @property
     def _own_place(self) -> str:
         """The place of the store, as its index has it; the embedded MongoDB moves with it."""
-        if self._uri == EMBEDDED:
+        if self._named == EMBEDDED:
             return EMBEDDED
         return f"{platform.node()}:{os.path.realpath(self._directory.path)}"
 
@@ -216,7 +216,7 @@ class IndexAccess:
         name = self.connect().name
         if self._mongod is not None:
             return IndexAddress(self._mongod.publish(wait_s), name)
-        return IndexAddress(without_password(self._uri or ""), name)
+        return IndexAddress(without_password(self._named), name)
 
     @property
     def _named(self) -> str:
@@ -241,23 +241,26 @@ class IndexAccess:
 
     def _another(self) -> Database:
         """A new connection; starts the embedded MongoDB if it is not running."""
-        from hybridlog.index import consent
-
-        if self._uri is None:
-            self._uri = consent.trusted_uri(
-                self._directory.settings, self._directory.path, self.wanted
-            )
-        if self._uri == NONE:
+        uri = self._named
+        if uri == NONE:
             setting = "--mongo none" if self.wanted else f'mongo = "none" in {NAME}'
             raise WithoutMongoError(
                 f"The store is used without MongoDB ({setting}). With --mongo embedded, or --mongo "
                 "URI, a command uses one; `hybridlog index rebuild` makes its index."
             )
-        from hybridlog_storage.mongo.database import Database
+        from hybridlog_storage.mongo.database import Database, without_secrets
 
-        if self._uri == EMBEDDED:
+        if uri == EMBEDDED:
             return Database.connect(self._started(), timeout_s=_EMBEDDED_TIMEOUT_S)
-        return Database.connect(with_password(self._uri), timeout_s=_TIMEOUT_S)
+        if self.wanted is not None:
+            # No other server gets the password: an unpacked store is a user's own, too.
+            return Database.connect(with_password(uri), timeout_s=_TIMEOUT_S)
+        if not is_own(self._directory.path):
+            raise DatabaseError(
+                f"The store {self._directory.path} names a MongoDB at {without_secrets(uri)}, and "
+                f"its {NAME} is not yours: if that server is, name it by `--mongo URI`."
+            )
+        return Database.connect(uri, timeout_s=_TIMEOUT_S)
 
     def _started(self) -> str:
         """The URI of the embedded MongoDB, which runs."""
@@ -322,7 +325,7 @@ class IndexAccess:
         self.may_write = database.may_write()
         owner = state.owner()
         if owner is not None and owner.store != store_id:
-            if self._uri != EMBEDDED:
+            if self._named != EMBEDDED:
                 raise other_store(database)
             database.drop_all()  # the store is a copy that has an id of its own now
             owner = None

@@ -29,7 +29,6 @@ from hybridlog.entries import (
     topic_of,
 )
 from hybridlog.follow.follower import bring, make_tables
-from hybridlog.index import consent
 from hybridlog.maintenance import tables
 from hybridlog.maintenance.opening import recover, recover_segments
 from hybridlog.maintenance.report import Repaired, reporter
@@ -455,7 +454,4 @@ def become_another(path: Path, mongo: str | None) -> None:
             "of its own: --mongo mongodb://host/NAME, or --mongo embedded."
         )
     own = None if mongo == EMBEDDED else mongo or settings.mongo
-    changed = structs.replace(settings, store_id=secrets.token_hex(16), mongo=own)
-    write_settings(path, changed)
-    if is_uri(own):
-        consent.trust(changed.store_id, own)
+    write_settings(path, structs.replace(settings, store_id=secrets.token_hex(16), mongo=own))

@@ -1,7 +1,7 @@
 """The settings of a store: its file `hybridlog.toml`.
 
 The file may come from another user, or be read by others of a group. So it holds no
-password, and a URI in it is only a proposal (`hybridlog.index.consent`).
+password, and a URI in it counts only for its owner.
 """
 
 from __future__ import annotations
@@ -42,7 +42,8 @@ _HOST = r"(?:\[[^\s@/\[\]]+\]|[^\s@:/?\[\]]+)(?::\d{1,5})?"
 _HOSTS = re.compile(rf"{_HOST}(?:,{_HOST})*")
 LOGIN_CURE: Final = (
     "Give the password in HYBRIDLOG_MONGO_PASSWORD, or in a file that "
-    "HYBRIDLOG_MONGO_PASSWORD_FILE names."
+    "HYBRIDLOG_MONGO_PASSWORD_FILE names: a server that --mongo or HYBRIDLOG_MONGO_URI names "
+    "gets it."
 )
 """The cure for a password that is missing or readable by others."""
 
@@ -87,6 +88,11 @@ def read_settings(path: Path) -> StoreSettings:
                 "there."
             ) from error
         raise unreadable(error, file) from error
+
+
+def is_own(path: Path) -> bool:
+    """True if the settings of a store are a file of this user."""
+    return files.status(path / NAME).st_uid == os.geteuid()
 
 
 def settings_of(content: bytes, store: str) -> StoreSettings:

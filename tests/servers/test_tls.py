@@ -111,8 +111,8 @@ def test_everything_works_and_the_password_stays_where_it_is(
     password = tmp_path / "password"
     password.touch(0o600)
     password.write_text(PASSWORD + "\n")
-    env = {"HYBRIDLOG_MONGO_PASSWORD_FILE": str(password)}
-    said = [run("record", log, "--mongo", uri, store=store, **env)]
+    env = {"HYBRIDLOG_MONGO_PASSWORD_FILE": str(password), "HYBRIDLOG_MONGO_URI": uri}
+    said = [run("record", log, store=store, **env)]
     where = ("fetch", "-t", "/number", "--where", "n >= 100")
     counted = run(*where, "--count", "--quiet", store=store, **env)
     assert counted.out.split() == [str(MESSAGES - 100)]
@@ -124,7 +124,7 @@ def test_everything_works_and_the_password_stays_where_it_is(
     said += [counted, rows, indexed, verified, again, run("verify", store=store, **env)]
     monkeypatch.setenv("HYBRIDLOG_MONGO_PASSWORD_FILE", str(password))
     channel = Channel("/live", "ros1", Schema("a/N", "ros1msg", b"uint32 n\n"), {}, False)
-    with hl.open(store, require_database=True) as opened:
+    with hl.open(store, mongo=uri, require_database=True) as opened:
         recording = opened.start("live")
         for n in range(100):
             recording.write(channel, n.to_bytes(4, "little"))

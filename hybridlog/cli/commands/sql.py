@@ -15,6 +15,7 @@ from hybridlog.cli.answers import SCREEN, Tabular
 from hybridlog.cli.binder import SECONDS, SIZE, argument, command, option
 from hybridlog.cli.options import Ranged, Strict
 from hybridlog.cli.signals import if_stopped
+from hybridlog_storage.disk.files import user_directory
 from hybridlog_storage.errors import HybridlogError
 from hybridlog_storage.stopping import at_safe_points
 
@@ -126,7 +127,6 @@ def _line_editing(connection: SqlConnection, lines: Sequence[str]) -> Iterator[N
     except ImportError:
         yield
         return
-    from hybridlog.index.consent import state_directory
     from hybridlog.sql.names import DELIMITERS, candidates
 
     found: list[str] = []
@@ -141,7 +141,7 @@ def _line_editing(connection: SqlConnection, lines: Sequence[str]) -> Iterator[N
 
     path: Path | None = None
     with suppress(HybridlogError, OSError):
-        path = state_directory() / _HISTORY
+        path = user_directory("XDG_STATE_HOME", ".local/state", "the history") / _HISTORY
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         if path.exists():
             readline.read_history_file(path)
