@@ -20,6 +20,7 @@ DAY = 86_400 * 10**9
 NOW = 20_000 * DAY  # 2024
 MB = 10**6
 CAMERA, SCAN = "/camera/front", "/scan"
+Recording = tuple[Manifest, list[Held]]
 
 
 SIZES = {CAMERA: 8 * MB, SCAN: 2 * MB}
@@ -58,7 +59,7 @@ def gone(number: int, age: float) -> list[File]:
     return [log, rows]
 
 
-def held(name: str, *files: File, ended: bool = True, window: int = 0, **values: Any) -> Held:
+def held(name: str, *files: File, ended: bool = True, window: int = 0, **values: Any) -> Recording:
     manifest = Manifest(
         f"{name}-{sum(name.encode()):016x}",
         name,
@@ -68,10 +69,12 @@ def held(name: str, *files: File, ended: bool = True, window: int = 0, **values:
         files=files,
         **values,
     )
-    return held_of(manifest, NOW, window)
+    return manifest, held_of(manifest, NOW, window)
 
 
-def made(rules: Mapping[str, Any], *recordings: Held, used: float = 0, free: float = 1e12) -> Plan:
+def made(
+    rules: Mapping[str, Any], *recordings: Recording, used: float = 0, free: float = 1e12
+) -> Plan:
     return plan(recordings, Rules.of(rules), used=round(used), free=round(free), now=NOW)
 
 
@@ -126,7 +129,7 @@ def test_when_room_is_short_the_oldest_goes(used: int, free: int, steps: list[An
 def test_a_topic_rule_leaves_what_a_trigger_may_want() -> None:
     rules = {"quota": "100MB", "topic": {CAMERA: "1y"}}
     running = held("running", *both(50, 40, 20), ended=False, window=25 * DAY)
-    assert [s.goes_last for s in running.segments] == [False, False, True, True, True, True]
+    assert [log.goes_last for log in running[1]] == [False, False, True, True, True, True]
     assert [one[:3] for one in told(made(rules, running, used=90 * MB))] == [
         ("running", (0,), (CAMERA,))
     ]

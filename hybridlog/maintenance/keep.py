@@ -152,13 +152,15 @@ class Keeper:
         """
         with self._alone():
             found = KeepReport(self.plan(Rules()))
-            for held in self._held(time.time_ns()):
-                if held.id == recording and not rules.is_never(held.tags):
-                    own = (s.number for s in held.segments if s.may_go and not s.is_pinned)
-                    step = Step(held.name, held.id, tuple(digests.keys() & {*own}), (), 0, "")
+            for manifest, logs in self._held(time.time_ns()):
+                if manifest.id == recording and not rules.is_never(manifest.tags):
+                    own = {one.log.number for one in logs if one.may_go and not one.is_pinned}
+                    going = tuple(digests.keys() & own)
                     how = {"digests": digests, "copy": copy, "progress": progress}
-                    if step.segments:
-                        self._do(step, rules, found, how)
+                    if going:
+                        self._do(
+                            Step(manifest.name, recording, going, (), 0, ""), rules, found, how
+                        )
         return found
 
     @contextmanager
@@ -171,29 +173,20 @@ class Keeper:
             self._failed.clear()
             yield
 
-    def _held(self, now: int) -> Iterator[Held]:
-        """What may go of the recordings; damaged and unproven ones are left alone."""
+    def _held(self, now: int) -> Iterator[tuple[Manifest, list[Held]]]:
+        """Recordings and what they hold; nothing of those that are unproven, or held by others."""
         self._unproven.clear()
         for manifest in self._directory.manifests.each(self._directory.ids()):
+            failed, logs = self._failed[manifest.id], list[Held]()
             if manifest.status == "unproven":
                 self._unproven.add(manifest.name)
-                continue
-            failed = self._failed[manifest.id]
-            is_own = manifest.id == self._own
-            if is_own:
-                held = held_of(manifest, now, self._window, self._judged())
-            else:
-                held = held_of(manifest, now)
-            # Of a damaged log, its group stays, too.
-            left = [
-                replace(s, may_go=False, is_pinned=True) if s.number in failed else s
-                for s in held.segments
-            ]
-            if not is_own and (
-                _WHOLE in failed or (not held.is_ended and self._directory.is_recorded(held.id))
+            elif manifest.id == self._own:
+                logs = held_of(manifest, now, self._window, self._judged(), failed)
+            elif _WHOLE not in failed and (
+                manifest.is_ended or not self._directory.is_recorded(manifest.id)
             ):
-                left, held = [], replace(held, is_ended=False)
-            yield replace(held, segments=left)
+                logs = held_of(manifest, now, stays=failed)
+            yield manifest, logs
 
     def _do(self, step: Step, rules: Rules, found: KeepReport, how: Mapping[str, Any]) -> None:
         """Do a step, with the room of the spare file if there is no other; reports in `found`."""
@@ -286,7 +279,6 @@ LOOK_S: Final = 5.0
 """Seconds between two looks at the rules and at free space."""
 _TICK_S: Final = 0.1
 _AGES_S: Final = 60.0  # between two passes for the ages alone
-_PATIENCE_S: Final = 60.0  # of a full disk's writer for a pass
 
 
 class RetentionThread:
@@ -330,11 +322,8 @@ class RetentionThread:
         self._reserve = self._wanted = reserve
         self._say = say
         self._over = threading.Event()
-        self._passed = threading.Condition()
-        self._passes = 0  # that have ended
-        self._asked = 0  # number of the pass that must be made
-        self._is_urgent = False  # a writer waits for it
-        self._freed = 0  # bytes, by the last pass
+        self._alone = threading.Lock()  # who makes a pass
+        self._is_asked = False  # for one
         self._is_exhausted = False  # nothing was left to go when it was asked for
         self._thread = threading.Thread(target=self._run, name="hybridlog-keep", daemon=True)
         self._rules = self._read_rules()
@@ -347,30 +336,20 @@ class RetentionThread:
     def stop(self) -> None:
         """End after the deletion in progress."""
         self._over.set()
-        with self._passed:
-            self._passed.notify_all()
         if self._thread.is_alive():
             self._thread.join()
 
     def wants(self, free_bytes: int) -> bool:
         """Ask for so many free bytes; False if none can be made."""
         self._wanted = max(free_bytes, self._reserve)
-        with self._passed:
-            if self._asked <= self._passes:
-                if self._is_exhausted:
-                    return False
-                self._asked = self._passes + 1
+        if self._is_exhausted and not self._is_asked:
+            return False
+        self._is_asked = True
         return self._rules.makes_room
 
     def make_room(self) -> bool:
-        """Wait for a pass, on a full disk; returns whether it freed anything."""
-        with self._passed:
-            self._asked = seen = self._passes + 1
-            self._is_urgent = True
-            done = self._passed.wait_for(
-                lambda: self._passes >= seen or self._over.is_set(), _PATIENCE_S
-            )
-            return done and not self._over.is_set() and self._freed > 0
+        """Make a pass on a full disk, for a writer that waits; returns whether to try again."""
+        return self._pass(is_urgent=True) != 0
 
     def _read_rules(self) -> Rules:
         rules = Rules.of(read_settings(self._directory.path).retention)
@@ -380,35 +359,41 @@ class RetentionThread:
         looked = last_pass = -_AGES_S
         sealed = 0
         while not self._over.wait(_TICK_S):
-            now, count, is_low = time.monotonic(), self._sealed(), False
-            is_asked = self._asked > self._passes
-            freed = 0
-            try:
-                if now - looked >= LOOK_S or is_asked:
-                    looked, self._rules = now, self._read_rules()
+            now, count, is_asked, is_low = time.monotonic(), self._sealed(), self._is_asked, False
+            if now - looked >= LOOK_S:
+                looked = now
+                with self._saying():
                     free = shutil.disk_usage(self._directory.path).free
+                    self._rules = self._read_rules()
                     is_low = free < (self._rules.min_free or 0)
-                is_due = is_asked or is_low or count != sealed or now - last_pass >= _AGES_S
-                if not is_due:
-                    continue
+            if is_asked or is_low or count != sealed or now - last_pass >= _AGES_S:
                 last_pass, sealed = now, count
-                if not self._rules.is_empty:
-                    freed = self._make_pass()
-            except HeldError:
-                sealed, freed = -1, 1  # another process makes room: see later what is left
-            except (HybridlogError, OSError) as error:
-                self._say(f"making room failed: {error}")
-            with self._passed:
-                self._freed, self._passes = freed, self._passes + 1
-                self._is_exhausted = is_asked and not freed
-                self._passed.notify_all()
+                freed = self._pass()
+                sealed = -1 if freed is None else sealed
+                self._is_exhausted, self._is_asked = is_asked and freed == 0, False
 
-    def _make_pass(self) -> int:
-        done = self._keeper.keep(replace(self._rules, is_urgent=self._is_urgent))
-        self._is_urgent = False
-        warnings = [] if self._has_warned else done.plan.warnings
-        self._has_warned = bool(done.plan.warnings)
-        reasons = (f"making room: {step.reason}" for step in done.plan.steps)
-        for text in (*reasons, *done.problems, *warnings):
-            self._say(text)
-        return done.freed_bytes
+    @contextmanager
+    def _saying(self) -> Iterator[None]:
+        try:
+            yield
+        except (HybridlogError, OSError) as error:
+            self._say(f"making room failed: {error}")
+
+    def _pass(self, *, is_urgent: bool = False) -> int | None:
+        """Make a pass; returns the bytes that it freed, None while another process makes one."""
+        with self._alone, self._saying():
+            self._rules = self._read_rules()
+            if self._over.is_set() or self._rules.is_empty:
+                return 0
+            try:
+                done = self._keeper.keep(replace(self._rules, is_urgent=is_urgent))
+            except HeldError:
+                self._over.wait(_TICK_S)
+                return None
+            warnings = [] if self._has_warned else done.plan.warnings
+            self._has_warned = bool(done.plan.warnings)
+            reasons = (f"making room: {step.reason}" for step in done.plan.steps)
+            for text in (*reasons, *done.problems, *warnings):
+                self._say(text)
+            return done.freed_bytes
+        return 0

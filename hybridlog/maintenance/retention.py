@@ -7,9 +7,10 @@ topics and times of their channels. Nothing is deleted here; see `keep.py`.
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final
 
 from hybridlog.maintenance.expiry import may_go
 from hybridlog.query.choice import Choice
@@ -152,93 +153,84 @@ def _age_ns(value: object) -> int:
 
 
 @dataclass(frozen=True, slots=True)
-class HeldSegment:
-    """A log, or what is left of it.
+class Held:
+    """A log of a recording, or what is left of it.
 
     Attributes:
         written: When it was written, or the time of its last message if that is later, ns.
-        size: Bytes of its file; 0 if it is gone.
-        may_go: Whether its payloads may go before its group: not those of small topics.
+        row_bytes: Bytes of its files of rows.
         is_pinned: Whether a pin keeps messages of it.
+        stays: Whether nothing of its group may go now.
         goes_last: Whether a trigger may still want what it holds.
     """
 
-    number: int
-    group: int
+    recording: Manifest
+    log: File
     written: int
-    size: int
     row_bytes: int
     topics: frozenset[str]
-    may_go: bool
     is_pinned: bool
-    goes_last: bool = False
+    stays: bool
+    goes_last: bool
 
+    @property
+    def key(self) -> tuple[str, int]:
+        """Id of its recording, and its number."""
+        return self.recording.id, self.log.number
 
-@dataclass(frozen=True, slots=True)
-class Held:
-    """The content of a recording.
+    @property
+    def size(self) -> int:
+        """Bytes of its file; 0 if it is gone."""
+        return self.log.bytes if self.log.is_here else 0
 
-    Attributes:
-        created: When it began, ns.
-        written: When its last segment was written, or its last message if that is later, ns.
-        size: Bytes of all its files.
-    """
+    @property
+    def may_go(self) -> bool:
+        """Whether its payloads may go before its group, unless they are pinned."""
+        return may_go(self.log) and not self.stays
 
-    id: str
-    name: str
-    created: int
-    written: int
-    tags: Mapping[str, str]
-    size: int
-    segments: Sequence[HeldSegment]
-    is_ended: bool = True
-    pins: int = 0
+    @property
+    def order(self) -> tuple[bool, int, int, tuple[str, int]]:
+        """The oldest first, and last what a trigger may want."""
+        return self.goes_last, self.written, self.recording.created, self.key
 
 
 def held_of(
-    manifest: Manifest, now: int, window: int = 0, seen: Collection[int] | None = None
-) -> Held:
-    """The content of a recording at `now`, ns.
+    manifest: Manifest,
+    now: int,
+    window: int = 0,
+    seen: Collection[int] | None = None,
+    stays: Collection[int] = (),
+) -> list[Held]:
+    """The logs of a recording at `now`, ns.
 
-    Segments that are at most `window` (ns) older than its newest sealed message go last, and those
+    Those that are at most `window` (ns) older than its newest sealed message go last, and those
     that are not among the numbers that triggers have `seen`; None if there are no triggers.
+    `stays` has the numbers of those that cannot go.
     """
-    found: list[HeldSegment] = []
+    found: list[Held] = []
     recent = math.inf
     if window:
         ends = [part.last or 0 for log in manifest.logs.values() for part in log.parts.values()]
         recent = max(ends, default=0) - window
-    later, last, rows = now, 0, manifest.rows
+    later, rows = now, manifest.rows
     for number, log in sorted(manifest.logs.items(), reverse=True):
         parts = _parts_of(log, manifest)
-        times = [part.last for _, part in parts if part.last is not None]
-        written = min(max([log.written, *times]), now)
-        # A segment is not newer than those that follow it, whatever the clock was.
-        later, last = min(later, written), max(last, written)
+        last = max((part.last or 0 for _, part in parts), default=0)
+        # A log is not newer than those that follow it, whatever the clock was.
+        later = min(later, max(log.written, last))
         found.append(
-            HeldSegment(
-                number,
-                log.group,
+            Held(
+                manifest,
+                log,
                 later,
-                log.bytes if log.is_here else 0,
                 sum(file.bytes for file in rows.get(number, ())),
                 frozenset(topic for topic, _ in parts),
-                may_go(log),
                 is_pinned(log, manifest),
-                max(times, default=0) >= recent or (seen is not None and number not in seen),
+                number in stays,
+                last >= recent or (seen is not None and number not in seen),
             )
         )
-    return Held(
-        manifest.id,
-        manifest.name,
-        manifest.created,
-        last,
-        manifest.tags,
-        sum(one.size + one.row_bytes for one in found),
-        found[::-1],
-        manifest.is_ended,
-        len(manifest.pins),
-    )
+    return found[::-1]
 
 
 def _parts_of(log: File, manifest: Manifest) -> list[tuple[str, Part]]:
@@ -311,62 +303,39 @@ class Plan:
     is_short: bool = False
 
 
-def plan(held: Iterable[Held], rules: Rules, *, used: int, free: int | None, now: int) -> Plan:
+def plan(
+    held: Iterable[tuple[Manifest, Sequence[Held]]],
+    rules: Rules,
+    *,
+    used: int,
+    free: int | None,
+    now: int,
+) -> Plan:
     """Plan deletions: their order, and the reason of each.
 
-    `held` lacks segments that another process records; `used` and `free` are bytes, the latter None
-    in a bucket; `now` is ns.
+    `held` are recordings with their logs, none of those that another process records; `used` and
+    `free` are bytes, the latter None in a bucket; `now` is ns.
     """
-    return _Planning([*held], rules, used, free, now).made()
-
-
-class _Piece(NamedTuple):
-    """A segment of a recording of which something may go."""
-
-    held: Held
-    segment: HeldSegment
-
-    @property
-    def order(self) -> tuple[bool, int, int, str, int]:
-        """The oldest first, and last what a trigger may want."""
-        held, one = self.held, self.segment
-        return one.goes_last, one.written, held.created, held.id, one.number
+    return _Planning(rules, Plan(used, free), now).made(held)
 
 
 class _Planning:
-    def __init__(
-        self, held: list[Held], rules: Rules, used: int, free: int | None, now: int
-    ) -> None:
-        self._held = held
-        self._rules = rules
-        self._now = now
-        self._plan = Plan(used, free)
+    def __init__(self, rules: Rules, made: Plan, now: int) -> None:
+        self._rules, self._plan, self._now = rules, made, now
         self._freed = 0
-        self._others: list[Held] = []  # without those that a tag keeps
-        self._gone: set[str] = set()  # recordings
-        self._pieces: list[_Piece] = []
-        self._shared: set[str] = set()  # topics of rules, in segments with others
-        self._going: set[tuple[str, int]] = set()  # recordings and numbers of segments
+        self._left: list[Held] = []  # logs of recordings of which something may go
+        self._shared: set[str] = set()  # topics of rules, in logs with others
+        self._going: set[tuple[str, int]] = set()  # keys of logs
 
-    def made(self) -> Plan:
-        kept = [one for one in self._held if self._rules.is_never(one.tags)]
-        others = [one for one in self._held if not self._rules.is_never(one.tags)]
-        pinned = [s for one in others for s in one.segments if s.may_go and s.is_pinned]
-        self._plan.pins = sum(one.pins for one in self._held)
-        self._plan.pinned_bytes = sum(s.size for one in kept for s in one.segments if s.may_go)
-        self._plan.pinned_bytes += sum(s.size for s in pinned)
-        self._others = others
-        self._whole_recordings(others)
-        self._pieces = sorted(
-            (
-                _Piece(o, s)
-                for o in others
-                if o.id not in self._gone
-                for s in o.segments
-                if s.may_go
-            ),
-            key=lambda piece: piece.order,
-        )
+    def made(self, held: Iterable[tuple[Manifest, Sequence[Held]]]) -> Plan:
+        for manifest, logs in held:
+            is_never = self._rules.is_never(manifest.tags)
+            pinned = [one.size for one in logs if one.may_go and (is_never or one.is_pinned)]
+            self._plan.pinned_bytes += sum(pinned)
+            self._plan.pins += len(manifest.pins)
+            if not is_never and not self._goes_whole(manifest, logs):
+                self._left += logs
+        self._left.sort(key=lambda one: one.order)
         self._by_age()
         self._by_room()
         self._warn()
@@ -376,16 +345,15 @@ class _Planning:
         # The age of what a clock that was not set has written is unknown.
         return _CLOCK_WAS_SET <= written <= self._now - age
 
-    def _whole_recordings(self, others: Iterable[Held]) -> None:
+    def _goes_whole(self, manifest: Manifest, logs: Sequence[Held]) -> bool:
         age = self._rules.fields_age
-        if age is None:
-            return
-        age_ns = parse_duration(age)
-        for one in others:
-            if one.is_ended and not one.pins and self._is_older(one.written, age_ns):
-                self._gone.add(one.id)
-                reason = f"fields older than {age}"
-                self._step(Step(one.name, one.id, (), (), one.size, reason))
+        if age is None or manifest.pins or not manifest.is_ended:
+            return False
+        if not logs or not self._is_older(logs[-1].written, parse_duration(age)):
+            return False
+        size = sum(one.size + one.row_bytes for one in logs)
+        self._step(Step(manifest.name, manifest.id, (), (), size, f"fields older than {age}"))
+        return True
 
     def _by_age(self) -> None:
         age = self._rules.max_age
@@ -398,7 +366,7 @@ class _Planning:
         if self._short(_SEGMENTS_FROM, 1.0) > 0:
             need = self._short(_TOPICS_FROM, _TOPICS_BELOW)
             if self._rules.is_urgent:
-                self._pieces.sort(key=lambda piece: (piece.segment.goes_last, -piece.segment.size))
+                self._left.sort(key=lambda one: (one.goes_last, -one.size))
             self._take(self._reason(_SEGMENTS_FROM, 1.0), need=need)
         for rule in self._rules.topics:
             need = self._short(_TOPICS_FROM, _TOPICS_BELOW)
@@ -415,28 +383,23 @@ class _Planning:
         """
         reason = f"{self._reason(_SEGMENTS_FROM, 1.0)}, and no payloads are left to go"
         need = self._short(_TOPICS_FROM, _TOPICS_BELOW)
-        found: dict[tuple[bool, int, int, str, int], list[_Piece]] = {}
-        held = [
-            one
-            for one in self._others
-            if one.id not in self._gone and (one.is_ended or self._rules.is_urgent)
-        ]
-        for one in held:
-            for number in {segment.group for segment in one.segments}:
-                own = [_Piece(one, s) for s in one.segments if s.group == number]
-                found[min(piece.order for piece in own)] = own
+        groups: defaultdict[tuple[str, int], list[Held]] = defaultdict(list)
+        for one in sorted(self._left, key=lambda one: one.order):
+            if one.recording.is_ended or self._rules.is_urgent:
+                groups[one.recording.id, one.log.group].append(one)
         chosen: dict[str, dict[int, int]] = {}  # what becomes free besides, by group
-        for _, own in sorted(found.items()):
-            if need > 0 and not any(piece.segment.is_pinned for piece in own):
-                left = (p for p in own if (p.held.id, p.segment.number) not in self._going)
-                size = sum(p.segment.size for p in left) + sum(p.segment.row_bytes for p in own)
-                chosen.setdefault(own[0].held.id, {})[own[0].segment.group] = size
+        for (recording, group), logs in groups.items():
+            if need > 0 and not any(one.is_pinned or one.stays for one in logs):
+                size = sum(one.row_bytes for one in logs)
+                size += sum(one.size for one in logs if one.key not in self._going)
+                chosen.setdefault(recording, {})[group] = size
                 need -= size
-        for one in held:
-            if groups := chosen.get(one.id):
-                is_whole = one.is_ended and groups.keys() == {s.group for s in one.segments}
-                numbers = () if is_whole and not one.pins else tuple(groups)
-                self._step(Step(one.name, one.id, (), (), sum(groups.values()), reason, numbers))
+        for recording, own in chosen.items():
+            manifest = groups[recording, next(iter(own))][0].recording
+            left = {group for one, group in groups if one == recording} - own.keys()
+            is_whole = manifest.is_ended and not left and not manifest.pins
+            numbers = () if is_whole else tuple(own)
+            self._step(Step(manifest.name, recording, (), (), sum(own.values()), reason, numbers))
 
     def _short(self, share: float, times: float) -> float:
         """Bytes that are to become free for a share of the quota, and for the free space."""
@@ -463,34 +426,32 @@ class _Planning:
         age_ns: int | None = None,
         need: float = math.inf,
     ) -> None:
-        """Let segments go, the oldest first, until `need` bytes become free; a step a recording.
+        """Let logs go, the oldest first, until `need` bytes become free; a step a recording.
 
         With `rule`, those with no other topics than its own; with `age_ns`, those that are as old.
         """
-        chosen: dict[str, list[_Piece]] = {}  # by recording
-        for held, segment in self._pieces:
-            key = held.id, segment.number
+        chosen: dict[str, list[Held]] = {}  # by recording
+        for one in self._left:
             if need <= 0:
                 break
-            if age_ns is not None and not self._is_older(segment.written, age_ns):
+            if not one.may_go or (age_ns is not None and not self._is_older(one.written, age_ns)):
                 continue
             if rule is not None:
-                fits = {t for t in segment.topics if self._rules.topic_rule(t) is rule}
-                if fits != segment.topics:
+                fits = {t for t in one.topics if self._rules.topic_rule(t) is rule}
+                if fits != one.topics:
                     self._shared |= fits
                     continue
-            if age_ns is None and rule is not None and segment.goes_last:
-                continue
-            if key not in self._going and not segment.is_pinned:
-                self._going.add(key)
-                need -= segment.size
-                chosen.setdefault(held.id, []).append(_Piece(held, segment))
-        for pieces in chosen.values():
-            held, going = pieces[0].held, [piece.segment for piece in pieces]
-            topics = set[str]().union(*(one.topics for one in going if rule is not None))
-            numbers = tuple(sorted(one.number for one in going))
-            size = sum(one.size for one in going)
-            self._step(Step(held.name, held.id, numbers, tuple(sorted(topics)), size, reason))
+                if age_ns is None and one.goes_last:
+                    continue
+            if one.key not in self._going and not one.is_pinned:
+                self._going.add(one.key)
+                need -= one.size
+                chosen.setdefault(one.recording.id, []).append(one)
+        for recording, logs in chosen.items():
+            topics = set[str]().union(*(one.topics for one in logs if rule is not None))
+            numbers = tuple(sorted(one.log.number for one in logs))
+            size, name = sum(one.size for one in logs), logs[0].recording.name
+            self._step(Step(name, recording, numbers, tuple(sorted(topics)), size, reason))
 
     def _step(self, step: Step) -> None:
         self._freed += step.bytes
