@@ -225,7 +225,7 @@ class Store:
     @property
     def database(self) -> Database | None:
         """The index, connected on first access; None if MongoDB is unavailable."""
-        return self.shared.index.database
+        return self.shared.index.reached()
 
     @property
     def index(self) -> Index:

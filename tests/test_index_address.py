@@ -66,6 +66,6 @@ def test_an_address_has_no_password(tmp_path: Path) -> None:
     uri = "mongodb://me:secret@127.0.0.1:1/robots?serverSelectionTimeoutMS=1&authSource=admin"
     with hl.open(tmp_path / "store", create=True, mongo=uri) as store:
         index = store.shared.index
-        index._uri = uri
+        index.wanted = uri
         index.connect = lambda: SimpleNamespace(name="robots")  # type: ignore[method-assign, assignment, return-value]
         assert index.address(1).uri == uri.replace(":secret", "")

@@ -12,6 +12,7 @@ import pytest
 import hybridlog as hl
 from hybridlog.maintenance.verify import RESTORE
 from hybridlog_storage.errors import SegmentError, TopicError
+from hybridlog_storage.manifest import replace
 from hybridlog_storage.manifests import MANIFEST_OLD
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
@@ -136,6 +137,20 @@ def test_what_a_kill_has_left_is_sealed_before_its_manifest_is_made(store: Path)
     (folder / MANIFEST_OLD).unlink()
     assert repair(store)[0] == {("one", "manifest")}
     assert look(store) == ("unproven", COUNT, 0)
+
+
+@pytest.mark.mongo("embedded")
+def test_without_a_repair_no_file_is_changed(store: Path) -> None:
+    folder = places.folder(store, "one")
+    last = max(folder.glob("*.mcap"))
+    last.rename(last.with_name(f"{last.name}.open"))
+    places.change_in(folder, lambda now: replace(now, status="open"))
+    before = {p: p.read_bytes() for p in places.root(store).rglob("*") if p.is_file()}
+    with hl.open(store) as opened:
+        done = opened.verify()
+    assert done.index
+    assert "a crash has left it open" in {one.problem for one in done.findings}
+    assert {p: p.read_bytes() for p in places.root(store).rglob("*") if p.is_file()} == before
 
 
 @pytest.mark.parametrize("has_old", [True, False])

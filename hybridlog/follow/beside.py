@@ -231,7 +231,7 @@ class _Beside:
                 kept = sum(one.messages for one in segments)
                 self.tell("say", f"{name} was cut short by a crash: {kept} messages are recovered")
         self._store.shared.invalidate()
-        self._store.shared.index.database  # noqa: B018 - brings the index up to date
+        self._store.shared.index.reached()  # which brings it up to date
 
 
 def _takes(trigger: Trigger, topic: str) -> bool:

@@ -123,23 +123,21 @@ class IndexAccess:
         """The index, if it is connected already."""
         return None if self._database is None or self._database.is_lost else self._database
 
-    @property
-    def database(self) -> Database | None:
-        """The index, connected when it is needed; None if MongoDB is unavailable.
+    def reached(self, *, brings: bool = True, writes: bool = False) -> Database | None:
+        """The index, connected when it is needed; without `brings`, it may lack recordings.
 
-        A failure is remembered for some seconds.
+        None if it is unavailable, or if it is for who `writes`, and its user may only read. A
+        failure is remembered for some seconds.
         """
-        return self._reached(brings=True)
-
-    @property
-    def writable_database(self) -> Database | None:
-        """The index; None if it is unavailable, or if its user may only read."""
-        database = self.database
-        return database if self.may_write else None
+        is_ready = self._is_complete or not brings
+        if (self.connected is None or not is_ready) and time.monotonic() >= self._rests_until:
+            with suppress(HybridlogError):
+                self.connect(brings=brings)
+        return self.connected if self.may_write or not writes else None
 
     def database_for(self, purpose: str, *, writes: bool = False, brings: bool = True) -> Database:
         """The index, for a purpose that errors name; without `brings`, it may lack recordings."""
-        database = self._reached(brings=brings)
+        database = self.reached(brings=brings)
         if database is None:
             raise DatabaseError(f"{purpose} needs MongoDB. {self.unavailable or ''}".strip())
         if writes and not self.may_write:
@@ -277,14 +275,6 @@ class IndexAccess:
         if self._mongod.damage is not None:
             self._shared.repairs.damage.append(self._mongod.damage)
         return uri
-
-    def _reached(self, *, brings: bool) -> Database | None:
-        """The index, connected when it is needed; `brings` it up to date first."""
-        is_ready = self._is_complete or not brings
-        if (self.connected is None or not is_ready) and time.monotonic() >= self._rests_until:
-            with suppress(HybridlogError):
-                self.connect(brings=brings)
-        return self.connected
 
     def _connect(self, *, brings: bool) -> Database:
         from hybridlog.maintenance.derived import StoreIndex

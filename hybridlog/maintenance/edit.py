@@ -269,7 +269,7 @@ def remove_if(
     directory = shared.directory
     try:
         entry = shared.now().entry(recording)
-        database = shared.index.writable_database
+        database = shared.index.reached(writes=True)
         with directory.writing(entry.id, entry.name, wait_s=LOCK_WAIT_S):
             try:
                 directory.manifests.remove(entry.id, check)

@@ -120,22 +120,21 @@ def verify(
 ) -> Verification:
     """Check every byte of segments, manifests and tables, and count the documents of the index.
 
-    `names` are those of recordings by id, None for all; `repairs` makes the repairs first. Without
-    MongoDB, only files are checked.
+    `names` are those of recordings by id, None for all; `repairs` makes the repairs first, else
+    nothing is written. Without MongoDB, only files are checked.
     """
     directory, catalog, left = shared.directory, shared.catalog, list[Finding]()
     result = Verification()
     if repairs:
         left = _repair(shared, names, result.repaired, progress)
         shared.invalidate()
-    database = shared.index.database
+    database = shared.index.reached(brings=repairs)
     result.index = database is not None
-    index = None if database is None else _Index(database)
     checker = tables.TableChecker(directory)
     for recording in _all(directory) if names is None else names:
         result.recordings += 1
         try:
-            check = _Check(directory, catalog, index, recording, result, checker=checker)
+            check = _Check(directory, catalog, database, recording, result, checker=checker)
             check.run(progress)
         except ManifestError as error:
             cure = RESTORE if directory.is_remote else _REPAIR
@@ -154,23 +153,6 @@ def _all(directory: StoreDirectory) -> list[str]:
     return [*directory.ids(), *directory.manifests.without()]
 
 
-class _Index:
-    """Counts the documents of recordings; each collection is read once."""
-
-    def __init__(self, database: Database) -> None:
-        self.database = database
-        self._counts: dict[str, dict[str, int]] = {}
-
-    def documents_of(self, entry: RecordingEntry) -> Counter[str]:
-        """Numbers of documents of a recording, by collection."""
-        names = {collection_of(channel.topic) for channel in entry.channels}
-        new = sorted(names - self._counts.keys())
-        counted = self.database.count_each([(name, {}) for name in new])
-        for name, counts in zip(new, counted, strict=True):
-            self._counts[name] = {key: count for key, count in counts if isinstance(key, str)}
-        return Counter({name: self._counts[name].get(entry.key, 0) for name in names})
-
-
 class _Check:
     """Checks one recording."""
 
@@ -178,7 +160,7 @@ class _Check:
         self,
         directory: StoreDirectory,
         catalog: Catalog,
-        index: _Index | None,
+        database: Database | None,
         recording: str,
         result: Verification,
         *,
@@ -187,7 +169,7 @@ class _Check:
         self._checker = checker
         self._directory = directory
         self._catalog = catalog
-        self._indexed = index
+        self._database = database
         self._recording = self._name = recording
         self._result = result
         self._path = directory.recording(recording)
@@ -309,32 +291,23 @@ class _Check:
             self._result.bytes_read += summary.size
         self._result.messages += sum(summary.counts.values())
 
-    @property
-    def _rebuild(self) -> str:
-        return f"run `hybridlog index rebuild -r {quote(self._name)}`"
-
     def _index(self, entry: RecordingEntry) -> None:
-        """Find documents that are not in the segments."""
-        if self._indexed is None:
+        """Find documents that lack, or are of no message; those still to be made do not count."""
+        if self._database is None:
             return
-        indexed = IndexState(self._indexed.database).one(entry.key)
+        state = IndexState(self._database)
+        indexed = state.one(entry.key)
         if indexed is None or not indexed.is_whole(entry):
-            self.found("index", "it is not complete", self._rebuild)
-        have = self._indexed.documents_of(entry)
+            return
         expected: Counter[str] = Counter()
         for channel in entry.channels:
             if channel.is_indexed:
                 expected[collection_of(channel.topic)] += channel.stats.messages
-        if +have != +expected:
-            # The recording may have ended since all documents were counted.
-            count, of = self._indexed.database.count, {"_meta.rec": entry.key}
-            have = Counter({name: count(name, of) for name in have.keys() | expected.keys()})
-        for collection in sorted(have.keys() | expected.keys()):
-            found, want = have[collection], expected[collection]
+        for collection, want in sorted(expected.items()):
+            found = self._database.count(collection, state.documents_of(entry))
             if not want - self._lost[collection] <= found <= want:
                 problem = f"{found} index documents, {want} messages in the segments"
-                # Surplus documents may have any time.
-                cure = self._rebuild if found < want else "run `hybridlog index rebuild`"
+                cure = f"run `hybridlog index rebuild -r {quote(self._name)}`"
                 self.found(f"collection {collection}", problem, cure)
 
     def _tables(self, entry: RecordingEntry) -> None:
@@ -351,7 +324,7 @@ def _repair(
     """Repair files, manifests, the catalog, tables and index; returns what was not repaired."""
     directory, catalog, repairs = shared.directory, shared.catalog, shared.repairs
     directory.check_writable()
-    database = shared.index.writable_database
+    database = shared.index.reached(writes=True)
     left: list[Finding] = []
     checker = tables.TableChecker(directory)
     chosen = {one: one for one in _all(directory)} if names is None else names
