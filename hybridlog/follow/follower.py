@@ -335,7 +335,7 @@ class Follower:
                     return
                 database = target.renew()
             state = IndexState(database)
-            if state.one(self._entry.key) is None:
+            if not state.of([self._entry.key]):
                 state.begin(self._entry)
             self.failure = None
             self._sender = Sender(self._entry.key, database)
@@ -495,9 +495,9 @@ def begin_again(
         Digests of the segments by number as text, and whether they are all there are.
     """
     state = IndexState(database)
-    indexed = None if anew else state.one(entry.key)
-    done = {} if indexed is None else dict(indexed.segments.items() & entry.digests.items())
-    is_whole = indexed is not None and indexed.is_whole(entry)
+    indexed = None if anew else state.of([entry.key]).get(entry.key)
+    done = {} if indexed is None else dict(indexed.items() & entry.digests.items())
+    is_whole = indexed == entry.digests
     if not is_whole:
         state.begin(entry, done)
         state.clear(entry, but=done)

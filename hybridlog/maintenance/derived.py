@@ -81,8 +81,7 @@ class StoreIndex:
         changed, current = set(), []
         for summary in behind:
             entry = entry_of(summary)
-            indexed = known.get(entry.key)
-            if indexed is not None and indexed.is_whole(entry) and entry.is_decoded:
+            if known.get(entry.key) == entry.digests and entry.is_decoded:
                 current.append(entry.id)
             elif directory.is_writable:  # else the segments answer, without an index
                 self._bring_one(entry, report)

@@ -296,8 +296,7 @@ class _Check:
         if self._database is None:
             return
         state = IndexState(self._database)
-        indexed = state.one(entry.key)
-        if indexed is None or not indexed.is_whole(entry):
+        if state.of([entry.key]).get(entry.key) != entry.digests:
             return
         expected: Counter[str] = Counter()
         for channel in entry.channels:

@@ -125,9 +125,8 @@ def _documents(database: Database, parts: Sequence[Part]) -> dict[Part, int]:
     indexed = IndexState(database).of({part.recording.key for part in parts})
     doubtful = []
     for part in parts:
-        one = indexed.get(part.recording.key)
-        is_there = one is not None and part.recording.digests.items() <= one.segments.items()
-        if part.recording.status == "open" or not is_there:
+        there = indexed.get(part.recording.key, {}).items()
+        if part.recording.status == "open" or not part.recording.digests.items() <= there:
             doubtful.append(part)
     return _counts(database, doubtful, {})
 

@@ -74,8 +74,8 @@ def test_what_comes_into_a_store_is_indexed_once_by_several_that_watch(
         def is_indexed(label: str) -> Any:
             with hl.open(robot, mongo="none") as source, hl.open(lab, mongo=uri) as store:
                 state = IndexState(store.shared.index.connect(brings=False))
-                indexed = state.one(source.entry(label).key)
-                return indexed is not None and indexed.is_whole(source.entry(label))
+                entry = source.entry(label)
+                return state.of([entry.key]) == {entry.key: entry.digests}
 
         with ExitStack() as stack:
             watching, outs, errs = [], [tmp_path / "out-0", tmp_path / "out-1"], []

@@ -76,16 +76,6 @@ def test_clearing_looks_around_the_times_of_its_topics(
     assert left(database, OTHER) == list(range(5))
 
 
-def test_whoever_asks_sees_that_documents_were_about_to_go(state: IndexState) -> None:
-    entry = recording("/one")
-    made = set()
-    for _ in range(2):
-        state.begin(entry)
-        state.put_segments(entry.key, {"0": "a"})
-        made.add(state.of()[entry.key].made)
-    assert len(made) == 2
-
-
 @pytest.mark.parametrize("key", ["other", "", None, {"a": 1}])
 def test_documents_of_what_is_no_recording_can_be_cleared(
     state: IndexState, database: Database, key: Any

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from hybridlog_storage.catalog import RecordingEntry
@@ -21,24 +20,6 @@ RECORDINGS: Final = f"{CATALOG_PREFIX}recordings"
 STORE: Final = f"{CATALOG_PREFIX}store"
 """Collection that names the store that owns a database."""
 _AROUND_NS: Final = 3600 * 10**9  # what a crash has cut may be so far from the rest
-
-
-@dataclass(frozen=True, slots=True)
-class Indexed:
-    """The state of a recording's index.
-
-    Attributes:
-        made: Drawn at random when the documents were begun. Who reads the same before and after
-            a question knows that none were removed meanwhile.
-        segments: Digest of each completely indexed segment, by its number as text.
-    """
-
-    made: str
-    segments: Mapping[str, str]
-
-    def is_whole(self, entry: RecordingEntry) -> bool:
-        """True if all documents of a recording are there."""
-        return dict(self.segments) == entry.digests
 
 
 class Owner(NamedTuple):
@@ -66,15 +47,15 @@ class IndexState:
     def __init__(self, database: Database) -> None:
         self._db = database
 
-    def one(self, key: str) -> Indexed | None:
-        """The index state of a recording by its key; None if it is unknown."""
-        return self.of([key]).get(key)
+    def of(self, keys: Collection[str] | None = None) -> dict[str, dict[str, str]]:
+        """Digests of completely indexed segments of these recordings, or of all, by key.
 
-    def of(self, keys: Collection[str] | None = None) -> dict[str, Indexed]:
-        """The index states of these recordings, or of all, by key."""
+        They are by their numbers as text. Of a recording whose documents are all there, they are
+        those of its entry.
+        """
         chosen: dict[str, object] = {} if keys is None else {"_id": {"$in": sorted(keys)}}
         return {
-            found["_id"]: Indexed(str(found.get("made", "")), dict(found.get("segments") or {}))
+            found["_id"]: dict(found.get("segments") or {})
             for found in self._db.find(RECORDINGS, chosen)
         }
 
@@ -87,7 +68,7 @@ class IndexState:
 
         `segments` has the digest of each segment whose documents stay, by its number as text.
         """
-        state = {"id": entry.id, "made": secrets.token_hex(8), "segments": dict(segments or {})}
+        state = {"id": entry.id, "segments": dict(segments or {})}
         self._db.update(RECORDINGS, {"_id": entry.key}, {"$set": state}, upsert=True)
 
     def put_segments(self, key: str, segments: Mapping[str, str]) -> None:
