@@ -151,6 +151,10 @@ def test_without_a_repair_no_file_is_changed(store: Path) -> None:
     assert done.index
     assert "a crash has left it open" in {one.problem for one in done.findings}
     assert {p: p.read_bytes() for p in places.root(store).rglob("*") if p.is_file()} == before
+    flip(last.with_name(f"{last.name}.open"), 600)
+    with hl.open(store, mongo="none") as opened:
+        with pytest.raises(SegmentError, match=r"is damaged.*`hybridlog verify --repair` seals"):
+            opened.topic("/n").where("n >= 0").count()
 
 
 @pytest.mark.parametrize("has_old", [True, False])

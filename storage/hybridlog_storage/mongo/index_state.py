@@ -76,12 +76,11 @@ class IndexState:
         digests = {f"segments.{number}": digest for number, digest in segments.items()}
         self._db.update(RECORDINGS, {"_id": key}, {"$set": digests})
 
-    @staticmethod
-    def documents_of(entry: RecordingEntry) -> dict[str, object]:
-        """A filter for the documents of a recording.
+    def clear(self, entry: RecordingEntry, but: Collection[str] = ()) -> None:
+        """Remove the index documents of a recording, but those of some segments, numbers as text.
 
         A crash may have cut messages whose documents are here. So these are looked for up to an
-        hour around its messages and losses.
+        hour around its messages and losses, and in all topics unless the recording is complete.
         """
         chosen: dict[str, object] = {"_meta.rec": entry.key}
         rows = entry.end.get("losses", ())
@@ -89,14 +88,6 @@ class IndexState:
         known = [time for time in times if time is not None]
         if len(known) == len(times):
             chosen.update(between(max(0, min(known) - _AROUND_NS), max(known) + _AROUND_NS))
-        return chosen
-
-    def clear(self, entry: RecordingEntry, but: Collection[str] = ()) -> None:
-        """Remove the index documents of a recording, but those of some segments, numbers as text.
-
-        They are looked for in all topics unless the recording is complete.
-        """
-        chosen = self.documents_of(entry)
         if but:
             chosen["_meta.ref.seg"] = {"$nin": sorted(map(int, but))}
         collections = {collection_of(channel.topic) for channel in entry.channels}

@@ -277,7 +277,11 @@ class SegmentReader:
         return StoredChunk(self.number, place, batch, seq)
 
     def _damaged(self, place: ChunkPlace, error: SegmentError) -> SegmentError:
-        return SegmentError(f"Chunk at byte {place.offset} of {self.path} is damaged: {error}")
+        is_open = self.path.suffix == ".open"
+        cure = ". `hybridlog verify --repair` seals all else of a crash" if is_open else ""
+        return SegmentError(
+            f"Chunk at byte {place.offset} of {self.path} is damaged: {error}{cure}"
+        )
 
     def read_times(self, place: ChunkPlace) -> dict[int, NDArray[np.int64]]:
         """Log times of a chunk's messages, int64[n], ns, ascending, by channel id, of its indexes.
