@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import re
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
@@ -265,35 +265,30 @@ class Copying:
             if copied.lacking:
                 report.lacking.append(name)
 
-    def _let_go(self, one: RecordingSummary, digests: Mapping[int, str]) -> None:
+    def _let_go(self, one: RecordingSummary, proved: Collection[int]) -> None:
         """Let payloads expire here whose copies were proved there just now."""
-        logs = self._source.manifests.read(one.id).logs
-        left = len({n for n, log in logs.items() if log.is_here} - digests.keys())
-        if left:
-            self.report.problems.append(
-                f"Payloads of {counted(left, 'segment')} of {one.name} stay: their copies in "
-                f"{self._place.address} have lost some."
-            )
-        if digests:
-            self._expire(one.id, digests)
-
-    def _expire(self, recording: str, digests: Mapping[int, str]) -> None:
         from hybridlog.maintenance.edit import remove_if
         from hybridlog.maintenance.keep import Keeper
         from hybridlog.maintenance.retention import Rules
 
-        rules, report = Rules.of(self._directory.settings.retention), self.report
+        report, place = self.report, self._place.address
+        logs = self._source.manifests.read(one.id).logs
+        left = len({n for n, log in logs.items() if log.is_here}.difference(proved))
+        if left:
+            report.problems.append(
+                f"Payloads of {counted(left, 'segment')} of {one.name} stay: their copies in "
+                f"{place} have lost some."
+            )
+        rules = Rules.of(self._directory.settings.retention)
         keeper = Keeper(self._directory, partial(remove_if, self.shared))
         try:
-            expired = keeper.expire_all(
-                recording, digests, rules, self._place.address, self.progress
-            )
+            expired = keeper.expire_all(one.id, proved, rules, place, self.progress)
         except HeldError as error:
             report.problems.append(f"Payloads stay: {error}")
-            report.held.append(recording)
+            report.held.append(one.id)
             return
         finally:
-            self.shared.catch_up(recording)
+            self.shared.catch_up(one.id)
         report.freed_bytes += expired.freed_bytes
         report.problems += expired.problems
 

@@ -57,7 +57,6 @@ def expire(
     recording: str,
     segments: Collection[int],
     *,
-    digests: Mapping[int, str] = MappingProxyType({}),
     copy: str = "",
     check: Check = lambda _: None,
     progress: Progress | None = None,
@@ -71,18 +70,15 @@ def expire(
 
     Logs that are gone already are left out, and those without messages. Those that have their rows
     go first. Where there is no room for rows, a log goes without, and is lost. Damaged ones without
-    rows stay. They must have the `digests`, by number; `copy` is the address of a store with a
-    proven copy of them. `check`, part of each change of the manifest, raises if they must stay by
-    now; `make_room` returns False if there is none to make. After an error, logs that are listed
-    are as before. Where another process writes the rows (`is_followed`), they are waited for,
-    and a log that gets none goes without.
+    rows stay. `copy` is the address of a store with a proven copy of them. `check`, part of each
+    change of the manifest, raises if they must stay by now; `make_room` returns False if there is
+    none to make. After an error, logs that are listed are as before. Where another process writes
+    the rows (`is_followed`), they are waited for, and a log that gets none goes without.
     """
     if is_followed:
         _have_rows(directory, recording, segments, check, make_room)
     manifest, freed, damaged = directory.manifests.read(recording), 0, dict[int, str]()
     logs = [manifest.logs.get(number) for number in sorted(segments)]
-    if any(log and digests.get(log.number, log.digest) != log.digest for log in logs):
-        raise ChangedError(f"{manifest.name}: a segment was replaced meanwhile.")
     going = [log for log in logs if log is not None and log.is_here and log.parts]
     if manifest.is_ended:
         _remove_arrays(directory, manifest, going)

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
-from hybridlog.maintenance.expiry import expire, let_go
+from hybridlog.maintenance.expiry import expire, let_go, may_go
 from hybridlog.maintenance.retention import (
     Held,
     Plan,
@@ -141,26 +141,22 @@ class Keeper:
     def expire_all(
         self,
         recording: str,
-        digests: Mapping[int, str],
+        logs: Collection[int],
         rules: Rules,
         copy: str,
         progress: Progress | None = None,
     ) -> KeepReport:
         """Let payloads of a recording go, but for what pins and a `never_tag` of rules keep.
 
-        `digests`, by number, are of the segments that have a copy in the store at `copy`.
+        `logs` are the numbers of the segments that have a copy in the store at `copy`.
         """
         with self._alone():
-            found = KeepReport(self.plan(Rules()))
-            for manifest, logs in self._held(time.time_ns()):
-                if manifest.id == recording and not rules.is_never(manifest.tags):
-                    own = {one.log.number for one in logs if one.may_go and not one.is_pinned}
-                    going = tuple(digests.keys() & own)
-                    how = {"digests": digests, "copy": copy, "progress": progress}
-                    if going:
-                        self._do(
-                            Step(manifest.name, recording, going, (), 0, ""), rules, found, how
-                        )
+            found, now = KeepReport(Plan(0, None)), self._directory.manifests.read(recording)
+            own = [now.logs[number] for number in sorted(logs) if number in now.logs]
+            going = [log.number for log in own if may_go(log) and not is_pinned(log, now)]
+            if going and not rules.is_never(now.tags):
+                step = Step(now.name, recording, tuple(going), (), 0, "")
+                self._do(step, rules, found, {"copy": copy, "progress": progress})
         return found
 
     @contextmanager

@@ -42,8 +42,8 @@ class How:
         named: Makes a free name there of the name here. Meanwhile nobody else begins a recording,
             where there are locks.
         progress: Called with the bytes done, and those in all.
-        proved: Called with the digests here of logs that were proved there just now, by number;
-            where there are locks, nobody changes the copy meanwhile.
+        proved: Called with the numbers of logs that were proved there just now; where there are
+            locks, nobody changes the copy meanwhile.
     """
 
     prepare: Callable[[Manifest, list[File]], AbstractContextManager[Prepared]] | None = None
@@ -51,7 +51,7 @@ class How:
     limit_rate: float | None = None
     named: Callable[[str], str] = lambda name: name
     progress: Callable[[int, int], None] = lambda *_: None
-    proved: Callable[[Mapping[int, str]], None] | None = None
+    proved: Callable[[Collection[int]], None] | None = None
 
 
 @dataclass(slots=True)
@@ -258,11 +258,11 @@ class _Copy:
         for path in left:
             self._target.drop(f"{RECORDINGS}/{now.id}/{path}")
 
-    def _proved_logs(self, here: Manifest) -> dict[int, str]:
-        """Digests here of logs whose copies were proved, and that are still listed there."""
+    def _proved_logs(self, here: Manifest) -> set[int]:
+        """Numbers of logs whose copies were proved, and that are still listed there."""
         there = self._target.manifests.read(here.id).logs
         return {
-            number: log.digest
+            number
             for number, log in here.logs.items()
             if log.is_here
             and number in there
@@ -330,21 +330,7 @@ def _messages(manifest: Manifest) -> int:
 
 def check_origin(here: Manifest, there: Manifest | None) -> None:
     """Raise `RefusedError` if two manifests of one id are not of one recording."""
-    if there is None:
-        return
-    logs, channels = there.logs, there.channels
-    is_one = (
-        here.created == there.created
-        and all(
-            channels[number].topic == one.topic
-            for number, one in here.channels.items()
-            if number in channels
-        )
-        and all(
-            logs[number].parts == log.parts for number, log in here.logs.items() if number in logs
-        )
-    )
-    if not is_one:
+    if there is not None and there.created != here.created:
         raise RefusedError(
             f"{here.name} is not copied: another recording, {there.name}, has its id {here.id} "
             "there."

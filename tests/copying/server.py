@@ -1,14 +1,12 @@
-"""A server that `ssh` and `sftp` reach, in a process of its own, behind a relay that cuts."""
+"""A server that `ssh` and `sftp` reach, in a process of its own, behind a proxy that cuts."""
 
 from __future__ import annotations
 
-import select
-import socket
 import subprocess
 import sys
-import threading
-from contextlib import suppress
 from pathlib import Path
+
+from tests.servers.proxy import Proxy
 
 _SERVES = """
 import asyncio
@@ -63,7 +61,7 @@ asyncio.run(main())
 """
 
 
-class Sshd:
+class Sshd(Proxy):
     """A server on this machine.
 
     Args:
@@ -71,9 +69,7 @@ class Sshd:
         kind: "shell", or "sftp" for one that runs no commands.
 
     Attributes:
-        port: That of the relay.
         ssh: The program that reaches it, with options.
-        left: Bytes from the client until the connections are cut; None for no cut.
     """
 
     def __init__(self, folder: Path, kind: str) -> None:
@@ -86,15 +82,11 @@ class Sshd:
             stderr=subprocess.DEVNULL,
         )
         assert self._process.stdout is not None
-        self._server = int(self._process.stdout.readline())
+        super().__init__(int(self._process.stdout.readline()))
         self.ssh = (
             f"ssh -F /dev/null -i {key} -o StrictHostKeyChecking=no -o LogLevel=ERROR "
             "-o UserKnownHostsFile=/dev/null"
         )
-        self.left: int | None = None
-        self._listening = socket.create_server(("127.0.0.1", 0))
-        self.port = self._listening.getsockname()[1]
-        threading.Thread(target=self._serve, daemon=True).start()
 
     def url(self, path: Path) -> str:
         return f"ssh://127.0.0.1:{self.port}{path}"
@@ -103,35 +95,6 @@ class Sshd:
         self.left = None
 
     def close(self) -> None:
-        self._listening.close()
+        super().close()
         self._process.kill()
         self._process.wait()
-
-    def _serve(self) -> None:
-        with suppress(OSError):
-            while True:
-                client, _ = self._listening.accept()
-                threading.Thread(target=self._relay, args=(client,), daemon=True).start()
-
-    def _relay(self, client: socket.socket) -> None:
-        with client, socket.create_connection(("127.0.0.1", self._server)) as server:
-            for one in (client, server):
-                one.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            with suppress(OSError):
-                while self._pass_on(client, server):
-                    pass
-
-    def _pass_on(self, client: socket.socket, server: socket.socket) -> bool:
-        for one in select.select([client, server], [], [])[0]:
-            data = one.recv(1 << 16)
-            if not data:
-                return False
-            if one is server:
-                client.sendall(data)
-                continue
-            if self.left is not None:
-                data, self.left = data[: self.left], self.left - len(data[: self.left])
-            server.sendall(data)
-            if self.left == 0:
-                return False
-        return True

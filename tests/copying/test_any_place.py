@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Collection
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from typing import Any, NoReturn
@@ -12,7 +13,7 @@ import pytest
 from hybridlog_storage.copy import Copied, How, copy
 from hybridlog_storage.copy_places import Directory, Place, RefusedError
 from hybridlog_storage.errors import HybridlogError, StoreError
-from hybridlog_storage.manifest import Channel, Manifest, Mark, Note, Pin, replace, with_rows
+from hybridlog_storage.manifest import Manifest, Mark, Note, Pin, replace, with_rows
 from hybridlog_storage.remote.bucket import Bucket
 from hybridlog_storage.remote.store import BucketStore
 from hybridlog_storage.sftp import Server
@@ -34,7 +35,6 @@ from tests.copying.server import Sshd
 from tests.places import begin
 
 Pair = tuple[Store, Store]
-FILE = listed("000000.mcap")
 CHECK = How(check=True)
 FIELDS_FIRST = How(prepare=without_payloads)
 
@@ -140,14 +140,9 @@ def test_a_damaged_file_is_refused_and_named(pair: Pair) -> None:
     target.check(recording())
 
 
-@pytest.mark.parametrize("what", ["begin", "channel", "file"])
-def test_another_recording_of_its_id_is_refused(pair: Pair, what: str) -> None:
+def test_another_recording_of_its_id_is_refused(pair: Pair) -> None:
     source, target = pair
-    other = {
-        "begin": Manifest(RECORDING, "other", 2),
-        "channel": Manifest(RECORDING, "other", 1, channels={0: Channel("/other")}),
-        "file": Manifest(RECORDING, "other", 1, files=(replace(FILE, parts={}),)),
-    }[what]
+    other = Manifest(RECORDING, "other", 2)
     with target.place.working(RECORDING):
         begin(target.place.manifests, other)
     with pytest.raises(RefusedError, match="another recording, other, has its id"):
@@ -213,10 +208,10 @@ def test_both_have_let_other_payloads_go(pair: Pair) -> None:
     copy(source.source, target.place, RECORDING)
     expire(source, 1)
     expired = expire(target, 4)
-    told: list[dict[int, str]] = []
+    told: list[Collection[int]] = []
     assert copy(source.source, target.place, RECORDING, How(proved=told.append)).lacking == [4]
     target.check(expired)
-    assert [{*one} for one in told] == [{0, 2}]
+    assert told == [{0, 2}]
 
 
 def test_what_expires_here_meanwhile_is_no_damage(pair: Pair) -> None:
@@ -265,9 +260,9 @@ def test_what_is_wrong_there_is_sent_again_if_it_is_checked(pair: Pair) -> None:
 
 def test_files_expire_that_are_proved_there(pair: Pair) -> None:
     source, target = pair
-    told: list[dict[int, str]] = []
+    told: list[Collection[int]] = []
     copy(source.source, target.place, RECORDING, How(proved=told.append))
-    assert told == [{n: log.digest for n, log in recording().logs.items() if log.is_here}]
+    assert told == [{n for n, log in recording().logs.items() if log.is_here}]
     path = f"recordings/{RECORDING}/000004.mcap"
     target.write(path, bytes_of("000004.mcap")[:-1] + b"?")
     copied = copy(source.source, target.place, RECORDING, How(proved=told.append))
@@ -278,7 +273,7 @@ def test_files_expire_that_are_proved_there(pair: Pair) -> None:
 def test_files_that_expire_there_meanwhile_are_not_told(pair: Pair) -> None:
     source, target = pair
     copy(source.source, target.place, RECORDING)
-    told: list[dict[int, str]] = []
+    told: list[Collection[int]] = []
     expired: list[int] = []
 
     def meanwhile(done: int, total: int) -> None:
@@ -288,7 +283,7 @@ def test_files_that_expire_there_meanwhile_are_not_told(pair: Pair) -> None:
 
     how = How(progress=meanwhile, proved=told.append)
     copy(source.source, target.place, RECORDING, how)
-    assert [{*one} for one in told] == [{0, 1, 2}]
+    assert told == [{0, 1, 2}]
 
 
 @pytest.mark.parametrize("kind", ["directory", "bucket"])

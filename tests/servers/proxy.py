@@ -22,11 +22,13 @@ class Proxy:
         port: Its own port.
         reset_after: Bytes from the server after which a connection is reset; 0 for never.
         resets: Connections that were reset.
+        left: Bytes from clients until their connections are cut; None for no cut.
     """
 
     def __init__(self, target: int) -> None:
         self.reset_after = 0
         self.resets = 0
+        self.left: int | None = None
         self._target = target
         self._listener = socket.create_server(("127.0.0.1", 0))
         self._listener.settimeout(_LOOK_S)
@@ -39,6 +41,9 @@ class Proxy:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
         self._has_ended = True
         for thread in self._threads:
             thread.join()
@@ -68,7 +73,12 @@ class Proxy:
                     if not data:
                         return
                     if source is ours:
+                        if self.left is not None:
+                            data = data[: self.left]
+                            self.left -= len(data)
                         theirs.sendall(data)
+                        if self.left == 0:
+                            return
                         continue
                     passed += len(data)
                     if self.reset_after and passed > self.reset_after:
