@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 
 _Key = TypeVar("_Key")
+_SUMMED = ("messages", "payload_bytes", "segment_bytes", "column_bytes", "table_bytes")
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,18 +99,14 @@ def sizes_of(
     database: Database | None,
 ) -> Sizes:
     """Sizes of some recordings."""
-    index: dict[tuple[str, str], int] = {}
-    if database is not None:
-        index = _index_bytes(entries, database)
+    index = None if database is None else _index_bytes(entries, database)
     rows: list[Size] = []
     tables = table_bytes(directory.path, entries)
     for entry in entries:
-        segments = _segment_bytes(directory, entry)
-        columns: Counter[str] = Counter()
+        segments, messages = _segment_bytes(directory, entry), entry.messages_by_topic()
+        columns, payload = Counter[str](), Counter[str]()
         for _, topic, size in entry.rows:
             columns[topic] += size
-        messages = entry.messages_by_topic()
-        payload: Counter[str] = Counter()
         for channel in entry.channels:
             payload[channel.topic] += channel.stats.payload_bytes
         rows += [
@@ -121,7 +118,7 @@ def sizes_of(
                 segments[topic],
                 columns[topic],
                 tables.get((entry.id, topic), 0),
-                None if database is None else index.get((entry.id, topic), 0),
+                None if index is None else index.get((entry.id, topic), 0),
             )
             for topic in {"", *messages}
         ]
@@ -143,16 +140,8 @@ def disk_bytes(root: Path) -> int:
 
 def _sum(recording: str, topic: str, rows: Sequence[Size]) -> Size:
     index = [row.index_bytes for row in rows if row.index_bytes is not None]
-    return Size(
-        recording,
-        topic,
-        sum(row.messages for row in rows),
-        sum(row.payload_bytes for row in rows),
-        sum(row.segment_bytes for row in rows),
-        sum(row.column_bytes for row in rows),
-        sum(row.table_bytes for row in rows),
-        sum(index) if index or not rows else None,
-    )
+    sums = {name: sum(getattr(row, name) for row in rows) for name in _SUMMED}
+    return Size(recording, topic, **sums, index_bytes=sum(index) if index or not rows else None)
 
 
 def _largest_first(rows: Iterable[Size]) -> list[Size]:

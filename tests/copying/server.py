@@ -96,5 +96,5 @@ class Sshd(Proxy):
 
     def close(self) -> None:
         super().close()
-        self._process.kill()
-        self._process.wait()
+        with self._process:
+            self._process.kill()

@@ -114,7 +114,7 @@ def test_payloads_expire_here_when_they_are_proved_there(robots: Path, tmp_path:
         assert (found != right[label]) == is_gone, label
         assert found == {key: value for key, value in right[label].items() if key in found}
         assert answers(lab, label) == right[label]
-    told = f"{lab} has more payloads of recorded"
+    told = f"{lab} has more payloads of recorded; ask there"
     assert told in " ".join(answer("info", "recorded", store=robot).out.split())
     said = answer("fetch", "-t", "/cloud", "-r", "recorded", "--count", "--where", "data[0] > 0",
                   store=robot).err  # fmt: skip

@@ -158,7 +158,7 @@ def coverage(entry: RecordingEntry, losses: Collection[Row]) -> str:
 
 def copies_of(entry: RecordingEntry) -> list[str]:
     """Where payloads are that a recording lacks, in words."""
-    return [f"{address} has more payloads of {entry.name}" for address in entry.copies]
+    return [f"{address} has more payloads of {entry.name}; ask there" for address in entry.copies]
 
 
 def _coverage(entry: RecordingEntry, losses: Collection[Row]) -> str:
