@@ -345,7 +345,8 @@ class RetentionThread:
 
     def make_room(self) -> bool:
         """Make a pass on a full disk, for a writer that waits; returns whether to try again."""
-        return self._pass(is_urgent=True) != 0
+        freed = self._pass(is_urgent=True)
+        return freed is None or freed > 0
 
     def _read_rules(self) -> Rules:
         rules = Rules.of(read_settings(self._directory.path).retention)
