@@ -330,7 +330,21 @@ def _messages(manifest: Manifest) -> int:
 
 def check_origin(here: Manifest, there: Manifest | None) -> None:
     """Raise `RefusedError` if two manifests of one id are not of one recording."""
-    if there is not None and there.created != here.created:
+    if there is None:
+        return
+    logs, channels = there.logs, there.channels
+    is_one = (
+        here.created == there.created
+        and all(
+            channels[number].topic == one.topic
+            for number, one in here.channels.items()
+            if number in channels
+        )
+        and all(
+            logs[number].parts == log.parts for number, log in here.logs.items() if number in logs
+        )
+    )
+    if not is_one:
         raise RefusedError(
             f"{here.name} is not copied: another recording, {there.name}, has its id {here.id} "
             "there."

@@ -13,7 +13,7 @@ import pytest
 from hybridlog_storage.copy import Copied, How, copy
 from hybridlog_storage.copy_places import Directory, Place, RefusedError
 from hybridlog_storage.errors import HybridlogError, StoreError
-from hybridlog_storage.manifest import Manifest, Mark, Note, Pin, replace, with_rows
+from hybridlog_storage.manifest import Channel, Manifest, Mark, Note, Pin, replace, with_rows
 from hybridlog_storage.remote.bucket import Bucket
 from hybridlog_storage.remote.store import BucketStore
 from hybridlog_storage.sftp import Server
@@ -35,6 +35,7 @@ from tests.copying.server import Sshd
 from tests.places import begin
 
 Pair = tuple[Store, Store]
+FILE = listed("000000.mcap")
 CHECK = How(check=True)
 FIELDS_FIRST = How(prepare=without_payloads)
 
@@ -140,9 +141,14 @@ def test_a_damaged_file_is_refused_and_named(pair: Pair) -> None:
     target.check(recording())
 
 
-def test_another_recording_of_its_id_is_refused(pair: Pair) -> None:
+@pytest.mark.parametrize("what", ["begin", "channel", "file"])
+def test_another_recording_of_its_id_is_refused(pair: Pair, what: str) -> None:
     source, target = pair
-    other = Manifest(RECORDING, "other", 2)
+    other = {
+        "begin": Manifest(RECORDING, "other", 2),
+        "channel": Manifest(RECORDING, "other", 1, channels={0: Channel("/other")}),
+        "file": Manifest(RECORDING, "other", 1, files=(replace(FILE, parts={}),)),
+    }[what]
     with target.place.working(RECORDING):
         begin(target.place.manifests, other)
     with pytest.raises(RefusedError, match="another recording, other, has its id"):
