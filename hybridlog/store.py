@@ -1014,8 +1014,8 @@ class Store:
 def _query_of(store: Store, name: str | Query, fields: dict[str, Sequence[str]]) -> Query:
     """A query about a topic, with its share of the fields, which is taken out of them."""
     query = store.topic(name) if isinstance(name, str) else name
-    if query.session.shared is not store.shared:
-        place = query.session.directory.place
+    if query.source.now().shared is not store.shared:
+        place = query.source.now().directory.place
         raise UsageError(f"A query of {place} cannot be joined with another store's.")
     for key in [*fields]:
         if key == name or store.topic(key).topics == query.topics:

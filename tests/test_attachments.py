@@ -120,7 +120,7 @@ def test_a_channel_without_messages_changes_no_answer(store: hl.Store) -> None:
 
 
 def extras_in(query: hl.Query) -> Extras:
-    return extras_of(query.session, query.question)
+    return extras_of(query.source.now(), query.question)
 
 
 def test_a_whole_recording_comes_back(log: Path, store: hl.Store, tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import hybridlog as hl
+from hybridlog.frames.lines import json_lines
 from hybridlog.live import LiveOptions
 from hybridlog.recordings import Recordings
 from hybridlog.snapshot import Snapshot
@@ -261,7 +262,7 @@ def test_tables_name_recordings(store: hl.Store) -> None:
     query = store.topic("/scan", "/imu")
     frame = query.to_pandas()
     assert list(frame.columns) == ["topic", "recording", "n", "robot"]
-    rows = [json.loads(line) for lines in query.to_json_lines() for line in lines]
+    rows = [json.loads(line) for line in json_lines(query)]
     assert list(rows[0]) == ["log_time_ns", "topic", "recording", "n", "robot"]
     assert [row["recording"] for row in rows] == frame["recording"].tolist()
 

@@ -199,7 +199,7 @@ def answering(given: Topics) -> Iterator[Query]:
         query = given.query(store)
         yield query
         print_end(query.counters, started, verbose=given.verbose, count=True)
-        output.remarks(query.remarks())
+        output.remarks(query.completeness().sentences)
 
 
 def write_answer(
@@ -272,6 +272,7 @@ def _answer_of(
     """The answer in the form that a format takes."""
     from hybridlog.formats.answer import Answer
     from hybridlog.formats.slices import Front, log_of
+    from hybridlog.query.query import tables_of
 
     content, question = OUTPUTS[form].content, query.question
     if content in {"pictures", "video"}:
@@ -280,7 +281,7 @@ def _answer_of(
         from hybridlog.tf.in_frame import points_of
 
         query.counters.reset()
-        found = points_of(query.session, question, query.counters)
+        found = points_of(query.source.now(), question, query.counters)
         return Answer(
             points=(
                 (one.points, one.message.topic, one.message.type, one.message.log_time_ns)
@@ -290,16 +291,16 @@ def _answer_of(
     if content in {"log", "payloads"}:
         return log_of(query, front if content == "log" else Front(latched=False), extras)
     if question.frame is not None:
-        return _rows(query.to_tables())
+        return _rows(tables_of(query))
     from hybridlog.frames.answer import schema_of
     from hybridlog.frames.lines import lines
     from hybridlog.query.planner import Planner
 
     if content == "table":
-        schema = schema_of(Planner(query.session, question))
-        return Answer(tables=query.to_tables(), schema=schema)
+        schema = schema_of(Planner(query.source.now(), question))
+        return Answer(tables=tables_of(query), schema=schema)
     query.counters.reset()
-    return Answer(lines=lines(Planner(query.session, question, query.counters)))
+    return Answer(lines=lines(Planner(query.source.now(), question, query.counters)))
 
 
 def _checked(pieces: Iterable[_T], completeness: Callable[[], Completeness] | None) -> Iterator[_T]:
@@ -350,7 +351,7 @@ def _pictures(query: Query, form: str, target: Target, front: Front) -> Answer:
 
     before: list[Message] = []
     if OUTPUTS[form].content == "video" and front.latched:
-        before = frames_in_front(query.session, query.question)
+        before = frames_in_front(query.source.now(), query.question)
     answer = Answer()
     is_folder = isinstance(target, str | os.PathLike) and is_directory(form, Path(target))
 

@@ -26,7 +26,7 @@ from hybridlog.cli.record_choices import (
 )
 from hybridlog.cli.render import print_fields
 from hybridlog.cli.signals import handled, write_note
-from hybridlog.query.answers.lost import coverage, in_words
+from hybridlog.query.answers.loss_words import coverage, in_words
 from hybridlog.record.losses import Cause, losses_of
 from hybridlog_storage.errors import (
     DatabaseError,

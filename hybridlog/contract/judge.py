@@ -15,7 +15,7 @@ from hybridlog.arrays.message_arrays import plain_type
 from hybridlog.query.answers.completeness import completeness_of
 from hybridlog.query.answers.marks import marks_in
 from hybridlog.query.planner import log_times
-from hybridlog.query.query import Query
+from hybridlog.query.query import Query, tables_of
 from hybridlog.query.question import Question
 from hybridlog.query.times import format_duration
 from hybridlog.record.losses import topics_of
@@ -126,7 +126,7 @@ def _of_stamps(rules: TopicRules, query: Query) -> Iterator[_Verdict]:
         return
     (topic,) = query.topics
     unset, pieces = 0, [np.empty((2, 0), np.int64)]
-    for table in query.fields("stamp").to_tables():
+    for table in tables_of(query.fields("stamp")):
         rows = table.select(["log_time", "stamp"]).drop_null()
         unset += table.num_rows - rows.num_rows
         pieces.append(np.array([column.cast("int64").to_numpy() for column in rows.columns]))
@@ -151,7 +151,7 @@ def _of_others(
     rules: TopicRules, one: TopicCheck, known: Collection[str], about: Callable[..., Query]
 ) -> Iterator[_Verdict]:
     def times_of(topic: str) -> NDArray[np.int64]:
-        return log_times(query.session, about(topic).question)
+        return log_times(query.source.now(), about(topic).question)
 
     query = about(one.topic)
     times = times_of(one.topic) if rules.offset else np.empty(0, np.int64)

@@ -176,7 +176,7 @@ def lines(query: Query, fields: Sequence[str], *, pixels: int) -> list[Line]:
     if not fields:
         numbers = [name for one in _by_topic(query) for name in numbers_of(one)]
         raise UsageError(f"Name a field, such as {listed(dict.fromkeys(numbers), _MAX_NAMES)}.")
-    summaries = {summary.id: summary for summary in query.summaries()}
+    summaries = {summary.id: summary for summary in query.source.now().summaries_of(query.question)}
     with query.counters.timed():
         found: list[Line] = []
         missing: dict[str, TopicError] = {}

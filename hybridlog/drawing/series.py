@@ -17,7 +17,7 @@ from hybridlog.frames.names import FIELD, is_summary
 from hybridlog.query.answers.infer_fields import infer_fields
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.periods import GAP_PERIODS, Steps
-from hybridlog.query.query import field_types, spans_of
+from hybridlog.query.query import field_types, spans_of, tables_of
 from hybridlog.query.times import TIME_LIMIT
 from hybridlog.schema.arrow_types import is_list, is_number, is_time, lengths_of
 from hybridlog.schema.kinds import NUMERIC, element_of, width_of
@@ -121,7 +121,7 @@ def series(
         return [Series(one.text, none.astype(np.int64), none, none, True) for one in wanted]
     with query.counters.timed():
         rows = ShownRows(span or (begin, end), pixels, most=2 * pixels)
-        found = _read(narrowed.to_tables(), wanted, rows)
+        found = _read(tables_of(narrowed), wanted, rows)
         query.counters.add(narrowed.counters)
     return found
 

@@ -139,10 +139,10 @@ class Matches:
     """
 
     def __init__(self, query: Query) -> None:
-        found = [*_bounded(match_times(query.session, query.question, query.counters))]
+        found = [*_bounded(match_times(query.source.now(), query.question, query.counters))]
         self._times = np.concatenate([np.empty(0, np.int64), *(one.log_time for one in found)])
         self._seqs = np.concatenate([np.empty(0, np.int64), *(one.seq for one in found)])
-        queries = IntervalQueries(query.session, query.question, query.counters)
+        queries = IntervalQueries(query.source.now(), query.question, query.counters)
         held = [rows[:, :2].copy() for _, rows in queries.held(None)]
         self._held = np.concatenate([np.empty((0, 2), np.int64), *held])
 

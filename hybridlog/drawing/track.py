@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 import numpy as np
 
 from hybridlog.drawing.series import ShownRows, Wanted, log_times, over_time
-from hybridlog.query.query import field_types
+from hybridlog.query.query import field_types, tables_of
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
@@ -130,7 +130,7 @@ def track(query: Query, *, pixels: int, span: Span | None = None) -> Track:
     rows.add(np.empty(0, np.int64), {"x": np.empty(0), "y": np.empty(0)})
     grid, messages, fixes = None, 0, 0
     with query.counters.timed():
-        for table in narrowed.to_tables() if begin < end else ():
+        for table in tables_of(narrowed) if begin < end else ():
             first, second, *status = (_numbers(table, path) for path in paths)
             if position.is_geographic:
                 has_fix = _is_position(first, second)

@@ -52,7 +52,10 @@ def fingerprint(query: Query) -> str:
 
     As long as it is the same, so is the answer.
     """
-    states = [(o.id, o.look, o.status, o.messages, o.extent) for o in query.summaries()]
+    states = [
+        (o.id, o.look, o.status, o.messages, o.extent)
+        for o in query.source.now().summaries_of(query.question)
+    ]
     return hashlib.sha256(pickle.dumps((query.question, states), protocol=5)).hexdigest()
 
 
@@ -61,13 +64,13 @@ def payload_bytes(query: Query) -> int:
     question = query.question
     if not question.is_by_log_time:
         question = replace(question, bounds=None)
-    parts = Planner(query.session, question).split()
+    parts = Planner(query.source.now(), question).split()
     return int(sum(p.share * sum(s.payload_bytes for s in p.stats) for p in parts))
 
 
 def profile_of(query: Query) -> str:
     """The MCAP profile of a slice: `ros1` or `ros2`, empty for others and for a mixture."""
-    examples = Planner(query.session, query.question).examples
+    examples = Planner(query.source.now(), query.question).examples
     spoken = [channel for channel in examples if channel.stats.messages] or examples
     encodings = {channel.channel.message_encoding for channel in spoken}
     return {"ros1": "ros1", "cdr": "ros2"}.get(encodings.pop(), "") if len(encodings) == 1 else ""
@@ -80,7 +83,7 @@ def log_of(query: Query, front: Front = IN_FORCE, extras: Extras | None = None) 
 
 def write_mcap(query: Query, path: Path) -> None:
     """Write a slice as an MCAP file, as `hybridlog export` does; all of it or nothing."""
-    OUTPUTS["mcap"].write(log_of(query, extras=extras_of(query.session, query.question)), path)
+    OUTPUTS["mcap"].write(log_of(query, extras=extras_of(query.source.now(), query.question)), path)
 
 
 MAX_BYTES: Final = 16 << 30

@@ -20,6 +20,7 @@ from hybridlog.frames.names import (
     summary_of,
 )
 from hybridlog.index.indexing import rows_by_channel
+from hybridlog.query.rows import summaries_in
 from hybridlog.schema.arrow_columns import OFFSET_LIMIT, TIME, numbers, structs
 from hybridlog.schema.arrow_types import (
     common_schema,
@@ -267,11 +268,7 @@ def _to_decode(
     if fields is None:
         return None
     known = {path.path: path.type for path in channel.codec.paths()}
-    wanted = set(fields)
-    for path in fields:
-        summary = summary_of(path)
-        if summary is not None and is_summary(path, known):
-            wanted.add(summary[0])
+    wanted = {*fields, *(path.rpartition(".")[0] for path in summaries_in(fields, known))}
     return frozenset(wanted | {STAMP} if "stamp" in own else wanted)
 
 

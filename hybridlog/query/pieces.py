@@ -30,7 +30,7 @@ def pieces(query: Query, how: str) -> Iterator[Piece]:
     """
     if how == "recording":
         names = _files_of(query)
-        for one in query.summaries():
+        for one in query.source.now().summaries_of(query.question):
             yield Piece(names[one.id], query.in_recording(one.id))
         return
     if how == "mark":
@@ -38,12 +38,12 @@ def pieces(query: Query, how: str) -> Iterator[Piece]:
         return
     if ": " in how and not is_filter(how):
         topic, how = split_topic(how)
-        question = query.session.question([topic], query.recordings)
+        question = query.source.now().question([topic], query.recordings)
     elif len(query.topics) != 1:
         raise UsageError("Name the topic of the predicate: 'TOPIC: PREDICATE'.")
     else:
         question = Question(query.topics, query.recordings)
-    held = type(query)(query.session, question).where(how).intervals()
+    held = type(query)(query.source.now(), question).where(how).intervals()
     yield from _of_intervals(query, ((one.recording, one.begin_ns, one.end_ns, "") for one in held))
 
 
@@ -54,8 +54,8 @@ def _marks(query: Query) -> Iterator[tuple[str, int, int, str]]:
     """
     from hybridlog.query.answers.marks import marks_in
 
-    ends = {one.id: one.extent[1] for one in query.summaries()}
-    found = sorted(marks_in(query.session, query.recordings))
+    ends = {one.id: one.extent[1] for one in query.source.now().summaries_of(query.question)}
+    found = sorted(marks_in(query.source.now(), query.recordings))
     for place, one in enumerate(found):
         moments = (
             later.begin
@@ -70,7 +70,7 @@ def _files_of(query: Query) -> dict[str, str]:
     """A name of a file for each recording, by its id."""
     found: dict[str, str] = {}
     taken: set[str] = set()
-    for one in query.summaries():
+    for one in query.source.now().summaries_of(query.question):
         found[one.id] = free_name(file_name(one.name), taken)
         taken.add(found[one.id])
     return found

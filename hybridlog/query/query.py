@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any, cast
 
@@ -28,6 +29,7 @@ from hybridlog_storage.errors import (
     DefinitionError,
     HybridlogError,
     PayloadError,
+    TimeError,
     TopicError,
     UsageError,
 )
@@ -47,9 +49,8 @@ if TYPE_CHECKING:
     from hybridlog.query.predicate.tree import Predicate
     from hybridlog.query.question import RecordedChannel, Span
     from hybridlog.query.times import DurationLike, TimeLike
-    from hybridlog.session import Asked, Session
+    from hybridlog.session import Asked
     from hybridlog_storage.messages import Batch
-    from hybridlog_storage.summary import RecordingSummary
 
 _MAX_STEP = 2**62  # longer than any topic, and an int64
 
@@ -79,15 +80,6 @@ class Query:
         self.conditions = conditions
         self.source = source
 
-    @property
-    def session(self) -> Session:
-        """The store at the moment that an answer is about: now, or that of a snapshot.
-
-        Raises:
-            UsageError: It was opened before this process was forked.
-        """
-        return self.source.now()
-
     def __eq__(self, other: object) -> bool:
         """True if both are the same question to the same open store."""
         if not isinstance(other, Query):
@@ -106,7 +98,7 @@ class Query:
     @property
     def recordings(self) -> tuple[str, ...]:
         """Ids of the recordings, oldest first."""
-        return tuple(summary.id for summary in self.summaries())
+        return tuple(one.id for one in self.source.now().summaries_of(self.question))
 
     def __copy__(self) -> Query:
         """The same question with separate counters."""
@@ -126,7 +118,7 @@ class Query:
         question = self.question
         begin, end = question.bounds or (None, None)
         try:
-            known = self.summaries()
+            known = self.source.now().summaries_of(self.question)
             one = f"recording {known[0].name}" if len(known) == 1 else f"{len(known)} recordings"
         except HybridlogError as error:
             one = str(error)
@@ -195,7 +187,7 @@ class Query:
             TopicError: no such topic exists.
             TimeError: `within` is no duration.
         """
-        checked = self.session.predicate(predicate, self.topics, self.question.recordings)
+        checked = self.source.now().predicate(predicate, self.topics, self.question.recordings)
         if checked.is_across:
             return self._near(checked, within)
         if within is not None:
@@ -221,7 +213,7 @@ class Query:
             within = within, f"{parse_duration(within) + 1}ns"
         own, others = split_own(predicate.root)
         query = self._satisfying(replace(predicate, root=And(tuple(own))))
-        near = Windows(self.session, query.question, predicate.text, *within)
+        near = Windows(self.source.now(), query.question, predicate.text, *within)
         near.answer(others)
         asked = (Query(self.source, *one) for one in near.asked)
         return Query(self.source, near.question, conditions=(*self.conditions, *asked))
@@ -284,7 +276,7 @@ class Query:
             tf_topics: Topics with transforms; empty for `tf` and `tf_static` of the topic's
                 innermost namespace that has them, and for frames that these lack, of the root.
         """
-        topics = self.session.resolve_in(tf_topics, self.question.recordings)
+        topics = self.source.now().resolve_in(tf_topics, self.question.recordings)
         return self._with(frame=frame, tf_topics=tuple(topics))
 
     def in_recording(self, *names: str) -> Query:
@@ -295,11 +287,11 @@ class Query:
         """
         from hybridlog.query.choosing import choose
 
-        chosen = choose(self.session, Choice.of(names))
+        chosen = choose(self.source.now(), Choice.of(names))
         if chosen.problem:
             raise TopicError(chosen.problem)
         ids = [summary.id for summary in chosen.summaries]
-        topics, recordings = self.session.having(self.topics, ids)
+        topics, recordings = self.source.now().having(self.topics, ids)
         return self._with(topics=topics, recordings=recordings)
 
     def during(self, intervals: Intervals) -> Query:
@@ -314,7 +306,7 @@ class Query:
         Raises:
             TopicError: an interval is of a recording that is not in the store.
         """
-        intervals = intervals.by_id(self.session.snapshot().ids_called())
+        intervals = intervals.by_id(self.source.now().snapshot().ids_called())
         return Query(self.source, self.question.within(intervals), conditions=self.conditions)
 
     def windows(self, before: DurationLike = 0, after: DurationLike = 0) -> Intervals:
@@ -334,10 +326,6 @@ class Query:
         """
         with self.counters.timed():
             return self._intervals().windows(before, after)
-
-    def summaries(self) -> list[RecordingSummary]:
-        """The recordings in short, oldest first; some may have no message in the answer."""
-        return self.session.summaries_of(self.question)
 
     # Messages.
 
@@ -375,7 +363,9 @@ class Query:
         return Following(self.source, self.question, self.counters, names)
 
     def at(self, moment: TimeLike) -> Message:
-        """The message of `at_time`. Its arrays are read-only: copy to change them.
+        """The message that was current at a time: the last one not after it.
+
+        Its arrays are read-only: copy to change them.
 
         Raises:
             TopicError: no such message exists.
@@ -384,26 +374,6 @@ class Query:
         """
         self._as_they_came("Loops and `at`")
         return _message_at(self, moment)
-
-    def at_time(self, moment: TimeLike) -> Query:
-        """Only the message that was current at a time: the last one not after it.
-
-        Raises:
-            TopicError: no such message exists.
-            UsageError: the question has a time range, or another clock than log time.
-        """
-        from hybridlog.query.answers.current import just_before
-
-        now = of_now(self)
-        found = _message_at(now, moment)
-        time = found.log_time_ns
-        question = just_before(self.question, found.recording, time, time)
-        # What is lost between the message and the moment may have been the current one.
-        snapshot = now.session.snapshot()
-        start, end = snapshot.summaries[snapshot.by_id[found.recording]].extent
-        latest = max(parse_time(moment, start=start, end=end), time)
-        since = Query(self.source, replace(question, bounds=(time, latest + 1)))
-        return Query(self.source, question, conditions=(*self.conditions, since))
 
     def batches(self) -> Iterator[tuple[Batch, Sequence[RecordedChannel]]]:
         """The messages in order, many at once; `batch.channel` indexes the channels.
@@ -429,12 +399,14 @@ class Query:
         from hybridlog.query.answers.current import in_force
 
         self.counters.reset()
-        return in_force(self.session, self.question, self.counters, original_times=original_times)
+        return in_force(
+            self.source.now(), self.question, self.counters, original_times=original_times
+        )
 
     def count(self) -> int:
         """Number of messages."""
         with self.counters.timed():
-            found = Planner(self.session, self.question, self.counters).count()
+            found = Planner(self.source.now(), self.question, self.counters).count()
             self.counters.messages = found
         return found
 
@@ -453,7 +425,7 @@ class Query:
             from hybridlog.tf.in_frame import points_of
 
             self.counters.reset()
-            found = points_of(self.session, self.question, self.counters)
+            found = points_of(self.source.now(), self.question, self.counters)
             return _stacked([one.points for one in found])
         arrays: list[NDArray[Any]] = []
         refused: PayloadError | DefinitionError | None = None
@@ -476,7 +448,7 @@ class Query:
         from hybridlog.frames.answer import to_arrow
 
         if self.question.frame is not None:
-            return pa.concat_tables(self.to_tables(), promote_options="permissive")
+            return pa.concat_tables(tables_of(self), promote_options="permissive")
         return to_arrow(self._planner())
 
     def to_polars(self) -> Any:
@@ -496,20 +468,6 @@ class Query:
         frame = frame_of(self.to_arrow())
         frame.attrs["hybridlog"] = asdict(self.counters)
         return frame
-
-    def to_tables(self) -> Iterator[pa.Table]:
-        """The answer in order, in Arrow tables of bounded size; at least one, possibly empty."""
-        from hybridlog.tf.in_frame import stream
-
-        return stream(self._planner())
-
-    def to_json_lines(self) -> Iterator[list[str]]:
-        """The answer in order as lines of JSON, many at a time."""
-        from hybridlog.frames.lines import lines
-
-        self._as_they_came("Lines")
-        for batch in lines(self._planner()):
-            yield [line if isinstance(line, str) else "".join(line) for line in batch]
 
     def resample(
         self,
@@ -537,7 +495,7 @@ class Query:
         """
         from hybridlog.across.align import resampled
 
-        return resampled(self.session, self.question, step, how, tolerance)
+        return resampled(self.source.now(), self.question, step, how, tolerance)
 
     def check(self) -> list[TopicCheck]:
         """Check how regularly the topics came: rate, jitter, gap, late start, early stop, losses.
@@ -553,7 +511,7 @@ class Query:
         from hybridlog.query.answers.statistics import check
 
         with self.counters.timed():
-            return check(self.session, self.question, self.counters)
+            return check(self.source.now(), self.question, self.counters)
 
     def stats(self, *fields: str) -> list[FieldStatistics]:
         """Statistics of the numeric fields: count, NaN, infinite, least, greatest, mean, deviation.
@@ -573,7 +531,7 @@ class Query:
         now = of_now(self)
         query = now.fields(*fields) if fields else now
         with self.counters.timed():
-            return statistics(now.session, query.question, self.counters)
+            return statistics(now.source.now(), query.question, self.counters)
 
     # Intervals.
 
@@ -659,47 +617,39 @@ class Query:
         from hybridlog.query.answers.statistics import gaps
 
         with self.counters.timed():
-            return gaps(self.session, self.question, self.counters, longer_than, periods)
+            return gaps(self.source.now(), self.question, self.counters, longer_than, periods)
 
     # What an answer lacks.
 
-    def completeness(self) -> Completeness:
+    def completeness(self, *, is_empty: bool | None = None) -> Completeness:
         """Completeness of the last answer, or, without one, of an answer given now.
 
-        Losses of topics in conditions count as an unknown number.
-        """
-        from hybridlog.query.answers.completeness import completeness_of
-
-        others = ((one.question, one.counters) for one in self.conditions)
-        return completeness_of(self.session, self.question, self.counters, *others)
-
-    def remarks(self, *, is_empty: bool | None = None) -> list[str]:
-        """Sentences about the last answer.
-
-        They tell what it lacks: messages that could not be read or asked, those without their
-        payload, losses in its range, and recordings that go on. And topics that lack fields of
-        the predicate, topics whose end is a short name that was given, header stamps of another
-        epoch, likely causes of an empty answer.
+        Losses of topics in conditions count as an unknown number. Its sentences also tell of
+        topics that lack fields of the predicate, header stamps of another epoch, and likely
+        causes of an empty answer.
 
         Args:
             is_empty: Whether the answer was empty; without, if `counters` has no messages.
         """
+        from hybridlog.query.answers.completeness import completeness_of
         from hybridlog.query.answers.remarks import remarks
 
-        if is_empty is None:
-            is_empty = not self.counters.messages
-        now = of_now(self)
-        found = [*now.completeness().sentences]
-        for one in self.conditions:
-            nothing = self.question.during is not None and not self.question.during
-            found += remarks(now.session, one.question, is_empty=nothing)
-        found += remarks(now.session, self.question, is_empty=is_empty)
-        return [*dict.fromkeys(found)]
+        session = self.source.now()
+        others = ((one.question, one.counters) for one in self.conditions)
+        found = completeness_of(session, self.question, self.counters, *others)
+        sentences = [*found.sentences]
+        with suppress(TimeError):  # nothing is in the range
+            for one in self.conditions:
+                nothing = self.question.during is not None and not self.question.during
+                sentences += remarks(session, one.question, is_empty=nothing)
+            nothing = not self.counters.messages if is_empty is None else is_empty
+            sentences += remarks(session, self.question, is_empty=nothing)
+        return replace(found, sentences=tuple(dict.fromkeys(sentences)))
 
     def _intervals(self) -> IntervalQueries:
         from hybridlog.query.answers.interval_queries import IntervalQueries
 
-        return IntervalQueries(self.session, self.question, self.counters)
+        return IntervalQueries(self.source.now(), self.question, self.counters)
 
     def _with(self, **changes: Any) -> Query:
         return Query(self.source, replace(self.question, **changes), conditions=self.conditions)
@@ -712,12 +662,12 @@ class Query:
     def _planner(self) -> Planner:
         """A planner for an answer, of a moment that begins now."""
         self.counters.reset()
-        return Planner(self.session, self.question, self.counters)
+        return Planner(self.source.now(), self.question, self.counters)
 
 
 def of_now(query: Query) -> Query:
     """The same question with the same counters, at the moment that begins now."""
-    return Query(query.session, query.question, query.counters, query.conditions)
+    return Query(query.source.now(), query.question, query.counters, query.conditions)
 
 
 def narrowed(query: Query, *topics: str) -> Query:
@@ -725,21 +675,63 @@ def narrowed(query: Query, *topics: str) -> Query:
 
     If the question is about several recordings, tables of each topic name them.
     """
-    session, question = query.session, query.question
+    session, question = query.source.now(), query.question
     several = question.names_recording or len(session.chosen(question)) > 1
     names, chosen = session.having(topics, question.recordings)
     question = replace(question, topics=names, recordings=chosen, names_recording=several)
     return Query(query.source, question, conditions=query.conditions)
 
 
+def at_time(query: Query, moment: TimeLike) -> Query:
+    """The question about the message of `Query.at` alone.
+
+    What is lost between the message and the moment may have been the current one: that is a
+    condition of it.
+    """
+    from hybridlog.query.answers.current import just_before
+
+    now = of_now(query)
+    found = _message_at(now, moment)
+    time = found.log_time_ns
+    question = just_before(query.question, found.recording, time, time)
+    snapshot = now.source.now().snapshot()
+    start, end = snapshot.summaries[snapshot.by_id[found.recording]].extent
+    latest = max(parse_time(moment, start=start, end=end), time)
+    since = Query(query.source, replace(question, bounds=(time, latest + 1)))
+    return Query(query.source, question, conditions=(*query.conditions, since))
+
+
+def _message_at(query: Query, moment: TimeLike) -> Message:
+    if not query.question.is_unbounded or query.question.clock != "log":
+        raise UsageError(
+            "A message at a time is the last one by log time; `between`, `during` and "
+            "`clock` cannot be combined with it."
+        )
+    from hybridlog.query.answers.current import message_at
+
+    with query.counters.timed():
+        found = message_at(query.source.now(), query.question, query.counters, moment)
+    if found is None:
+        raise TopicError(f"No message of {', '.join(query.topics)} is at or before {moment}.")
+    return found
+
+
+def tables_of(query: Query) -> Iterator[pa.Table]:
+    """The answer in order, in Arrow tables of bounded size; at least one, possibly empty."""
+    from hybridlog.tf.in_frame import stream
+
+    query.counters.reset()
+    return stream(Planner(query.source.now(), query.question, query.counters))
+
+
 def channels_of(query: Query) -> list[RecordedChannel]:
     """Every channel of a question."""
-    return Planner(query.session, query.question, query.counters).channels()
+    return Planner(query.source.now(), query.question, query.counters).channels()
 
 
 def field_types(query: Query) -> dict[str, str] | None:
     """Paths that can be queried and their types; None when a topic has no fixed fields."""
-    return query.session.field_types(query.topics, query.question.recordings)
+    return query.source.now().field_types(query.topics, query.question.recordings)
 
 
 def spans_of(query: Query) -> dict[str, Span]:
@@ -749,7 +741,7 @@ def spans_of(query: Query) -> dict[str, Span]:
     or a range of another clock.
     """
     found: dict[str, Span] = {}
-    for part in Planner(query.session, query.question).split():
+    for part in Planner(query.source.now(), query.question).split():
         extent = part.extent
         if extent is not None:
             low, high = found.get(part.recording.id, extent)
@@ -777,18 +769,3 @@ def _no_field(path: str, known: Mapping[str, str], topics: Sequence[str]) -> str
 def _stacked(arrays: list[NDArray[Any]]) -> NDArray[Any] | list[NDArray[Any]]:
     alike = {(a.shape, a.dtype) for a in arrays}
     return np.stack(arrays) if len(alike) == 1 else arrays or np.empty(0)
-
-
-def _message_at(query: Query, moment: TimeLike) -> Message:
-    if not query.question.is_unbounded or query.question.clock != "log":
-        raise UsageError(
-            "A message at a time is the last one by log time; `between`, `during` and "
-            "`clock` cannot be combined with it."
-        )
-    from hybridlog.query.answers.current import message_at
-
-    with query.counters.timed():
-        found = message_at(query.session, query.question, query.counters, moment)
-    if found is None:
-        raise TopicError(f"No message of {', '.join(query.topics)} is at or before {moment}.")
-    return found

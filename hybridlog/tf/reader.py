@@ -18,8 +18,7 @@ from hybridlog.query.answers.completeness import completeness_of
 from hybridlog.query.planner import Planner, log_times
 from hybridlog.query.question import Counters, Question
 from hybridlog.tf import is_of_transforms
-from hybridlog.tf.epochs import epochs_of
-from hybridlog.tf.rows import transforms_of
+from hybridlog.tf.epochs import epochs_of, transforms_of
 from hybridlog.tf.transform import Transform, unknown
 from hybridlog.tf.tree import Frame, FrameTree, Lookup
 from hybridlog.wording import counted, listed

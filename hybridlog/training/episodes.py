@@ -87,12 +87,12 @@ def episodes(
     gaps, by part.
     """
     name, query = piece
-    for summary, (begin, end) in RangeResolver(query.session, query.question).spans():
+    for summary, (begin, end) in RangeResolver(query.source.now(), query.question).spans():
         times, read = {}, {}
         for topic in features.images.values():
-            times[topic] = _times(_query(query.session, summary.id, topic, begin, end))
+            times[topic] = _times(_query(query.source.now(), summary.id, topic, begin, end))
         for source in (part for parts in features.vectors.values() for part in parts):
-            own = _query(query.session, summary.id, source.topic, begin, end)
+            own = _query(query.source.now(), summary.id, source.topic, begin, end)
             read[source] = _values(own, source)
             times[source.topic] = read[source].times
         first = max([begin, *(int(own[0]) for own in times.values())])
@@ -173,7 +173,7 @@ def _query(session: Session, recording: str, topic: str, begin: int, end: int) -
 
 def _times(query: Query) -> NDArray[np.int64]:
     """Log times of the messages, ns; at least one."""
-    times = log_times(query.session, query.question)
+    times = log_times(query.source.now(), query.question)
     _check(query, times)
     return times
 
@@ -199,7 +199,7 @@ def _values(query: Query, source: Source) -> Values:
 
 def _check(query: Query, times: NDArray[np.int64]) -> None:
     if not len(times):
-        (recording,), (topic,) = query.summaries(), query.topics
+        (recording,), (topic,) = query.source.now().summaries_of(query.question), query.topics
         _, end = query.question.bounds or (0, 0)
         raise TopicError(
             f"Recording {recording.name} has no message of {topic} before "

@@ -151,7 +151,10 @@ def nearly_empty(query: Query) -> dict[str, int]:
     """Topics of a question with less than a message a second, and their number of messages."""
     found = {}
     for one in (narrowed(query, topic) for topic in query.topics):
-        length = sum(end - begin for begin, end in (each.extent for each in one.summaries()))
+        length = sum(
+            end - begin
+            for begin, end in (each.extent for each in one.source.now().summaries_of(one.question))
+        )
         if (count := one.count()) < max(length / 1e9, 1):
             found[one.topics[0]] = count
     return found
@@ -166,7 +169,7 @@ def proposed(query: Query, without: Collection[str] = ()) -> FeatureMap:
     states: list[Source] = []
     actions: list[Source] = []
     images: dict[str, str] = {}
-    entries = map(query.session.entry_of, query.summaries())
+    entries = map(query.source.now().entry_of, query.source.now().summaries_of(query.question))
     types = {one.topic: plain_type(one.type) for entry in entries for one in entry.channels}
     for topic in query.topics:
         kind = "" if topic in without else types.get(topic, "")

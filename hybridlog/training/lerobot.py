@@ -99,7 +99,7 @@ def write_lerobot(
     episode and the number of its frames.
     """
     pyav()
-    features = features.resolved(query.session)
+    features = features.resolved(query.source.now())
     selected = narrowed(query, *features.topics)
     plan = _plan(selected, features, options)
     root, report = Path(path), LerobotReport(Path(path))
@@ -119,7 +119,7 @@ def write_lerobot(
             report.resumed += written is not None
             if written is None:
                 with failures(str(place)):
-                    written = write_episode(query.session, episode, features, options, place)
+                    written = write_episode(query.source.now(), episode, features, options, place)
             made.append(written)
             if progress is not None:
                 progress(episode.name, made[-1].length)

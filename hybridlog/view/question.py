@@ -64,7 +64,7 @@ class PageQuestion:
         return {
             "count": count,
             "lost": found.describe(count) if found.has_losses else None,
-            "remarks": query.remarks(),
+            "remarks": found.sentences,
             "python": self.python(),
             "command": self.command(),
             "name": self.file_name(),

@@ -15,7 +15,8 @@ from pydantic import Field
 
 from hybridlog.arrays.message_arrays import IMAGES, plain_type
 from hybridlog.drawing.images import Picture, picture
-from hybridlog.query.answers.lost import coverage
+from hybridlog.frames.lines import json_lines
+from hybridlog.query.answers.loss_words import coverage
 from hybridlog.query.planner import match_times
 from hybridlog.query.predicate.tokens import MAX_TEXT
 from hybridlog.query.times import format_duration, format_time
@@ -108,7 +109,7 @@ def schema(
         return _answer({"topics": listed[:MAX_ROWS]}, "topics", is_cut=is_cut)
     query = chosen.topic(topic)
     fields = [{"field": path, "type": kind} for path, kind in known_fields(query).items()]
-    values = {"topics": query.topics, "lacks": query.remarks(is_empty=False)}
+    values = {"topics": query.topics, "lacks": query.completeness(is_empty=False).sentences}
     return _answer({**values, "fields": fields[:MAX_ROWS]}, "fields", is_cut=len(fields) > MAX_ROWS)
 
 
@@ -133,7 +134,7 @@ def ask(
     count = query.count()
     values: dict[str, Any] = {"count": count, **_lacks(query, count)}
     with suppress(TimeError):  # the range is outside all recordings
-        parts = match_times(query.session, query.question)
+        parts = match_times(query.source.now(), query.question)
         times = chain.from_iterable(part.log_time.tolist() for part in parts)
         values["first_times"] = [*map(format_time, islice(times, 10))]
     rows = []
@@ -142,7 +143,7 @@ def ask(
         held = query.intervals().at_least(at_least or 0)
         values["interval_count"] = len(held)
         is_cut = len(held) > MAX_ROWS
-        names = {one.id: one.name for one in query.summaries()}
+        names = {one.id: one.name for one in query.source.now().summaries_of(query.question)}
         rows = [
             {
                 "recording": names[one.recording],
@@ -193,7 +194,7 @@ def fetch(
     shown: list[Picture] = []
     problems: list[str] = []
     if fields:
-        rows = [json.loads(line) for lines in limited.to_json_lines() for line in lines]
+        rows = [json.loads(line) for line in json_lines(limited)]
     for message in limited if pictures or not fields else ():
         if not fields:
             rows.append(
@@ -211,7 +212,7 @@ def fetch(
                 problems.append(f"{format_time(message.log_time_ns)}: {error}")
     count = query.count()
     values = {"count": count, **_lacks(query, count), "not_shown": problems}
-    values["lacks"] = [*dict.fromkeys([*limited.remarks(), *values["lacks"]])]
+    values["lacks"] = [*dict.fromkeys([*limited.completeness().sentences, *values["lacks"]])]
     return _answer({**values, "messages": rows}, "messages", tuple(shown), is_cut=count > len(rows))
 
 
@@ -249,10 +250,10 @@ def plot(
 
 def _lacks(query: Query, count: int) -> dict[str, Any]:
     """The gaps of a query's last answer, in words."""
-    found = query.completeness()
+    found = query.completeness(is_empty=not count)
     return {
         "lost": found.describe(count) if found.has_losses else None,
-        "lacks": query.remarks(is_empty=not count),
+        "lacks": found.sentences,
     }
 
 

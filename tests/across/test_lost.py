@@ -12,6 +12,7 @@ import pytest
 import hybridlog as hl
 from hybridlog.query.answers.completeness import Completeness
 from hybridlog.query.intervals import Intervals
+from hybridlog.query.query import at_time
 from hybridlog_storage.errors import IncompleteError, UsageError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
@@ -173,15 +174,20 @@ def test_python_says_what_the_commands_say(damaged: Damaged) -> None:
     topic = store.topic("n").in_recording("part")
     lack = "part is not complete, so this answer may not be: {}; `hybridlog info part` says where."
     whole = [lack.format("3 messages lost in 3 places (segment)")]
-    for remarks, command in (
-        (lambda: topic.count() and topic.remarks(), ("fetch", "--count", "-t", "n")),
-        (lambda: topic.to_arrow() and topic.remarks(), ("fetch", "-t", "n")),
-        (lambda: topic.stats("v") and topic.remarks(), ("stats", "-t", "n", "--fields", "v")),
-        (lambda: topic.intervals() and topic.remarks(), ("intervals", "-t", "n")),
-        (topic.resample("1s").remarks, ("align", "-t", "n", "--step", "1s")),
-        (store.align(topic, []).remarks, ("align", "--to", "n", "-t", "n")),
+    for ask, command in (
+        (topic.count, ("fetch", "--count", "-t", "n")),
+        (topic.to_arrow, ("fetch", "-t", "n")),
+        (lambda: topic.stats("v"), ("stats", "-t", "n", "--fields", "v")),
+        (topic.intervals, ("intervals", "-t", "n")),
     ):
-        assert remarks() == whole
+        ask()
+        assert [*topic.completeness().sentences] == whole
+        assert whole[0] in run(*command, "-r", "part", store=path).err.splitlines()
+    for aligned, command in (
+        (topic.resample("1s"), ("align", "-t", "n", "--step", "1s")),
+        (store.align(topic, []), ("align", "--to", "n", "-t", "n")),
+    ):
+        assert aligned.remarks() == whole
         assert whole[0] in run(*command, "-r", "part", store=path).err.splitlines()
     answer = store.sql("select v from n where recording = 'part'")
     answer.to_arrow()
@@ -192,13 +198,13 @@ def test_python_says_what_the_commands_say(damaged: Damaged) -> None:
         ("+8s", "+9s", [lack.format("1 message lost in 1 place (segment)")]),
     ):
         asked = topic.between(begin, end)
-        assert (asked.remarks(is_empty=False), asked.completeness().has_losses) == (
-            said,
-            bool(said),
-        )
+        found = asked.completeness(is_empty=False)
+        assert ([*found.sentences], found.has_losses) == (said, bool(said))
     # The message that was lost may have been the current one.
-    assert topic.at_time("+4.5s").remarks() == [lack.format("1 message lost in 1 place (segment)")]
-    assert topic.at_time("+4.5s").completeness().has_losses
-    assert topic.at_time("+3.5s").remarks() == []
+    assert [*at_time(topic, "+4.5s").completeness().sentences] == [
+        lack.format("1 message lost in 1 place (segment)")
+    ]
+    assert at_time(topic, "+4.5s").completeness().has_losses
+    assert not at_time(topic, "+3.5s").completeness().sentences
     with pytest.raises(IncompleteError):
-        topic.at_time("+4.5s").completeness().check()
+        at_time(topic, "+4.5s").completeness().check()

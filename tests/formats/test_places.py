@@ -17,6 +17,7 @@ import hybridlog as hl
 from hybridlog.formats import OUTPUTS
 from hybridlog.formats.answer import Answer
 from hybridlog.formats.ply import ply_of
+from hybridlog.query.query import tables_of
 from hybridlog_storage.errors import UsageError
 from tests.data import DATA, needs_data
 from tests.independent import read_bag
@@ -93,7 +94,7 @@ def test_scans_become_points(store: hl.Store, tmp_path: Path) -> None:
 @needs_data
 def test_poses(store: hl.Store) -> None:
     query = store.topic("/coug2/odom")
-    lines = written("tum", *query.to_tables()).splitlines()
+    lines = written("tum", *tables_of(query)).splitlines()
     for line, message in zip(lines, query, strict=True):
         said = message.decode()
         pose, stamp = said.pose.pose, said.header.stamp
@@ -120,7 +121,7 @@ def test_the_pose_of_a_table() -> None:
 
 @needs_data
 def test_fixes(store: hl.Store) -> None:
-    found = json.loads(written("geojson", *store.topic("/position_gps").to_tables()))
+    found = json.loads(written("geojson", *tables_of(store.topic("/position_gps"))))
     assert found["type"] == "FeatureCollection"
     seen = [m for m in read_bag(DATA / "real/tilt_laser.bag") if m.topic == "/position_gps"]
     assert len(found["features"]) == len(seen)

@@ -110,7 +110,7 @@ def test_the_last_seconds_stay_and_nothing_else(store: hl.Store) -> None:
     # All that is derived is of what is left, and what was lost before is not in it.
     assert store.topic("/scan").where("near >= 0").count() == len(kept)
     indexed = store.topic("/scan").where({"near": {"$gte": 0}})
-    assert (indexed.count(), indexed.remarks()) == (len(kept), [])
+    assert (indexed.count(), [*indexed.completeness().sentences]) == (len(kept), [])
     assert store.topic("/scan").to_arrow().num_rows == len(kept)
     assert store.sql("select count(*) as n from scan").to_pandas()["n"][0] == len(kept)
     assert entry.end["losses"] == []

@@ -49,13 +49,13 @@ def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
 def test_the_number_is_that_of_the_topics_asked(live: hl.Store) -> None:
     query = live.topic("/a")
     assert query.count() == 2
-    assert query.remarks() == [f"{TOLD}, nor in this answer."]
+    assert [*query.completeness().sentences] == [f"{TOLD}, nor in this answer."]
     assert query.completeness().unwritten == 3
     assert not query.completeness().has_losses
     with pytest.raises(IncompleteError, match="3 messages not written yet"):
         query.completeness().check()
     quiet = live.topic("/quiet")
-    assert quiet.remarks() == []
+    assert not quiet.completeness().sentences
     assert quiet.completeness().unwritten == 0
     quiet.completeness().check()
     # An alignment tells it once for all topics.
@@ -67,10 +67,10 @@ def test_the_number_is_that_of_the_topics_asked(live: hl.Store) -> None:
     for limit, lacks in ((1, False), (2, False), (3, True)):
         query = live.topic("/a").limit(limit)
         assert len(list(query)) == min(limit, 2)
-        assert bool(query.remarks()) == lacks
+        assert bool(query.completeness().sentences) == lacks
     last = live.topic("/a").limit(1).reverse()
     list(last)
-    assert last.remarks()
+    assert last.completeness().sentences
 
 
 def test_it_is_told_only_where_the_time_reaches_past_the_last_flush(live: hl.Store) -> None:
@@ -89,7 +89,7 @@ def test_it_is_told_only_where_the_time_reaches_past_the_last_flush(live: hl.Sto
         (query.between(None, 2 * SECOND).clock("header"), 3),
     ):
         assert part.completeness().unwritten == unwritten, part
-        assert len(part.remarks(is_empty=False)) == (unwritten > 0)
+        assert len(part.completeness(is_empty=False).sentences) == (unwritten > 0)
     options = ["fetch", "-t", "/a", "--count", "--strict", "--between", "start"]
     done = run(*options, "2000000000ns", store=live.directory.path)
     assert (done.out, "not written" in done.err) == ("1\n", False)
@@ -120,7 +120,7 @@ def test_without_a_socket_it_is_told_in_words(tmp_path: Path) -> None:
             recording.write(CHANNEL, text("x"), log_time=number * SECOND)
         wait_until_flushed(store, 2)
         query = store.topic("/a")
-        assert query.remarks(is_empty=False) == [
+        assert [*query.completeness(is_empty=False).sentences] == [
             "own is being recorded: up to 0.5 s not written yet, nor in this answer."
         ]
         assert query.completeness().unwritten is None
@@ -130,7 +130,7 @@ def test_without_a_socket_it_is_told_in_words(tmp_path: Path) -> None:
         query.between(None, 2 * SECOND).completeness().check()
         assert "up to 0.5 s not written yet" in run("fetch", "-t", "/a", "--count", store=path).err
         recording.close()
-        assert query.remarks(is_empty=False) == []
+        assert not query.completeness(is_empty=False).sentences
         assert query.completeness().unwritten == 0
         query.completeness().check()
 
@@ -149,7 +149,7 @@ def test_what_the_index_lacks_is_told_where_mongodb_answers(tmp_path: Path, limi
         assert len(documents) < 5
         raw = query.where({"$expr": {"$eq": ["$data", "x"]}})
         assert raw.count() == len(documents)
-        assert any(late in line for line in raw.remarks(is_empty=False))
+        assert any(late in line for line in raw.completeness(is_empty=False).sentences)
         with pytest.raises(IncompleteError, match=late):
             raw.between(None, 5 * SECOND + 1).completeness().check()
         # What others answer is whole.

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import hybridlog as hl
-from hybridlog.query.query import Query
+from hybridlog.query.query import Query, at_time
 from hybridlog.record.recorder import RecordOptions
 from hybridlog_storage.errors import SegmentError, TopicError
 from hybridlog_storage.segments.segment_writer import SegmentSettings
@@ -82,7 +82,7 @@ def test_the_message_at_a_time_is_what_a_loop_finds(
                         continue
                     found = query.at(f"{now}ns")
                     assert (found.recording, found.fields["n"]) == want
-                    (same,) = query.at_time(f"{now}ns")
+                    (same,) = at_time(query, f"{now}ns")
                     assert (same.recording, same.fields["n"]) == want
 
 

@@ -158,7 +158,7 @@ def _answers(path: Path) -> Iterator[object]:
         yield store.topics(), store.entry("drive").messages, store.entry("drive").span
         yield [(m.log_time_ns, m.publish_time_ns, m.fields) for m in marks.reverse()]
         yield marks.between("+2s", "+3s").count(), marks.where("text = 'b'").count()
-        yield marks.to_arrow().to_pylist(), marks.remarks()
+        yield marks.to_arrow().to_pylist(), [*marks.completeness().sentences]
         yield [(one.begin_ns, one.end_ns) for one in marks.windows()]
         yield store.topic("*").count(), marks.at("+4s").fields, marks.at("+2.5s").fields
         yield str(marks.completeness()), store.verify().findings

@@ -167,7 +167,7 @@ def test_mongodb_answers_as_it_does_by_itself(store: hl.Store, own: dict[str, ob
     assert found == want
     assert query.count() == len(want)
     assert seqs(query.reverse()) == want[::-1]
-    assert query.remarks() == []
+    assert not query.completeness().sentences
 
 
 def test_it_is_joined_with_all_else(store: hl.Store) -> None:
@@ -330,12 +330,12 @@ def test_what_the_index_lacks_is_said(tmp_path: Path) -> None:
             query.completeness().check()
         assert query.count() == 1
         assert query.counters.unindexed == query.completeness().unindexed == 20
-        (says,) = query.remarks()
+        (says,) = query.completeness().sentences
         assert says.startswith("20 messages of two are not in the index, nor in this answer")
         assert "`hybridlog index rebuild`" in says
         part = query.between(105 * SECOND, 108 * SECOND)
         assert (part.count(), part.counters.unindexed) == (0, 3)
-        assert query.in_recording("one").remarks() == []
+        assert not query.in_recording("one").completeness().sentences
     answer(
         "fetch",
         "-t",
@@ -350,7 +350,7 @@ def test_what_the_index_lacks_is_said(tmp_path: Path) -> None:
     with hl.open(path) as store:
         query = store.topic("/t").where({"x": 3})
         assert query.count() == 2
-        assert query.remarks() == []
+        assert not query.completeness().sentences
 
 
 def test_messages_without_fields_are_told(tmp_path: Path) -> None:
@@ -362,7 +362,10 @@ def test_messages_without_fields_are_told(tmp_path: Path) -> None:
         query = topic.where({"x": {"$ne": 1}})
         assert query.count() == 1
         assert query.counters.unreadable == 1
-        assert "could not be tested: it has no fields in the index" in query.remarks()[0]
+        assert (
+            "could not be tested: it has no fields in the index"
+            in query.completeness().sentences[0]
+        )
         both = topic.where({"x": {"$ne": 1}}).where("x < 5")
         assert (both.count(), both.counters.unreadable) == (1, 1)
         assert topic.where({"_meta.error": {"$exists": True}}).count() == 1

@@ -63,7 +63,7 @@ def test_an_answer_that_lacks_nothing_has_no_remarks(store: hl.Store) -> None:
         store.topic("/n").limit(0),
     ):
         query.count()
-        assert query.remarks() == []
+        assert not query.completeness().sentences
 
 
 @pytest.mark.parametrize(
@@ -81,7 +81,7 @@ def test_what_a_predicate_did_not_see(
     query = store.topic(topic).where(predicate)
     for answer in (query.count, lambda: [*query], query.to_arrow if topic == "/n" else query.count):
         answer()
-        (remark,) = query.remarks()
+        (remark,) = query.completeness().sentences
         assert remark.startswith(words)
     assert query.where("_meta.t > 0").counters.unreadable == 0
 
@@ -89,11 +89,11 @@ def test_what_a_predicate_did_not_see(
 def test_a_topic_that_lacks_a_field_of_the_predicate(store: hl.Store) -> None:
     query = store.topic("/n", "/near").where("n > 2")
     assert query.count() == 3
-    assert query.remarks()[1:] == ["No message of /near has a field 'n'."]
+    assert [*query.completeness().sentences][1:] == ["No message of /near has a field 'n'."]
     # A field that is said to be missing is not missed.
     absent = store.topic("/n", "/near").where("n missing")
     assert absent.count() == 6
-    assert absent.remarks() == [
+    assert [*absent.completeness().sentences] == [
         "1 message could not be tested: it does not fit its definition, or has none."
     ]
 
@@ -101,7 +101,7 @@ def test_a_topic_that_lacks_a_field_of_the_predicate(store: hl.Store) -> None:
 def test_columns_of_messages_without_a_definition(store: hl.Store) -> None:
     query = store.topic("/j").fields("speed", "n", "seq", "list[].deep", "long.min")
     assert query.to_arrow().num_rows
-    assert query.remarks() == ["No message of /j has a field 'speed'."]
+    assert [*query.completeness().sentences] == ["No message of /j has a field 'speed'."]
     assert "n" in store.topic("/j").fields("n").resample("1s", how="mean").to_arrow().column_names
     with pytest.raises(UsageError, match="list of /j is no single number"):
         store.topic("/j").fields("n", "list").resample("1s", how="mean").to_arrow()
@@ -113,7 +113,7 @@ def test_header_stamps_of_another_epoch(store: hl.Store) -> None:
         (store.topic("/early").clock("header").between(BEGIN, None), 0),
     ):
         assert query.count() == want
-        epoch, missing = query.remarks()
+        epoch, missing = query.completeness().sentences
         assert epoch.startswith(
             "Header stamps of /early are from 1970-01-01T00:00:01Z to 1970-01-01T00:00:05Z, its "
             "log times from 2023-11-14T22:13:20Z to"
@@ -123,13 +123,13 @@ def test_header_stamps_of_another_epoch(store: hl.Store) -> None:
         )
     by_log = store.topic("/early").between("start", "end")
     assert by_log.count() == 6
-    assert by_log.remarks() == []
+    assert not by_log.completeness().sentences
 
 
 def test_why_an_answer_is_empty(store: hl.Store) -> None:
     def remarks(query: hl.Query) -> list[str]:
         assert query.count() == 0
-        return query.remarks()
+        return [*query.completeness().sentences]
 
     late = store.topic("/n").in_recording("monday").between(BEGIN + 15 * SECOND, None)
     assert remarks(late) == [

@@ -15,8 +15,9 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.attachments import Extras, extras_of
+from hybridlog.frames.lines import json_lines
 from hybridlog.query.intervals import Intervals
-from hybridlog.query.query import channels_of, field_types, narrowed, spans_of
+from hybridlog.query.query import at_time, channels_of, field_types, narrowed, spans_of, tables_of
 from hybridlog_storage.errors import HybridlogError, IncompleteError, PayloadError
 from tests.running.sequence import CHANNELS, MS, SECOND, START, STEP, Known, Sent
 
@@ -212,7 +213,7 @@ def ranged(known: Known, topic: str, clock: str, begin: int | None, end: int | N
 
 
 def _json_lines(query: Any) -> list[tuple[int, int]]:
-    found = [json.loads(line) for lines in query.to_json_lines() for line in lines]
+    found = [json.loads(line) for line in json_lines(query)]
     return [(one["n"], one["big"]) for one in found]
 
 
@@ -306,7 +307,7 @@ def _lost(store: hl.Store) -> Any:
 
 def _extras(store: hl.Store) -> Extras:
     query = store.all_topics()
-    return extras_of(query.session, query.question)
+    return extras_of(query.source.now(), query.question)
 
 
 METHODS: dict[str, Rule] = {
@@ -323,10 +324,6 @@ METHODS: dict[str, Rule] = {
             current(k, "/said", t).seq
             for t in (FIRST_S, LAST_S + 1, k.span[1] + 1 - 300 * MS, k.span[1])
         ],
-    ),
-    "at_time": Rule(
-        lambda s: rows(s.topic("arm").at_time("-0.1s")),
-        lambda k: sent([current(k, "/arm", k.span[1] + 1 - 100 * MS)]),
     ),
     "batches": Rule(
         lambda s: batches(s.topic("said", "cam", "opaque").batches()),
@@ -454,10 +451,6 @@ METHODS: dict[str, Rule] = {
     "recordings": Rule(
         lambda s: [s.entry(one).name for one in s.topic("arm").recordings], lambda _: [LABEL]
     ),
-    "remarks": Rule(
-        lambda s: any("3 messages" in remark for remark in s.topic("said").remarks()),
-        lambda _: True,
-    ),
     "resample": Rule(
         lambda s: _table(
             s.topic("said").resample("100ms", "count").to_arrow(), "log_time", "count"
@@ -471,10 +464,6 @@ METHODS: dict[str, Rule] = {
             for f in s.topic("said").stats("x")
         ],
         lambda k: numbers(k, "/said", "x"),
-    ),
-    "summaries": Rule(
-        lambda s: [(r.name, r.messages, r.span) for r in s.topic("arm").summaries()],
-        lambda k: [(LABEL, len(k.of()), k.span)],
     ),
     "to_arrow": Rule(
         lambda s: (
@@ -492,7 +481,6 @@ METHODS: dict[str, Rule] = {
             ],
         ),
     ),
-    "to_json_lines": Rule(lambda s: _json_lines(s.topic("said")), _numbers),
     "to_numpy": Rule(
         lambda s: [image.tolist() for image in s.topic("cam").to_numpy()],
         lambda k: [
@@ -506,10 +494,6 @@ METHODS: dict[str, Rule] = {
     ),
     "to_polars": Rule(
         lambda s: _table(s.topic("said").to_polars().to_arrow(), "log_time", "n"),
-        lambda k: _times(k, "/said"),
-    ),
-    "to_tables": Rule(
-        lambda s: [row for t in s.topic("said").to_tables() for row in _table(t, "log_time", "n")],
         lambda k: _times(k, "/said"),
     ),
     "topics": Rule(lambda s: sorted(s.all_topics().topics), lambda _: sorted(CHANNELS)),
@@ -547,7 +531,6 @@ METHODS: dict[str, Rule] = {
 
 EXEMPT_METHODS: dict[str, str] = {
     "follow": "it gives what comes later; see tests/live/test_follow.py",
-    "session": "the open store, which is asked by all others",
 }
 """Methods without a rule here, and why."""
 
@@ -566,6 +549,21 @@ def _aligned(found: Any) -> Any:
 
 
 STORE: dict[str, Rule] = {
+    "at_time": Rule(
+        lambda s: rows(at_time(s.topic("arm"), "-0.1s")),
+        lambda k: sent([current(k, "/arm", k.span[1] + 1 - 100 * MS)]),
+    ),
+    "sentences": Rule(
+        lambda s: any(
+            "3 messages" in remark for remark in s.topic("said").completeness().sentences
+        ),
+        lambda _: True,
+    ),
+    "json_lines": Rule(lambda s: _json_lines(s.topic("said")), _numbers),
+    "tables_of": Rule(
+        lambda s: [row for t in tables_of(s.topic("said")) for row in _table(t, "log_time", "n")],
+        lambda k: _times(k, "/said"),
+    ),
     "channels": Rule(
         lambda s: sorted(c.channel.topic for c in channels_of(s.all_topics())),
         lambda _: sorted(CHANNELS),

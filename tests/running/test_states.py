@@ -187,7 +187,7 @@ def test_extras_and_what_is_shown(tmp_path: Path) -> None:
             assert (attachment.name, b"".join(attachment.pieces())) == (record.name, b"fx: 500")
             assert [one.values for one in store.metadata(LABEL)] == [{"name": "seven"}]
             query = store.topic("arm")
-            extras = extras_of(query.session, query.question)
+            extras = extras_of(query.source.now(), query.question)
             assert (len(extras.attachments), len(extras.metadata)) == (1, 1)
         done = answer("info", LABEL, "--attachments", "--json", store=found.path)
         assert [one["name"] for one in done.json] == [record.name]

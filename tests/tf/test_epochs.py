@@ -149,7 +149,7 @@ def test_nothing_is_interpolated_across(tmp_path: Path) -> None:
 def test_transforms_are_of_the_same_run(store: hl.Store) -> None:
     query = store.topic("/a").in_frame("map")
     assert places(query) == [2, 4, 6, 8, 10, 202, 204, 208, 210]
-    assert AGAIN in " ".join(query.remarks())
+    assert AGAIN in " ".join(query.completeness().sentences)
     assert store.tf().transform("map", "base", 2 * S).translation[0] == 102  # of the last run
     assert store.tf().transform("base", "cam", 2 * S).translation[0] == 7
 

@@ -92,7 +92,7 @@ def test_scans_of_a_real_log(demo: Path, store: hl.Store, tmp_path: Path) -> Non
             cloud = read_ply((tmp_path / "out" / line["file"]).read_bytes())
             np.testing.assert_array_equal(cloud[axis], values)
     assert 0 < missing < len(scans)
-    (said,) = [one for one in query.remarks() if "transform" in one]
+    (said,) = [one for one in query.completeness().sentences if "transform" in one]
     assert said.startswith(f"{missing} message")
     assert "before the first transform of" in said
     with pytest.raises(IncompleteError, match="without a transform"):

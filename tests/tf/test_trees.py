@@ -130,7 +130,7 @@ def test_topics_that_give_a_frame_two_parents(store: hl.Store) -> None:
     found = store.topic("/p").in_frame("map")
     assert places(found) == [None]
     told = "base is below odom by /tf, and at the same time below map by /tf_static"
-    assert told in " ".join(found.remarks())
+    assert told in " ".join(found.completeness().sentences)
     assert told in " ".join(store.tf().problems()).lower()
     assert store.tf().transform("map", "odom", at).translation[0] == 3
 
@@ -164,7 +164,9 @@ def test_a_recording_without_transforms(store: hl.Store) -> None:
         recorded(store, f"r{n}", [*frames, ("/p", point("base", at), at)])
     query = store.topic("/p").in_frame("map")
     assert places(query) == [0, None, 2]
-    assert "1 message without a transform to map: no such frame" in " ".join(query.remarks())
+    assert "1 message without a transform to map: no such frame" in " ".join(
+        query.completeness().sentences
+    )
     with pytest.raises(TopicError, match="no frame 'maap'"):
         store.topic("/p").in_frame("maap").to_arrow()
 
@@ -191,7 +193,9 @@ def test_a_stamp_of_zero_is_no_time(store: hl.Store) -> None:
     assert places(query.between("+0s", "+1.5s")) == [1, 2]  # begins at the first that is set
     whole = query.between(None, None)
     assert places(whole) == [1, 2, 4]
-    assert "2 messages are at no time of the header clock" in " ".join(whole.remarks())
+    assert "2 messages are at no time of the header clock" in " ".join(
+        whole.completeness().sentences
+    )
     assert store.topic("/a").fields("stamp").to_arrow()["stamp"].null_count == 2
     rows = store.align("/a", ["/b"], clock="header").to_arrow()
     assert rows["b.point.x"].to_pylist() == [None, 1, 2, None, 4]
@@ -242,8 +246,8 @@ def test_an_unset_stamp_has_no_transform(store: hl.Store, tmp_path: Path) -> Non
     for frame, wanted in (("map", 6), ("base", 5)):
         query = store.topic("/p").in_frame(frame)
         assert places(query) == [None, wanted]
-        assert "1 message without a transform to " in " ".join(query.remarks())
-        assert "a stamp of zero, which is not set" in " ".join(query.remarks())
+        assert "1 message without a transform to " in " ".join(query.completeness().sentences)
+        assert "a stamp of zero, which is not set" in " ".join(query.completeness().sentences)
     tree = store.tf()
     assert tree.invalid == {"a stamp of zero, which is not set": 1}
     assert tree.frames["base"].stamps.tolist() == [BEGIN, BEGIN + S]

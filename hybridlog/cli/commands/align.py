@@ -111,7 +111,7 @@ def _aligned(store: Store, given: _Given) -> Aligned:
         from hybridlog.query.planner import Planner
         from hybridlog.tf.in_frame import has_places
 
-        placed = [has_places(Planner(q.session, q.question, q.counters)) for q in queries]
+        placed = [has_places(Planner(q.source.now(), q.question, q.counters)) for q in queries]
         queries = [
             given.placed(query) if is_placed or not any(placed) else query
             for query, is_placed in zip(queries, placed, strict=True)

@@ -126,7 +126,7 @@ def export_command(given: _Given) -> None:
                 _write_log(one, form, path, given, settings)
             else:
                 _write_tables(one, form, path, given)
-            output.remarks(one.remarks(is_empty=None if is_log else False))
+            output.remarks(one.completeness(is_empty=None if is_log else False).sentences)
 
 
 def _write_log(
@@ -134,7 +134,7 @@ def _write_log(
 ) -> None:
     from hybridlog.attachments import extras_of
 
-    extras = extras_of(query.session, query.question)
+    extras = extras_of(query.source.now(), query.question)
     if given.no_attachments:
         extras = extras._replace(attachments=[], left_out=0)
     write_answer(query, form, path, front=given.front, extras=extras, settings=settings)
@@ -153,7 +153,9 @@ def _write_tables(query: Query, form: str, directory: Path, given: _Given) -> No
     from hybridlog.query.ranges import RangeResolver
     from hybridlog_storage.mongo.collection_names import collection_of
 
-    RangeResolver(query.session, query.question).resolve()  # refuses a range without any message
+    RangeResolver(
+        query.source.now(), query.question
+    ).resolve()  # refuses a range without any message
     topics = _image_topics(query) if OUTPUTS[form].content == "video" else query.topics
     suffix = OUTPUTS[form].suffixes[0]
     paths = {topic: directory / f"{collection_of(topic)}{suffix}" for topic in topics}
@@ -189,7 +191,7 @@ def _image_topics(query: Query) -> list[str]:
     """The topics of images and of video among those of a query."""
     from hybridlog.arrays.message_arrays import IMAGES, plain_type
 
-    entries = map(query.session.entry_of, query.summaries())
+    entries = map(query.source.now().entry_of, query.source.now().summaries_of(query.question))
     found = {c.topic for entry in entries for c in entry.channels if plain_type(c.type) in IMAGES}
     if not found.intersection(query.topics):
         raise UsageError("There is no topic of images or of video.")

@@ -115,10 +115,13 @@ def fetch_command(choices: _Choices) -> None:
             _follow(query, choices)
             return
         if choices.at is not None:
+            from hybridlog.query.query import at_time
+
             try:
-                query = query.at_time(choices.at)
+                query = at_time(query, choices.at)
             except TopicError:
-                output.remarks(query.between("start", choices.at).remarks(is_empty=False))
+                before = query.between("start", choices.at)
+                output.remarks(before.completeness(is_empty=False).sentences)
                 raise
         if choices.strict:
             query.completeness().check(payloads=not choices.count)
@@ -143,7 +146,7 @@ def fetch_command(choices: _Choices) -> None:
         for condition in query.conditions:
             cost.add(condition.counters)
         print_end(cost, started, verbose=choices.verbose, count=choices.count)
-        output.remarks((*query.remarks(), *lost))
+        output.remarks((*query.completeness().sentences, *lost))
 
 
 def _answer(query: Query, choices: _Choices, front: Front) -> Query:
@@ -156,10 +159,11 @@ def _answer(query: Query, choices: _Choices, front: Front) -> Query:
         settings = choices.settings(form)
         write_answer(query, form, choices.place, front=front, strict=strict, settings=settings)
         return query
+    from hybridlog.query.query import tables_of
     from hybridlog.record.marks import MARKS
 
     answered = query if query.question.limit is not None else query.limit(SCREEN_ROWS + 1)
-    tables = answered.to_tables()
+    tables = tables_of(answered)
     if answered.topics == (MARKS,):
         tables = map(_with_times, tables)
     completeness = answered.completeness if strict else None
@@ -201,10 +205,12 @@ def _follow(query: Query, choices: _Choices) -> None:
             write_following(following, choices.to_form)
     finally:
         print_end(query.counters, started, verbose=choices.verbose)
-        asked = Query(query.session, following.question)
+        asked = Query(query.source.now(), following.question)
         asked.counters = query.counters
-        ended = (one for one in asked.summaries() if one.status != "open")
-        output.remarks(asked.remarks())
+        ended = (
+            one for one in asked.source.now().summaries_of(asked.question) if one.status != "open"
+        )
+        output.remarks(asked.completeness().sentences)
         output.remarks(f"{one.name} has ended: {status_text(one)}." for one in ended)
 
 

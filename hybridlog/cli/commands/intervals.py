@@ -77,7 +77,10 @@ def intervals_command(given: _Given) -> None:
         if given.count:
             output.say(str(len(found)))
         else:
-            names = {recording.id: recording.name for recording in query.summaries()}
+            names = {
+                recording.id: recording.name
+                for recording in query.source.now().summaries_of(query.question)
+            }
             rows = (
                 {
                     "recording": names[row.recording],

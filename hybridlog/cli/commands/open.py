@@ -98,9 +98,9 @@ def open_command(given: _Given) -> None:
             name = store.entry(ids[0]).name if len(ids) == 1 else "slice"
             path = folder.path / f"{name[:_NAME_LENGTH]}.mcap"
         assert path is not None
-        write_answer(query, "mcap", path, extras=extras_of(query.session, query.question))
+        write_answer(query, "mcap", path, extras=extras_of(query.source.now(), query.question))
         opened = f"{path}: {output.size(path.stat().st_size)}, opened with {program}"
-        output.remarks([*query.remarks(is_empty=False), opened])
+        output.remarks([*query.completeness(is_empty=False).sentences, opened])
     ended = subprocess.run(  # noqa: S603
         [program, *_VIEWERS[given.viewer][1], path.absolute()], check=False
     )
@@ -149,7 +149,7 @@ def _play(given: _Given) -> None:
         log = PlayedLog(query)
         name = " ".join(["hybridlog", *given.choice.name])
         server = PlaybackServer(log, name, options, output.note)
-        output.remarks([*query.remarks(is_empty=False), *unplayed(query)])
+        output.remarks([*query.completeness(is_empty=False).sentences, *unplayed(query)])
         asyncio.run(_until_signal(server))
 
 

@@ -366,7 +366,7 @@ def _told(path: Path, report: RecordReport) -> int:
         output.note(f"{path}: {left} from before the time range did not fit in memory.")
     output.remarks((*remarks_on(entry), *report.remarks))
     if report.damage:
-        from hybridlog.query.answers.lost import coverage
+        from hybridlog.query.answers.loss_words import coverage
         from hybridlog.record.losses import losses_of
 
         code = SourceDamagedError.exit_code

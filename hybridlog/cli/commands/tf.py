@@ -99,7 +99,7 @@ def _show_transforms(given: _Given, target: str, trees: Trees, query: Query | No
         stamps = _times(tree, given, given.span if given.step else given.between)
         log_time = 0 * stamps + END  # of the last epoch
     else:
-        asked = query.session, query.question, query.counters
+        asked = query.source.now(), query.question, query.counters
         frames, stamps, log_time = frames_and_stamps(*asked)
         source = frames[0] if source is None and len(frames) == 1 and frames[0] else source
     if source is None:

@@ -12,14 +12,14 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from hybridlog.query.answers.lost import (
+from hybridlog.query.answers.loss_words import (
     MAX_NAMES,
     NOT_LOST,
     about_losses,
     copies_of,
-    losses_in,
     number_of,
 )
+from hybridlog.query.answers.lost import losses_in
 from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.record.losses import Cause

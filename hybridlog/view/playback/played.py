@@ -12,7 +12,7 @@ import numpy as np
 
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.latching import depth_of, is_video
-from hybridlog.query.query import Query, channels_of, narrowed, spans_of
+from hybridlog.query.query import Query, at_time, channels_of, narrowed, spans_of
 from hybridlog_storage.errors import TimeError, TopicError
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ class PlayedLog:
         self.begin = int(times[:, 0].min())
         self.end = int(times[:, 1].max()) - 1
         whole = replace(query.question, bounds=None, during=None, clock="log")
-        self._whole = Query(query.session, whole, conditions=query.conditions)
+        self._whole = Query(query.source.now(), whole, conditions=query.conditions)
         params = Intervals((id_, times[row : row + 1]) for row, id_ in enumerate(spans))
         during = query.question.during
         self._during = params if during is None else during.common(params)
@@ -126,7 +126,7 @@ class PlayedLog:
     def _last(self, topic: str, position: int) -> Iterator[Batch]:
         """The last message of a topic until a log time, ns, if the range has one."""
         try:
-            query = narrowed(self._whole, topic).at_time(position)
+            query = at_time(narrowed(self._whole, topic), position)
         except TopicError:
             return  # the topic has none yet
         for batch, channels in query.during(self._during).batches():
