@@ -246,15 +246,17 @@ def _write(
     size: int = 0,
 ) -> int:
     """Write an answer, all of it or nothing, with progress; gives the number of rows or lines."""
-    rows, path = 0, target if isinstance(target, Path) else None
+    rows = done = 0
+    path = target if isinstance(target, Path) else None
 
     def told(pieces: Iterable[_T]) -> Iterator[_T]:
-        nonlocal rows
+        nonlocal rows, done
         for piece in pieces:
             yield piece
             rows += len(piece) if OUTPUTS[form].content in {"lines", "table"} else 0  # type: ignore[arg-type]
             if counters is None:
-                bar(0, output.counted(rows, "row"))
+                done += getattr(piece, "nbytes", 0)
+                bar(done, output.counted(rows, "row"))
             else:
                 bar(counters.payload_bytes, output.counted(counters.messages, "message"))
 

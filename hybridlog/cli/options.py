@@ -152,14 +152,9 @@ class Choosing:
         return recordings_of(store, self.choice)
 
 
-def names_argument(
-    metavar: str = "[RECORDING]...", what: str = "Only these recordings", without: str = "all"
-) -> Any:
+def names_argument(what: str = "Only these recordings", without: str = "all") -> Any:
     """The argument that names recordings; its help says `without` for no name."""
-    return argument(
-        f"{what}, as for --recording; without, {without}.",
-        metavar,
-    )
+    return argument(f"{what}, as for --recording; without, {without}.", "[RECORDING]...")
 
 
 @dataclass(frozen=True, kw_only=True)

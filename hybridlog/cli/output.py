@@ -186,7 +186,7 @@ class Drawn:
             self._count = 0
 
     def _write(self, text: str) -> None:
-        with suppress(BrokenPipeError):
+        with suppress(OSError):  # the terminal may be gone, and the work goes on
             self._stream.write(text)
             self._stream.flush()
 

@@ -1,4 +1,4 @@
-"""`hybridlog info`: recordings, one thing about them, or a segment file."""
+"""`hybridlog info`: recordings, or one thing about them."""
 
 from __future__ import annotations
 
@@ -24,13 +24,12 @@ from hybridlog.cli.render import (
     bytes_of,
     densities,
     duration_of,
-    numbers,
     print_fields,
     print_table,
 )
 from hybridlog.query.topics import resolve
 from hybridlog.wording import listed
-from hybridlog_storage.errors import SegmentError, StoreError, TopicError, UsageError
+from hybridlog_storage.errors import SegmentError, TopicError, UsageError
 
 if TYPE_CHECKING:
     from hybridlog.attachments import StoredAttachment, StoredMetadata
@@ -50,9 +49,7 @@ _READABLE = {"ros1msg", "ros2msg", "ros2idl", "jsonschema"}
 
 @dataclass(frozen=True, kw_only=True)
 class _Given(Choosing, InStore, AsJson, Forced):
-    names: tuple[str, ...] = names_argument(  # type: ignore[misc]
-        "[RECORDING|SEGMENT]...", "Only a segment file, or these recordings"
-    )
+    names: tuple[str, ...] = names_argument()  # type: ignore[misc]
     topic: tuple[str, ...] = options.topics(
         "Instead: the message definition and the fields of this topic. With --losses: only those "
         "of this topic."
@@ -93,9 +90,6 @@ def info_command(given: _Given) -> None:
 
     Options show one thing instead: the definition of a topic, losses, sizes, attachments.
     """
-    if len(given.names) == 1 and _is_segment(given.names[0]):
-        _show_segment(Path(given.names[0]), given)
-        return
     with given.opened(snapshot=True) as store:
         if given.losses:
             _show_losses(store, given)
@@ -335,69 +329,6 @@ _CHANNELS = [
     bytes_of("payload", "payload_bytes", order=2),
     Column("log - header", _skew_text, "right", order=3),
 ]
-
-
-def _is_segment(what: str) -> bool:
-    """True for the path of a file; names and ids of recordings have no slash."""
-    looks = "/" in what or what.endswith((".mcap", ".mcap.open", ".bag", ".db3"))
-    return looks and Path(what).exists()
-
-
-def _show_segment(path: Path, given: _Given) -> None:
-    """Print the summary of a sealed segment."""
-    from hybridlog_storage.segments.segment_reader import SegmentReader
-
-    if path.name.endswith(".open"):
-        raise StoreError(
-            f"{path} is being written, or was left by a crash. Any command on its store, such as "
-            "`hybridlog ls --store DIR`, seals segments that a crash left."
-        )
-    stem = path.name.split(".")[0]
-    try:
-        with SegmentReader(path, int(stem) if stem.isdecimal() else 0) as reader:
-            summary, size = reader.summary(), reader.size
-    except SegmentError as error:
-        raise StoreError(
-            f"{path} is no whole segment of a store. Of a log, `hybridlog record "
-            f"{quote(str(path))}` makes a recording. {error}"
-        ) from error
-    chunks = summary.chunks
-    channels = [
-        {
-            "topic": channel.topic,
-            "type": channel.schema.name if channel.schema is not None else None,
-            "messages": summary.counts.get(channel_id, 0),
-            "chunks": sum(channel_id in place.channels for place in chunks),
-        }
-        for channel_id, channel in sorted(summary.channels.items())
-    ]
-    about: dict[str, Any] = {
-        "segment": str(path),
-        "bytes": size,
-        "recording": summary.recording,
-        "first_ns": min((place.first for place in chunks), default=None),
-        "last_ns": max((place.last for place in chunks), default=None),
-        "chunks": len(chunks),
-        "channels": channels,
-    }
-    if given.as_json:
-        output.print_json(about)
-        return
-    print_fields(
-        [
-            ("segment", path),
-            ("recording", summary.recording.get("name")),
-            ("id", summary.recording.get("id")),
-            ("start", output.time_text(about["first_ns"])),
-            ("last", output.time_text(about["last_ns"])),
-            ("bytes", output.size(size)),
-            ("chunks", len(chunks)),
-            ("messages", sum(summary.counts.values())),
-        ]
-    )
-    output.say()
-    kind = Column("type", short=lambda channel: (channel["type"] or "").rpartition("/")[2])
-    print_table([Column("topic"), kind, *numbers("messages", "chunks")], channels)
 
 
 def _show_topics(store: Store, query: Query, given: _Given) -> None:
