@@ -37,7 +37,7 @@ from hybridlog.columns.layout import (
 )
 from hybridlog.columns.rows import Piece, as_table, columns_from, piece_of
 from hybridlog.schema.arrow_columns import structs
-from hybridlog.schema.codec import NO_MESSAGES
+from hybridlog.schema.codec import no_messages
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.left import LeftFields
 from hybridlog.schema.states import State, encoding_of, state_of
@@ -84,7 +84,7 @@ class _Topic:
         reserved = RESERVED if self.points is None else RESERVED | {POINTS}
         self.shape = FieldShape(arrays=arrays, reserved=reserved)
         codec = codec_for(whole)
-        decoded = codec.columns_of(NO_MESSAGES) if codec.indexed else None
+        decoded = codec.columns_of(no_messages()) if codec.indexed else None
         self.none = structs({}, 0) if decoded is None else self.shape.columns(decoded.arrow())
         """No fields, with the columns that the definition fixes."""
         self.rows = 0

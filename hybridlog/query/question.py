@@ -309,9 +309,9 @@ class Counters:
 
 @lru_cache(maxsize=256)
 def _arrow_type(codec: Codec, fields: frozenset[str] | None) -> Any:
-    from hybridlog.schema.codec import NO_MESSAGES
+    from hybridlog.schema.codec import no_messages
 
-    return codec.columns_of(NO_MESSAGES, fields).arrow().type
+    return codec.columns_of(no_messages(), fields).arrow().type
 
 
 def windows_in(windows: NDArray[np.int64] | None, bounds: Span | None) -> NDArray[np.int64]:

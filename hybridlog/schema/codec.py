@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
@@ -39,8 +39,9 @@ def payload_alone(payload: bytes) -> Batch:
     return Batch(payload, none, size, none.astype(np.int32), none, none, none.astype(np.uint32))
 
 
-NO_MESSAGES: Final = payload_alone(b"").take(no_rows())
-"""From them follow the types of fields."""
+def no_messages() -> Batch:
+    """From them follow the types of fields."""
+    return payload_alone(b"").take(no_rows())
 
 
 @dataclass(slots=True)

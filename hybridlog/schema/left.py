@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
-from hybridlog.schema.codec import NO_MESSAGES, Codec, Decoded, no_rows, unreadable
+from hybridlog.schema.codec import Codec, Decoded, no_messages, no_rows, unreadable
 from hybridlog.schema.column import Records
 from hybridlog.schema.objects import Objects
 from hybridlog.schema.states import CAUSES, State
@@ -117,7 +117,7 @@ class LeftCodec(Codec):
             batch = with_rows(batch)
         places = batch.left
         if places is None:
-            return self.original.columns_of(NO_MESSAGES, fields)
+            return self.original.columns_of(no_messages(), fields)
         parts: list[pa.StructArray] = []
         rows: list[NDArray[np.intp]] = []
         bad: dict[str, list[int]] = {}
@@ -134,7 +134,7 @@ class LeftCodec(Codec):
             has_surplus = found.field("ref").field("surplus").to_numpy(zero_copy_only=False)
             surplus.append(own[has_surplus])
         order = np.argsort(good := np.concatenate([no_rows(), *rows]))
-        empty = self.original.columns_of(NO_MESSAGES, fields)
+        empty = self.original.columns_of(no_messages(), fields)
         columns = joined(parts) if parts else structs({}, 0)
         columns = columns.take(order) if len(parts) > 1 else columns
         records = LeftFields(columns, fields, empty)
