@@ -1,36 +1,32 @@
-"""Makes catalog entries of recordings from their manifests and segments, and puts them there.
+"""Makes entries of recordings of their manifests, and compares their files with these.
 
-Recording, recovery and opening use the same functions, so their entries are equal. Summaries of
-whole recordings are made of manifests alone. Files that
-differ from the manifest in size or content are not used; whole files are compared with its
-digests by `verify` only. Content that the manifest lists and that is missing or
-changed becomes rows of the loss ledger.
+An entry needs no file but the manifest: only names and sizes of the others are looked at. What is
+missing, or was found to be unreadable, becomes rows of the loss ledger. An inventory reads the
+summaries of all files, to recover, to verify, or to make a manifest again.
 """
 
 from __future__ import annotations
 
 import os
-from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeVar
 
-import numpy as np
 from msgspec import UNSET, ValidationError, convert, structs, to_builtins
 
 from hybridlog.record.losses import Cause, extent_of, joined, topics_of
-from hybridlog.record.marks import mark_channel
 from hybridlog.schema.states import State, expired_messages
 from hybridlog_storage import manifest as truth
 from hybridlog_storage.catalog import (
+    WHOLE,
+    ChannelEntry,
     ChannelStats,
-    Described,
+    Damage,
     RecordingEntry,
-    channel_entry,
-    channel_totals,
-    spans_of,
+    file_of,
+    is_of,
 )
 from hybridlog_storage.errors import (
     ManifestError,
@@ -43,34 +39,41 @@ from hybridlog_storage.manifest import (
     Source,
     free_name,
 )
-from hybridlog_storage.messages import EXPIRED, NOT_COPIED, REDUCED, Channel, schema_hash
+from hybridlog_storage.messages import (
+    EXPIRED,
+    EXPIRED_IDS,
+    NOT_COPIED,
+    ORIGINAL_ENCODING,
+    REDUCED,
+    schema_hash,
+)
 from hybridlog_storage.segments.gone_log import GoneLog, open_log
 from hybridlog_storage.segments.segment_file import (
     Sealed,
     is_rows,
-    listed_parts,
     sealed_name,
 )
 from hybridlog_storage.segments.segment_format import group_of
 from hybridlog_storage.segments.segment_reader import SegmentSummary
 from hybridlog_storage.summary import RecordingSummary, TopicType, hash_of, topics_to_json
-from hybridlog_storage.times import span_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from pathlib import Path
 
     from hybridlog_storage.catalog import Catalog
     from hybridlog_storage.disk.directory import Listing, StoreDirectory
+    from hybridlog_storage.messages import Schema
 
 
 NO_MANIFEST: Final = (
     "{} has no manifest: `hybridlog verify --repair` makes it again from `manifest.old` and the "
     "segments."
 )
+ANOTHER: Final = "it is another file than the one listed"
 _TRIES = 10  # to read a recording while its files are replaced
-_ENCODINGS: Final = {"expired": EXPIRED, "elsewhere": NOT_COPIED}
-"""Of the messages of a log that is gone."""
+_GONE: Final = {"expired": (EXPIRED_IDS, EXPIRED), "elsewhere": (2 * EXPIRED_IDS, NOT_COPIED)}
+"""What is added to the ids of the channels of a log that is gone, and their encoding."""
+_T = TypeVar("_T")
 
 
 def recording_metadata(entry: RecordingEntry) -> dict[str, object]:
@@ -109,8 +112,6 @@ class Inventory:
         listing: Names of its files; of several segments of one number, the listed one.
         summaries: Summaries of valid segments, by number.
         misfits: Files that differ from the manifest.
-        lost: Listed segments that are missing or changed; of those that are gone, files of rows of
-            which nothing is believed.
     """
 
     id: str
@@ -119,7 +120,6 @@ class Inventory:
     manifest: Manifest | None
     summaries: dict[int, SegmentSummary] = field(default_factory=dict)
     misfits: list[Misfit] = field(default_factory=list)
-    lost: list[File] = field(default_factory=list)
 
     @property
     def name(self) -> str:
@@ -147,21 +147,6 @@ class Inventory:
         with open_log(self.path / self.listing.sealed[number], number) as reader:
             return reader.digest()
 
-    @property
-    def state(self) -> str:
-        """A value that changes with its files, and with what the manifest says of them."""
-        return state_of(self.listing, self.manifest)
-
-    @property
-    def is_proven(self) -> bool:
-        """True if the manifest was never lost, and all segments that it lists are valid."""
-        return self.manifest is not None and self.manifest.status != "unproven" and not self.lost
-
-
-def state_of(listing: Listing, manifest: Manifest | None) -> str:
-    """The state of a recording's files, as of `Inventory`, by its directory and its manifest."""
-    return listing.print if manifest is None else truth.state_of(manifest, listing.print)
-
 
 def take_inventory(directory: StoreDirectory, recording: str) -> Inventory:
     """Compare the sealed segments of a recording with its manifest."""
@@ -177,7 +162,7 @@ def inventory_of(
     listed = manifest.logs if manifest is not None else {}
     listing = listing.choosing(manifest)
     found = Inventory(recording, path, listing, manifest)
-    others = set[str]()
+    others, channels = set[str](), {} if manifest is None else channels_in(manifest)
     for number, name in listing.sealed.items():
         if manifest is not None and manifest.has_let_go(number):
             continue
@@ -186,9 +171,9 @@ def inventory_of(
         except SegmentError as error:
             found.misfits.append(Misfit(number, name, str(error)))
             continue
-        if not _is_listed(summary, recording, number, listed.get(number)):
+        if not is_of(summary, recording, listed.get(number), channels, number):
             others.add(str(summary.recording.get("id")))
-            found.misfits.append(Misfit(number, name, "it is another file than the one listed"))
+            found.misfits.append(Misfit(number, name, ANOTHER))
             continue
         found.summaries[number] = summary
         if manifest is not None and number not in listed:
@@ -209,13 +194,9 @@ def inventory_of(
                 for row in own
                 if (problem := _problem(listing.rows.get(row.name), row.bytes))
             ]
-            found.lost += own
-        elif number not in found.summaries and number not in listing.open:
-            lost = [file] if file.is_here else own
-            found.lost += lost
-            if number not in listing.sealed:
-                name = "" if file.is_here else lost[0].name
-                found.misfits.append(Misfit(number, name, f"{lost[0].name} is missing"))
+        elif number not in {*found.summaries, *listing.open, *listing.sealed}:
+            name = file.name if file.is_here else own[0].name
+            found.misfits.append(Misfit(number, "" if file.is_here else name, f"{name} is missing"))
     found.misfits.sort(key=lambda misfit: misfit.segment)
     return found
 
@@ -226,33 +207,169 @@ def _problem(size: int | None, wanted: int) -> str:
 
 
 def steady_inventory(directory: StoreDirectory, recording: str) -> Inventory:
-    """The inventory of a recording that may be changed meanwhile.
+    """The inventory of a recording that may be changed meanwhile."""
+
+    def look(listing: Listing, manifest: Manifest | None) -> tuple[Inventory, bool]:
+        found = inventory_of(directory, recording, listing, manifest)
+        return found, not found.misfits
+
+    return _steadily(directory, recording, look)
+
+
+def _steadily(
+    directory: StoreDirectory,
+    recording: str,
+    look: Callable[[Listing, Manifest | None], tuple[_T, bool]],
+) -> _T:
+    """What a look at a listing and a manifest finds, which says if that is sure.
 
     Files come and go before or after the manifest says so. What seems to be missing is looked
     for again if anything has changed; edits alone, however many, are waited for by nobody.
     """
+
+    def now() -> tuple[Listing, Manifest | None]:
+        return directory.listing(recording), directory.manifests.find(recording)
+
+    def state(listing: Listing, manifest: Manifest | None) -> object:
+        return listing.sizes, listing.open, manifest and (manifest.files, manifest.status)
+
     for _ in range(_TRIES):
-        found = take_inventory(directory, recording)
-        if not (found.misfits or found.lost):
-            return found
-        manifest = directory.manifests.find(recording)
-        if state_of(directory.listing(recording), manifest) == found.state:
+        before = now()
+        found, is_sure = look(*before)
+        if is_sure or state(*now()) == state(*before):
             return found
     raise StoreError(f"The files of recording {recording!r} change while they are read. Ask again.")
-
-
-def _is_listed(summary: SegmentSummary, recording: str, number: int, log: File | None) -> bool:
-    """True for a whole segment of a recording and number that is as the manifest lists it."""
-    said = summary.recording.get("id"), summary.recording.get("segment")
-    parts = listed_parts(summary.table.as_stored())
-    as_listed = log is None or (summary.size, parts) == (log.bytes, log.parts)
-    return said == (recording, number) and as_listed
 
 
 def read_summary(path: Path, number: int) -> SegmentSummary:
     """The summary of a sealed segment."""
     with open_log(path, number) as reader:
         return reader.summary()
+
+
+class Seen(NamedTuple):
+    """A recording as its manifest and its files are now.
+
+    `look` is as of `StoreDirectory.looks`. It is empty if a recorder or a change that was
+    interrupted has left something (`has_left`), so that each process sees that.
+    """
+
+    entry: RecordingEntry
+    look: str
+    has_left: bool
+
+
+def see(
+    directory: StoreDirectory, recording: str, damage: Damage, catalog: Catalog | None = None
+) -> Seen:
+    """A recording by its manifest, and by the names and sizes of its files.
+
+    Of segments with damage, the summaries are read. Without a catalog, nothing is known of
+    decoding.
+    """
+
+    def look(listing: Listing, known: Manifest | None) -> tuple[Seen, bool]:
+        if known is None:
+            raise ManifestError(NO_MANIFEST.format(recording))
+        manifest, new = known, listing.sealed.keys() - known.logs.keys()
+        if any(not known.has_let_go(number) for number in new):
+            manifest = unlisted(inventory_of(directory, recording, listing, known))(known)
+        names = listing.choosing(manifest).sealed
+        logs, lost = _logs(directory.recording(recording), manifest, listing, damage)
+        goes_on = not manifest.is_ended or bool(listing.open)
+        is_open = goes_on and directory.is_recorded(recording)
+        digests = {number: log.digest for number, log in logs.items()}
+        decoded = {} if catalog is None else catalog.decoded(recording, digests)
+        entry = entry_of(manifest, logs, names, lost, decoded)
+        entry.status = _status(manifest, lost, is_open=is_open, is_left=bool(listing.open))
+        has_left = not is_open and bool(goes_on or new or listing.left_over(known))
+        return Seen(
+            entry, "" if has_left else listing.look, has_left
+        ), not lost and goes_on == is_open
+
+    return _steadily(directory, recording, look)
+
+
+def put_entry(directory: StoreDirectory, catalog: Catalog, recording: str) -> RecordingEntry:
+    """The entry of a recording as its files are now; the catalog gets its summary."""
+    seen = see(directory, recording, catalog.damage(recording), catalog)
+    catalog.put([summary_by(seen)])
+    return seen.entry
+
+
+def summary_by(seen: Seen) -> tuple[RecordingSummary, frozenset[TopicType]]:
+    """The summary of a recording with its marks, and its topics."""
+    shown = with_marks(seen.entry)
+    return summary_of(shown, seen.look), topic_types(shown)
+
+
+def _logs(
+    path: Path, manifest: Manifest, listing: Listing, damage: Damage
+) -> tuple[dict[int, File], list[dict[str, Any]]]:
+    """The segments that can be read, by number, and rows of the ledger for what is lost."""
+    found, lost = dict[int, File](), list[dict[str, Any]]()
+    rows, suspects = manifest.rows, {number for number, _ in damage}
+    for number, log in sorted(manifest.logs.items()):
+        files = [log] if log.is_here else rows[number]
+        problems = ((one.name, _problem(listing.sizes.get(one.name), one.bytes)) for one in files)
+        reason = "; ".join(f"{name} {problem}" for name, problem in problems if problem)
+        if not reason and number in suspects:
+            reason, own = _losses_of_chunks(path / files[0].name, manifest, log, damage)
+            lost += own
+        if not reason:
+            found[number] = log
+        elif number not in listing.open:  # it is about to get its name
+            lost += [row for file in files for row in _losses_of_file(manifest, file, reason)]
+    return found, lost
+
+
+def entry_of(
+    manifest: Manifest,
+    logs: Mapping[int, File],
+    names: Mapping[int, str],
+    lost: Sequence[dict[str, Any]],
+    decoded: Mapping[int, Mapping[int, ChannelStats]],
+) -> RecordingEntry:
+    """The entry of a recording by its manifest.
+
+    `logs` are those that can be read, with the names of their files and the results of decoding,
+    by number; `lost` are rows of the ledger for the others.
+    """
+    rows = [file for file in manifest.files if file.kind == "rows"]
+    entry = RecordingEntry(
+        id=manifest.id,
+        name=manifest.name,
+        tags=dict(manifest.tags),
+        source=_source_of(manifest.source),
+        created=manifest.created,
+        status=manifest.status,
+        end=end_values(manifest) if manifest.is_ended else {},
+        channels=_channels(manifest, logs, decoded),
+        stored_bytes=sum(file.bytes for file in (*rows, *logs.values()) if file.is_here),
+        segments=len(logs),
+        chunks=sum(log.chunks for log in logs.values()),
+        attachments=sum(log.attachments for log in logs.values()),
+        metadata_records=sum(log.metadata for log in logs.values()),
+        notes=[structs.asdict(note) for note in manifest.notes],
+        marks=[_without_none(mark) for mark in manifest.marks],
+        pins=[pin_values(pin) for pin in manifest.pins],
+        spans=[
+            (number, log.first, log.last)
+            for number, log in logs.items()
+            if log.first is not None and log.last is not None
+        ],
+        logs=dict(logs),
+        digests={str(number): log.digest for number, log in logs.items()},
+        files={str(n): names[n] for n in logs if names[n] != sealed_name(n)},
+        is_decoded=all(number in decoded or not log.parts for number, log in logs.items()),
+        rows=[(file.name, topic_of(file, manifest), file.bytes) for file in rows],
+        copies=sorted({file.copy for file in manifest.files if file.copy}),
+    )
+    noted = [loss_values(row) for log in logs.values() for row in log.losses]
+    made = [] if manifest.is_ended else [*map(loss_values, manifest.losses)]  # to make room
+    if noted or lost or made:
+        entry.end["losses"] = [*joined([*entry.end.get("losses", ()), *noted]), *lost, *made]
+    return entry
 
 
 def with_marks(entry: RecordingEntry) -> RecordingEntry:
@@ -264,128 +381,72 @@ def with_marks(entry: RecordingEntry) -> RecordingEntry:
     return beside(entry)
 
 
-def describe(catalog: Catalog, inventory: Inventory, *, is_open: bool = False) -> Described:
-    """Make the complete entry of a recording."""
-    from hybridlog.schema.codecs import codec_for
-
-    manifest = inventory.manifest
-    if manifest is None:
-        raise ManifestError(NO_MANIFEST.format(inventory.id))
-    entry = _base(inventory, manifest)
-    channels = channels_of(inventory.summaries.values())
-    lost: list[dict[str, Any]] = []
-    entry.stored_bytes = sum(size for _, _, size in entry.rows)
-    for number, summary in inventory.summaries.items():
-        lost += map(loss_values, summary.losses)
-        entry.held[str(number)] = np.unique(summary.table.parts["channel"]).tolist()
-        entry.digests[str(number)] = inventory.digest(number)
-        entry.spans += spans_of(number, summary.table)
-        name = inventory.listing.sealed[number]
-        if name == sealed_name(number):
-            entry.stored_bytes += summary.size
-        else:
-            entry.files[str(number)] = name
-        entry.chunks += len(summary.table.chunks)
-        entry.attachments += len(summary.attachments)
-        entry.metadata_records += len(summary.metadata)
-    entry.segments = len(inventory.summaries)
-    entry.end = end_values(manifest) if manifest.is_ended else {}
-    ours = [row for sealed in inventory.lost for row in _losses_of_segment(inventory, sealed)]
-    ours += _losses_of_chunks(inventory, catalog.damage(inventory.id))
-    if not manifest.is_ended:  # what went to make room
-        ours += map(loss_values, manifest.losses)
-    has_losses = bool(ours) or any(row.cause == Cause.SEGMENT for row in manifest.losses)
-    entry.status = _status(inventory, manifest, is_open=is_open, has_losses=has_losses)
-    if lost or ours:
-        entry.end["losses"] = joined([*entry.end.get("losses", ()), *lost]) + ours
-    entry.channels = [
-        channel_entry(channel_id, channel, codec_for(channel).reason)
-        for channel_id, channel in sorted(channels.items())
-    ]
-    _fill_stats(entry, inventory, catalog)
-    return described_of(entry, inventory.listing.look, inventory.state, channels)
+def _without_none(part: truth.Record) -> dict[str, Any]:
+    return {name: value for name, value in structs.asdict(part).items() if value is not None}
 
 
-def described_of(
-    entry: RecordingEntry, look: str, files: str, channels: Mapping[int, Channel] | None = None
-) -> Described:
-    """The rows of a recording in the catalog, with states of its directory and its files.
+def _channels(
+    manifest: Manifest,
+    logs: Mapping[int, File],
+    decoded: Mapping[int, Mapping[int, ChannelStats]],
+) -> list[ChannelEntry]:
+    """The channels with messages in some logs, and those that never had any, by id."""
+    found: dict[int, ChannelEntry] = {}
+    for number, channel in manifest.channels.items():
+        if not channel.messages and manifest.let_go is None:
+            found[number] = _channel(number, channel)
+    for number, log in logs.items():
+        added, encoding = (0, "") if log.is_here else _GONE[str(log.gone)]
+        known = decoded.get(number, {})
+        for own, part in log.parts.items():
+            channel = manifest.channels[own]
+            if own not in found:
+                found[own] = _channel(own, channel)
+            if own + added not in found:
+                found[own + added] = _channel(own + added, channel, encoding)
+            entry, stats = found[own + added], ChannelStats(part.messages, part.bytes)
+            stats.first, stats.last = part.first, part.last
+            if own in known:
+                stats.add(known[own])
+            if entry.stats.messages:
+                stats.add(entry.stats)
+            entry.stats = stats
+    return [found[number] for number in sorted(found)]
 
-    The entry has no marks that somebody set; channels are None if the catalog has their
-    definitions.
-    """
-    shown = with_marks(entry)
-    return Described(entry, summary_of(shown, look), topic_types(shown), files, channels or {})
 
-
-def put_entry(
-    directory: StoreDirectory, catalog: Catalog, recording: str, *, is_open: bool = False
-) -> RecordingEntry:
-    """Read a recording's files and update its catalog row."""
-    described = describe(catalog, steady_inventory(directory, recording), is_open=is_open)
-    catalog.put(described)
-    return described.entry
-
-
-def with_said(entry: RecordingEntry, manifest: Manifest) -> RecordingEntry:
-    """The entry with what people say of its recording by a manifest."""
-    return replace(entry, name=manifest.name, tags=dict(manifest.tags), **_said(manifest))
-
-
-def summary_by(
-    manifest: Manifest, look: str
-) -> tuple[RecordingSummary, frozenset[TopicType]] | None:
-    """The summary and the topics of a whole recording by its manifest.
-
-    They are as of `summary_of` and `topic_types`; None if only its files say what is left.
-    """
-    if not manifest.is_ended:
-        return None
-    logs = [file for file in manifest.files if file.kind == "log"]
-    # Of those whose messages a ring has let go, no file says anything.
-    channels = [c for c in manifest.channels.values() if c.messages or manifest.let_go is None]
-    times = [time for c in channels for time in (c.first, c.last) if time is not None]
-    times += [mark.time for mark in manifest.marks]
-    lost = [row for row in manifest.losses if row.cause == Cause.SEGMENT]
-    spans = [time for row in lost for time in (row.first, row.last) if time is not None]
-    topics = {TopicType(c.topic, c.encoding, c.schema) for c in channels}
-    topics |= {_marks_type()} if manifest.marks else set()
-    gone = Counter[str]()
-    for file in logs:
-        if file.gone is UNSET:
-            continue
-        encoding = _ENCODINGS[file.gone]
-        for number, part in file.parts.items():
-            of = manifest.channels[number]
-            if of.encoding != REDUCED:  # it had no payloads before
-                topics.add(TopicType(of.topic, encoding, of.schema))
-                gone[encoding] += part.messages
-    has_losses = bool(manifest.losses) or any(file.has_losses for file in logs)
-    names = {topic.topic for topic in topics}
-    topics |= {TopicType(row.topic, "", "") for row in lost if row.topic not in {*names, ""}}
-    types = frozenset(topics)
-    summary = RecordingSummary(
-        id=manifest.id,
-        name=manifest.name,
-        tags=manifest.tags,
-        source=_source_of(manifest.source),
-        created=manifest.created,
-        status="damaged" if lost else manifest.status,
-        span=(min(times), max(times)) if times else None,
-        extent=span_of(min(times + spans), max(times + spans)) if times or spans else (0, 0),
-        topics=_hash_of(types),
-        topic_count=len(names),
-        messages=sum(c.messages for c in channels) + len(manifest.marks),
-        stored_bytes=sum(file.bytes for file in manifest.files if file.is_here),
-        segments=len(logs),
-        has_losses=has_losses,
-        has_lost_segments=bool(lost),
-        expired=gone[EXPIRED],
-        not_copied=gone[NOT_COPIED],
-        notes=_said(manifest)["notes"],
-        look=look,
+def _channel(number: int, channel: truth.Channel, gone: str = "") -> ChannelEntry:
+    metadata, encoding = dict(channel.metadata), channel.encoding
+    if gone and encoding != REDUCED:  # which had no payloads before
+        metadata[ORIGINAL_ENCODING], encoding = encoding, gone
+    return ChannelEntry(
+        number,
+        channel.topic,
+        encoding,
+        channel.schema or None,
+        channel.type,
+        metadata,
+        channel.has_publish_time,
+        is_indexed=channel.is_indexed,
     )
-    return summary, types
+
+
+def channels_in(manifest: Manifest) -> dict[int, tuple[str, str | None]]:
+    """Topic and hash of the schema of each channel of a manifest, by id."""
+    return {n: (one.topic, one.schema or None) for n, one in manifest.channels.items()}
+
+
+def schemas_in(directory: StoreDirectory, entry: RecordingEntry) -> dict[str, Schema]:
+    """Definitions of a recording by hash, from the segments that can be read."""
+    found: dict[str, Schema] = {}
+    wanted = {channel.schema for channel in entry.channels} - {None}
+    for number in entry.logs:
+        if wanted <= found.keys():
+            break
+        with suppress(SegmentError):
+            path = directory.recording(entry.id) / file_of(entry, number)
+            own = (channel.schema for channel in read_summary(path, number).channels.values())
+            found |= {schema_hash(schema): schema for schema in own if schema is not None}
+    return found
 
 
 @lru_cache(maxsize=1024)
@@ -393,16 +454,8 @@ def _hash_of(topics: frozenset[TopicType]) -> str:
     return hash_of(topics_to_json(topics))
 
 
-@lru_cache(maxsize=1)
-def _marks_type() -> TopicType:
-    """The topic of marks that somebody set."""
-    channel = mark_channel()
-    assert channel.schema is not None
-    return TopicType(channel.topic, channel.message_encoding, schema_hash(channel.schema))
-
-
 def summary_of(entry: RecordingEntry, look: str = "") -> RecordingSummary:
-    """The summary of a recording."""
+    """The summary of a recording; `look` is as of `StoreDirectory.looks`."""
     losses, gone = entry.end.get("losses", ()), expired_messages(entry)
     return RecordingSummary(
         id=entry.id,
@@ -413,7 +466,7 @@ def summary_of(entry: RecordingEntry, look: str = "") -> RecordingSummary:
         status=entry.status,
         span=entry.span,
         extent=extent_of(entry),
-        topics=hash_of(topics_to_json(topic_types(entry))),
+        topics=_hash_of(topic_types(entry)),
         topic_count=len({channel.topic for channel in entry.channels}),
         messages=entry.messages,
         stored_bytes=entry.stored_bytes,
@@ -427,39 +480,16 @@ def summary_of(entry: RecordingEntry, look: str = "") -> RecordingSummary:
     )
 
 
-def topic_types(entry: RecordingEntry) -> set[TopicType]:
+def topic_types(entry: RecordingEntry) -> frozenset[TopicType]:
     """Topics of a recording and their types; includes those that have lost all messages."""
-    found = {TopicType(c.topic, c.message_encoding, c.schema or "") for c in entry.channels}
+    found = {TopicType(c.topic, c.message_encoding, c.schema or "", c.type) for c in entry.channels}
     lost = topics_of(entry) - {topic.topic for topic in found}
-    return found | {TopicType(topic, "", "") for topic in lost}
-
-
-def _base(inventory: Inventory, manifest: Manifest) -> RecordingEntry:
-    return RecordingEntry(
-        id=manifest.id,
-        name=manifest.name,
-        tags=dict(manifest.tags),
-        source=_source_of(manifest.source),
-        created=manifest.created,
-        status="open",
-        rows=[(file.name, topic_of(file, manifest), file.bytes) for file in inventory.rows],
-        copies=sorted({file.copy for file in manifest.files if file.copy}),
-        **_said(manifest),
-    )
+    return frozenset(found | {TopicType(topic, "", "", "") for topic in lost})
 
 
 def topic_of(rows: File, manifest: Manifest) -> str:
     """The topic of a file of rows."""
     return manifest.channels[next(iter(rows.parts))].topic
-
-
-def _said(manifest: Manifest) -> dict[str, Any]:
-    marks = [structs.asdict(mark) for mark in manifest.marks]
-    return {
-        "notes": [structs.asdict(note) for note in manifest.notes],
-        "marks": [{k: v for k, v in mark.items() if v is not None} for mark in marks],
-        "pins": [pin_values(pin) for pin in manifest.pins],
-    }
 
 
 _SOURCE = {"path": "", "kind": "", "profile": "", "bytes": 0}
@@ -530,26 +560,23 @@ def pin_values(pin: truth.Pin) -> dict[str, Any]:
     return {"id": pin.id, **span, "topics": topics, "reason": pin.reason}
 
 
-def _status(inventory: Inventory, manifest: Manifest, *, is_open: bool, has_losses: bool) -> str:
-    # The holder of an ended recording does not record it.
-    if is_open and (inventory.listing.open or not manifest.is_ended):
+def _status(
+    manifest: Manifest, lost: Sequence[dict[str, Any]], *, is_open: bool, is_left: bool
+) -> str:
+    """The status of a recording; `is_left` says that it has segments that are not sealed."""
+    if is_open:
         return "open"
-    if inventory.listing.open:
+    if is_left:
         return "unfinished"
-    if has_losses:
+    if lost or any(row.cause == Cause.SEGMENT for row in manifest.losses):
         return "damaged"
-    if not inventory.is_proven:
-        return "unproven"
     return manifest.status if manifest.is_ended else "recovered"
 
 
-def _losses_of_segment(inventory: Inventory, file: File) -> list[dict[str, Any]]:
-    """Rows of the loss ledger for a listed file that is not readable."""
-    reasons = [m.reason for m in inventory.misfits if m.segment == file.number]
-    reason = "; ".join(reasons) or "it cannot be read"
-    channels = inventory.manifest.channels if inventory.manifest is not None else {}
+def _losses_of_file(manifest: Manifest, file: File, reason: str) -> list[dict[str, Any]]:
+    """Rows of the loss ledger for a listed file that cannot be read."""
     rows = [
-        _loss(file.name, reason, channels[number].topic, part, length=file.bytes)
+        _loss(file.name, reason, manifest.channels[number].topic, part, length=file.bytes)
         for number, part in file.parts.items()
         if part.messages
     ]
@@ -557,22 +584,26 @@ def _losses_of_segment(inventory: Inventory, file: File) -> list[dict[str, Any]]
 
 
 def _losses_of_chunks(
-    inventory: Inventory, damage: Mapping[tuple[int, int], str]
-) -> list[dict[str, Any]]:
-    """Rows for unreadable chunks."""
-    rows = []
+    path: Path, manifest: Manifest, log: File, damage: Damage
+) -> tuple[str, list[dict[str, Any]]]:
+    """Why a segment with damage cannot be read at all, if so, and rows for unreadable chunks."""
+    try:
+        summary = read_summary(path, log.number)
+    except SegmentError as error:
+        return str(error), []
+    if not is_of(summary, manifest.id, log, channels_in(manifest), log.number):
+        return ANOTHER, []
+    rows, table = [], summary.table
     for (segment, number), reason in sorted(damage.items()):
-        summary = inventory.summaries.get(segment)
-        if summary is None or number >= len(summary.table.chunks):
+        if segment != log.number or not WHOLE < number < len(table.chunks):
             continue
-        chunk, bounds = summary.table.chunks[number], summary.table.part_bounds()
+        chunk = table.chunks[number]
         place = {name: int(chunk[name]) for name in ("offset", "length")}
-        for part in summary.table.parts[bounds[number] : bounds[number + 1]]:
-            channel = summary.channels.get(int(part["channel"]))
-            topic = channel.topic if channel is not None else ""
+        for part in table.chunk_parts(number):
+            topic = summary.channels[int(part["channel"])].topic
             lost = truth.Part(int(part["messages"]), 0, int(part["first"]), int(part["last"]))
-            rows.append(_loss(inventory.listing.sealed[segment], reason, topic, lost, **place))
-    return rows
+            rows.append(_loss(path.name, reason, topic, lost, **place))
+    return "", rows
 
 
 def _loss(
@@ -583,27 +614,6 @@ def _loss(
     return loss_values(
         truth.Loss(cause, topic, count, lost.first, lost.last, reason, file, offset, length)
     )
-
-
-def _fill_stats(entry: RecordingEntry, inventory: Inventory, catalog: Catalog) -> None:
-    silent = {c.id for c in entry.channels if not c.has_publish_time}
-    totals: dict[int, ChannelStats] = {}
-    entry.is_decoded = True
-    for number, summary in inventory.summaries.items():
-        decoded = catalog.decoded(entry, number)
-        entry.is_decoded &= decoded is not None or not len(summary.table.parts)
-        for channel_id, stats in channel_totals(summary.table, decoded, silent).items():
-            totals.setdefault(channel_id, ChannelStats()).add(stats)
-    for channel in entry.channels:
-        channel.stats = totals.get(channel.id, ChannelStats())
-
-
-def channels_of(summaries: Iterable[SegmentSummary]) -> dict[int, Channel]:
-    """All channels of a recording, by id."""
-    channels: dict[int, Channel] = {}
-    for summary in summaries:
-        channels.update(summary.channels)
-    return channels
 
 
 def listed(*segments: Sealed) -> Callable[[Manifest], Manifest]:
@@ -688,7 +698,8 @@ def sealed_of(inventory: Inventory, number: int) -> Sealed:
         (summary.size, inventory.digest(number)),
         summary.table.as_stored(),
         summary.channels,
-        has_losses=bool(summary.losses),
+        extras=(len(summary.attachments), len(summary.metadata)),
+        losses=summary.losses,
     )
 
 

@@ -7,13 +7,16 @@ from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from hybridlog.index.access import IndexAccess
+from hybridlog.schema.codecs import unindexed
 from hybridlog.session import Session
 from hybridlog.shared import Shared
 from hybridlog.snapshot import UNFINISHED, Snapshot
-from hybridlog_storage.disk import files
+from hybridlog_storage.disk import durability, files
 from hybridlog_storage.errors import DatabaseError, HybridlogError
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from hybridlog.maintenance.report import Progress
     from hybridlog.record.recorder import RecordReport
     from hybridlog_storage.disk.directory import StoreDirectory
@@ -40,6 +43,7 @@ class OpenStore(Shared):
         self._changed = 0, False  # as of the latest state, see `StoreDirectory.changed`
         self._names: list[str] = []  # ids of recordings
         self._listed_at = 0.0  # when they were compared last, by `monotonic`
+        self._has_changed = False  # ended recordings, so that their list is to be made again
 
     def now(self) -> Session:
         """The store at this moment, for one question; no file is read if nothing has changed."""
@@ -72,7 +76,6 @@ class OpenStore(Shared):
         All else that was read stays, so this costs little in a store of thousands.
         """
         with self.following:
-            self.catalog.has_changed |= bool(recordings)
             before = Snapshot((), {}) if self._latest is None else self._latest.snapshot()
             changed, names = self.directory.changed(), self.directory.ids()
             known = before.by_id.keys()
@@ -118,11 +121,32 @@ class OpenStore(Shared):
             for recording in done:
                 self._running.pop(recording, None)
             if done:
+                self._drop_list()
                 self.catch_up(*done)
+
+    def change(self) -> None:
+        """Get ready to change ended recordings: their list goes, and is made again at the end."""
+        self.recover()
+        self._drop_list()
+
+    @property
+    def _list(self) -> Path:
+        """The list of ended recordings for other readers of their tables."""
+        return self.directory.path / "tables/recordings.parquet"
+
+    def _drop_list(self) -> None:
+        self._has_changed = self.directory.is_writable and not self.catalog.is_in_memory
+        if self._has_changed:
+            removing = durability.explained(self._list, "removing")
+            with removing, suppress(FileNotFoundError):
+                files.unlink(self._list)
 
     def recorded(self, report: RecordReport) -> None:
         """See a recording that has ended; if MongoDB is available again, index the rest."""
+        self._drop_list()
         self.catch_up(report.entry.id)
+        with suppress(HybridlogError):  # its files may have gone already
+            report.not_indexed = unindexed(self.now().definitions(report.entry))
         if report.failure is None:
             return
         self.index.disconnect()
@@ -136,14 +160,13 @@ class OpenStore(Shared):
 
     # Closing.
 
-    def _write_recordings_file(self) -> None:
-        """List the ended recordings for other readers of their tables."""
+    def _write_list(self) -> None:
         from hybridlog.columns.recordings_file import write_recordings_file
 
         ended = self._ended_now()
-        write_recordings_file(self.catalog.recordings_file, ended)
+        write_recordings_file(self._list, ended)
         if ended != self._ended_now():  # somebody has changed one meanwhile
-            files.unlink(self.catalog.recordings_file)
+            files.unlink(self._list)
 
     def _ended_now(self) -> list[RecordingSummary]:
         """Summaries of all ended recordings."""
@@ -156,11 +179,9 @@ class OpenStore(Shared):
                 reader.close()
         self._drop_files()
         self.index.disconnect()
-        is_missing = "tables" in vars(self) and not self.catalog.recordings_file.exists()
         vars(self).pop("tables", None)
-        is_written = self.directory.is_writable and not self.catalog.is_in_memory
-        if is_written and (self.catalog.has_changed or is_missing):
+        if self._has_changed:
             with suppress(OSError, HybridlogError):
-                self._write_recordings_file()
+                self._write_list()
         self.is_closed = True
         self.catalog.close()

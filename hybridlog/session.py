@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import numpy as np
 
-from hybridlog.entries import channels_of, put_entry, summary_of, take_inventory
+from hybridlog.entries import put_entry, schemas_in, summary_of
 from hybridlog.query.chunk_columns import PARTS, ChunkColumns, log_bounds
 from hybridlog.query.question import Question, RecordedChannel, field_types
 from hybridlog.query.topics import resolve
@@ -24,7 +24,7 @@ from hybridlog.record.losses import lost_spans
 from hybridlog.record.marks import MARKS
 from hybridlog.snapshot import UNFINISHED
 from hybridlog.wording import counted, listed
-from hybridlog_storage.catalog import file_of
+from hybridlog_storage.catalog import WHOLE, file_of
 from hybridlog_storage.disk.directory import gone
 from hybridlog_storage.errors import (
     CatalogError,
@@ -33,7 +33,7 @@ from hybridlog_storage.errors import (
     StoreError,
     TopicError,
 )
-from hybridlog_storage.messages import Channel, schema_hash
+from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segments.chunk_table import place_of
 from hybridlog_storage.times import BEGIN, END, placed
 
@@ -262,7 +262,7 @@ class Session:
         found: dict[str, list[RecordedChannel]] = defaultdict(list)
         for own in recording.channels:
             if not counts[own.topic] or own.stats.messages:
-                one = RecordedChannel(recording, own.id, definitions[own.id], own.stats, own.reason)
+                one = RecordedChannel(recording, own.id, definitions[own.id], own.stats)
                 found[own.topic].append(one)
         self.shared.channels[recording.id] = recording, found
         return found
@@ -300,18 +300,6 @@ class Session:
         if recordings is None:
             return tuple(topics), None
         return tuple(topics), tuple(snapshot.summaries[place].id for place in places.tolist())
-
-    def type_names(self) -> dict[str, str]:
-        """Names of all types of messages, by the hash of their schema."""
-        snapshot = self._recordings
-        unknown = snapshot.schemas - self.shared.schemas.keys()
-        if unknown:
-            self.shared.schemas |= self.catalog.schemas(unknown)
-        # Those that the catalog has lost are read from segments.
-        lost = snapshot.with_schemas(snapshot.schemas - self.shared.schemas.keys())
-        for summary in snapshot.differing(lost):
-            self.definitions(self.entry_of(summary))
-        return {digest: schema.name for digest, schema in self.shared.schemas.items()}
 
     def question(self, names: Sequence[str], recordings: Sequence[str] | None = None) -> Question:
         """The question about the topics that patterns match, in recordings by their ids, or all."""
@@ -358,25 +346,25 @@ class Session:
 
     def definitions(self, recording: RecordingEntry) -> Mapping[int, Channel]:
         """All channels of a recording by id, also those without messages."""
-        wanted = {c.schema for c in recording.channels if c.schema is not None}
-        if not wanted <= self.shared.schemas.keys():
-            self.shared.schemas |= self.catalog.schemas(wanted - self.shared.schemas.keys())
-        if not wanted <= self.shared.schemas.keys():
-            # The catalog has lost a schema.
-            inventory = take_inventory(self.directory, recording.id)
-            channels = channels_of(inventory.summaries.values()).values()
-            there = (channel.schema for channel in channels if channel.schema is not None)
-            self.shared.schemas |= {schema_hash(schema): schema for schema in there}
-        if not wanted <= self.shared.schemas.keys():
-            raise StoreError(
-                f"Definitions of recording {recording.name!r} cannot be read at the moment. Ask "
-                "again."
-            )
+        known = self.shared.schemas
+        wanted = {c.schema: c for c in recording.channels if c.schema is not None}
+        if not wanted.keys() <= known.keys():
+            known |= self.catalog.schemas(wanted.keys() - known.keys())
+        if not wanted.keys() <= known.keys():
+            found = schemas_in(self.directory, recording)
+            known |= found
+            self.catalog.put_schemas(found.values())
+        for digest in wanted.keys() - known.keys():
+            if any(c.schema == digest and c.stats.messages for c in recording.channels):
+                raise StoreError(
+                    f"Definitions of recording {recording.name!r} cannot be read at the moment. "
+                    "Ask again."
+                )
         return {
             c.id: Channel(
                 c.topic,
                 c.message_encoding,
-                self.shared.schemas[c.schema] if c.schema is not None else None,
+                None if c.schema is None else known.get(c.schema, Schema(c.type, "", b"")),
                 c.metadata,
                 has_publish_time=c.has_publish_time,
                 is_indexed=c.is_indexed,
@@ -441,7 +429,7 @@ class Session:
         try:
             return self.catalog.table(recording, number)
         except CatalogError as error:
-            self._check_same(recording, number, reads=False)
+            self._check_same(recording, number, str(error))
             raise StoreError(f"{error} Ask again.") from error
 
     def parts(
@@ -534,25 +522,26 @@ class Session:
             self._check_same(self.entry(recording), number)
             raise
 
-    def _check_same(self, entry: RecordingEntry, number: int, *, reads: bool = True) -> None:
+    def _check_same(self, entry: RecordingEntry, number: int, problem: str = "") -> None:
         """Raise a `ChangedError` if a segment that cannot be read is another file by now.
 
-        Later questions to this moment are about the newer files. Without `reads`, only the
-        catalog was asked, so a segment that is gone counts as another file, too.
+        Later questions to this moment are about the newer files. With a problem of its summary it
+        is noted as lost, which counts as another file, too.
         """
         place = self._recordings.by_id.get(entry.id)
         look = None if place is None else self._recordings.summaries[place].look
-        if self.directory.looks([entry.id]).get(entry.id) == look:
-            if reads:
+        if self.directory.looks([entry.id]).get(entry.id) == look or (problem and look == ""):
+            if not problem:
                 return
-            is_open = self.directory.is_recorded(entry.id)
-            put_entry(self.directory, self.catalog, entry.id, is_open=is_open)
+            known = self.catalog.damage(entry.id)
+            self.catalog.put_damage(entry.id, {**known, (number, WHOLE): problem})
+            put_entry(self.directory, self.catalog, entry.id)
         self.shared.catch_up(entry.id)
         now: RecordingEntry | None = self.shared.now().entry_if_there(entry.id)
         if now is None:
             raise gone(entry.name)
         is_there = str(number) in now.digests or number in now.flushed
-        if reads and not is_there and not self._has_let_go(entry.id, number):
+        if not problem and not is_there and not self._has_let_go(entry.id, number):
             return  # it is lost: the caller's own error says so
         if _file_in(now, number) != _file_in(entry, number):
             self._entries[entry.id] = now

@@ -18,7 +18,7 @@ from hybridlog.snapshot import UNFINISHED
 from hybridlog_storage.cache import Cache
 from hybridlog_storage.catalog import file_of
 from hybridlog_storage.disk import files
-from hybridlog_storage.errors import StoreError, UsageError
+from hybridlog_storage.errors import UsageError
 from hybridlog_storage.lazy import lazy
 from hybridlog_storage.messages import schema_hash
 from hybridlog_storage.segments.gone_log import open_log
@@ -158,26 +158,15 @@ class Shared(ABC):
         """The entry of what is sealed of a recording, compared with its files once."""
         found = None if summary.status in UNFINISHED else self.entries.get(summary.id)
         if found is None:
-            entry = self._current(summary)
-            if entry is None:
+            seen = self._files.see(summary.id)
+            if seen is None:
                 return None
-            found = with_marks(entry)
-            if entry.status in UNFINISHED:
-                return found
-            found = self.entries.setdefault(summary.id, found)
+            if seen.look != summary.look:  # the index may have what the files had before
+                self.index.note_changes()
+            found = with_marks(seen.entry)
+            if found.status not in UNFINISHED:
+                found = self.entries.setdefault(summary.id, found)
         return found
-
-    def _current(self, summary: RecordingSummary) -> RecordingEntry | None:
-        try:
-            entry, is_new = self._files.current_entry(summary)
-        except StoreError:
-            if self.directory.has(summary.id):
-                raise
-            return None  # another process has just removed it
-        if entry is not None and is_new:
-            # The index may have what the files had before.
-            self.index.note_changes()
-        return entry
 
     # Files.
 

@@ -107,10 +107,10 @@ class Snapshot:
         return sorted({topic.topic for topics in self._topics.values() for topic in topics})
 
     @lazy
-    def schemas(self) -> frozenset[str]:
-        """Hashes of all schemas."""
+    def types(self) -> frozenset[str]:
+        """Names of all types of messages."""
         return frozenset(
-            topic.schema for topics in self._topics.values() for topic in topics if topic.schema
+            topic.type for topics in self._topics.values() for topic in topics if topic.type
         )
 
     @lazy
@@ -144,15 +144,15 @@ class Snapshot:
         sets = np.unique(self._set[places]).tolist()
         return sorted({topic.topic for number in sets for topic in held[number]})
 
-    def with_schemas(self, schemas: Collection[str]) -> NDArray[np.intp]:
-        """Positions of the recordings that have any of some schemas, by hash, in order."""
-        sets = [any(t.schema in schemas for t in held) for held in self._topics.values()]
+    def with_types(self, types: Collection[str]) -> NDArray[np.intp]:
+        """Positions of the recordings that have messages of any of some types, in order."""
+        sets = [any(t.type in types for t in held) for held in self._topics.values()]
         return np.flatnonzero(np.array(sets, np.bool_)[self._set])
 
-    def topics_with(self, schemas: Collection[str]) -> tuple[str, ...]:
-        """Names of all topics with any of some schemas, by hash, sorted."""
+    def topics_with(self, types: Collection[str]) -> tuple[str, ...]:
+        """Names of all topics with messages of any of some types, sorted."""
         held = {topic for topics in self._topics.values() for topic in topics}
-        return tuple(sorted({one.topic for one in held if one.schema in schemas}))
+        return tuple(sorted({one.topic for one in held if one.type in types}))
 
     def having(
         self, topics: Collection[str], ids: Collection[str] | None = None

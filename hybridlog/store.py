@@ -195,7 +195,7 @@ class Store:
 
     def _to_change(self) -> OpenStore:
         """The open store, about to be changed: what crashes have left is finished first."""
-        self._itself().recover()
+        self._itself().change()
         return self.shared
 
     def __repr__(self) -> str:
@@ -708,7 +708,8 @@ class Store:
         from hybridlog.formats.reading import fingerprint
         from hybridlog.record.recorder import RecordOptions, record
 
-        shared = self._to_change()
+        shared = self._itself()
+        shared.recover()
         with open_source(Path(log)) if isinstance(log, str | Path) else log as source:
             report = record(
                 source,
@@ -735,7 +736,8 @@ class Store:
         from hybridlog.live import LiveOptions, LiveRecording
         from hybridlog.live.recording import follow_interval_s
 
-        chosen, shared = options or LiveOptions(**choices), self._to_change()
+        chosen, shared = options or LiveOptions(**choices), self._itself()
+        shared.recover()
         about = self.directory, self.catalog
         target = shared.index.index_to_record("Starting a recording")
         return LiveRecording(

@@ -469,8 +469,9 @@ class Recording:
         }
         self.unlisted = {number for number in self.segments if number not in listed}
         for number in self.segments.keys() & listed.keys():
-            segment, has_losses = self.segments[number], listed[number].get("has_losses", False)
-            demand(has_losses == bool(segment.losses), "whether a segment has losses")
+            segment = self.segments[number]
+            losses = [*map(loss_of, listed[number].get("losses", ()))]
+            demand(losses == segment.losses, "the losses of a segment")
             for channel, (schema, *_) in segment.channels.items():
                 digest = schema_hash(*segment.schemas[schema]) if schema else ""
                 demand(self.manifest.schemas[channel] == digest, "the definition of a channel")

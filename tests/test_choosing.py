@@ -163,7 +163,7 @@ def test_a_choice_without_a_meaning_is_refused(
         (("-r", "mon*", "--tag", "robot="), "named 'mon*', with the tag robot=; did you mean"),
         (("--has", "imy"), "did you mean /imu?"),
         (("--type", "sensor_msgs/LaserScam"), "did you mean sensor_msgs/LaserScan, "),
-        (("--type", "x"), f"there are {ODD}, hybridlog.Mark, {SCAN}, {IMU}"),
+        (("--type", "x"), f"there are {ODD}, {SCAN}, {IMU}"),
         (("--during", "2030-01-01", "end"), "with messages from 2030-01-01 to end."),
         (("--with", "/scan: n > 99"), "with a message for which '/scan: n > 99' holds."),
         (("-r", "x*"), "named 'x*'; there are monday 1, monday 2, run1, run[1], tuesday"),

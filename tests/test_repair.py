@@ -43,8 +43,8 @@ def store(prepared: Path, tmp_path: Path) -> Path:
 def look(store: Path) -> tuple[str, int, int]:
     """Status, messages and lost messages of the first recording; what is read is right."""
     with closing(hl.open(store, mongo=NOWHERE)) as opened:
-        entry = opened.entry("one")
         got = [bytes(m.raw) for m in opened.topic("/n").in_recording("one")]
+        entry = opened.entry("one")  # what cannot be read is known by now
         assert set(got) <= {payload(n) for n in range(100, 100 + COUNT)}
         assert len(got) == entry.messages
         lost = sum(row["count"] for row in entry.end.get("losses", ()))

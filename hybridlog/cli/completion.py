@@ -62,7 +62,7 @@ def _tags(session: Session, _: click.Context, incomplete: str) -> Iterable[str]:
 
 def _types(session: Session, _: click.Context, incomplete: str) -> Iterable[str]:
     """Types of messages, whole or by the name behind the package."""
-    names = {*session.type_names().values()}
+    names = session.look().types
     return sorted(names | {name.rpartition("/")[2] for name in names if incomplete})
 
 

@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     from hybridlog.query.topics import TopicMatcher
     from hybridlog.record.recorder import RecordReport
     from hybridlog.store import Store
-    from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.segments.segment_writer import SegmentSettings
 
 _CHUNK: Final = 2 << 20
@@ -265,7 +264,9 @@ def row_of(report: RecordReport, path: object) -> dict[str, Any]:
         "seconds": round(report.elapsed_s, 3),
         "losses": losses_of(entry),
         "damage": [{**asdict(d), "file": str(d.file)} for d in report.damage],
-        "not_indexed": {c.topic: c.unindexed for c in entry.channels if c.unindexed is not None},
+        "not_indexed": {
+            c.topic: report.not_indexed[c.id] for c in entry.channels if c.id in report.not_indexed
+        },
     }
 
 
@@ -295,12 +296,12 @@ COLUMNS: Final = [
 ]
 
 
-def remarks_on(recording: RecordingEntry) -> Iterator[str]:
+def remarks_on(report: RecordReport) -> Iterator[str]:
     """A line for each topic with messages whose fields are not all there, or not all they hold."""
-    for channel in recording.channels:
+    for channel in report.entry.channels:
         unreadable, surplus = channel.stats.unreadable, channel.stats.surplus
-        if channel.is_indexed and channel.reason is not None:
-            yield f"{channel.topic}: not indexed beyond time: {channel.reason}"
+        if channel.is_indexed and channel.id in report.not_indexed:
+            yield f"{channel.topic}: not indexed beyond time: {report.not_indexed[channel.id]}"
         if unreadable:
             unfit = output.unfit(unreadable)
             yield f"{channel.topic}: {unfit}; stored, without fields in the index"

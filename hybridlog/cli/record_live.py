@@ -173,7 +173,7 @@ def _finish(
     output.remarks(f"{topic}: has a publisher that sent nothing" for topic in silent)
     output.remarks(f"no topic fits {text}" for text in unfitting)
     for report in reports:
-        output.remarks(remarks_on(report.entry))
+        output.remarks(remarks_on(report))
     if choices.exclude and not (unfitting or silent or state.topics):
         output.remarks(["no topic is left: --exclude takes away all that --topic names"])
     errors = [

@@ -204,7 +204,7 @@ class _Beside:
         why = index.unavailable
         if why is not None and not isinstance(why, WithoutMongoError):
             self.tell("say", f"MongoDB is unavailable, {target.without}: {why}")
-        entry = put_entry(directory, catalog, task.recording, is_open=True)
+        entry = put_entry(directory, catalog, task.recording)
         done: Collection[str] = ()
         topics: Collection[str] | None = None
         if task.is_again:

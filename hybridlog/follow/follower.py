@@ -23,7 +23,7 @@ from hybridlog.maintenance.expiry import make_rows
 from hybridlog.maintenance.report import reporter
 from hybridlog.maintenance.retention import Rules
 from hybridlog.maintenance.tables import missing
-from hybridlog_storage.catalog import ChannelStats, file_of
+from hybridlog_storage.catalog import WHOLE, ChannelStats, file_of
 from hybridlog_storage.errors import (
     DatabaseError,
     DiskFullError,
@@ -233,7 +233,9 @@ class Follower:
             summary = reader.summary()
             segment = self._segment(number)
             places = summary.chunks
-            if not segment.is_wanted and self._catalog.decoded(self._entry, number) is not None:
+            self._damage.pop((number, WHOLE), None)
+            known = self._catalog.decoded(self._entry.id, {number: digest})
+            if not segment.is_wanted and known:
                 segment.is_decoded = True
                 if self._topics is not None:
                     wanted = {one.id for one in self._entry.channels if one.topic in self._topics}

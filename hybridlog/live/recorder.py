@@ -18,8 +18,8 @@ from functools import partial
 from operator import attrgetter
 from typing import TYPE_CHECKING
 
+from hybridlog.entries import put_entry
 from hybridlog.entries import text as as_text
-from hybridlog.entries import with_said
 from hybridlog.follow.child import FollowerProcess, Task
 from hybridlog.live.clocks import CLOCK, MachineClock, SimulatedTime
 from hybridlog.live.incidents import GROUPS, RULE, Incidents, Moment, Ring, Silence, SilenceWatch
@@ -335,8 +335,7 @@ class Recorder:
                 self._shared.catch_up(report.entry.id)
         except HybridlogError as error:
             self.say(f"the last messages of triggers are not marked and pinned: {error}")
-        now = self._directory.manifests.read(self._target.id)
-        report.entry = with_said(report.entry, now)
+        report.entry = put_entry(self._directory, self._shared.catalog, self._target.id)
 
     @property
     def rest(self) -> RecorderOptions:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from hybridlog.columns.layout import SHARED, SUFFIX, TABLES, topics_of, type_prefix
-from hybridlog.entries import describe, take_inventory
+from hybridlog.entries import put_entry, schemas_in
 from hybridlog.follow.follower import bring, make_tables
 from hybridlog.maintenance.opening import open_catalog
 from hybridlog.maintenance.report import ArraysOfTopic
@@ -218,7 +218,7 @@ def bring_derived(source: Shared, target: RemoteDirectory, recordings: Collectio
         catalog = open_catalog(target)
         for recording, (entry, tables) in known.items():
             with suppress(StoreError):  # who asks for it there is told what is wrong
-                _describe(source.catalog, entry, target, catalog)
+                _describe(source, entry, target, catalog)
                 cells.put_tables(recording, tables)
         if cells.save():
             return
@@ -226,15 +226,16 @@ def bring_derived(source: Shared, target: RemoteDirectory, recordings: Collectio
 
 
 def _describe(
-    known: Catalog, entry: RecordingEntry, target: RemoteDirectory, catalog: Catalog
+    source: Shared, entry: RecordingEntry, target: RemoteDirectory, catalog: Catalog
 ) -> None:
     """Make the row of the catalog from what is there, and from what decoding found out here."""
-    for number, digest in entry.digests.items():
-        decoded = known.decoded(entry, int(number))
-        if decoded is not None:
-            catalog.put_decoded(entry.id, int(number), digest, decoded)
+    known = source.catalog
+    digests = {int(number): digest for number, digest in entry.digests.items()}
+    for number, decoded in known.decoded(entry.id, digests).items():
+        catalog.put_decoded(entry.id, number, digests[number], decoded)
     catalog.put_damage(entry.id, known.damage(entry.id))
-    catalog.put(describe(catalog, take_inventory(target, entry.id)))
+    catalog.put_schemas(schemas_in(source.directory, entry).values())
+    put_entry(target, catalog, entry.id)
 
 
 def _bring_tables(source: Shared, target: RemoteDirectory, entry: RecordingEntry) -> list[Object]:

@@ -1,47 +1,41 @@
 """Looks at the recordings of a store, and finishes what a crash or a killed command has left.
 
-A look writes nothing but the catalog. If the state of a recording's files matches its catalog
-row, the files are not opened. No server is needed.
+A look reads manifests and names of files, and writes nothing but the catalog. No server is needed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from contextlib import suppress
 from dataclasses import dataclass, field
-from dataclasses import replace as replaced
 from typing import TYPE_CHECKING
 
 from msgspec import to_builtins
 
 from hybridlog.entries import (
     NO_MANIFEST,
-    describe,
-    described_of,
+    Seen,
     ended,
     inventory_of,
     listed,
     lost_in_crash,
-    state_of,
-    steady_inventory,
+    see,
     summary_by,
     take_inventory,
     unlisted,
-    with_said,
 )
 from hybridlog.maintenance import tables
 from hybridlog.snapshot import UNFINISHED, Snapshot
-from hybridlog_storage.catalog import Catalog, Described
+from hybridlog_storage.catalog import Catalog, Damage
 from hybridlog_storage.errors import DiskFullError, RecordingGoneError, StoreError, TopicError
 from hybridlog_storage.manifest import Manifest, replace
 
 if TYPE_CHECKING:
     from hybridlog.maintenance.report import RepairReport
-    from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.disk.directory import Listing, StoreDirectory
     from hybridlog_storage.segments.recovery import Recovered
     from hybridlog_storage.segments.segment_file import Sealed
-    from hybridlog_storage.summary import RecordingSummary, TopicType
+    from hybridlog_storage.summary import RecordingSummary
 
 
 def open_catalog(directory: StoreDirectory) -> Catalog:
@@ -68,8 +62,7 @@ class StoreFiles:
     def look(self, before: Snapshot, recordings: Collection[str]) -> Snapshot:
         """`before`, with some recordings as they are now; those that are gone are left out.
 
-        The files of a recording are read if it is new, or looks different from outside. All
-        others are compared with their files before they first answer, see `current_entry`.
+        The manifest of a recording is read if it is new, or looks different from outside.
         """
         directory, catalog, report = self.directory, self.catalog, self.report
         is_first = not before.summaries  # of all
@@ -77,122 +70,50 @@ class StoreFiles:
         self._gone |= rows.keys() - {*recordings} if is_first else set()
         for recording in recordings:
             report.unreadable.pop(recording, None)
-        found = self._find(directory.looks(sorted(recordings)), rows)
+        looks = directory.looks(sorted(recordings))
+        found = {
+            one: rows[one]
+            for one, look in looks.items()
+            if one in rows and rows[one].look == look and rows[one].status not in UNFINISHED
+        }
+        found |= self._read(sorted(looks.keys() - found.keys()))
         for name in directory.manifests.without():
             report.unreadable[name] = _lost(directory, name)
         topics = {one.topics: catalog.topics(one.topics) for one in found.values()}
         return before.with_changes(found.values(), topics, recordings)
 
-    def _find(
-        self,
-        looks: Mapping[str, str],
-        known: Mapping[str, RecordingSummary],
-    ) -> dict[str, RecordingSummary]:
-        """Summaries by id, from the looks of directories and the summaries in the catalog."""
-        found: dict[str, RecordingSummary] = {}
-        due = set[str]()
-        for recording, look in looks.items():
-            summary = known.get(recording)
-            if summary is None or summary.look != look or summary.status in UNFINISHED:
-                due.add(recording)
-            else:
-                found[recording] = summary
-        whole = self._by_manifests({one: looks[one] for one in due}, known)
-        for recording in sorted(due - whole.keys()):
+    def _read(self, recordings: Collection[str]) -> dict[str, RecordingSummary]:
+        """Summaries of some recordings by id, of their manifests; the catalog gets them at once."""
+        found, damaged = {}, self.catalog.damaged(recordings)
+        for recording in recordings:
             try:
-                summary = self._look_again(recording)
+                seen = self._see(recording, damaged.get(recording, {}))
             except StoreError as error:
-                if self.directory.has(recording):  # another process may have removed it
-                    self.report.unreadable[recording] = str(error)
+                self.report.unreadable[recording] = str(error)
                 continue
-            if summary is not None:
-                found[recording] = summary
-        return found | whole
-
-    def _by_manifests(
-        self, looks: Mapping[str, str], known: Mapping[str, RecordingSummary]
-    ) -> dict[str, RecordingSummary]:
-        """Summaries of those of some recordings that are whole, by id; no log is opened."""
-        found: dict[str, RecordingSummary] = {}
-        topics: dict[str, Collection[TopicType]] = {}
-        damaged = self.catalog.damaged(looks)
-        for manifest in self.directory.whole(one for one in looks if one not in damaged):
-            made = summary_by(manifest, looks[manifest.id])
-            if made is not None:
-                summary, topics[summary.topics] = made
-                found[summary.id] = summary
+            if seen is not None:
+                found[recording] = summary_by(seen)
         if found:
-            before = {
-                one: known[one]._replace(look="", indexed_by="") for one in found if one in known
-            }
-            is_change = any(before.get(one.id) != one._replace(look="") for one in found.values())
-            self.catalog.put_summaries(found.values(), topics, is_change=is_change)
-        return found
+            self.catalog.put(found.values())
+        return {recording: summary for recording, (summary, _) in found.items()}
 
-    def _look_again(self, recording: str) -> RecordingSummary | None:
-        """The summary of a recording as its files are now; None if it is gone."""
-        known = self._known(recording)
-        if known is None:
-            described = self._read(recording)
-            return described.summary if described is not None else None
-        entry, look, files, is_noted = known
-        found = described_of(entry, look, files)
-        if found.entry.status not in UNFINISHED or not is_noted:
-            self.catalog.put(found)
-        return found.summary
+    def see(self, recording: str) -> Seen | None:
+        """A recording by its manifest, with results of decoding; None if it is gone."""
+        return self._see(recording, self.catalog.damage(recording), self.catalog)
 
-    def _known(self, recording: str) -> tuple[RecordingEntry, str, str, bool] | None:
-        """A recording by its catalog row, with what people say of it by now.
-
-        Its entry, its look, the state of its files, and True if the row has all of it already;
-        None if the row does not match the files.
-        """
-        directory, row = self.directory, self.catalog.recording(recording)
-        if row is None:
-            return None
-        files, entry = row
-        listing = directory.listing(recording)
+    def _see(self, recording: str, damage: Damage, catalog: Catalog | None = None) -> Seen | None:
         try:
-            manifest = directory.manifests.read(recording)
-        except RecordingGoneError:
-            return None
-        if files != state_of(listing, manifest):
-            return None
-        if _has_left(listing, manifest):
-            holder = directory.holder(recording)
-            if holder is None or not (holder.is_recording or entry.status != "open"):
-                return None
-        said = with_said(entry, manifest)
-        return said, listing.look, files, said == entry
-
-    def current_entry(self, summary: RecordingSummary) -> tuple[RecordingEntry | None, bool]:
-        """The entry of a recording, None if it is gone; and whether its files were read again."""
-        known = self._known(summary.id)
-        if known is not None:
-            return known[0], False
-        described = self._read(summary.id)
-        return (described.entry if described is not None else None), True
-
-    def _read(self, recording: str) -> Described | None:
-        """Read what is whole of a recording, and put it into the catalog; None if it is gone."""
-        directory, catalog = self.directory, self.catalog
-        try:
-            is_open = directory.is_recorded(recording)
-            inventory = steady_inventory(directory, recording)
-            described = describe(catalog, inventory, is_open=is_open)
+            seen = see(self.directory, recording, damage, catalog)
         except RecordingGoneError:
             self._left.add(recording)  # its removal was interrupted
             return None
         except StoreError:
-            if directory.has(recording):
+            if self.directory.has(recording):
                 raise
             return None  # another process has just removed it
-        noted, manifest = described, inventory.manifest
-        if not is_open and manifest and _has_left(directory.listing(recording), manifest):
-            self._left.add(recording)  # each process sees it, as long as the row has no look
-            noted = replaced(described, summary=described.summary._replace(look=""))
-        catalog.put(noted)
-        return described
+        if seen.has_left:
+            self._left.add(recording)
+        return seen
 
     def recover(self, died: Collection[str]) -> set[str]:
         """Finish what was interrupted, and seal what recorders that `died` have left.
@@ -222,14 +143,6 @@ class StoreFiles:
         for recording in gone:
             catalog.remove(recording)
         self._is_swept = True
-
-
-def _has_left(listing: Listing, manifest: Manifest) -> bool:
-    """True if a recorder or a change that was interrupted has left something, unless it goes on."""
-    unlisted_logs = listing.sealed.keys() - manifest.logs.keys()
-    return not manifest.is_ended or bool(
-        unlisted_logs or listing.open or listing.left_over(manifest)
-    )
 
 
 def _lost(directory: StoreDirectory, name: str) -> str:

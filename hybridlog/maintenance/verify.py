@@ -18,12 +18,10 @@ from msgspec import structs
 from hybridlog.columns import rows_file
 from hybridlog.columns.recording_logs import RecordingRows
 from hybridlog.entries import (
-    describe,
     free_name_in,
     inventory_of,
     made_again,
     put_entry,
-    state_of,
     steady_inventory,
     take_inventory,
     topic_of,
@@ -32,7 +30,7 @@ from hybridlog.follow.follower import bring, make_tables
 from hybridlog.maintenance import tables
 from hybridlog.maintenance.opening import recover, recover_segments
 from hybridlog.maintenance.report import Repaired, reporter
-from hybridlog_storage.catalog import file_of
+from hybridlog_storage.catalog import WHOLE, file_of
 from hybridlog_storage.disk.directory import LOCK, LOCK_WAIT_S
 from hybridlog_storage.errors import (
     HeldError,
@@ -205,7 +203,7 @@ class _Check:
         self._directory.look_closely(self._recording)
         inventory = steady_inventory(self._directory, self._recording)
         listing, manifest = self._directory.listing(self._recording), inventory.manifest
-        is_same = manifest is not None and state_of(listing, manifest) == inventory.state
+        is_same = manifest is not None and listing.sizes == inventory.listing.sizes
         left = listing.left_over(manifest) if manifest is not None and is_same else []
         self._name = inventory.name
         self._manifest(manifest)
@@ -221,8 +219,11 @@ class _Check:
         self._files(inventory, left, is_held=holder is not None)
         if manifest is None:
             return
-        is_open = holder is not None and holder.is_recording
-        entry = describe(self._catalog, inventory, is_open=is_open).entry
+        known = self._catalog.damage(self._recording)
+        lost = {(n, WHOLE): "" for n in inventory.logs.keys() - inventory.summaries.keys()}
+        if not lost.keys() <= known.keys():
+            self._catalog.put_damage(self._recording, {**lost, **known})
+        entry = put_entry(self._directory, self._catalog, self._recording)
         self._result.without_documents += entry.messages - entry.documents
         if entry.status == "open":
             return

@@ -140,10 +140,9 @@ class _Choosing:
             having = self._snapshot.having(topics).tolist()
             yield having, f"with the topic {pattern!r}", pattern, self._topics
         for name in choice.type:
-            types = self._session.type_names()
-            schemas = {digest for digest, known in types.items() if _is_type(known, name)}
-            having = self._snapshot.with_schemas(schemas).tolist()
-            yield having, f"with messages of the type {name!r}", name, [*types.values()]
+            types = self._snapshot.types
+            having = self._snapshot.with_types({one for one in types if _is_type(one, name)})
+            yield having.tolist(), f"with messages of the type {name!r}", name, [*types]
         if choice.during is not None:
             yield self._in_time(*choice.during)
         if choice.older_than is not None:

@@ -86,13 +86,12 @@ class Question:
 
 @dataclass(frozen=True)
 class RecordedChannel:
-    """One channel of one recording; `reason` is why the catalog knows no fields of it, or None."""
+    """One channel of one recording."""
 
     recording: RecordingEntry
     channel_id: int
     channel: Channel
     stats: ChannelStats
-    reason: str | None
 
     @lazy
     def codec(self) -> Codec:

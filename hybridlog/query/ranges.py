@@ -141,14 +141,19 @@ class RangeResolver:
         Where its statistics do not have them, the messages are read.
         """
         recording, stats = channel.recording, channel.stats
-        is_publish = self._question.clock == "publish"
-        if recording.is_decoded or is_publish:
+        number = channel.channel_id
+        if self._question.clock == "publish":
+            if channel.channel.has_publish_time:
+                for segment, _, _ in recording.spans_with([number]):
+                    parts = self._session.chunk_table(recording, segment).parts
+                    own = parts[parts["channel"] == number]
+                    yield from own["first_publish"].tolist()
+                    yield from own["last_publish"].tolist()
+            return
+        if recording.is_decoded:
             known = stats.first_stamp, stats.last_stamp
-            if is_publish:
-                known = stats.first_publish, stats.last_publish
             yield from (time for time in known if time is not None)
             return
-        number = channel.channel_id
         for chunk in self._session.chunks(recording, [number], None, "log"):
             from hybridlog.schema.codec import stamps_of
 

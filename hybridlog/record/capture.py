@@ -241,7 +241,7 @@ class Capture:
         lock = self._directory.writing(recording, wait_s=LOCK_WAIT_S, records=True, makes=True)
         self._held.enter_context(lock)
         create(manifest)
-        return put_entry(self._directory, self.catalog, recording, is_open=True)
+        return put_entry(self._directory, self.catalog, recording)
 
 
 def remote_segment_size(table: Mapping[str, Any] | None) -> float:

@@ -107,8 +107,8 @@ def _payloads(marks: Iterable[Mapping[str, Any]]) -> list[bytes]:
 def beside(entry: RecordingEntry) -> RecordingEntry:
     """The entry of a recording's files, and of its marks."""
     flushed = _MarksLog(entry.marks).flushed
-    channel = channel_entry(MARKS_CHANNEL, replace(mark_channel(), is_indexed=False), None)
-    channel.stats = channel_totals(flushed.table, None)[MARKS_CHANNEL]
+    channel = channel_entry(MARKS_CHANNEL, replace(mark_channel(), is_indexed=False))
+    channel.stats = channel_totals(flushed.table)[MARKS_CHANNEL]
     span = int(flushed.table.parts["first"].min()), int(flushed.table.parts["last"].max())
     return replace(
         entry,

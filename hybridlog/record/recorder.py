@@ -94,6 +94,7 @@ class RecordReport:
         latched_left_out: Those that were in force and did not fit in memory.
         attachments_left_out: Attachments from behind the time range.
         remarks: What is odd about the source, where nothing is damaged or lost.
+        not_indexed: Why the index has no fields of some channels, by id.
     """
 
     entry: RecordingEntry
@@ -107,6 +108,7 @@ class RecordReport:
     latched_left_out: int = 0
     attachments_left_out: int = 0
     remarks: list[str] = field(default_factory=list)
+    not_indexed: dict[int, str] = field(default_factory=dict)
 
 
 @at_safe_points()

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 
 from hybridlog.entries import loss_values, topic_types
 from hybridlog.record.losses import Cause, joined
-from hybridlog.schema.codecs import codec_for
 from hybridlog.snapshot import UNFINISHED
 from hybridlog_storage.catalog import ChannelEntry, channel_entry, channel_totals
 from hybridlog_storage.disk.directory import is_stable
@@ -57,7 +56,7 @@ class RunningRecording:
         self._segments: dict[int, OpenSegment] = {}
         self._unreadable: dict[int, str] = {}  # why, by number of the segment
         self.entry: RecordingEntry | None = None
-        self.topics: set[TopicType] = set()
+        self.topics: frozenset[TopicType] = frozenset()
         self.schemas: dict[str, Schema] = {}
 
     def follow(self) -> bool:
@@ -84,7 +83,7 @@ class RunningRecording:
         # What is created within a tick of the file system's clock leaves the look as it is.
         self._state = state if is_stable(look) else ("", False)
         self.entry = None if self._sealed is None else self._with_flushed(self._sealed)
-        self.topics = set() if self.entry is None else topic_types(self.entry)
+        self.topics = frozenset() if self.entry is None else topic_types(self.entry)
         return True
 
     @contextmanager
@@ -121,8 +120,7 @@ class RunningRecording:
             found.flushed[number] = segment.flushed
             table, attachments, metadata, _ = segment.flushed
             self._add_channels(channels, segment)
-            silent = {channel.id for channel in channels.values() if not channel.has_publish_time}
-            for channel_id, stats in channel_totals(table, None, silent).items():
+            for channel_id, stats in channel_totals(table).items():
                 total = channels[channel_id].stats = replace(channels[channel_id].stats)
                 total.add(stats)
             if len(table.parts):
@@ -143,8 +141,7 @@ class RunningRecording:
     def _add_channels(self, channels: dict[int, ChannelEntry], segment: OpenSegment) -> None:
         for number, channel in segment.channels.items():
             if number not in channels:
-                reason = codec_for(channel).reason
-                channels[number] = found = channel_entry(number, channel, reason)
+                channels[number] = found = channel_entry(number, channel)
                 if channel.schema is not None and found.schema is not None:
                     self.schemas[found.schema] = channel.schema
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, cast
@@ -11,6 +12,7 @@ from hybridlog.schema.codec import Codec, ObjectCodec, OpaqueCodec
 from hybridlog.schema.completion import has_hidden_fields
 from hybridlog.schema.states import State, encoding_of, state_of
 from hybridlog_storage.errors import DefinitionError, PayloadError
+from hybridlog_storage.messages import MARKS_CHANNEL
 
 if TYPE_CHECKING:
     from hybridlog.schema.objects import Plain
@@ -42,6 +44,19 @@ def _codec(encoding: str, schema: Schema | None) -> Codec:
         return JsonCodec() if encoding == "json" else _defined(encoding, schema)
     except DefinitionError as error:
         return OpaqueCodec(str(error))
+
+
+def unindexed(definitions: Mapping[int, Channel]) -> dict[int, str]:
+    """Why MongoDB has no fields of the messages of some channels, by id."""
+    found = dict[int, str]()
+    for number, channel in definitions.items():
+        if number == MARKS_CHANNEL:
+            found[number] = "marks that somebody set"
+        elif not channel.is_indexed:
+            found[number] = "recorded with --no-index"
+        elif (reason := codec_for(channel).reason) is not None:
+            found[number] = reason
+    return found
 
 
 def _defined(encoding: str, schema: Schema | None) -> Codec:

@@ -1,34 +1,31 @@
-"""The catalog: what is known of all recordings of a store, without a look at their files.
+"""The catalog: a cache of what manifests say, and what reading their files has found out.
 
-It is derived from manifests and segments, and may be deleted at any time. It lists recordings
-with summaries, and says more of those that are asked about: their channels, statistics and
-losses, and what was found out by decoding. What it says of a recording also has the state of
-the files that it was read from (sizes, times), and is used only while that is unchanged. Chunks
-are read from the footers of segments.
+It may be deleted at any time. Of each recording it has the summary, made of a manifest and used
+while that and the folder look the same, and the chunks that cannot be read; of each segment, by
+its digest, what was found out by decoding. Chunks are read from the footers of segments.
 """
 
 from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Collection, Container, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from msgspec import to_builtins
 from msgspec.json import Decoder, encode
 
 from hybridlog_storage.cache import Cache
 from hybridlog_storage.cells import Cells, Statement, drop, put
-from hybridlog_storage.disk import durability, files
 from hybridlog_storage.errors import CatalogError, SegmentError
+from hybridlog_storage.manifest import File
 from hybridlog_storage.manifests import RECORDINGS
-from hybridlog_storage.messages import EXPIRED_IDS, MARKS_CHANNEL, Channel, Schema, schema_hash
+from hybridlog_storage.messages import EXPIRED_IDS, Channel, Schema, schema_hash
 from hybridlog_storage.segments.chunk_table import ChunkTable
 from hybridlog_storage.segments.gone_log import GoneLog, open_log
-from hybridlog_storage.segments.segment_file import sealed_name
+from hybridlog_storage.segments.segment_file import listed_parts, sealed_name
 from hybridlog_storage.summary import (
     Int,
     RecordingSummary,
@@ -38,14 +35,16 @@ from hybridlog_storage.summary import (
 )
 
 if TYPE_CHECKING:
+    from hybridlog_storage.segments.segment_reader import SegmentSummary
     from hybridlog_storage.segments.walk import Flushed
-else:
-    Flushed = Any  # in no file
 
 CATALOG: Final = "catalog.sqlite"
 """Name of the file in the store's directory."""
+WHOLE: Final = -1
+"""Stands for all chunks of a segment whose summary cannot be read, or is another one."""
+Damage = Mapping[tuple[int, int], str]
+"""Why chunks of a recording cannot be read, by segment and number."""
 _SUMMARY: Final = "summary"
-_ENTRY: Final = "entry"
 _INDEX: Final = "index"
 _DECODED: Final = "decoded"
 """Kinds of the cells of a recording, whose key is its id; `_DECODED` has one a segment."""
@@ -75,8 +74,6 @@ class ChannelStats:
     surplus: Int = 0
     first: Int | None = None
     last: Int | None = None
-    first_publish: Int | None = None
-    last_publish: Int | None = None
     first_stamp: Int | None = None
     last_stamp: Int | None = None
     stamped: Int = 0
@@ -94,9 +91,9 @@ class ChannelStats:
         """Add the messages of another part of the channel."""
         for name in _COUNTS:
             setattr(self, name, getattr(self, name) + getattr(other, name))
-        for name in ("first", "first_publish", "first_stamp", "skew_min"):
+        for name in ("first", "first_stamp", "skew_min"):
             setattr(self, name, _least(getattr(self, name), getattr(other, name)))
-        for name in ("last", "last_publish", "last_stamp", "skew_max"):
+        for name in ("last", "last_stamp", "skew_max"):
             setattr(self, name, _greatest(getattr(self, name), getattr(other, name)))
 
 
@@ -110,22 +107,13 @@ class ChannelEntry:
     schema: str | None
     type: str
     metadata: dict[str, str]
-    has_publish_time: bool
-    reason: str | None
-    """Reason why its fields are not indexed, None if they are."""
+    has_publish_time: bool = True
     stats: ChannelStats = field(default_factory=ChannelStats)
     is_indexed: bool = True
     """False if its messages get no documents in MongoDB."""
 
     def __repr__(self) -> str:
         return f"<Channel {self.topic} {self.type}; {self.stats.messages} messages>"
-
-    @property
-    def unindexed(self) -> str | None:
-        """Reason why MongoDB has no fields of its messages, None if it has."""
-        if self.id == MARKS_CHANNEL:
-            return "marks that somebody set"
-        return self.reason if self.is_indexed else "recorded with --no-index"
 
 
 @dataclass(slots=True, repr=False)
@@ -153,15 +141,14 @@ class RecordingEntry:
             (ns).
         pins: What is never deleted to make room: `id`, `from`, `to`, `topics`, `reason`.
         spans: Number, first and last log time (ns) of each segment that has messages.
-        held: Ids of the channels with messages in each sealed segment, by its number as text.
-        digests: Digest of each valid segment as it was sealed, by its number as text.
+        logs: The line of the manifest of each segment that is there, by number.
+        digests: Their digests, by number as text.
         files: Of those that are gone, the names of their first files of rows.
         is_decoded: Whether messages were decoded. Otherwise header stamps, and messages that
         do not fit their definition, are unknown.
         rows: Name, topic and bytes of each file of rows.
         copies: Addresses of stores with copies that have more payloads.
-        flushed: Content of segments that are not sealed, and of marks, by number, at one moment;
-            the catalog's file does not have it.
+        flushed: Content of segments that are not sealed, and of marks, by number, at one moment.
     """
 
     id: str
@@ -181,7 +168,7 @@ class RecordingEntry:
     marks: list[dict[str, Any]] = field(default_factory=list)
     pins: list[dict[str, Any]] = field(default_factory=list)
     spans: list[tuple[Int, Int, Int]] = field(default_factory=list)
-    held: dict[str, list[Int]] = field(default_factory=dict)
+    logs: dict[int, File] = field(default_factory=dict)
     digests: dict[str, str] = field(default_factory=dict)
     files: dict[str, str] = field(default_factory=dict)
     is_decoded: bool = False
@@ -223,53 +210,28 @@ class RecordingEntry:
 
     def spans_with(self, channels: Collection[int]) -> list[tuple[int, int, int]]:
         """The spans of segments that may have messages of some channels."""
-        wanted = {*channels}
+        wanted = {channel % EXPIRED_IDS for channel in channels}
         return [
             span
             for span in self.spans
-            if (held := self.held.get(str(span[0]))) is None or not wanted.isdisjoint(held)
+            if (log := self.logs.get(span[0])) is None or not wanted.isdisjoint(log.parts)
         ]
 
 
-def channel_totals(
-    table: ChunkTable, decoded: Mapping[int, ChannelStats] | None, silent: Container[int] = ()
-) -> dict[int, ChannelStats]:
-    """Statistics of the channels of a segment.
-
-    `decoded` has the results of decoding, None before messages are decoded; `silent` has the ids of
-    channels without publish times.
-    """
-    names = ("channel", "messages", "payload_bytes", "first", "last")
-    rows = table.by_channel()[[*names, "first_publish", "last_publish"]].tolist()
-    found: dict[int, ChannelStats] = {}
-    for channel, messages, payload_bytes, first, last, *published in rows:
-        stats = found[channel] = ChannelStats(
-            messages=messages, payload_bytes=payload_bytes, first=first, last=last
-        )
-        if channel not in silent:
-            stats.first_publish, stats.last_publish = published
-        if decoded is not None and channel % EXPIRED_IDS in decoded:
-            stats.add(decoded[channel % EXPIRED_IDS])
-    return found
-
-
-@dataclass(frozen=True, slots=True)
-class Described:
-    """A recording, as read from its files; used while `files`, their state, is unchanged."""
-
-    entry: RecordingEntry
-    summary: RecordingSummary
-    topics: Collection[TopicType]
-    files: str
-    channels: Mapping[int, Channel]
+def channel_totals(table: ChunkTable) -> dict[int, ChannelStats]:
+    """Statistics of the channels of a segment, before its messages are decoded."""
+    rows = table.by_channel()[["channel", "messages", "payload_bytes", "first", "last"]].tolist()
+    return {
+        channel: ChannelStats(messages, payload_bytes, first=first, last=last)
+        for channel, messages, payload_bytes, first, last in rows
+    }
 
 
 class Catalog:
     """The catalog of a store; what is of another store is removed. Thread safe.
 
     `in_memory` leaves the file as it is, for a store that this user cannot write; `cells` are given
-    if they lie elsewhere. `has_changed` says that this process has changed an ended recording.
-    `recordings_file` lists these for other readers; it is removed when they change.
+    if they lie elsewhere.
     """
 
     def __init__(
@@ -281,9 +243,7 @@ class Catalog:
         cells: Cells | None = None,
     ) -> None:
         self.is_in_memory = in_memory or cells is not None
-        self.has_changed = False
         self._store = store
-        self.recordings_file = store / "tables/recordings.parquet"
         self._cells = cells or Cells(store / CATALOG, store_id, writes=not in_memory)
         self._topics: dict[str, tuple[TopicType, ...]] = {}
         self._tables = Cache(_MAX_TABLES)
@@ -295,60 +255,16 @@ class Catalog:
 
     # Changes.
 
-    def _remove_recordings_file(self) -> None:
-        """Remove the list of ended recordings, which is wrong now."""
-        if not self.is_in_memory:
-            removing = durability.explained(self.recordings_file, "removing")
-            with removing, suppress(FileNotFoundError):
-                files.unlink(self.recordings_file)
-
-    def put(self, described: Described) -> None:
-        """Insert or replace a recording."""
-        entry, summary = described.entry, described.summary
-        if entry.status != "open":
-            self.has_changed = True
-            self._remove_recordings_file()
-        self._tables.drop("table", entry.id)
-        self._topics[summary.topics] = tuple(described.topics)
-        plain = to_builtins(replace(entry, flushed={}))
-        schemas = {c.schema for c in described.channels.values() if c.schema is not None}
-        known = {schema_hash(schema): schema for schema in schemas}
-
-        def statements() -> Iterator[Statement]:
-            for digest, schema in known.items():
-                if self._cells.read(_SCHEMA, digest) is None:
-                    head = _body([schema.name, schema.encoding])
-                    yield put(_SCHEMA, digest, head + b"\n" + bytes(schema.data))
-            yield put(_TOPICS, summary.topics, topics_to_json(described.topics).encode())
-            yield put(_ENTRY, entry.id, _body([described.files, plain]))
-            yield put(_SUMMARY, entry.id, _summary_body(summary))
-            index, _, damage = self._index(entry.id)
-            if index:  # until it is compared with the index
-                yield put(_INDEX, entry.id, _body(["", "", damage]))
-
-        self._cells.write(statements)
-
-    def put_summaries(
-        self,
-        summaries: Collection[RecordingSummary],
-        topics: Mapping[str, Collection[TopicType]],
-        *,
-        is_change: bool,
-    ) -> None:
-        """Note summaries that manifests have made, at once.
-
-        `topics` are by hash; `is_change` says that a summary differs, in more than its look, from
-        what was known.
-        """
-        if is_change:
-            self._remove_recordings_file()
-        self._topics.update({digest: tuple(types) for digest, types in topics.items()})
+    def put(self, summaries: Collection[tuple[RecordingSummary, Collection[TopicType]]]) -> None:
+        """Insert or replace summaries of recordings, with their topics."""
+        topics = {one.topics: tuple(types) for one, types in summaries}
+        self._topics.update(topics)
 
         def statements() -> Iterator[Statement]:
             for digest, types in topics.items():
                 yield put(_TOPICS, digest, topics_to_json(types).encode())
-            for one in summaries:
-                yield put(_SUMMARY, one.id, _summary_body(one))
+            for one, _ in summaries:
+                yield put(_SUMMARY, one.id, encode(one[:-1]))
 
         self._cells.write(statements)
 
@@ -362,8 +278,8 @@ class Catalog:
 
         self._cells.write(statements)
 
-    def put_damage(self, recording: str, damage: Mapping[tuple[int, int], str]) -> None:
-        """Store the unreadable chunks of a recording: reason by segment and number."""
+    def put_damage(self, recording: str, damage: Damage) -> None:
+        """Store the unreadable chunks of a recording."""
         rows = [(*place, reason) for place, reason in sorted(damage.items())]
         self._cells.write(lambda: [put(_INDEX, recording, _body(["", "", rows]))])
 
@@ -372,16 +288,22 @@ class Catalog:
     ) -> None:
         """Store the results of decoding a segment."""
         rounded = {n: replace(one, skew_sum=float(one.skew_sum)) for n, one in decoded.items()}
-        cell = put(_DECODED, recording, encode((digest, rounded)), number)
+        cell = put(_DECODED, recording, encode((number, digest, rounded)), number)
         self._cells.write(lambda: [cell])
+
+    def put_schemas(self, schemas: Iterable[Schema]) -> None:
+        """Store schemas."""
+        heads = ((one, _body([one.name, one.encoding])) for one in schemas)
+        cells = [
+            put(_SCHEMA, schema_hash(one), b"%b\n%b" % (head, bytes(one.data)))
+            for one, head in heads
+        ]
+        self._cells.write(lambda: cells)
 
     def remove(self, recording: str) -> None:
         """Remove a recording."""
-        self.has_changed = True
-        self._remove_recordings_file()
         self._tables.drop("table", recording)
-        kinds = (_SUMMARY, _ENTRY, _INDEX, _DECODED)
-        self._cells.write(lambda: [drop(kind, recording) for kind in kinds])
+        self._cells.write(lambda: [drop(kind, recording) for kind in (_SUMMARY, _INDEX, _DECODED)])
 
     # Answers.
 
@@ -416,28 +338,26 @@ class Catalog:
                 self._topics[digest] = found
         return self._topics.get(digest)
 
-    def recording(self, recording: str) -> tuple[str, RecordingEntry] | None:
-        """State of the files and entry of a recording; None if it is missing or damaged."""
-        found = _read(_ENTRY_OF, self._cells.read(_ENTRY, recording))
-        return found if found is not None and found[1].id == recording else None
-
     def _index(self, recording: str) -> _Indexed:
         return _indexed(self._cells.read(_INDEX, recording))
 
-    def damaged(self, recordings: Collection[str]) -> set[str]:
-        """Those of some recordings, by id, that are known to have unreadable chunks."""
+    def damaged(self, recordings: Collection[str]) -> dict[str, Damage]:
+        """The unreadable chunks of those recordings, by id, that are known to have some."""
         known = self._cells.each(_INDEX, recordings)
-        return {recording for recording, body in known.items() if _indexed(body)[2]}
+        rows = {recording: _indexed(body)[2] for recording, body in known.items()}
+        return {one: {(n, chunk): why for n, chunk, why in own} for one, own in rows.items() if own}
 
     def damage(self, recording: str) -> dict[tuple[int, int], str]:
-        """The unreadable chunks of a recording: reason by segment and number."""
-        return {(segment, chunk): reason for segment, chunk, reason in self._index(recording)[2]}
+        """The unreadable chunks of a recording."""
+        return {(number, chunk): why for number, chunk, why in self._index(recording)[2]}
 
-    def decoded(self, entry: RecordingEntry, number: int) -> dict[int, ChannelStats] | None:
-        """Results of decoding a segment; None before its messages are decoded."""
-        found = _read(_DECODED_OF, self._cells.read(_DECODED, entry.id, number))
-        is_ours = found is not None and found[0] == entry.digests.get(str(number))
-        return found[1] if found is not None and is_ours else None
+    def decoded(
+        self, recording: str, digests: Mapping[int, str]
+    ) -> dict[int, dict[int, ChannelStats]]:
+        """Results of decoding those segments of a recording that have these digests, by number."""
+        bodies = self._cells.of(_DECODED, recording) if digests else ()
+        rows = (row for body in bodies if (row := _read(_DECODED_OF, body)) is not None)
+        return {number: found for number, digest, found in rows if digests.get(number) == digest}
 
     # Schemas.
 
@@ -454,7 +374,7 @@ class Catalog:
     # Chunks.
 
     def table(self, entry: RecordingEntry, number: int) -> ChunkTable:
-        """The chunks of a segment, from its footer."""
+        """The chunks of a segment, from its footer; `CatalogError` if that is another one."""
         if number in entry.flushed:
             return entry.flushed[number].table
         digest = entry.digests.get(str(number), "")
@@ -475,15 +395,35 @@ class Catalog:
                 summary = reader.summary()
         except SegmentError as error:
             raise CatalogError(str(error)) from error
-        said = summary.recording.get("id"), summary.recording.get("segment")
-        is_ours &= said == (entry.id, number)
-        if not is_ours or {*spans_of(number, summary.table)} - {*entry.spans}:
+        channels = {one.id: (one.topic, one.schema) for one in entry.channels}
+        if not is_ours or not is_of(summary, entry.id, entry.logs.get(number), channels, number):
             raise CatalogError(f"Segment {path} has changed since the store was opened.")
         return summary.table
 
 
-def _summary_body(summary: RecordingSummary) -> bytes:
-    return encode(summary[:-1])
+def is_of(
+    summary: SegmentSummary,
+    recording: str,
+    log: File | None,
+    channels: Mapping[int, tuple[str, str | None]],
+    number: int,
+) -> bool:
+    """True for a segment of a recording and number that is as its manifest lists it.
+
+    `channels` are the topic and the hash of the schema by id, of the manifest; None of `log` for
+    one that is not listed.
+    """
+    if (summary.recording.get("id"), summary.recording.get("segment")) != (recording, number):
+        return False
+    if log is None:
+        return True
+    has_parts = (summary.size, listed_parts(summary.table.as_stored())) == (log.bytes, log.parts)
+    own = {n: (c.topic, _hash_of(c)) for n, c in summary.channels.items() if n in channels}
+    return has_parts and all(channels[n] == one for n, one in own.items())
+
+
+def _hash_of(channel: Channel) -> str | None:
+    return None if channel.schema is None else schema_hash(channel.schema)
 
 
 def _body(values: object) -> bytes:
@@ -493,11 +433,10 @@ def _body(values: object) -> bytes:
 
 _SUMMARY_OF: Final = Decoder(RecordingSummary)
 _TOPICS_OF: Final = Decoder(tuple[TopicType, ...])
-_ENTRY_OF: Final = Decoder(tuple[str, RecordingEntry])
 _Indexed = tuple[str, str, list[tuple[Int, Int, str]]]
 """An index that is complete for a recording, its look then, and its unreadable chunks."""
 _INDEX_OF: Final = Decoder(_Indexed)
-_DECODED_OF: Final = Decoder(tuple[str, dict[int, ChannelStats]])
+_DECODED_OF: Final = Decoder(tuple[Int, str, dict[int, ChannelStats]])
 _NAMES_OF: Final = Decoder(tuple[str, str])
 
 
@@ -521,24 +460,16 @@ def file_of(entry: RecordingEntry, number: int) -> str:
     return entry.files.get(str(number)) or sealed_name(number)
 
 
-def spans_of(number: int, table: ChunkTable) -> list[tuple[int, int, int]]:
-    """Number of a segment, first and last log time of its messages, ns; none without any."""
-    if not len(table.parts):
-        return []
-    return [(number, int(table.parts["first"].min()), int(table.parts["last"].max()))]
-
-
-def channel_entry(channel_id: int, channel: Channel, reason: str | None) -> ChannelEntry:
-    """The catalog entry of a channel without messages."""
+def channel_entry(channel_id: int, channel: Channel) -> ChannelEntry:
+    """The entry of a channel without messages."""
     return ChannelEntry(
         id=channel_id,
         topic=channel.topic,
         message_encoding=channel.message_encoding,
-        schema=schema_hash(channel.schema) if channel.schema is not None else None,
+        schema=_hash_of(channel),
         type=channel.schema.name if channel.schema is not None else "",
         metadata=dict(channel.metadata),
         has_publish_time=channel.has_publish_time,
-        reason=reason,
         is_indexed=channel.is_indexed,
     )
 

@@ -25,12 +25,12 @@ from hybridlog_storage.disk import files
 
 Statement = tuple[str, tuple[object, ...]]
 """An SQL statement and its values."""
-_VERSION: Final = 2
+_VERSION: Final = 3
 _TABLE: Final = (
     "CREATE TABLE cells(kind TEXT, key TEXT, number INTEGER, body BLOB, crc INTEGER, "
     "PRIMARY KEY(kind, key, number)) WITHOUT ROWID"
 )
-_SELECT: Final = "SELECT kind, key, number, body, crc FROM cells WHERE kind = ? AND "
+_SELECT: Final = "SELECT kind, key, number, body, crc FROM cells WHERE kind = ? AND"
 _AMONG: Final = "key IN (SELECT value FROM json_each(?))"
 _ASIDE: Final = ("-journal", "-wal", "-shm")  # what SQLite would read or write, too
 _WAIT_S: Final = 0.1  # for other processes, once: then memory takes the place of the file
@@ -164,23 +164,26 @@ class Cells:
 
     # Cells.
 
-    def read(self, kind: str, key: str, number: int = 0) -> bytes | None:
-        """A cell; None if it is missing."""
-        found = self._found(f"{_SELECT} key = ? AND number = ?", kind, key, number)
-        return next(iter(found.values()), None)
+    def read(self, kind: str, key: str) -> bytes | None:
+        """The cell of a kind and key; None if it is missing."""
+        return next(iter(self.of(kind, key)), None)
+
+    def of(self, kind: str, key: str) -> list[bytes]:
+        """All cells of a kind and key."""
+        return [body for _, body in self._rows("key = ?", kind, key)]
 
     def each(self, kind: str, keys: Collection[str] | None = None) -> dict[str, bytes]:
         """Cells of a kind by key; all without keys."""
         if keys is None:
-            return self._found(f"{_SELECT} TRUE", kind)
-        return self._found(f"{_SELECT} {_AMONG}", kind, json.dumps([*keys]))
+            return dict(self._rows("TRUE", kind))
+        return dict(self._rows(_AMONG, kind, json.dumps([*keys])))
 
-    def _found(self, query: str, *values: object) -> dict[str, bytes]:
-        def work(opened: sqlite3.Connection) -> dict[str, bytes]:
-            rows = opened.execute(query, values).fetchall()
+    def _rows(self, condition: str, *values: object) -> list[tuple[str, bytes]]:
+        def work(opened: sqlite3.Connection) -> list[tuple[str, bytes]]:
+            rows = opened.execute(f"{_SELECT} {condition}", values).fetchall()
             if not all(_is_whole(*row) for row in rows):
                 raise sqlite3.DatabaseError("a cell is damaged")
-            return {row[1].decode(): row[3] for row in rows}
+            return [(row[1].decode(), row[3]) for row in rows]
 
         return self._run(work)
 

@@ -85,6 +85,8 @@ class Channel(Record, frozen=True):
         bytes: The same, of payloads.
         first: Log time of the first one, ns since the epoch, as `last`; None without messages.
         schema: SHA-256 of name, encoding and text of the definition; empty without one.
+        has_publish_time: False if the source has no publish times.
+        is_indexed: False if its messages get no documents in MongoDB.
     """
 
     topic: Topic
@@ -96,6 +98,8 @@ class Channel(Record, frozen=True):
     first: Nanoseconds | None = None
     last: Nanoseconds | None = None
     schema: Hash | Literal[""] = ""
+    has_publish_time: bool = True
+    is_indexed: bool = True
 
 
 class Part(Record, frozen=True, array_like=True):
@@ -105,6 +109,31 @@ class Part(Record, frozen=True, array_like=True):
     bytes: Count
     first: Nanoseconds | None = None
     last: Nanoseconds | None = None
+
+
+class Loss(Record, frozen=True):
+    """A row of the loss ledger.
+
+    Attributes:
+        cause: One word, such as `transport`.
+        topic: The topic; empty if unknown.
+        count: Messages that are missing; None if unknown.
+        first: Beginning of the loss, ns since the epoch, as its end, `last`; None if unknown.
+        reason: An explanation for people.
+        file: The damaged file; empty for messages that were never in one.
+        offset: Where in the file, bytes.
+        length: Bytes that are damaged there.
+    """
+
+    cause: Text
+    topic: Topic = ""
+    count: Count | None = None
+    first: Nanoseconds | None = None
+    last: Nanoseconds | None = None
+    reason: Text = ""
+    file: Text = ""
+    offset: Count | None = None
+    length: Count | None = None
 
 
 class File(Record, frozen=True):
@@ -119,7 +148,10 @@ class File(Record, frozen=True):
         written: When it was sealed, ns since the epoch.
         first: Log time of its first message, ns, as `last`; None without messages.
         parts: What it has of each channel.
-        has_losses: Whether it has rows of the loss ledger.
+        chunks: Number of its chunks.
+        attachments: Number of attachments of the source that it has.
+        metadata: The same of metadata records.
+        losses: Rows of the loss ledger that it has.
         gone: Why the file is no longer here; absent while it is.
         copy: Address of a store with a copy of a file that is gone.
     """
@@ -134,7 +166,10 @@ class File(Record, frozen=True):
     first: Nanoseconds | None = None
     last: Nanoseconds | None = None
     parts: dict[ChannelNumber, Part] = {}
-    has_losses: bool = False
+    chunks: Count = 0
+    attachments: Count = 0
+    metadata: Count = 0
+    losses: tuple[Loss, ...] = ()
     gone: Literal["expired", "elsewhere"] | UnsetType = UNSET
     copy: Text = ""
 
@@ -173,31 +208,6 @@ class Pin(Record, frozen=True):
     last: Nanoseconds | None = None
     topics: tuple[Topic, ...] | None = None
     reason: Text = ""
-
-
-class Loss(Record, frozen=True):
-    """A row of the loss ledger.
-
-    Attributes:
-        cause: One word, such as `transport`.
-        topic: The topic; empty if unknown.
-        count: Messages that are missing; None if unknown.
-        first: Beginning of the loss, ns since the epoch, as its end, `last`; None if unknown.
-        reason: An explanation for people.
-        file: The damaged file; empty for messages that were never in one.
-        offset: Where in the file, bytes.
-        length: Bytes that are damaged there.
-    """
-
-    cause: Text
-    topic: Topic = ""
-    count: Count | None = None
-    first: Nanoseconds | None = None
-    last: Nanoseconds | None = None
-    reason: Text = ""
-    file: Text = ""
-    offset: Count | None = None
-    length: Count | None = None
 
 
 class LetGo(Record, frozen=True):
@@ -292,11 +302,17 @@ class Manifest(Record, frozen=True):
         for ids in ([mark.id for mark in self.marks], [pin.id for pin in self.pins]):
             if len({*ids}) < len(ids):
                 raise ValueError("two marks or pins have one id")
-        timed: Iterable[Channel | File | Pin | Loss] = (
-            *self.channels.values(), *self.files, *self.pins, *self.losses
+        parts = [part for file in self.files for part in file.parts.values()]
+        if any(part.messages and part.first is None for part in parts):
+            raise ValueError("a file has messages without times")
+        timed: Iterable[Channel | File | Part | Loss] = (
+            *self.channels.values(), *self.files, *parts, *self.losses
         )  # fmt: skip
         spans = [(one.first, one.last) for one in timed]
+        if any((first is None) != (last is None) for first, last in spans):
+            raise ValueError("something begins and never ends, or the opposite")
         spans += [(mark.time, mark.end) for mark in self.marks]
+        spans += [(pin.first, pin.last) for pin in self.pins]
         if any(first is not None and last is not None and last < first for first, last in spans):
             raise ValueError("something ends before it begins")
         if not all(file.parts.keys() <= self.channels.keys() for file in self.files):
@@ -343,13 +359,6 @@ def free_name(text: str, taken: Collection[str]) -> str:
 def replace(part: _Part, **values: object) -> _Part:
     """A manifest, or a part of one, with other values."""
     return structs.replace(part, **values)
-
-
-def state_of(manifest: Manifest, files: str) -> str:
-    """A hash of a manifest but for what people say of the recording, and of its files' state."""
-    said = {"tags": {}, "notes": (), "marks": (), "uncounted_marks": 0, "pins": ()}
-    plain = replace(manifest, name="-", changes=0, **said)
-    return blake3(json.encode(plain) + files.encode()).hexdigest()
 
 
 def hasher(data: bytes = b"") -> blake3:
@@ -409,6 +418,10 @@ def rows_line(log: File, name: str, size: int, digest: str, parts: Mapping[int, 
         first=min(part.first for part in parts.values() if part.first is not None),
         last=max(part.last for part in parts.values() if part.last is not None),
         parts=dict(parts),
+        chunks=0,
+        attachments=0,
+        metadata=0,
+        losses=(),
         gone=UNSET,
         copy="",
     )

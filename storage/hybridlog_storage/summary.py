@@ -21,12 +21,14 @@ Int = Annotated[int, Meta(ge=-MAX_INT, le=MAX_INT)]
 class TopicType(NamedTuple):
     """A topic of a recording, and how its messages are encoded.
 
-    `encoding` is empty if all messages of the topic are lost; `schema`, a hash, without one.
+    `encoding` is empty if all messages of the topic are lost; `schema`, a hash, and `type`, its
+    name, without one.
     """
 
     topic: str
     encoding: str
     schema: str
+    type: str
 
 
 class RecordingSummary(NamedTuple):
@@ -40,7 +42,7 @@ class RecordingSummary(NamedTuple):
         has_lost_segments: Whether stored messages of it are missing.
         expired: Number of messages whose payloads were deleted to make room.
         not_copied: Number of messages whose payloads were not copied yet.
-        look: State of its directory and its manifest when its files were read.
+        look: State of its directory and its manifest then.
         indexed_by: The id of the index that is known to be complete for it; empty if none is.
     """
 

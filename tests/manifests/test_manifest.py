@@ -49,7 +49,7 @@ WHOLE = Manifest(
     pins=(Pin(MARK, 1, 2, ("/scan",), "incident"), Pin("00112233445566ab")),
     channels={0: Channel("/scan", "ros1", "a/Scan", {"callerid": "/n"}, 5, 6, 7, 8)},
     files=(
-        File(0, 0, "000000.mcap", "log", 9, DIGEST, 1, 7, 8, {0: Part(5, 6)}),
+        File(0, 0, "000000.mcap", "log", 9, DIGEST, 1, 7, 8, {0: Part(5, 6, 7, 8)}),
         File(1, 0, "000001.scan.mcap", "log", 9, DIGEST, 1, gone="elsewhere", copy="s3://lab/x"),
         File(1, 0, "000001.rows.parquet", "rows", 9, DIGEST, 1),
     ),

@@ -123,7 +123,7 @@ def test_a_segment_that_is_about_to_be_noted_is_no_problem(running: Running) -> 
         catalog, directory = reader.catalog, reader.directory
         catalog.remove(running.entry.id)
         assert not verify(reader.shared, {running.entry.id: "live"}).findings
-        put_entry(directory, catalog, running.entry.id, is_open=True)
+        put_entry(directory, catalog, running.entry.id)
 
 
 @pytest.mark.parametrize("is_file", [True, False])

@@ -41,7 +41,7 @@ def state(database: Database) -> IndexState:
 def recording(*topics: str) -> RecordingEntry:
     schema = Schema("x/msg/Y", "ros2msg", b"int8 x")
     channels = [
-        channel_entry(n, Channel(topic, "cdr", schema, {}), None) for n, topic in enumerate(topics)
+        channel_entry(n, Channel(topic, "cdr", schema, {})) for n, topic in enumerate(topics)
     ]
     channels[0].stats = ChannelStats(messages=2, first=5, last=9)
     return RecordingEntry(

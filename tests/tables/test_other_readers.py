@@ -308,7 +308,7 @@ def listed_by_command(store: Path) -> dict[str, Row]:
 
 
 def test_recordings_are_listed_beside_their_tables(recorded: hl.Store, tmp_path: Path) -> None:
-    """The list is right wherever it exists, and is made again when a store is closed."""
+    """The list is right wherever it exists, and is made again when a change has ended."""
     place = recorded.directory.path
     path = place / "tables/recordings.parquet"
     recorded.close()
@@ -335,9 +335,11 @@ def test_recordings_are_listed_beside_their_tables(recorded: hl.Store, tmp_path:
         lambda: answer("info", "--tables", "-t", "/a", store=place),
         lambda: answer("sql", "select count(*) from a", store=place),
     ):
+        before = path.read_bytes()
         path.unlink()
         work()
-        assert listed(place).keys() == {"first", "live"}
+        assert not path.exists()  # a question writes nothing
+        path.write_bytes(before)
     tags = (
         f"select distinct topic, tags['robot'] from '{place}/tables/test_State~*/*.parquet' "
         f"join '{path}' using (recording) where recordings.name = 'first' order by topic"

@@ -135,6 +135,7 @@ def _as_dict(store: Store, entry: RecordingEntry, *, with_videos: bool) -> dict[
     from hybridlog.query.answers.loss_words import coverage
     from hybridlog.query.periods import mean_rate
     from hybridlog.record.losses import losses_of
+    from hybridlog.schema.codecs import unindexed
     from hybridlog.schema.states import shown_channels
 
     attachments: list[StoredAttachment] = []
@@ -144,6 +145,7 @@ def _as_dict(store: Store, entry: RecordingEntry, *, with_videos: bool) -> dict[
     except SegmentError as error:
         output.note(f"{entry.name}: {error}")
     losses, videos = losses_of(entry), _videos(store, entry) if with_videos else {}
+    reasons = unindexed(store.session.definitions(entry))
     return {
         **recording_dict(summary_of(entry)),
         "chunks": entry.chunks,
@@ -169,7 +171,7 @@ def _as_dict(store: Store, entry: RecordingEntry, *, with_videos: bool) -> dict[
                 "unset_stamps": c.stats.unset if entry.is_decoded else None,
                 "unreadable": c.stats.unreadable if entry.is_decoded else None,
                 "surplus": c.stats.surplus if entry.is_decoded else None,
-                "not_indexed": c.unindexed,
+                "not_indexed": reasons.get(c.id),
                 "metadata": c.metadata,
                 "video": videos.get(c.topic),
             }

@@ -364,7 +364,7 @@ def _told(path: Path, report: RecordReport) -> int:
     if report.latched_left_out:
         left = output.counted(report.latched_left_out, "latched message")
         output.note(f"{path}: {left} from before the time range did not fit in memory.")
-    output.remarks((*remarks_on(entry), *report.remarks))
+    output.remarks((*remarks_on(report), *report.remarks))
     if report.damage:
         from hybridlog.query.answers.loss_words import coverage
         from hybridlog.record.losses import losses_of

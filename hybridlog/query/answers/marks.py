@@ -48,10 +48,8 @@ def mark_topics(session: Session, recordings: Collection[str] | None = None) -> 
         session: The open store.
         recordings: Ids; None for all.
     """
-    session.look(recordings)
-    types = session.type_names()
-    wanted = {digest for digest, name in types.items() if plain_type(name) in {MARK, EVENT}}
-    return session.snapshot().topics_with(wanted)
+    snapshot = session.look(recordings)
+    return snapshot.topics_with([n for n in snapshot.types if plain_type(n) in {MARK, EVENT}])
 
 
 def marks(session: Session, question: Question, counters: Counters | None = None) -> Iterator[Mark]:

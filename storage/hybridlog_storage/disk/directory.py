@@ -15,13 +15,12 @@ The id of a recording never changes. What people call it lies in its manifest.
 from __future__ import annotations
 
 import fcntl
-import hashlib
 import os
 import re
 import secrets
 import stat
 import time
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -56,7 +55,6 @@ LOCK: Final = WRITER_LOCK
 LOCK_WAIT_S: Final = 10.0
 """Seconds that a command waits for another one that holds its recording."""
 _OF_MANIFEST: Final = frozenset({MANIFEST_LOCK, MANIFEST_OLD, f".{MANIFEST_OLD}"})
-_BESIDE: Final = _OF_MANIFEST | {WRITER_LOCK}
 _TICK_NS: Final = 50_000_000
 _POLL_S = 0.02
 _RECORDER_WAIT_S = 0.5  # a reader's look at a lock must not pass for a recorder
@@ -82,18 +80,20 @@ class Listing:
         sealed: Names of sealed segments, by number; of those that are gone, of their first file of
             rows once `choosing` has told.
         open: Names of segments that were never sealed, by number.
-        rows: Sizes of files of rows, by name.
+        sizes: Bytes of sealed segments and files of rows; -1 of what is no ordinary file.
         look: As of `StoreDirectory.looks`, before the names were read.
-        print: A value that changes whenever a relevant file changes; of the manifest, see
-            `manifest.state_of`.
     """
 
     sealed: Mapping[int, str]
     open: Mapping[int, str]
     others: tuple[str, ...]
-    rows: Mapping[str, int]
+    sizes: Mapping[str, int]
     look: str
-    print: str
+
+    @property
+    def rows(self) -> dict[str, int]:
+        """Bytes of the files of rows, by name."""
+        return {name: size for name, size in self.sizes.items() if is_rows(name)}
 
     def choosing(self, manifest: Manifest | None) -> Listing:
         """The same as a manifest says; what it does not list, or says is gone, is among others."""
@@ -248,8 +248,7 @@ class StoreDirectory:
     def looks(self, ids: Sequence[str]) -> dict[str, str]:
         """The look of each recording, by id; those without a manifest are left out.
 
-        It changes whenever a file gets or loses its name, and when the manifest changes. A change
-        inside a segment shows only in `Listing.print`.
+        It changes whenever a file gets or loses its name, and when the manifest changes.
         """
         found: dict[str, str] = {}
         if not ids:
@@ -313,36 +312,21 @@ class StoreDirectory:
             raise unreadable(error, path) from error
         sealed: dict[int, str] = {}
         opened: dict[int, str] = {}
-        rows: dict[str, int] = {}
+        sizes: dict[str, int] = {}
         others = []
-        looks = hashlib.blake2b(digest_size=16)
         for name, about in sorted(found.items()):
             number, kind = _numbered(name)
             if kind == OPEN_SUFFIX:
                 opened[number] = name
-                looks.update(f"{name}\n".encode())
-            elif kind == SEALED_SUFFIX:
+                continue
+            if kind == SEALED_SUFFIX:
                 sealed[number] = name
-            elif is_rows(name):
-                rows[name] = about.st_size
-            elif name not in _OF_MANIFEST:
-                others.append(name)
-            if kind == SEALED_SUFFIX or name in rows:
-                looks.update(f"{name} {_file_look(about)}\n".encode())
-        return Listing(sealed, opened, tuple(others), rows, look, looks.hexdigest())
-
-    def whole(self, ids: Iterable[str]) -> Iterator[Manifest]:
-        """Manifests of those recordings, by id, all of whose files are there.
-
-        Nothing else is there to be read or mended. No log is opened.
-        """
-        for manifest in self.manifests.each(ids):
-            listed = {name: one.bytes for name, one in manifest.present.items()}
-            with suppress(OSError):  # copies of a store leave out what is empty
-                found = files.names(self.recording(manifest.id)).items()
-                there = {name: _size(about) for name, about in found if name not in _BESIDE}
-                if there == listed:
-                    yield manifest
+            elif not is_rows(name):
+                if name not in _OF_MANIFEST:
+                    others.append(name)
+                continue
+            sizes[name] = _size(about)
+        return Listing(sealed, opened, tuple(others), sizes, look)
 
     @contextmanager
     def retaining(self) -> Iterator[bool]:

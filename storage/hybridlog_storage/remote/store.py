@@ -19,7 +19,7 @@ import tempfile
 import threading
 import time
 import zlib
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, cast
@@ -27,7 +27,6 @@ from typing import Annotated, Any, ClassVar, Final, cast
 from msgspec import Meta, MsgspecError, json
 from msgspec.structs import replace
 
-from hybridlog_storage import manifest as truth
 from hybridlog_storage.cells import Cells, drop, put
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.copy_places import (
@@ -499,13 +498,9 @@ class RemoteDirectory(StoreDirectory):
             )
         sealed = {n: one.name for n, one in sorted(manifest.logs.items()) if one.is_here}
         sealed = {number: name for number, name in sealed.items() if name not in lost}
-        files = (one for own in manifest.rows.values() for one in own)
-        rows = {one.name: one.bytes for one in files if one.name not in lost}
-        return Listing(sealed, {}, (), rows, look, truth.state_of(manifest, repr(lost)))
-
-    def whole(self, ids: Iterable[str]) -> Iterator[Manifest]:
-        """As of a directory: all but those of which files were found to be missing."""
-        return (one for one in self.manifests.each(ids) if not self._lost(one.id))
+        here = manifest.present.items()
+        sizes = {name: one.bytes for name, one in here if name not in lost}
+        return Listing(sealed, {}, (), sizes, look)
 
     def listed_bytes(self) -> int:
         """Bytes of all files that manifests list, and of tables."""

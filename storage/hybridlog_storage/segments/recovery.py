@@ -116,6 +116,7 @@ class _Rest:
             segment.schemas[number] = Schema(one.name, one.encoding, bytes(one.data))
         segment.channels |= {n: (walk.schema_ids[n], one) for n, one in walk.channels.items()}
         segment.note_extras(walk.metadata, walk.attachments)
+        segment.losses += walk.losses
         segment.table = walk.table
         for chunk in walk.chunks:
             segment.note_index(chunk.offset, chunk.head, chunk.indexes)

@@ -27,7 +27,7 @@ from hybridlog_storage.disk import durability, files
 from hybridlog_storage.disk.append_file import AppendFile
 from hybridlog_storage.errors import HybridlogError, StoreError
 from hybridlog_storage.manifest import Channel as ListedChannel
-from hybridlog_storage.manifest import File, Part
+from hybridlog_storage.manifest import File, Loss, Part
 from hybridlog_storage.mcap.mcap_content import MAGIC, RECORD_HEAD, ChunkHead, chunk_head_of
 from hybridlog_storage.messages import EXPIRED_IDS, schema_hash
 from hybridlog_storage.segments.attachments import Attachment
@@ -37,6 +37,7 @@ from hybridlog_storage.segments.segment_format import (
     CHUNK_TABLE_OPCODE,
     FORMAT_VERSION,
     LOSSES_METADATA,
+    OUR_NAMES,
     RECORDING_METADATA,
     START,
     arrival_record,
@@ -44,6 +45,7 @@ from hybridlog_storage.segments.segment_format import (
     definitions_chunk,
     index_offsets,
     json_metadata,
+    losses_in,
     metadata_record,
     record_bytes,
     schema_record,
@@ -76,12 +78,14 @@ class Sealed(NamedTuple):
         table: ChunkTable,
         channels: Mapping[int, Channel],
         *,
-        has_losses: bool,
+        extras: tuple[int, int],
+        losses: Iterable[Loss],
     ) -> Sealed:
         """A segment as a manifest lists it.
 
         `place` is its number, and that of the first segment of its group; `content` is its bytes,
-        and their digest.
+        and their digest; `extras` are the numbers of its attachments and metadata records of the
+        source; `losses` are its rows of the loss ledger.
         """
         (number, group), (size, digest) = place, content
         spans = table.chunks[["first", "last"]]
@@ -96,7 +100,9 @@ class Sealed(NamedTuple):
             int(spans["first"].min()) if len(spans) else None,
             int(spans["last"].max()) if len(spans) else None,
             listed_parts(table),
-            has_losses=has_losses,
+            len(table.chunks),
+            *extras,
+            tuple(losses),
         )
         known = {n: _listed(one) for n, one in sorted(channels.items()) if n < EXPIRED_IDS}
         return cls(file, known)
@@ -132,7 +138,15 @@ def listed_parts(table: ChunkTable) -> dict[int, Part]:
 def _listed(channel: Channel) -> ListedChannel:
     schema = channel.schema
     kind, digest = ("", "") if schema is None else (schema.name, schema_hash(schema))
-    return ListedChannel(channel.topic, channel.message_encoding, kind, schema=digest)
+    return ListedChannel(
+        channel.topic,
+        channel.message_encoding,
+        kind,
+        dict(channel.metadata),
+        schema=digest,
+        has_publish_time=channel.has_publish_time,
+        is_indexed=channel.is_indexed,
+    )
 
 
 class SegmentFile:
@@ -152,6 +166,8 @@ class SegmentFile:
         self.channels: dict[int, tuple[int, Channel]] = {}
         self.table = TableBuilder()
         """The chunk table of the file."""
+        self.losses: list[Loss] = []
+        """Rows of the loss ledger in the file."""
         self._file = file
         self._chunk_indexes = bytearray()  # as records: a long segment has many
         self._attachment_indexes: list[AttachmentIndex] = []
@@ -233,6 +249,8 @@ class SegmentFile:
         self._append([data])
         index = MetadataIndex(offset=offset, length=len(data), name=record.name)
         self._metadata_indexes.append(index)
+        if record.name == LOSSES_METADATA:
+            self.losses += losses_in(record)
 
     def add_attachment(self, attachment: Attachment) -> None:
         """Append an attachment, piece by piece."""
@@ -347,7 +365,11 @@ class SegmentFile:
             (self.position, digest),
             self.table.build(),
             channels,
-            has_losses=any(one.name == LOSSES_METADATA for one in self._metadata_indexes),
+            extras=(
+                len(self._attachment_indexes),
+                sum(not one.name.startswith(OUR_NAMES) for one in self._metadata_indexes),
+            ),
+            losses=self.losses,
         )
 
     def trim(self) -> None:

@@ -427,7 +427,7 @@ def test_reduced_json_has_summaries(where: str, holds: bool) -> None:
     zero = np.zeros(1, np.int64)
     batch = Batch(payload, zero, zero + len(payload), zero, zero, zero, zero)
     entry = RecordingEntry("0", "a", {}, {}, 0, "complete")
-    recorded = RecordedChannel(entry, 0, left_channel(channel, REDUCED), ChannelStats(), None)
+    recorded = RecordedChannel(entry, 0, left_channel(channel, REDUCED), ChannelStats())
     part = Part(entry, "/r", (recorded,), None, "log", None, parse(where))
     found = matches(part, recorded, batch, zero)
     assert found.holds.tolist() == [holds]
