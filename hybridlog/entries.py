@@ -87,22 +87,6 @@ def recording_metadata(entry: RecordingEntry) -> dict[str, object]:
     }
 
 
-@dataclass(frozen=True, slots=True)
-class Misfit:
-    """A file of a recording that differs from the manifest.
-
-    Attributes:
-        segment: Number in the file's name.
-        file: Its name; empty for one that is missing.
-        is_unlisted: Whether it is a whole segment of this recording that the manifest lacks.
-    """
-
-    segment: int
-    file: str
-    reason: str
-    is_unlisted: bool = False
-
-
 @dataclass(slots=True)
 class Inventory:
     """Content of a recording's directory, compared with its manifest.
@@ -111,7 +95,9 @@ class Inventory:
         id: Id of the recording, which is the name of its directory.
         listing: Names of its files; of several segments of one number, the listed one.
         summaries: Summaries of valid segments, by number.
-        misfits: Files that differ from the manifest.
+        problems: What is wrong with files that differ from the manifest, by their names; of a
+            segment that is missing, by `segment` and its number.
+        unlisted: Numbers of valid segments that the manifest lacks.
     """
 
     id: str
@@ -119,7 +105,8 @@ class Inventory:
     listing: Listing
     manifest: Manifest | None
     summaries: dict[int, SegmentSummary] = field(default_factory=dict)
-    misfits: list[Misfit] = field(default_factory=list)
+    problems: dict[str, str] = field(default_factory=dict)
+    unlisted: list[int] = field(default_factory=list)
 
     @property
     def name(self) -> str:
@@ -169,16 +156,15 @@ def inventory_of(
         try:
             summary = read_summary(path / name, number)
         except SegmentError as error:
-            found.misfits.append(Misfit(number, name, str(error)))
+            found.problems[name] = str(error)
             continue
         if not is_of(summary, recording, listed.get(number), channels, number):
             others.add(str(summary.recording.get("id")))
-            found.misfits.append(Misfit(number, name, ANOTHER))
+            found.problems[name] = ANOTHER
             continue
         found.summaries[number] = summary
         if manifest is not None and number not in listed:
-            reason = "the manifest does not list it"
-            found.misfits.append(Misfit(number, name, reason, is_unlisted=True))
+            found.unlisted.append(number)
     if manifest is None and others and not found.summaries:
         raise StoreError(
             f"{path} has files of {', '.join(sorted(others))}: give the folder this name again, "
@@ -189,15 +175,11 @@ def inventory_of(
         own: Sequence[File] = rows.get(number, ())
         if not file.is_here and number in found.summaries and not listing.has_all(own):
             del found.summaries[number]
-            found.misfits += [
-                Misfit(number, row.name, f"{row.name} {problem}")
-                for row in own
-                if (problem := _problem(listing.rows.get(row.name), row.bytes))
-            ]
+            problems = {row.name: _problem(listing.rows.get(row.name), row.bytes) for row in own}
+            found.problems |= {name: f"{name} {why}" for name, why in problems.items() if why}
         elif number not in {*found.summaries, *listing.open, *listing.sealed}:
-            name = file.name if file.is_here else own[0].name
-            found.misfits.append(Misfit(number, "" if file.is_here else name, f"{name} is missing"))
-    found.misfits.sort(key=lambda misfit: misfit.segment)
+            name, place = own[0].name if not file.is_here else file.name, f"segment {number}"
+            found.problems[place if file.is_here else name] = f"{name} is missing"
     return found
 
 
@@ -211,7 +193,7 @@ def steady_inventory(directory: StoreDirectory, recording: str) -> Inventory:
 
     def look(listing: Listing, manifest: Manifest | None) -> tuple[Inventory, bool]:
         found = inventory_of(directory, recording, listing, manifest)
-        return found, not found.misfits
+        return found, not (found.problems or found.unlisted)
 
     return _steadily(directory, recording, look)
 
@@ -647,7 +629,7 @@ def ended(
 
 def unlisted(inventory: Inventory) -> Callable[[Manifest], Manifest]:
     """The change that lists valid segments which the manifest lacks, and what they need."""
-    return _listing_of(inventory, [one.segment for one in inventory.misfits if one.is_unlisted])
+    return _listing_of(inventory, inventory.unlisted)
 
 
 def made_again(inventory: Inventory, old: Manifest | None) -> Manifest:

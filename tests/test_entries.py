@@ -205,7 +205,7 @@ def check(entry: RecordingEntry, *missing: int) -> None:
 
 def test_a_whole_recording(made: Made) -> None:
     inventory = made.inventory()
-    assert (inventory.id, inventory.misfits) == (made.id, [])
+    assert (inventory.id, inventory.problems) == (made.id, {})
     entry = made.entry()
     check(entry)
     # What is noted within a segment is in the ledger.
@@ -274,12 +274,9 @@ HARMS: dict[str, Callable[[Made, int], object]] = {
 def test_a_file_that_is_not_the_one_listed(made: Made, harm: str, number: int) -> None:
     HARMS[harm](made, number)
     inventory = made.inventory()
-    (misfit,) = inventory.misfits
-    assert (misfit.segment, misfit.file) == (
-        number,
-        "" if harm == "missing" else f"{number:06d}.mcap",
-    )
-    assert ("another file than the one listed" in misfit.reason) == (harm == "another")
+    ((place, problem),) = inventory.problems.items()
+    assert place == (f"segment {number}" if harm == "missing" else f"{number:06d}.mcap")
+    assert ("another file than the one listed" in problem) == (harm == "another")
     if harm != "another":
         check(made.entry(), number)
     check(made.entry(0, 1, 2, 3), number)
@@ -287,9 +284,8 @@ def test_a_file_that_is_not_the_one_listed(made: Made, harm: str, number: int) -
 
 def test_one_that_lies_there_twice_under_a_number_of_its_own(made: Made) -> None:
     shutil.copy(made.segments[1], made.path / "000007.mcap")
-    (misfit,) = made.inventory().misfits
-    assert (misfit.segment, misfit.file) == (7, "000007.mcap")
-    assert not misfit.is_unlisted
+    inventory = made.inventory()
+    assert (inventory.problems.keys(), inventory.unlisted) == ({"000007.mcap"}, [])
     # Nothing is counted twice, and nothing is lost.
     check(made.entry())
 
@@ -317,7 +313,7 @@ def test_a_manifest_that_was_made_again_is_told(made: Made) -> None:
     places.write_in(made.path, made_again(inventory, None))
     inventory = made.inventory()
     assert made.manifest().logs.keys() == {0, 1, 2, 3}
-    assert inventory.misfits == []
+    assert inventory.problems == {}
     assert plain(made.entry()) == unproven(before)
     # From here on it is watched over again.
     made.segments[3].unlink()
@@ -371,12 +367,11 @@ def test_a_segment_that_the_manifest_does_not_list(made: Made) -> None:
     before = made.entry()
     made.drop(1)
     inventory = made.inventory()
-    (misfit,) = inventory.misfits
-    assert (misfit.segment, misfit.is_unlisted) == (1, True)
+    assert (inventory.problems, inventory.unlisted) == ({}, [1])
     # It answers, and is listed by the next one that may write.
     assert plain(made.entry()) == plain(before)
     made.change(unlisted(inventory))
-    assert made.inventory().misfits == []
+    assert made.inventory().unlisted == []
     assert plain(made.entry()) == plain(before)
 
 
@@ -393,7 +388,7 @@ def test_what_a_crash_took_of_a_listed_segment(made: Made) -> None:
     made.change(lambda now: with_rows(now, other, ()))
     losses = tuple(lost_in_crash(made.manifest(), sealed))
     made.change(lambda now: changed(listed(sealed)(now), losses=losses, status="damaged"))
-    assert made.inventory().misfits == []
+    assert made.inventory().unlisted == []
     entry = made.entry()
     assert entry.status == "damaged"
     assert kept(entry) == by_topic(0, 1, 2, 3)

@@ -45,7 +45,7 @@ from hybridlog_storage.mongo.collection_names import collection_of
 from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.segments.gone_log import open_log
 from hybridlog_storage.segments.recovery import damage_of, rebuild_summary
-from hybridlog_storage.segments.segment_file import is_rows
+from hybridlog_storage.segments.segment_file import SEALED_SUFFIX, is_rows
 from hybridlog_storage.segments.segment_reader import SegmentReader
 from hybridlog_storage.settings import EMBEDDED, is_uri, read_settings, write_settings
 
@@ -244,12 +244,13 @@ class _Check:
             )
 
     def _files(self, inventory: Inventory, left: list[str], *, is_held: bool) -> None:
-        for misfit in inventory.misfits:
-            if misfit.file in self._told and not misfit.is_unlisted:
-                continue
-            place = misfit.file or f"segment {misfit.segment}"
-            cure = _REPAIR if misfit.file else _RESTORE_LOST
-            self.found(place, misfit.reason, RESTORE if is_rows(misfit.file) else cure)
+        for place, problem in inventory.problems.items():
+            if place not in self._told:
+                cure = _REPAIR if place.endswith(SEALED_SUFFIX) else _RESTORE_LOST
+                self.found(place, problem, RESTORE if is_rows(place) else cure)
+        for number in inventory.unlisted:
+            name = inventory.listing.sealed[number]
+            self.found(name, "the manifest does not list it", _REPAIR)
         for name in inventory.listing.open.values():
             if not is_held:
                 self.found(name, "a crash has left it open", _REPAIR)
@@ -260,8 +261,7 @@ class _Check:
 
     def _check_rows(self, inventory: Inventory) -> None:
         """Check every byte of the files of rows."""
-        told = {misfit.file for misfit in inventory.misfits}
-        for file in (file for file in inventory.rows if file.name not in told):
+        for file in (file for file in inventory.rows if file.name not in inventory.problems):
             try:
                 rows_file.RowsFile(self._path, file).check()
                 continue

@@ -75,7 +75,7 @@ def listed(name: str) -> File:
         len(content),
         blake3(content).hexdigest(),
         1,
-        parts={0: Part(10, 20)},
+        parts={0: Part(10, 20, 1, 2)},
     )
 
 

@@ -266,8 +266,6 @@ def test_lost_objects(here: Path, address: str, tmp_path: Path, how: str) -> Non
     with hl.open(address) as store:
         assert store.topic("/scan").count() == whole + 20
         lose(address, "000001.mcap", run, how)
-        with pytest.raises(StoreError, match="missing or was changed"):
-            list(store.topic("/scan"))  # it has begun to answer
         assert 20 < sum(1 for _ in store.topic("/scan")) < whole + 20
         assert store.topic("/scan").completeness().has_losses
     files.mounted.clear()
