@@ -11,6 +11,7 @@ from collections.abc import (
     Mapping,
     Sequence,
 )
+from contextlib import suppress
 from itertools import accumulate
 from typing import TYPE_CHECKING, Protocol, TypeVar
 
@@ -354,12 +355,11 @@ class Session:
             found = schemas_in(self.directory, recording)
             known |= found
             self.catalog.put_schemas(found.values())
-        for digest in wanted.keys() - known.keys():
-            if any(c.schema == digest and c.stats.messages for c in recording.channels):
-                raise StoreError(
-                    f"Definitions of recording {recording.name!r} cannot be read at the moment. "
-                    "Ask again."
-                )
+        missing = wanted.keys() - known.keys()
+        if any(c.schema in missing and c.stats.messages for c in recording.channels):
+            for number in recording.logs:
+                with suppress(ChangedError):  # it is noted as lost, and who asks for chunks hears
+                    self.chunk_table(recording, number)
         return {
             c.id: Channel(
                 c.topic,
