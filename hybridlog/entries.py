@@ -10,11 +10,10 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeVar
 
-from msgspec import UNSET, ValidationError, convert, structs, to_builtins
+from msgspec import UNSET, Struct, ValidationError, convert, field, structs, to_builtins
 
 from hybridlog.record.losses import Cause, extent_of, joined, topics_of
 from hybridlog.schema.states import State, expired_messages
@@ -87,8 +86,7 @@ def recording_metadata(entry: RecordingEntry) -> dict[str, object]:
     }
 
 
-@dataclass(slots=True)
-class Inventory:
+class Inventory(Struct):
     """Content of a recording's directory, compared with its manifest.
 
     Attributes:

@@ -563,7 +563,7 @@ def public(thing: type) -> dict[str, Any]:
     classes = [c for c in reversed(thing.__mro__) if c.__module__.startswith("hybridlog")]
     found = {n: v for c in classes for n, v in vars(c).items() if not n.startswith("_")}
     found.update(
-        {n: None for n in getattr(thing, "__dataclass_fields__", {}) if not n.startswith("_")}
+        {n: None for n in getattr(thing, "__struct_fields__", ()) if not n.startswith("_")}
     )
     return found
 

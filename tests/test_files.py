@@ -5,10 +5,10 @@ from __future__ import annotations
 import random
 import shutil
 import struct
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 import hybridlog as hl
 from hybridlog_storage.messages import Channel, Schema

@@ -15,7 +15,7 @@ import re
 import struct
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field
 from itertools import count, cycle
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -35,6 +35,7 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 from mcap.writer import CompressionType
+from msgspec.structs import replace
 from rosbags.interfaces import ConnectionExtRosbag1
 from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -805,7 +806,7 @@ def compare(entry: RecordingEntry, known: Recording) -> None:
 def mended(store: hl.Store) -> set[str]:
     """What the opening of a store had to put right, by the names of `RepairReport`."""
     repairs = store.repairs
-    return {of.name for of in fields(repairs) if getattr(repairs, of.name)}
+    return {name for name in repairs.__struct_fields__ if getattr(repairs, name)}
 
 
 def can_crash(known: Recording) -> bool:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import dataclasses
 import gc
 import tracemalloc
 from collections import defaultdict
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec.structs import asdict
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
@@ -33,7 +34,7 @@ pytestmark = pytest.mark.mongo
 SECOND = 10**9
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Decoded:
     """A message as `rosbags` decodes it."""
 
@@ -116,9 +117,9 @@ def test_each_chunk_is_read_once(store: hl.Store, robot: Truth, topic: str) -> N
     assert counters.messages == len(robot[topic])
     assert counters.payload_bytes == sum(len(m.raw) for m in robot[topic])
     # The same again counts anew, not on top.
-    before = dataclasses.asdict(counters) | {"elapsed_s": 0}
+    before = asdict(counters) | {"elapsed_s": 0}
     list(query)
-    assert dataclasses.asdict(query.counters) | {"elapsed_s": 0} == before
+    assert asdict(query.counters) | {"elapsed_s": 0} == before
     backwards = query.reverse()
     assert [m.raw for m in backwards] == [m.raw for m in reversed(robot[topic])]
     assert backwards.counters.chunks_read == counters.chunks_read

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import pyarrow as pa
+from msgspec.structs import replace
 
 from hybridlog.across.topic_reader import TIME, Beside, Block, Empty, nanoseconds
 from hybridlog.frames.names import free_name, is_summary

@@ -9,10 +9,10 @@ import os
 from array import array
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeAlias, overload
 
 import numpy as np
+from msgspec.structs import replace
 
 from hybridlog.across.topic_reader import TopicReader
 from hybridlog.message import messages_in

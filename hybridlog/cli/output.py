@@ -10,8 +10,10 @@ import threading
 import time
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from dataclasses import asdict, is_dataclass
 from typing import Final, Self, TextIO
+
+from msgspec import Struct
+from msgspec.structs import asdict
 
 from hybridlog import wording
 from hybridlog_storage.stopping import safe_point
@@ -102,7 +104,7 @@ def print_json(value: object, *, at_once: bool = False) -> None:
 
 
 def _plain(value: object) -> object:
-    if is_dataclass(value) and not isinstance(value, type):
+    if isinstance(value, Struct):
         return asdict(value)
     return str(value)
 

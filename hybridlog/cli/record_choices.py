@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, cast
 
 import click
+from msgspec.structs import asdict
 
 from hybridlog.cli import output
 from hybridlog.cli.binder import (

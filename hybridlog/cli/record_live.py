@@ -9,9 +9,10 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
-from dataclasses import asdict, replace
 from functools import partial
 from typing import TYPE_CHECKING, Final
+
+from msgspec.structs import asdict, replace
 
 from hybridlog.cli import output
 from hybridlog.cli.app import DIFFERENT

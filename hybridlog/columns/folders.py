@@ -15,13 +15,13 @@ import re
 from bisect import bisect_right
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
 from itertools import chain, count
 from pathlib import Path
 from stat import S_ISDIR
 from typing import Any, Final
 
 import pyarrow as pa
+from msgspec import Struct, field
 
 from hybridlog.columns.column_file import ColumnFile, ColumnFileWriter
 from hybridlog.columns.layout import SHARED, SUFFIX, TABLES, Section, parts_folder
@@ -40,8 +40,7 @@ _Piece = tuple[Section, Any]
 """Rows of a topic of a recording, and what they are."""
 
 
-@dataclass(slots=True)
-class Addition:
+class Addition(Struct):
     """Rows of one recording for a folder: pieces of a shared file, and files of long topics."""
 
     pieces: list[_Piece] = field(default_factory=list)

@@ -17,12 +17,12 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
+from msgspec import Struct
 
 from hybridlog.schema.states import encoding_of
 from hybridlog_storage.errors import StoreError
@@ -121,8 +121,7 @@ def column_names(
         yield name, column
 
 
-@dataclass(frozen=True, slots=True)
-class Section:
+class Section(Struct, frozen=True):
     """Rows of one topic of one recording in a file; `begin` is of the recording, ns.
 
     `segments` has the digest of each segment with rows in it, by its number as text. So many rows
@@ -143,8 +142,7 @@ class Section:
         return self.arrays == self.rows
 
 
-@dataclass(frozen=True, slots=True)
-class About:
+class About(Struct, frozen=True):
     """The description of a file of columns, in the file."""
 
     sections: Sequence[Section]

@@ -9,7 +9,6 @@ stream. It has the columns of fields, `error`, and of `ref` size, SHA-256 and su
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 from hashlib import sha256
 from typing import TYPE_CHECKING, Any, Final
@@ -17,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import pyarrow as pa
 from bson.int64 import Int64
+from msgspec.structs import replace
 
 from hybridlog.columns.fields import (
     SUMMARY_FIELDS,

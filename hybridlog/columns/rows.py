@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from msgspec import Struct, field
 
 from hybridlog.columns.fields import without
 from hybridlog.schema.codec import no_rows, stamp_array
@@ -26,8 +26,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.segments.chunk import Placed
 
 
-@dataclass(slots=True)
-class Piece:
+class Piece(Struct):
     """Rows of a topic in some segments; so many are `unreadable`, and have `arrays` in full.
 
     Attributes:

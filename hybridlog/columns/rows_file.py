@@ -7,12 +7,12 @@ behind the message. Unlike a table it is never made again.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from hashlib import sha256
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import pyarrow as pa
+from msgspec import Struct, field
 
 from hybridlog.columns.column_file import ColumnFile, ColumnFileWriter
 from hybridlog.columns.fields import FieldShape
@@ -113,8 +113,7 @@ def line_of(folder: Path, log: File, name: str) -> File:
     return rows_line(log, name, file.size_bytes, file.digest(), parts)
 
 
-@dataclass(slots=True)
-class _OpenFile:
+class _OpenFile(Struct):
     """A file that is being written; `tables` wait for a row group."""
 
     topic: str

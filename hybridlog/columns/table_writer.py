@@ -15,11 +15,11 @@ import shutil
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import pyarrow as pa
+from msgspec.structs import replace
 
 from hybridlog.columns.clouds import PointColumns, is_cloud
 from hybridlog.columns.column_file import ColumnFileWriter

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from itertools import chain
 from typing import TYPE_CHECKING, Any, Final
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from msgspec import Struct
 
 from hybridlog.columns.column_file import FIRST
 from hybridlog.columns.fields import joined, names_of, records_of
@@ -33,8 +33,7 @@ if TYPE_CHECKING:
 _MAX_TYPES: Final = 64  # sets of fields whose types are kept for a table
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TableRows:
+class TableRows(Struct, frozen=True, eq=False):
     """Some messages of a topic, in order.
 
     Attributes:

@@ -6,10 +6,11 @@ import difflib
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
+
+from msgspec import Struct, field
 
 from hybridlog.formats.yaml_values import YamlError, parse_yaml, read_yaml
 from hybridlog.query.periods import GAP_PERIODS
@@ -28,8 +29,7 @@ MAX_RULES: Final = 1000
 _REGULAR_FROM: Final = 10  # messages from which a rate is a rule
 
 
-@dataclass(frozen=True, slots=True)
-class TopicRules:
+class TopicRules(Struct, frozen=True):
     """Rules for a topic; None is no rule.
 
     Attributes:
@@ -65,8 +65,7 @@ class TopicRules:
     optional: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Contract:
+class Contract(Struct, frozen=True):
     """Rules that a good recording keeps.
 
     Attributes:
@@ -121,7 +120,7 @@ class _Reader:
         if topics[topic] is None:
             return TopicRules()
         rules = self._mapping(topics, topic)
-        self._check_keys(rules, [one.name for one in fields(TopicRules)])
+        self._check_keys(rules, [*TopicRules.__struct_fields__])
         values: dict[str, Any] = {}
         for key in map(str, rules):
             if key in {"offset", "share"}:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
+
+from msgspec import Struct
 
 from hybridlog.contract.judge import broken, judge
 from hybridlog.query.times import format_duration
@@ -29,8 +30,7 @@ _ENDS: Final = ("late_start", "early_stop")
 _STATISTICS: Final = ("count", "nan", "infinite", "min", "max", "mean", "std")
 
 
-@dataclass(frozen=True, slots=True)
-class Difference:
+class Difference(Struct, frozen=True):
     """Something that differs.
 
     Attributes:

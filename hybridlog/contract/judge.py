@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree as ET
 
 import numpy as np
+from msgspec import Struct
 
 from hybridlog.across.match import match
 from hybridlog.arrays.message_arrays import plain_type
@@ -31,8 +31,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.summary import RecordingSummary
 
 
-@dataclass(frozen=True, slots=True)
-class Result:
+class Result(Struct, frozen=True):
     """One rule of a contract on one recording.
 
     Attributes:

@@ -6,11 +6,11 @@ import io
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from itertools import groupby
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from msgspec import Struct
 
 from hybridlog.drawing.series import Series, numbers_of, series
 from hybridlog.query.query import field_types, narrowed, spans_of
@@ -157,8 +157,7 @@ _GREATEST: Final = 1e300
 _MAX_NAMES = 8  # names in a message
 
 
-@dataclass(frozen=True)
-class Line:
+class Line(Struct, frozen=True):
     """A field of a topic in a recording, which starts at a time in ns."""
 
     topic: str

@@ -7,10 +7,10 @@ import struct
 import warnings
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
+from msgspec import Struct
 
 from hybridlog.arrays.message_arrays import COMPRESSED_IMAGES, IMAGES, depth_picture
 from hybridlog.drawing.pixels import pixels, png
@@ -22,8 +22,7 @@ if TYPE_CHECKING:
     from hybridlog.message import Message
 
 
-@dataclass(frozen=True)
-class Picture:
+class Picture(Struct, frozen=True):
     """An image as the content of a file, with a suffix (`.png`) and a type (`image/png`)."""
 
     media_type: str

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
+
+from msgspec import Struct
 
 from hybridlog_storage.errors import HybridlogError, TimeError, UsageError
 
@@ -20,8 +21,7 @@ MAX_TEXT: Final = 4000
 _MAX_NAME: Final = 200
 
 
-@dataclass(frozen=True, slots=True)
-class Kind:
+class Kind(Struct, frozen=True):
     """Fields of a message type that a log line shows: text, and name of the sender; empty for none.
 
     `levels` are the least numbers in the field `level` for each of `LEVELS`; empty for none.

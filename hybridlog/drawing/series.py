@@ -5,13 +5,13 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from msgspec import Struct
 
 from hybridlog.frames.names import FIELD, is_summary
 from hybridlog.query.answers.infer_fields import infer_fields
@@ -39,8 +39,7 @@ _MAX_NAMES = 8  # names of fields in a message
 _EXTREMES = (np.fmin, np.fmax)
 
 
-@dataclass(frozen=True)
-class Series:
+class Series(Struct, frozen=True):
     """One field over time. Entries are in order of time; NaN means no line there.
 
     A time without messages longer than `GAP_PERIODS` usual periods has one entry of NaN in its
@@ -174,8 +173,7 @@ def _no_number(text: str, kind: str) -> str:
     return f"{text} is an array of {element}: name a number in one element, such as {text}[0].x."
 
 
-@dataclass(frozen=True, slots=True)
-class Wanted:
+class Wanted(Struct, frozen=True):
     """A field as it was asked for.
 
     Attributes:

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
+from msgspec import Struct
 
 from hybridlog.query.answers.interval_queries import IntervalQueries
 from hybridlog.query.periods import GAP_PERIODS, usual_period
@@ -35,8 +35,7 @@ _SAMPLED: Final = 100_000  # steps that tell the usual one
 _LATEST: Final = np.iinfo(np.int64).max
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Lane:
+class Lane(Struct, frozen=True, eq=False):
     """Log times, ns, of a topic's messages in a recording, sorted; estimates if not `exact`."""
 
     times: NDArray[np.int64]

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
+from msgspec import Struct
 
 from hybridlog.drawing.series import ShownRows, Wanted, log_times, over_time
 from hybridlog.query.query import field_types, tables_of
@@ -29,8 +29,7 @@ _STATUS: Final = "status.status"
 _POSITIONS_PER_PIXEL = 6  # positions of a pixel at most
 
 
-@dataclass(frozen=True, slots=True)
-class Grid:
+class Grid(Struct, frozen=True):
     """A local metric grid: east and north of an origin (degrees), on the ellipsoid of WGS 84.
 
     Lengths are right near the origin; 100 km away from it, they are wrong by a few percent.
@@ -75,8 +74,7 @@ Track: TypeAlias = "dict[str, Any]"
 """
 
 
-@dataclass(frozen=True, slots=True)
-class Position:
+class Position(Struct, frozen=True):
     """Place of the position in the messages of a topic.
 
     Attributes:

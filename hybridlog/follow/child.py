@@ -9,9 +9,10 @@ import threading
 import time
 from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+from msgspec import Struct
 
 from hybridlog.entries import put_entry
 from hybridlog.query.predicate.parser import parse
@@ -236,8 +237,7 @@ def _started(control: Connection[Any, Any]) -> subprocess.Popen[bytes]:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class Trigger:
+class Trigger(Struct, frozen=True):
     """A condition on messages of topics; without a predicate any of them fires it."""
 
     text: str

@@ -11,8 +11,9 @@ import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
+
+from msgspec import Struct, field
 
 from hybridlog.columns.recording_logs import RecordingRows
 from hybridlog.entries import put_entry
@@ -54,8 +55,7 @@ _GROUP_ROWS: Final = 1 << 17  # messages that are decoded together
 _RETRY_S: Final = 2.0  # between attempts after the database has failed
 
 
-@dataclass(slots=True)
-class _Segment:
+class _Segment(Struct):
     """A segment in work.
 
     Attributes:

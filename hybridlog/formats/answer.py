@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeAlias
+
+from msgspec import Struct, field
 
 from hybridlog.formats.writing import Whole
 from hybridlog_storage.errors import HybridlogError, SegmentError
@@ -22,8 +23,7 @@ Line: TypeAlias = "str | Iterator[str]"
 """A line of JSON, or its pieces."""
 
 
-@dataclass(kw_only=True)
-class Answer:
+class Answer(Struct, kw_only=True):
     """An answer in the forms that formats take; a format pulls one of them, once.
 
     Attributes:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Final
+
+from msgspec import Struct
 
 from hybridlog.formats import LOGS, LogFormat, spool
 from hybridlog.formats.reading import Damage, cannot_open, size_of
@@ -37,8 +38,7 @@ def sniff(path: Path) -> tuple[LogFormat, bool]:
     return found, is_packed
 
 
-@dataclass(frozen=True, slots=True)
-class LogFile:
+class LogFile(Struct, frozen=True):
     """A file of a log.
 
     Attributes:

@@ -6,10 +6,11 @@ import os
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
 from pathlib import Path
 from stat import S_ISREG
 from typing import NamedTuple
+
+from msgspec import Struct, field
 
 from hybridlog.formats import LOGS
 from hybridlog.formats.detect import UNKNOWN, LogFile, grouped_parts, sniff
@@ -27,8 +28,7 @@ _BAG_INDEX = b"index_pos="
 _BAG_HEAD = 8192  # bytes; the header record of a bag has 4 KiB
 
 
-@dataclass(slots=True)
-class Found:
+class Found(Struct):
     """Logs by path, stores (which are not searched), and what is unreadable below a directory."""
 
     logs: list[LogSet] = field(default_factory=list)

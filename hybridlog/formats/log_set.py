@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 from contextlib import nullcontext, suppress
-from dataclasses import dataclass, replace
 from stat import S_ISDIR, S_ISREG
 from typing import TYPE_CHECKING
 
 import numpy as np
 import zstandard
+from msgspec import Struct
+from msgspec.structs import replace
 
 from hybridlog.formats.detect import (
     UNKNOWN,
@@ -42,8 +43,7 @@ def open_source(path: Path) -> Source:
     return LogSet.at(path).open()
 
 
-@dataclass(frozen=True, slots=True)
-class LogSet:
+class LogSet(Struct, frozen=True):
     """The files of one log.
 
     Attributes:

@@ -8,11 +8,12 @@ file of which nothing can be read raises `SourceError`, when the source is opene
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
 from hashlib import blake2b
 from typing import TYPE_CHECKING, NamedTuple, Self
 
 import numpy as np
+from msgspec import Struct
+from msgspec.structs import force_setattr, replace
 
 from hybridlog_storage.errors import SourceError
 from hybridlog_storage.messages import MAX_CHANNELS, joined
@@ -48,8 +49,7 @@ TOO_MANY_SILENT = f"channels without messages are left out; a recording can have
 _TOO_MUCH = 1 << 63  # limit of BSON integers and of file sizes
 
 
-@dataclass(frozen=True, slots=True)
-class Damage:
+class Damage(Struct, frozen=True):
     """One place of a file that could not be read.
 
     Attributes:
@@ -74,7 +74,7 @@ class Damage:
         for name in ("offset", "length", "messages_lost"):
             value = getattr(self, name)
             if value is not None and not 0 <= value < _TOO_MUCH:
-                object.__setattr__(self, name, None)
+                force_setattr(self, name, None)
 
 
 class Source(ABC):

@@ -7,8 +7,10 @@ import pickle
 import threading
 from collections.abc import Iterator, Sequence
 from copy import copy
-from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from hybridlog.attachments import extras_of
 from hybridlog.formats import OUTPUTS
@@ -24,8 +26,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.messages import Batch, Channel
 
 
-@dataclass(frozen=True, slots=True)
-class Front:
+class Front(Struct, frozen=True):
     """Latched messages from before the time range, and whether these keep their log time."""
 
     latched: bool = True

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
+
+from msgspec import Struct
 
 from hybridlog_storage.mongo.collection_names import collection_of
 from hybridlog_storage.mongo.index_state import IndexState
@@ -23,8 +24,7 @@ if TYPE_CHECKING:
 _SEND_BYTES: Final = 8 << 20  # documents that are sent together, at most
 
 
-@dataclass(frozen=True, slots=True)
-class IndexTarget:
+class IndexTarget(Struct, frozen=True):
     """The database for the index documents of a recording.
 
     Attributes:

@@ -9,8 +9,9 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 from hybridlog.query.topics import TopicMatcher, matcher
 from hybridlog_storage.errors import UsageError
@@ -26,8 +27,7 @@ WHOLE_BELOW: Final = {"low": 0.5, "normal": 0.7, "high": 0.9}
 """Shares of the budget above which large messages of a priority keep their fields only."""
 
 
-@dataclass(frozen=True, slots=True)
-class Rule:
+class Rule(Struct, frozen=True):
     """A setting for the topics that match a pattern: a rate in Hz, or a share of the budget."""
 
     pattern: str

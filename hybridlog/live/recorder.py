@@ -13,10 +13,12 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
 from functools import partial
 from operator import attrgetter
 from typing import TYPE_CHECKING
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from hybridlog.entries import put_entry
 from hybridlog.entries import text as as_text
@@ -74,8 +76,7 @@ _SETTLED_S = 3.0  # after the first topic, when others may have come
 _SLOW_WRITE_S = 2.0  # to pack and write a chunk, on a disk that is busy
 
 
-@dataclass(frozen=True, slots=True)
-class RecorderOptions(LiveOptions):
+class RecorderOptions(LiveOptions, frozen=True):
     """Options of a recorder, and of its recording; the first rule that fits a topic applies.
 
     It stops after `max_bytes` of payloads, or when less than `reserve_bytes` are free. After
@@ -107,8 +108,7 @@ class RecorderOptions(LiveOptions):
             raise UsageError("--before cannot be longer than --ring")
 
 
-@dataclass(slots=True)
-class _RecordedChannel:
+class _RecordedChannel(Struct):
     """A channel, with its policies and counters."""
 
     channel: Channel

@@ -12,12 +12,12 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
 from operator import index as index_of
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
+from msgspec import Struct, field
 
 from hybridlog.live.memory import MIN_USER_BUDGET, default_budget
 from hybridlog.live.policy import SMALL_BYTES
@@ -53,8 +53,7 @@ LIVE_SETTINGS = SegmentSettings(segment_size=1 << 30, segment_span_s=600.0)
 """Live segments are short, since what is not sealed is read anew by each command."""
 
 
-@dataclass(frozen=True, slots=True)
-class LiveOptions:
+class LiveOptions(Struct, frozen=True):
     """Options of a live recording.
 
     Attributes:
@@ -92,8 +91,7 @@ class _Message(NamedTuple):
     payload: Buffer
 
 
-@dataclass(slots=True)
-class _Taken:
+class _Taken(Struct):
     """What was taken of a channel: log times in ns."""
 
     index: int

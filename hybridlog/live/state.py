@@ -10,13 +10,14 @@ import time
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
 from operator import attrgetter
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
+from msgspec import Struct, field
+from msgspec.structs import asdict
 
 from hybridlog.record.losses import Cause
 from hybridlog_storage.disk import files
@@ -32,8 +33,7 @@ _SUFFIX: Final = ".json"
 _MAX_BYTES: Final = 1 << 26
 
 
-@dataclass(frozen=True, slots=True)
-class RecorderState:
+class RecorderState(Struct, frozen=True):
     """State of a recorder at one time; `docs/live.md` says what each field is."""
 
     name: str
@@ -185,8 +185,7 @@ _RATES = 60  # so many past rates give the expected rate
 _NS = 1e9
 
 
-@dataclass(slots=True)
-class Tally:
+class Tally(Struct):
     """Counters of one channel; one thread at a time updates them. Times in ns."""
 
     messages: int = 0
@@ -208,8 +207,7 @@ class Tally:
         self.payload_bytes += size
 
 
-@dataclass(frozen=True, slots=True)
-class TopicState:
+class TopicState(Struct, frozen=True):
     """Statistics of a topic at one time."""
 
     topic: str
@@ -225,8 +223,7 @@ class TopicState:
     lost: int
 
 
-@dataclass(slots=True)
-class TopicCounts:
+class TopicCounts(Struct):
     """Counts of messages of a topic that were received and lost."""
 
     topic: str

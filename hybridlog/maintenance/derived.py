@@ -7,9 +7,10 @@ import tempfile
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
+
+from msgspec import Struct
 
 from hybridlog.columns.layout import SHARED, SUFFIX, TABLES, topics_of, type_prefix
 from hybridlog.entries import put_entry, schemas_in
@@ -46,8 +47,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.summary import RecordingSummary
 
 
-@dataclass(frozen=True, slots=True)
-class StoreIndex:
+class StoreIndex(Struct, frozen=True):
     """The index of a store. All methods raise `DatabaseError` if MongoDB fails."""
 
     directory: StoreDirectory

@@ -14,9 +14,11 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from hybridlog.maintenance.expiry import expire, let_go, may_go
 from hybridlog.maintenance.retention import (
@@ -58,8 +60,7 @@ _SPARE_SHARE: Final = 64  # of the quota, at most
 _LEAST_SPARE: Final = 1 << 16
 
 
-@dataclass(slots=True)
-class KeepReport:
+class KeepReport(Struct):
     """The result of a pass.
 
     Attributes:

@@ -7,10 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from contextlib import suppress
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from msgspec import to_builtins
+from msgspec import Struct, field, to_builtins
 
 from hybridlog.entries import (
     NO_MANIFEST,
@@ -48,8 +47,7 @@ def open_catalog(directory: StoreDirectory) -> Catalog:
     )
 
 
-@dataclass(slots=True)
-class StoreFiles:
+class StoreFiles(Struct):
     """The recordings of a store, compared with their files."""
 
     directory: StoreDirectory

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
+
+from msgspec import Struct, field
 
 if TYPE_CHECKING:
     from hybridlog_storage.segments.recovery import Recovered
@@ -20,8 +21,7 @@ def reporter(
     return lambda done: None if progress is None else progress(name, before + done, total)
 
 
-@dataclass(frozen=True, slots=True)
-class Repaired:
+class Repaired(Struct, frozen=True):
     """A repair.
 
     Attributes:
@@ -35,8 +35,7 @@ class Repaired:
     done: str
 
 
-@dataclass(slots=True)
-class RepairReport:
+class RepairReport(Struct):
     """Repairs of a store; recordings by name.
 
     Attributes:
@@ -54,8 +53,7 @@ class RepairReport:
     damage: list[str] = field(default_factory=list)
 
 
-@dataclass(slots=True)
-class ArraysOfTopic:
+class ArraysOfTopic(Struct):
     """The result of `Index.arrays` for a topic.
 
     Attributes:

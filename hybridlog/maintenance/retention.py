@@ -9,8 +9,10 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from hybridlog.maintenance.expiry import may_go
 from hybridlog.query.choice import Choice
@@ -35,8 +37,7 @@ _LEAST_BARE: Final = 1 << 16  # bytes that a size without a unit has; less is me
 _KEYS: Final = ("quota", "min-free", "max-age", "topic", "never-tag", "fields-age")
 
 
-@dataclass(frozen=True, slots=True)
-class TopicRule:
+class TopicRule(Struct, frozen=True):
     """Age at which payloads of some topics go; `pattern` and `age` are as the user wrote them."""
 
     pattern: str
@@ -45,8 +46,7 @@ class TopicRule:
     age: str
 
 
-@dataclass(frozen=True, slots=True)
-class Rules:
+class Rules(Struct, frozen=True):
     """Rules of retention; None for no bound.
 
     Attributes:
@@ -152,8 +152,7 @@ def _age_ns(value: object) -> int:
         raise UsageError(f"{value!r} is no age: write 12h, 30d or 2y") from error
 
 
-@dataclass(frozen=True, slots=True)
-class Held:
+class Held(Struct, frozen=True):
     """A log of a recording, or what is left of it.
 
     Attributes:
@@ -257,8 +256,7 @@ def _touches(pin: Pin, topic: str, part: Part) -> bool:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class Step:
+class Step(Struct, frozen=True):
     """A deletion; without segments and groups, that of the whole recording, with its fields.
 
     Attributes:
@@ -280,8 +278,7 @@ class Step:
     groups: tuple[int, ...] = ()
 
 
-@dataclass(slots=True)
-class Plan:
+class Plan(Struct):
     """Deletions, in their order.
 
     Attributes:

@@ -11,10 +11,10 @@ import os
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
+from msgspec import Struct
 
 from hybridlog.columns.layout import type_prefix
 from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD
@@ -32,8 +32,7 @@ _Key = TypeVar("_Key")
 _SUMMED = ("messages", "payload_bytes", "segment_bytes", "column_bytes", "table_bytes")
 
 
-@dataclass(frozen=True, slots=True)
-class Size:
+class Size(Struct, frozen=True):
     """Bytes on the disk.
 
     Attributes:
@@ -63,8 +62,7 @@ class Size:
         return self.segment_bytes + self.column_bytes + self.table_bytes + (self.index_bytes or 0)
 
 
-@dataclass(frozen=True, slots=True)
-class Sizes:
+class Sizes(Struct, frozen=True):
     """Sizes of recordings.
 
     Attributes:

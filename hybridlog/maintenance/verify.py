@@ -9,11 +9,10 @@ import secrets
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
 from shlex import quote
 from typing import TYPE_CHECKING
 
-from msgspec import structs
+from msgspec import Struct, field, structs
 
 from hybridlog.columns import rows_file
 from hybridlog.columns.recording_logs import RecordingRows
@@ -67,8 +66,7 @@ _RESTORE_LOST = f"{RESTORE}; `hybridlog info --losses` lists the lost messages"
 _KNOWN = frozenset({LOCK})
 
 
-@dataclass(frozen=True, slots=True)
-class Finding:
+class Finding(Struct, frozen=True):
     """A problem found by `verify`.
 
     Attributes:
@@ -84,8 +82,7 @@ class Finding:
     cure: str
 
 
-@dataclass(slots=True)
-class Verification:
+class Verification(Struct):
     """The result of `verify`.
 
     Attributes:

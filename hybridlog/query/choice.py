@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
+
+from msgspec import Struct
 
 from hybridlog_storage.errors import TimeError, UsageError
 
@@ -19,8 +20,7 @@ During: TypeAlias = "tuple[TimeLike | None, TimeLike | None] | None"
 """Begin and end of a range of log time; None leaves a side open."""
 
 
-@dataclass(frozen=True, slots=True)
-class Choice:
+class Choice(Struct, frozen=True):
     """Conditions for recordings; all of them must hold, and one of the names must match.
 
     Attributes:

@@ -12,11 +12,11 @@ import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from msgspec import Struct, field
 
 from hybridlog.query.predicate.tree import is_meta
 from hybridlog.query.question import Counters
@@ -48,8 +48,7 @@ ChunkKey = tuple[str, int, int]
 """Recording id, segment number, chunk number in the segment."""
 
 
-@dataclass(frozen=True, slots=True)
-class RecordingScan:
+class RecordingScan(Struct, frozen=True):
     """The part of one recording to read.
 
     Attributes:
@@ -66,8 +65,7 @@ class RecordingScan:
     windows: NDArray[np.int64] | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class ChunkTask:
+class ChunkTask(Struct, frozen=True):
     """A chunk to read, and the messages wanted from it."""
 
     scan: RecordingScan
@@ -79,8 +77,7 @@ class ChunkTask:
         return self.scan.recording.id, self.chunk.segment, self.chunk.number
 
 
-@dataclass(frozen=True, slots=True)
-class MessageRun:
+class MessageRun(Struct, frozen=True):
     """Messages in order.
 
     Attributes:
@@ -97,8 +94,7 @@ class MessageRun:
         return MessageRun(self.batch.take(rows), self.seq[rows], self.channels)
 
 
-@dataclass(slots=True)
-class ScanPlan:
+class ScanPlan(Struct):
     """Everything to read, in order.
 
     Attributes:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import struct
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
+from msgspec.structs import replace
 
 from hybridlog.index.access import again_if_lost
 from hybridlog.query.predicate.mongo_filter import misjudged

@@ -8,10 +8,10 @@ on access.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from msgspec import Struct
 
 from hybridlog.query.times import DurationLike, format_duration, format_time, parse_duration
 from hybridlog.schema.column import ranges
@@ -39,8 +39,7 @@ def _no_rows() -> NDArray[np.int64]:
     return np.empty((0, 3), np.int64)
 
 
-@dataclass(frozen=True, slots=True)
-class Interval:
+class Interval(Struct, frozen=True):
     """A span of log time of one recording.
 
     Attributes:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import reduce
 from typing import TYPE_CHECKING
 
 import numpy as np
+from msgspec.structs import replace
 
 from hybridlog.query.answers.interval_queries import IntervalQueries
 from hybridlog.query.answers.marks import mark_topics

@@ -15,10 +15,10 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
+from msgspec.structs import asdict, replace
 
 from hybridlog.query.choice import Choice
 from hybridlog.query.planner import Planner

@@ -5,11 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from msgspec import Struct
+from msgspec.structs import asdict, replace
 
 from hybridlog.query.times import TimeLike
 from hybridlog.schema.states import State, encoding_of, state_of
@@ -31,8 +32,7 @@ Span = tuple[int, int]
 """`[begin, end)`, nanoseconds."""
 
 
-@dataclass(frozen=True, slots=True)
-class Question:
+class Question(Struct, frozen=True):
     """The content of a question. Immutable, hashable and picklable.
 
     Attributes:
@@ -84,8 +84,7 @@ class Question:
         return replace(self, during=common.merged())
 
 
-@dataclass(frozen=True)
-class RecordedChannel:
+class RecordedChannel(Struct, frozen=True, dict=True):
     """One channel of one recording."""
 
     recording: RecordingEntry
@@ -120,8 +119,7 @@ class RecordedChannel:
         return state_of(self.channel.message_encoding)
 
 
-@dataclass(frozen=True, eq=False)
-class Part:
+class Part(Struct, frozen=True, eq=False, dict=True):
     """The part of a question for one topic of one recording.
 
     Attributes:
@@ -213,8 +211,7 @@ class Part:
         return span_of(min(firsts), max(lasts)) if firsts else None
 
 
-@dataclass(slots=True)
-class Counters:
+class Counters(Struct):
     """The cost of an answer, and what is missing from it.
 
     Attributes:
@@ -265,8 +262,8 @@ class Counters:
 
     def reset(self) -> None:
         """Set every counter to zero."""
-        for each in fields(self):
-            setattr(self, each.name, each.default)
+        for name, value in asdict(Counters()).items():
+            setattr(self, name, value)
 
     def copy(self) -> Counters:
         """The same counts."""
@@ -274,10 +271,9 @@ class Counters:
 
     def add(self, other: Counters) -> None:
         """Add the counts of a part of the answer; the wall time is unchanged."""
-        for each in fields(self):
-            if each.name != "elapsed_s":
-                total = getattr(self, each.name) + getattr(other, each.name)
-                setattr(self, each.name, total)
+        for name in self.__struct_fields__:
+            if name != "elapsed_s":
+                setattr(self, name, getattr(self, name) + getattr(other, name))
 
     def add_chunk(self, chunk: StoredChunk) -> None:
         """Count a chunk that was read."""

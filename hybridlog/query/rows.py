@@ -10,12 +10,12 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
 from itertools import pairwise
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
+from msgspec.structs import replace
 
 from hybridlog.query.chunk_scan import ChunkKey, ChunkScan, RecordingScan, ScanPlan
 from hybridlog.query.predicate.tree import is_meta

@@ -10,10 +10,10 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 from msgspec import convert
+from msgspec.structs import replace
 
 from hybridlog.entries import (
     ended,

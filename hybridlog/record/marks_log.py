@@ -7,12 +7,12 @@ which are derived from files, never have them.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
 from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+from msgspec.structs import replace
 
 from hybridlog.record.marks import MARKS, MARKS_SEGMENT, mark_channel, mark_payload
 from hybridlog_storage.catalog import channel_entry, channel_totals

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from msgspec import Struct, field
 
 from hybridlog.entries import text
 from hybridlog.query.latching import LatchedFront
@@ -51,8 +51,7 @@ _FOLLOW_S = 0.5  # between two looks of the follower
 _MAX_PARTS = 1000  # of a log, whose fingerprints the recording has
 
 
-@dataclass(frozen=True, slots=True)
-class RecordOptions:
+class RecordOptions(Struct, frozen=True):
     """Options of a recording.
 
     Attributes:
@@ -78,8 +77,7 @@ class RecordOptions:
     no_index: TopicMatcher | None = None
 
 
-@dataclass(slots=True)
-class RecordReport:
+class RecordReport(Struct):
     """The result of a recording.
 
     Attributes:

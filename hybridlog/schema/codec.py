@@ -7,10 +7,10 @@ documents are made from its result, in one way for all encodings.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
+from msgspec import Struct
 
 from hybridlog.schema.column import STAMP, Records
 from hybridlog_storage.errors import DefinitionError, PayloadError
@@ -44,8 +44,7 @@ def no_messages() -> Batch:
     return payload_alone(b"").take(no_rows())
 
 
-@dataclass(slots=True)
-class Unreadable:
+class Unreadable(Struct):
     """Payloads that cannot be read, all for the same reason.
 
     Attributes:
@@ -57,8 +56,7 @@ class Unreadable:
     reason: str
 
 
-@dataclass(slots=True)
-class Decoded:
+class Decoded(Struct):
     """Some messages as columns, or as objects where no definition fixes their layout.
 
     Attributes:

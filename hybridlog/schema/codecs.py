@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, cast
+
+from msgspec.structs import replace
 
 from hybridlog.schema.codec import Codec, ObjectCodec, OpaqueCodec
 from hybridlog.schema.completion import has_hidden_fields

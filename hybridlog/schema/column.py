@@ -6,10 +6,10 @@ pandas frames are made from them. No row of a column is a Python object.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, TypeVar
 
 import numpy as np
+from msgspec import Struct
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-@dataclass(slots=True)
-class Scalars:
+class Scalars(Struct):
     """Numbers, booleans or times.
 
     Attributes:
@@ -35,8 +34,7 @@ class Scalars:
         return len(self.values)
 
 
-@dataclass(slots=True)
-class Strings:
+class Strings(Struct):
     """Strings as unchanged bytes (UTF-8 is not checked here), without terminating NUL.
 
     Attributes:
@@ -52,8 +50,7 @@ class Strings:
         return len(self.offset) - 1
 
 
-@dataclass(slots=True)
-class Arrays:
+class Arrays(Struct):
     """Arrays and sequences: row i holds elements `offset[i]:offset[i + 1]` of `values`.
 
     Attributes:
@@ -71,8 +68,7 @@ class Arrays:
         return len(self.offset) - 1
 
 
-@dataclass(slots=True)
-class Records:
+class Records(Struct):
     """Nested messages, and the top level itself; columns are in the order of the definition."""
 
     fields: dict[str, Column]

@@ -13,11 +13,13 @@ best is chosen, the newest of equal ones.
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from itertools import accumulate
 from operator import itemgetter
 from typing import TYPE_CHECKING
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from hybridlog.schema.definition import (
     MessageType,
@@ -48,8 +50,7 @@ _DEFAULTS = {"ros1msg": 1, "ros2msg": 2}
 _ENCODINGS = {"", "ros1msg", "ros2msg", "ros2idl", "omgidl"}
 
 
-@dataclass(frozen=True, slots=True)
-class _Candidate:
+class _Candidate(Struct, frozen=True):
     """A definition of one release.
 
     Attributes:

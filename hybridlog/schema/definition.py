@@ -6,11 +6,11 @@ are limited before types are built, and nothing in it is executed.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
+from msgspec import Struct
 
 from hybridlog.schema.definition_idl import IdlTypes, parse_idl
 from hybridlog.schema.definition_text import (
@@ -47,8 +47,7 @@ MAX_FIXED_BYTES = 1 << 40
 """Largest minimum size of a message in bytes; nested fixed arrays multiply."""
 
 
-@dataclass(frozen=True, slots=True)
-class Primitive:
+class Primitive(Struct, frozen=True):
     """A number or a boolean; `code` is its kind and size in bytes, such as `u1`.
 
     Those of `byte` and `char` differ between ROS 1 and ROS 2.
@@ -68,15 +67,13 @@ class Primitive:
         return np.dtype(self.code)
 
 
-@dataclass(frozen=True, slots=True)
-class Text:
+class Text(Struct, frozen=True):
     """A string of at most `bound` characters, None without a bound."""
 
     bound: int | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Instant:
+class Instant(Struct, frozen=True):
     """A time or a duration: 32 bits of seconds, then 32 bits of nanoseconds.
 
     Seconds are signed except for the time of ROS 1, nanoseconds only for the duration of ROS 1.
@@ -87,8 +84,7 @@ class Instant:
     signed_nanoseconds: bool
 
 
-@dataclass(frozen=True, slots=True)
-class ArrayOf:
+class ArrayOf(Struct, frozen=True):
     """An array of `width` elements, a number not on the wire; or a sequence, `bound` unchecked."""
 
     element: FieldType
@@ -96,8 +92,7 @@ class ArrayOf:
     bound: int | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class MessageType:
+class MessageType(Struct, frozen=True):
     """A message: its name in the definition, and its fields in wire order."""
 
     name: str
@@ -107,8 +102,7 @@ class MessageType:
 FieldType: TypeAlias = Primitive | Text | Instant | ArrayOf | MessageType
 
 
-@dataclass(frozen=True, slots=True)
-class FieldPath:
+class FieldPath(Struct, frozen=True):
     """A field for predicates.
 
     Attributes:
@@ -227,8 +221,7 @@ def standard_text(name: str, ros: int) -> str | None:
     return text.split("=" * 80, maxsplit=1)[0]
 
 
-@dataclass(frozen=True, slots=True)
-class _Extent:
+class _Extent(Struct, frozen=True):
     """Size of an unfolded type: levels, fields, characters of their paths, least bytes."""
 
     depth: int

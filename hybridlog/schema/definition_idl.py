@@ -10,7 +10,9 @@ The parser of rosbags is not used: it does not know enums, and fails on deep nes
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field, replace
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from hybridlog.schema.definition_text import RawField, canonical
 from hybridlog.schema.kinds import INTEGERS
@@ -50,8 +52,7 @@ _PRIMITIVES = frozenset(_WORDS.values())
 _ENUM = "uint32"
 
 
-@dataclass(slots=True)
-class IdlTypes:
+class IdlTypes(Struct):
     """Declarations of all IDL texts of one definition, by scoped name with slashes."""
 
     structs: dict[str, list[RawField]] = field(default_factory=dict)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from msgspec import Struct
 
 from hybridlog.schema.column import Scalars
 from hybridlog.schema.text import nearest
@@ -20,8 +20,7 @@ if TYPE_CHECKING:
 _LONG = 4096  # elements of rows that are summed one by one, as of images and clouds
 
 
-@dataclass(slots=True)
-class Summary:
+class Summary(Struct):
     """Summaries of the rows of an array column.
 
     Attributes:

@@ -7,10 +7,10 @@ and all other rows are read.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+from msgspec import Struct, field
 
 from hybridlog.schema.codec import Decoded, Unreadable, no_rows
 from hybridlog.schema.column import Records, concatenate, take
@@ -43,8 +43,7 @@ _OTHER_ENCAPSULATIONS = {
 }
 
 
-@dataclass(slots=True)
-class _Odd:
+class _Odd(Struct):
     """Rows to remark: unreadable ones by reason, and those with bytes left over."""
 
     bad: dict[str, list[NDArray[np.intp]]] = field(default_factory=dict)

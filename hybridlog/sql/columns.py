@@ -9,12 +9,12 @@ Durations are nanoseconds. Fields without a common exact type are JSON text.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from msgspec import Struct
 
 from hybridlog.columns.fields import LIMIT, filled, has_summaries, original_name
 from hybridlog.columns.layout import OWN_COLUMNS, POINTS, column_names
@@ -59,8 +59,7 @@ Key = tuple[Path, bool]
 """The path of a field of messages; True for the summary of an array."""
 
 
-@dataclass(frozen=True, slots=True)
-class ViewColumn:
+class ViewColumn(Struct, frozen=True):
     """A column of a view, or a field inside one.
 
     Attributes:

@@ -11,9 +11,10 @@ import json
 import re
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator
-from dataclasses import dataclass
 from operator import eq
 from typing import Any, Final
+
+from msgspec import Struct
 
 from hybridlog.columns.layout import column_names
 from hybridlog_storage.mongo.collection_names import collection_of
@@ -152,8 +153,7 @@ def _below(schema: Any, path: str) -> list[str]:
 # Parts of columns.
 
 
-@dataclass(frozen=True, slots=True)
-class Usage:
+class Usage(Struct, frozen=True):
     """Paths named in a query, from wherever each begins: view, column or field."""
 
     chains: frozenset[Path] | None = None

@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
 from functools import reduce
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from msgspec import Struct, field
 from pyarrow import acero
 
 from hybridlog.columns.clouds import NEEDED, PointColumns, is_cloud
@@ -291,8 +291,7 @@ class Asked:
         return reduce(np.logical_or, found, np.zeros(rows, np.bool_))
 
 
-@dataclass(slots=True)
-class Reading:
+class Reading(Struct):
     """One execution of a query: what it reads, what it may lack, and the first error in that.
 
     Attributes:

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from msgspec import Struct
 
 from hybridlog.arrays.message_arrays import plain_type
 from hybridlog.frames.answer import flat, stream
@@ -41,8 +41,7 @@ _LEAST_STAMPS: Final = 100  # of a topic that alone has stamps
 _ROOM: Final = 49 * 10**17  # ns beyond all stamps, those of 2106 too; for all epochs together
 
 
-@dataclass(frozen=True, slots=True)
-class Epochs:
+class Epochs(Struct, frozen=True):
     """The epochs of a recording.
 
     Attributes:

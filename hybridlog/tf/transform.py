@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from msgspec import Struct
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -16,8 +16,7 @@ _NEARLY_PARALLEL = 1 - 1e-12
 """Cosine of half an angle that counts as the largest; nearer rotations are mixed as at it."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Transform:
+class Transform(Struct, frozen=True, eq=False):
     """Takes points from the source frame to the target frame; NaN where none is known.
 
     Attributes:

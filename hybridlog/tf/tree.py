@@ -10,10 +10,10 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from msgspec import Struct, field
 
 from hybridlog.query.times import format_time, parse_duration, parse_time, units_of
 from hybridlog.tf.transform import Transform, identity, interpolated, unknown
@@ -34,8 +34,7 @@ _S: Final = 1e9
 _BLOCK: Final = 1 << 13  # times looked up together, so that they stay in the processor's cache
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Frame:
+class Frame(Struct, frozen=True, eq=False):
     """A frame, and its transforms to its parent.
 
     Attributes:
@@ -124,8 +123,7 @@ class Frame:
             yield f"after the last transform of {self.name}, {end}", late
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Lookup(Transform):
+class Lookup(Transform, frozen=True, eq=False):
     """Transforms at many times; NaN where there is none.
 
     Attributes:
@@ -154,8 +152,7 @@ class Lookup(Transform):
         )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FrameTree:
+class FrameTree(Struct, frozen=True, eq=False):
     """The frames of a recording.
 
     Attributes:

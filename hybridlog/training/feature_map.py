@@ -21,6 +21,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NoReturn
 
+from msgspec import Struct
+
 from hybridlog.arrays.message_arrays import IMAGES, plain_type
 from hybridlog.formats.yaml_values import YamlError, parse_yaml, read_yaml
 from hybridlog.query.query import narrowed
@@ -54,8 +56,7 @@ class Source:
     paths: tuple[str, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class FeatureMap:
+class FeatureMap(Struct, frozen=True):
     """Features of a training set.
 
     Attributes:

@@ -6,11 +6,11 @@ import json
 import shutil
 from collections.abc import Mapping
 from contextlib import closing
-from dataclasses import dataclass
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
+from msgspec import Struct
 
 from hybridlog.arrays.video import pyav
 from hybridlog.query.query import Query
@@ -42,8 +42,7 @@ _ABOUT: Final = "episode.json"
 _VECTORS: Final = "vectors.npz"
 
 
-@dataclass(frozen=True, slots=True)
-class LerobotOptions:
+class LerobotOptions(Struct, frozen=True):
     """Options of a training set.
 
     Attributes:
@@ -69,8 +68,7 @@ class LerobotOptions:
             raise UsageError("Say what the robot does: --task TEXT or --task-topic TOPIC.")
 
 
-@dataclass(slots=True)
-class WrittenEpisode:
+class WrittenEpisode(Struct):
     """An episode that was written.
 
     Attributes:

@@ -13,9 +13,9 @@ import traceback
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from copy import copy
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeAlias
 
+from msgspec import Struct
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 from starlette.routing import Route
@@ -213,8 +213,7 @@ def broken_response(_: Request, error: Exception) -> Response:
     return json_response({"error": "hybridlog failed; its terminal has the details."}, 500)
 
 
-@dataclass(frozen=True, slots=True)
-class Current:
+class Current(Struct, frozen=True):
     """The message that is current at a time: the last one not after it; None if there is none.
 
     Attributes:

@@ -11,9 +11,10 @@ import errno
 import secrets
 import socket
 from collections.abc import Collection
-from dataclasses import dataclass
 from typing import Final
 from urllib.parse import SplitResult, urlsplit
+
+from msgspec import Struct
 
 from hybridlog_storage.errors import UsageError
 
@@ -22,8 +23,7 @@ _OWN_HOSTS: Final = ("127.0.0.1", "localhost", "::1")
 _FOXGLOVE: Final = ".foxglove.dev"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Admission:
+class Admission(Struct, frozen=True, kw_only=True):
     """The rules of a server about host, origin and token.
 
     Attributes:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
+
+from msgspec import Struct
 
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.tokens import MAX_TEXT
@@ -28,8 +29,7 @@ _EVERY_TOPIC: Final = "**"
 _NO_NAME: Final = re.compile(r"[^\w.+-]+")
 
 
-@dataclass(frozen=True, slots=True)
-class PageQuestion:
+class PageQuestion(Struct, frozen=True):
     """A question about one recording.
 
     Attributes:

@@ -11,11 +11,12 @@ import json
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
+from msgspec import Struct, field
 from msgspec.json import Decoder, encode
+from msgspec.structs import replace
 
 from hybridlog_storage.cache import Cache
 from hybridlog_storage.cells import Cells, Statement, drop, put
@@ -58,8 +59,7 @@ _COUNTS: Final = (
 )  # fmt: skip
 
 
-@dataclass(slots=True)
-class ChannelStats:
+class ChannelStats(Struct):
     """Statistics of the messages of one channel, in a chunk or in a recording.
 
     Times are nanoseconds; `first` and `last` are both inclusive; None without messages
@@ -97,8 +97,7 @@ class ChannelStats:
             setattr(self, name, _greatest(getattr(self, name), getattr(other, name)))
 
 
-@dataclass(slots=True, repr=False)
-class ChannelEntry:
+class ChannelEntry(Struct):
     """One channel of a recording."""
 
     id: Int
@@ -116,8 +115,7 @@ class ChannelEntry:
         return f"<Channel {self.topic} {self.type}; {self.stats.messages} messages>"
 
 
-@dataclass(slots=True, repr=False)
-class RecordingEntry:
+class RecordingEntry(Struct):
     """One recording.
 
     Attributes:

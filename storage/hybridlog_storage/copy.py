@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import time
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
+
+from msgspec import Struct, field
 
 from hybridlog_storage.copy_places import RefusedError, Sending
 from hybridlog_storage.errors import RecordingExistsError, StoreError
@@ -30,8 +31,7 @@ Prepared = tuple[Manifest, "Source"]
 """A manifest to send, and the store that has the files which are in no other one."""
 
 
-@dataclass(frozen=True, slots=True)
-class How:
+class How(Struct, frozen=True):
     """The way in which recordings are copied.
 
     Attributes:
@@ -54,8 +54,7 @@ class How:
     proved: Callable[[Collection[int]], None] | None = None
 
 
-@dataclass(slots=True)
-class Copied:
+class Copied(Struct):
     """A recording after it was copied.
 
     Attributes:

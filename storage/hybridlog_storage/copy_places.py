@@ -13,9 +13,10 @@ import stat
 import tempfile
 from abc import ABC, abstractmethod
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Final
+
+from msgspec import Struct
 
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.disk.directory import (
@@ -43,8 +44,7 @@ class RefusedError(StoreError):
     """A recording that is not copied; others are."""
 
 
-@dataclass(frozen=True, slots=True)
-class Sending:
+class Sending(Struct, frozen=True):
     """A file that is sent.
 
     Attributes:

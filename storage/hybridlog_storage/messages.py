@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from itertools import accumulate
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from hybridlog_storage.ordering import distinct
 
@@ -56,8 +57,7 @@ REPLACED = "hybridlog.definition.replaced"
 """Metadata of such a channel: what the source has in place of a definition, if anything."""
 
 
-@dataclass(frozen=True, slots=True)
-class Schema:
+class Schema(Struct, frozen=True):
     """A message definition, unchanged from its source.
 
     Attributes:
@@ -81,8 +81,7 @@ def schema_hash(schema: Schema) -> str:
     return digest.hexdigest()
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Channel:
+class Channel(Struct, frozen=True, eq=False):
     """One stream of messages of one type on one topic.
 
     A topic may have several channels (several ROS 1 connections, a type that changes).
@@ -125,8 +124,7 @@ def with_expired(channels: Mapping[int, Channel], ids: Iterable[int]) -> dict[in
     return found
 
 
-@dataclass(frozen=True, slots=True)
-class Left:
+class Left(Struct, frozen=True):
     """The rows of messages without payload. All columns have the same length n.
 
     Attributes:
@@ -172,8 +170,7 @@ class Left:
         return cls(parts, *map(np.concatenate, zip(*columns, strict=True)))
 
 
-@dataclass(slots=True)
-class Batch:
+class Batch(Struct):
     """Messages whose payloads lie in one buffer. All columns have the same length n.
 
     Rows are in arrival order. `buffer` must not change while the batch is in use.
@@ -232,8 +229,7 @@ class Batch:
         return int(self.places[1].sum())
 
 
-@dataclass(slots=True)
-class LooseBatch:
+class LooseBatch(Struct):
     """Messages with a separate buffer each, to be joined once. All columns have length n.
 
     Rows are in arrival order. `payloads` is object[n]; the other columns are as in `Batch`.

@@ -12,6 +12,7 @@ from typing import Any
 from xml.etree import ElementTree as ET
 
 import pytest
+from msgspec import structs
 
 import hybridlog as hl
 from hybridlog.contract import MAX_RULES, Contract, contract_of
@@ -440,7 +441,9 @@ def test_latched_topics_neither_start_late_nor_stop_early(tmp_path: Path) -> Non
         for name, late in (("a", 0), ("b", 140_000)):
             with store.start(name) as live:
                 odom = channel("/odom", "test_msgs/Odom")
-                latched = replace(channel("/map", "test_msgs/Map"), metadata={"latching": "1"})
+                latched = structs.replace(
+                    channel("/map", "test_msgs/Map"), metadata={"latching": "1"}
+                )
                 for time in (0, SECOND):
                     live.write(odom, bytes(24), log_time=START + time)
                 live.write(latched, bytes(24), log_time=START + late)

@@ -1,11 +1,11 @@
 from __future__ import annotations
 
 import os
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from mcap.reader import NonSeekingReader, make_reader
+from msgspec.structs import replace
 from rosbags.rosbag1 import Reader
 
 from hybridlog.formats.mcap.writer import McapWriter

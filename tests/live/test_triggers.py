@@ -7,10 +7,10 @@ import random
 import struct
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from operator import itemgetter
 
 import pytest
+from msgspec.structs import replace
 
 import hybridlog as hl
 from hybridlog.follow import child

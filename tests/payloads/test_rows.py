@@ -6,13 +6,13 @@ import shutil
 import struct
 import tempfile
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 import hybridlog as hl
 from hybridlog.columns.left_rows import reduced

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Any
 
 import bson
 import pytest
+from msgspec.structs import replace
 
 from hybridlog_storage.catalog import ChannelStats, RecordingEntry, channel_entry
 from hybridlog_storage.messages import Channel, Schema

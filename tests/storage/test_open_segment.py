@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 from mcap.records import Metadata
+from msgspec.structs import asdict
 
 from hybridlog_storage.mcap.mcap_content import RECORD_HEAD
 from hybridlog_storage.segments import walk

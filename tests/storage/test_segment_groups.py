@@ -184,7 +184,7 @@ def test_where_topics_lie(tmp_path: Path) -> None:
 
 
 def vars_of(setup: SegmentSettings) -> dict[str, Any]:
-    return {name: getattr(setup, name) for name in SegmentSettings.__dataclass_fields__}
+    return {name: getattr(setup, name) for name in SegmentSettings.__struct_fields__}
 
 
 def test_the_next_group_goes_by_the_one_before(tmp_path: Path) -> None:

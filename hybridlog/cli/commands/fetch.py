@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 import click
+from msgspec import structs
 
 from hybridlog.cli import output
 from hybridlog.cli.answers import (
@@ -137,7 +138,7 @@ def fetch_command(choices: _Choices) -> None:
         else:
             front = choices.front
             if choices.at is not None and choices.to_form != "mp4":  # the answer is one message
-                front = replace(front, latched=False)
+                front = structs.replace(front, latched=False)
             if choices.split is not None:
                 _write_pieces(query, choices, front)
                 return

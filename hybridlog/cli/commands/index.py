@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
 import click
+from msgspec.structs import asdict
 
 from hybridlog.cli import output
 from hybridlog.cli.binder import SOME_SECONDS, argument, command, option

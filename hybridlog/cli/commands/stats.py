@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import ClassVar
+
+from msgspec.structs import asdict
 
 from hybridlog.cli.answers import Listing, answering
 from hybridlog.cli.binder import command, option

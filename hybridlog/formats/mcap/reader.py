@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import chain
 from typing import TYPE_CHECKING
 
 import numpy as np
 from mcap import records
+from msgspec.structs import replace
 
 from hybridlog.formats.reading import (
     MAX_CHUNK,

@@ -7,9 +7,10 @@ counts as missing. The files themselves take precedence over it.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import PureWindowsPath
 from typing import TYPE_CHECKING
+
+from msgspec import Struct, field
 
 from hybridlog.formats.reading import Damage, cannot_open
 from hybridlog.formats.yaml_values import YamlError, parse_yaml
@@ -74,8 +75,7 @@ MAX_FILES = 100_000
 _NO_FILES = {"", ".", ".."}
 
 
-@dataclass(frozen=True, slots=True)
-class BagMetadata:
+class BagMetadata(Struct, frozen=True):
     """The used part of a bag's metadata.
 
     Attributes:

@@ -6,11 +6,11 @@ import os
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import yaml
+from msgspec import Struct, field
 from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 
@@ -34,8 +34,7 @@ _VERSION: Final = 9
 _TABLES: Final = f"{Sqlite3Writer.SQLITE_SCHEMA} UPDATE schema SET ros_distro = 'hybridlog';"  # noqa: S608
 
 
-@dataclass(slots=True)
-class _Span:
+class _Span(Struct):
     """Messages of a file or of the bag."""
 
     messages: int = 0
@@ -56,8 +55,7 @@ class _Span:
         }
 
 
-@dataclass(slots=True)
-class _Topic:
+class _Topic(Struct):
     """A topic of one type."""
 
     number: int

@@ -9,8 +9,9 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
+
+from msgspec import Struct
 
 from hybridlog.query.answers.loss_words import (
     MAX_NAMES,
@@ -37,8 +38,7 @@ if TYPE_CHECKING:
 _INTERVAL_S: Final = 1.0  # flush interval of recorders that do not say it
 
 
-@dataclass(frozen=True, slots=True)
-class Completeness:
+class Completeness(Struct, frozen=True):
     """Completeness of an answer in its range.
 
     Attributes:

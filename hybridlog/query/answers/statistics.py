@@ -8,12 +8,13 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
 from itertools import groupby
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
 
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.periods import GAP_PERIODS, mean_rate, usual_period
@@ -38,8 +39,7 @@ if TYPE_CHECKING:
     Times = NDArray[np.int64]
 
 
-@dataclass(frozen=True, slots=True)
-class FieldStatistics:
+class FieldStatistics(Struct, frozen=True):
     """Statistics of one numeric field of a topic, over all messages of a question.
 
     Attributes:
@@ -178,8 +178,7 @@ def _add(running: dict[str, _Running], question: Question, records: pa.StructArr
             running.setdefault(field.name, _Running()).add(column)
 
 
-@dataclass(frozen=True, slots=True)
-class TopicCheck:
+class TopicCheck(Struct, frozen=True):
     """Regularity of a topic in a recording, or in a range of it.
 
     Attributes:

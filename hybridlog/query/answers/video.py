@@ -5,8 +5,10 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from contextlib import suppress
-from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from hybridlog.arrays import is_video_type
 from hybridlog.arrays.video import VideoDecoder, frame_of, is_key_frame
@@ -117,8 +119,7 @@ def back_to_key(
     raise PayloadError("a frame of video cannot be decoded: there is no key frame before it")
 
 
-@dataclass(slots=True)
-class _Playing:
+class _Playing(Struct):
     """A decoder, and the frame that it has taken last: log time, arrival number, picture."""
 
     decoder: VideoDecoder

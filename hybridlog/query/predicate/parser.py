@@ -47,11 +47,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from functools import lru_cache
 from itertools import groupby
 from operator import itemgetter
 from typing import TypeAlias
+
+from msgspec.structs import replace
 
 from hybridlog.query.predicate.tokens import (
     RegexError,

@@ -6,10 +6,10 @@ meaning: their places in the text are ignored, and NaN equals NaN.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Final, Literal, NamedTuple, TypeAlias
+
+from msgspec import Struct
 
 from hybridlog_storage.lazy import lazy
 
@@ -21,13 +21,19 @@ NEGATED: Final[dict[Op, Op]] = {"!=": "==", "not in": "in", "!~": "~"}
 """Operators that hold for a field that is there and does not satisfy another one."""
 
 
-class _Node:
+class _Node(Struct, frozen=True, eq=False):
     """Equality and hash of nodes, by what is shown of them: `1` is not `True`, NaN equals NaN."""
 
-    __slots__ = ()
+    def __repr__(self) -> str:
+        names = [name for name in self.__struct_fields__ if name not in {"position", "text"}]
+        shown = ", ".join(f"{name}={getattr(self, name)!r}" for name in names)
+        return f"{type(self).__name__}({shown})"
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, _Node) and repr(self) == repr(other)
+
+    def __ne__(self, other: object) -> bool:
+        return not self == other
 
     def __hash__(self) -> int:
         return hash(repr(self))
@@ -52,8 +58,7 @@ Parts: TypeAlias = tuple[str | int | Slice, ...]
 """Names, numbers of elements, and slices."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Field(_Node):
+class Field(_Node, frozen=True, eq=False):
     """A field path.
 
     Attributes:
@@ -64,7 +69,7 @@ class Field(_Node):
 
     parts: Parts
     is_absolute: bool = False
-    position: int = dataclasses.field(default=0, repr=False)
+    position: int = 0
 
     @property
     def path(self) -> str:
@@ -77,8 +82,7 @@ class Field(_Node):
         return ".".join(part for part in self.parts if isinstance(part, str))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Condition(_Node):
+class Condition(_Node, frozen=True, eq=False):
     """A condition on a field: `x < 5`, `x in [1, 2]`, `x ~ "^a"`, `x exists`.
 
     Attributes:
@@ -92,32 +96,28 @@ class Condition(_Node):
     op: Op
     operands: tuple[Value, ...] = ()
     other: Field | None = None
-    position: int = dataclasses.field(default=0, repr=False)
+    position: int = 0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class And(_Node):
+class And(_Node, frozen=True, eq=False):
     """All of the items hold; without items, always."""
 
     items: tuple[Node, ...]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Or(_Node):
+class Or(_Node, frozen=True, eq=False):
     """One of the items holds."""
 
     items: tuple[Node, ...]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Not(_Node):
+class Not(_Node, frozen=True, eq=False):
     """The item does not hold."""
 
     item: Node
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Near(_Node):
+class Near(_Node, frozen=True, eq=False):
     """A message of another topic near in time, as `Query.where` answers it.
 
     Attributes:
@@ -133,8 +133,7 @@ Reach: TypeAlias = Literal["exists", "value", "whole"]
 """How a MongoDB filter asks for a path: whether there is one, for its value, for all below it."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MongoFilter(_Node):
+class MongoFilter(_Node, frozen=True, eq=False):
     """A MongoDB filter, at the root of a predicate or in an `And` there.
 
     Attributes:
@@ -162,8 +161,7 @@ ALWAYS: Final = And(())
 Node: TypeAlias = Condition | And | Or | Not | Near | MongoFilter
 
 
-@dataclass(frozen=True)
-class Predicate:
+class Predicate(_Node, frozen=True, eq=False, dict=True):
     """A predicate that was parsed and checked.
 
     Attributes:
@@ -172,7 +170,7 @@ class Predicate:
     """
 
     root: Node
-    text: str = dataclasses.field(default="", compare=False)
+    text: str = ""
 
     def __bool__(self) -> bool:
         """True if it has any condition."""

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, Literal, cast
+
+from msgspec import Struct, field
 
 from hybridlog.query.predicate.tokens import error_at
 from hybridlog.query.predicate.tree import (
@@ -66,8 +67,7 @@ _META = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class FieldTypes:
+class FieldTypes(Struct, frozen=True):
     """The types of the fields of a topic.
 
     Attributes:

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Collection, Generator, Iterator, Sequence
-from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
 
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.latching import depth_of, is_video
@@ -20,8 +21,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.messages import Batch, Channel
 
 
-@dataclass(frozen=True, slots=True)
-class PlayedChannel:
+class PlayedChannel(Struct, frozen=True):
     """A channel for viewers: those of all recordings with the same topic, encoding and type.
 
     Attributes:

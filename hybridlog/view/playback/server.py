@@ -13,11 +13,11 @@ import secrets
 import time
 from collections.abc import AsyncIterator, Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from msgspec import Struct, field
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 
@@ -46,8 +46,7 @@ _PING_S: Final = 10.0
 _CLOSE_S: Final = 1.0
 
 
-@dataclass(frozen=True, slots=True)
-class PlaybackOptions:
+class PlaybackOptions(Struct, frozen=True):
     """Options of a playback.
 
     Attributes:
@@ -65,8 +64,7 @@ class PlaybackOptions:
     origins: tuple[str, ...] = ()
 
 
-@dataclass(eq=False, slots=True)
-class _Client:
+class _Client(Struct, eq=False):
     """A client, and the subscriptions that it has by number of the channel."""
 
     connection: ServerConnection

@@ -22,11 +22,11 @@ import stat
 import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
-from msgspec import structs
+from msgspec import Struct, structs
+from msgspec.structs import replace
 
 from hybridlog_storage.cells import Cells
 from hybridlog_storage.disk import durability, files
@@ -61,8 +61,7 @@ _RECORDER_WAIT_S = 0.5  # a reader's look at a lock must not pass for a recorder
 _HOLDER = 32  # bytes of the line in a lock
 
 
-@dataclass(frozen=True, slots=True)
-class Holder:
+class Holder(Struct, frozen=True):
     """The process that holds a recording's lock, by its own account; `name` is for messages.
 
     Unless `is_recording`, it changes an ended recording.
@@ -72,8 +71,7 @@ class Holder:
     is_recording: bool
 
 
-@dataclass(frozen=True, slots=True)
-class Listing:
+class Listing(Struct, frozen=True):
     """Content of a recording's directory.
 
     Attributes:

@@ -7,7 +7,6 @@ other kinds are rare and become objects.
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
 from io import BytesIO
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
@@ -17,6 +16,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.summary import Summary
+from msgspec import Struct
 
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.lazy import RowType
@@ -111,8 +111,7 @@ class Definition(NamedTuple):
     record: records.Schema | records.Channel
 
 
-@dataclass(frozen=True, slots=True)
-class Damage:
+class Damage(Struct, frozen=True):
     """A place that could not be read.
 
     Attributes:

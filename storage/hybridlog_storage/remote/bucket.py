@@ -17,10 +17,11 @@ import re
 import secrets
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from datetime import timedelta
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+from msgspec import Struct
 
 from hybridlog_storage.errors import (
     BucketError,
@@ -65,8 +66,7 @@ _users: Final[dict[str, int]] = {}
 """The process that has used the library first."""
 
 
-@dataclass(frozen=True, slots=True)
-class Object:
+class Object(Struct, frozen=True):
     """An object as a list or an answer describes it; its name is below the address of the bucket.
 
     `version` is the entity tag, another one after every change.

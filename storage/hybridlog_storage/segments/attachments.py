@@ -9,11 +9,11 @@ import os
 import struct
 import weakref
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex
+from msgspec import Struct
 
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import files
@@ -35,8 +35,7 @@ _SIZE = struct.Struct("<Q")
 _CRC = struct.Struct("<I")
 
 
-@dataclass(frozen=True, slots=True)
-class Attachment:
+class Attachment(Struct, frozen=True):
     """An attachment record of a file; times are ns, 0 if unknown. `data` is in the file.
 
     Its name need be no valid file name, and need not be unique.

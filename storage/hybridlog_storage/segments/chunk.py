@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from mcap.opcode import Opcode
+from msgspec import Struct
 
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD
@@ -88,8 +88,7 @@ def _in_one_buffer(parts: list[Buffer], size: int) -> Buffer:
     return content.data
 
 
-@dataclass(frozen=True, slots=True)
-class PackedChunk:
+class PackedChunk(Struct, frozen=True):
     """A closed chunk, compressed and indexed, ready for the file.
 
     Attributes:
@@ -140,8 +139,7 @@ def pack(
     )
 
 
-@dataclass(frozen=True, slots=True)
-class StoredChunk:
+class StoredChunk(Struct, frozen=True):
     """A chunk stored in a segment, with its content in memory.
 
     Attributes:

@@ -7,10 +7,11 @@ there, which say less.
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
 
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.lazy import RowType
@@ -52,8 +53,7 @@ _MAX_FILE = 1 << 62
 _MAX_CHANNEL = 65535
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ChunkTable:
+class ChunkTable(Struct, frozen=True, eq=False):
     """The chunks of a segment.
 
     Attributes:
@@ -146,8 +146,7 @@ class ChunkTable:
         return table
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ChunkPlace:
+class ChunkPlace(Struct, frozen=True, kw_only=True):
     """Position of a chunk in its segment.
 
     Attributes:

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
+
+from msgspec import Struct, field
 
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.disk.append_file import BLOCK, AppendFile
@@ -38,8 +39,7 @@ if TYPE_CHECKING:
 _PIECE = 4 << 20  # bytes read at once for a digest
 
 
-@dataclass(slots=True)
-class Recovered:
+class Recovered(Struct):
     """The result of recovering an open segment; `path` is None for an empty one, which is removed.
 
     `cut_bytes` are of records at the end, without an incomplete summary.

@@ -10,13 +10,13 @@ import os
 import stat
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, Metadata, MetadataIndex
+from msgspec import Struct
 
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import files
@@ -68,8 +68,7 @@ _PIECE = 4 << 20  # bytes read at once for a checksum
 _AHEAD = 64 << 20  # bytes that are announced at once; a multiple of the former
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SegmentSummary:
+class SegmentSummary(Struct, frozen=True, kw_only=True):
     """The checked summary of a sealed segment.
 
     Attributes:

@@ -13,13 +13,14 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeVar
 
 import numpy as np
 from mcap.records import Metadata
+from msgspec import Struct
+from msgspec.structs import replace
 
 from hybridlog_storage.errors import DiskFullError, StoreError, UsageError
 from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD
@@ -47,8 +48,7 @@ _SMALL_SPANS = 256  # times the usual span, for a chunk that is still small
 _SYNC_STRIDE = 32 << 20  # bytes
 
 
-@dataclass(frozen=True, slots=True)
-class SegmentSettings:
+class SegmentSettings(Struct, frozen=True):
     """Settings for the division and compression of segments.
 
     Attributes:
@@ -95,8 +95,7 @@ class SegmentSettings:
                 raise UsageError(f"{words}; give another value.")
 
 
-@dataclass(slots=True)
-class RecordingTotals:
+class RecordingTotals(Struct):
     """Progress of a recording's writer."""
 
     messages: int = 0

@@ -11,8 +11,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
+
+from msgspec import Struct
 
 from hybridlog.live.sources.base import PeerError, one_line
 from hybridlog.live.sources.network import PATIENCE_S, Endpoint, Network, UnreachedError, reason_of
@@ -31,8 +32,7 @@ _MAX_PAUSE_S: Final = 10.0
 _STABLE_S: Final = 10.0
 
 
-@dataclass(frozen=True, slots=True)
-class Context:
+class Context(Struct, frozen=True):
     """Parts that all subscriptions of a source share.
 
     `spawn` runs a coroutine until the source stops; `look_again` asks the master for the publishers
