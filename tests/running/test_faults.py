@@ -5,18 +5,15 @@ from __future__ import annotations
 import random
 from collections import Counter
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
 import hybridlog as hl
-from hybridlog_storage.errors import HybridlogError, SegmentError
+from hybridlog_storage.errors import HybridlogError
 from hybridlog_storage.mcap.mcap_content import MAGIC, RECORD_HEAD
 from hybridlog_storage.segments.segment_format import (
     ARRIVAL_OPCODE,
-    ARRIVALS,
-    arrival_record,
 )
 from hybridlog_storage.segments.walk import OpenSegment
 from tests.running.methods import LABEL, rows, sent
@@ -99,23 +96,6 @@ def record_starts(data: bytes) -> list[int]:
     return found
 
 
-def without(data: bytes, chunk: int) -> bytes:
-    """A segment without one of its chunks; the following ones come earlier."""
-    starts = record_starts(data)
-    arrivals = [at for at in starts if data[at] == ARRIVAL_OPCODE]
-    last = next(at for at in arrivals if at > chunk)
-    end = last + RECORD_HEAD.size + RECORD_HEAD.unpack_from(data, last)[1]
-    changed = bytearray(data)
-    for at in arrivals:
-        size = RECORD_HEAD.unpack_from(data, at)[1]
-        body = data[at + RECORD_HEAD.size : at + RECORD_HEAD.size + size]
-        owner, *checks = ARRIVALS.unpack_from(body)
-        if owner > chunk:
-            record = arrival_record(owner - end + chunk, *checks, body[ARRIVALS.size :])
-            changed[at : at + len(record)] = record
-    return bytes(changed[:chunk] + changed[end:])
-
-
 def test_flipped_bits_are_no_silence(running: Running, copied: Path) -> None:
     found = check_flips(running, copied, 12, 1)
     assert found["error"] > 2
@@ -156,33 +136,3 @@ def test_a_torn_end_is_no_damage(running: Running, copied: Path) -> None:
                 topics = [topic for topic, count in there.counts.items() if count]
                 assert rows(store.query(topics)) == sent(there.of()), cut
     assert before > 0
-
-
-def test_what_was_taken_back_is_read_again(running: Running, copied: Path) -> None:
-    """On a full disk the writer cuts its last chunks off, and may write others there."""
-    running.flushed()
-    path = open_segment(copied)
-    data = path.read_bytes()
-    chunks = [at for at in record_starts(data) if data[at] == 6]
-    with as_running(copied) as store:
-        whole = store.entry(LABEL).messages
-        path.write_bytes(data[: chunks[-2]])
-        fewer = store.all_topics().count()
-        assert 0 < fewer < whole == len(running.sent)
-        assert len(rows(store.all_topics())) == fewer
-        then = store.snapshot()
-        assert then.all_topics().count() == fewer
-        path.write_bytes(data[: chunks[-3]])
-        with ThreadPoolExecutor(1) as pool:  # which sees it first
-            assert pool.submit(store.all_topics().count).result() < fewer
-        assert store.topic("arm").to_arrow().num_rows == store.topic("arm").count()
-        assert store.all_topics().count() < fewer
-        with pytest.raises(SegmentError):  # and no gap in silence
-            rows(then.all_topics())
-        # Other bytes of another chunk are in the place of the last one that was read.
-        path.write_bytes(data[: chunks[-1]])
-        before = store.all_topics().count()
-        path.write_bytes(without(data, chunks[-3]))
-        assert len(rows(store.all_topics())) == store.all_topics().count() != before
-        path.write_bytes(data)
-        assert store.all_topics().count() == whole
