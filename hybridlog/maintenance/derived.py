@@ -127,6 +127,7 @@ class StoreIndex(Struct, frozen=True):
         """
         left: dict[str, HybridlogError] = {}
         for chosen in entries:
+            self.catalog.put_indexed([chosen.id], "")
             try:
                 self._bring(chosen, anew=True, wait_s=LOCK_WAIT_S)
             except (HeldError, TopicError) as error:
