@@ -753,9 +753,11 @@ def recorded(tmp_path_factory: pytest.TempPathFactory, demo_bag: Path) -> Iterat
 
 
 def entry_of(store: Path, name: str) -> RecordingEntry:
-    """What hybridlog says of a recording, once what a crash has left is finished."""
+    """What hybridlog says of a recording that was read, and what a crash has left is finished."""
     with hl.open(store) as opened:
         opened.shared.recover()
+        assert [one.raw for one in opened.all_topics().in_recording(name)]
+        opened.refresh()
         return next(entry for entry in opened.recordings() if entry.name == name)
 
 

@@ -20,6 +20,7 @@ from tests import places
 from tests.cli.within import answer
 from tests.damage import flip
 from tests.running.running import NO_MONGODB as NOWHERE
+from tests.running.test_faults import record_starts
 from tests.test_identity import COUNT, make_log, payload
 
 
@@ -151,7 +152,9 @@ def test_without_a_repair_no_file_is_changed(store: Path) -> None:
     assert done.index
     assert "a crash has left it open" in {one.problem for one in done.findings}
     assert {p: p.read_bytes() for p in places.root(store).rglob("*") if p.is_file()} == before
-    flip(opened_files[0], 600)
+    data = opened_files[0].read_bytes()
+    _, chunk, *_ = (at for at in record_starts(data) if data[at] == 6)
+    flip(opened_files[0], chunk + 300)
     with hl.open(store, mongo="none") as opened:
         with pytest.raises(SegmentError, match=r"is damaged.*`hybridlog verify --repair` seals"):
             _ = [one.raw for one in opened.topic("/n").in_recording("one")]

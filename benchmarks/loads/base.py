@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import mmap
 from base64 import b64decode, b64encode
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from msgspec.structs import asdict
 
 from hybridlog_storage.messages import Channel, Schema
 
@@ -97,10 +98,10 @@ class Load:
 
 
 def _channel_to_json(channel: Channel) -> dict[str, Any]:
-    value = asdict(channel)
-    value["metadata"] = dict(channel.metadata)
+    value = {**asdict(channel), "metadata": dict(channel.metadata)}
     if channel.schema is not None:
-        value["schema"]["data"] = b64encode(channel.schema.data).decode("ascii")
+        data = b64encode(channel.schema.data).decode("ascii")
+        value["schema"] = {**asdict(channel.schema), "data": data}
     return value
 
 

@@ -24,6 +24,7 @@ from hybridlog.live.recorder import Recorder, RecorderOptions
 from hybridlog.live.state import choose, read, running, summary_of
 from hybridlog.record.losses import Cause
 from hybridlog.record.marks import MARKS
+from hybridlog.schema.codecs import unindexed
 from hybridlog_storage.disk import append_file, files
 from hybridlog_storage.errors import (
     DiskFullError,
@@ -466,7 +467,8 @@ def test_a_standard_type_without_its_definition(store: hl.Store) -> None:
     assert store.topic("/chatter").to_arrow()["data"].to_pylist() == ["0", "1", "2"]
     channels = {c.topic: c for c in store.entry(robot.recorder.name).channels}
     assert channels["/chatter"].metadata[SUPPLIED] == "noetic, fits the messages"
-    assert "no definition in the source" in str(channels["/odd"].reason)
+    reasons = unindexed(store.session.definitions(store.entry(robot.recorder.name)))
+    assert "no definition in the source" in reasons[channels["/odd"].id]
 
 
 def test_a_publisher_that_connects_again_and_again_is_one_channel(store: hl.Store) -> None:

@@ -326,6 +326,7 @@ def test_who_closes_it_while_the_same_thread_does_is_told(
         recording.abort()
     with hl.open(store.directory.path) as again:
         assert [m.raw for m in again.topic("/talk")] == [text(b"kept")]
+        again.verify(repair=True)
         assert again.verify().findings == []
 
 

@@ -235,7 +235,7 @@ def test_what_is_lost_is_said(page: Page, demo_store: hl.Store, tmp_path: Path) 
     path = places.segment(tmp_path / "store", "robot")
     flip(path, int(chunk["offset"]) + int(chunk["length"]) // 2, bits=0xFF)
     with hl.open(tmp_path / "store") as store:
-        store.verify()
+        store.verify(repair=True)
         store.refresh()
         (loss,) = [loss for loss in store.entry("robot").end["losses"] if loss["count"]][:1]
         with served(store) as url:
