@@ -290,7 +290,7 @@ def account(
     ("seconds", "speed", "quota"),
     [
         # Beside all pins there is room for what triggers have yet to see, on any machine.
-        (12, 15, 26_000_000),
+        (12, 8, 26_000_000),
         pytest.param(
             450, 12, 100_000_000, marks=[pytest.mark.exhaustive, pytest.mark.timeout(1800)]
         ),

@@ -48,6 +48,7 @@ def proxy(running_proxy: Proxy, monkeypatch: pytest.MonkeyPatch, tmp_path: Path)
     """As a new process finds it, without a cache."""
     running_proxy.reset()
     files.mounted.clear()
+    monkeypatch.setenv("AWS_ENDPOINT_URL", running_proxy.url)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     return running_proxy
 
