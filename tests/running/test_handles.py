@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import threading
 import time
@@ -14,7 +15,8 @@ import hybridlog as hl
 from hybridlog.live import LiveOptions
 from hybridlog.maintenance.expiry import expire
 from hybridlog.maintenance.opening import StoreFiles
-from hybridlog_storage.errors import SegmentError, UsageError
+from hybridlog_storage.disk import files
+from hybridlog_storage.errors import UsageError
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segments.segment_reader import SegmentReader
 from hybridlog_storage.segments.segment_writer import SegmentSettings
@@ -82,11 +84,8 @@ def test_a_segment_that_cannot_be_read_any_more_is_told(
                 time.sleep(0.02)
             time.sleep(0.5)  # until it is flushed
 
-            def fail(self: SegmentReader, *_: object) -> memoryview:
-                raise SegmentError(f"{self.path} cannot be read: Input/output error.")
-
             with monkeypatch.context() as patch:
-                patch.setattr(SegmentReader, "read", fail)
+                Calls(patch).fail(files, "preadv", OSError(errno.EIO, "Input/output error"))
                 assert store.topic("said").completeness().has_losses
             assert store.topic("said").count() == 2
             assert not store.topic("said").completeness().has_losses

@@ -350,7 +350,6 @@ class OpenSegment(Walk):
 
     def _read_on(self) -> None:
         self.reader.grow()
-        self.reader.read(0, len(START))  # what cannot be read at all is not damaged
         size, end = self.reader.size, self.end
         try:
             self.go_on()
