@@ -71,7 +71,7 @@ NO_MANIFEST: Final = (
 ANOTHER: Final = "it is another file than the one listed"
 _TRIES = 10  # to read a recording while its files are replaced
 _GONE: Final = {"expired": (EXPIRED_IDS, EXPIRED), "elsewhere": (2 * EXPIRED_IDS, NOT_COPIED)}
-"""What is added to the ids of the channels of a log that is gone, and their encoding."""
+"""Added to the channel ids of a file that is gone, and the encoding that these channels get."""
 _T = TypeVar("_T")
 
 
@@ -201,7 +201,7 @@ def _steadily(
     recording: str,
     look: Callable[[Listing, Manifest | None], tuple[_T, bool]],
 ) -> _T:
-    """What a look at a listing and a manifest finds, which says if that is sure.
+    """The result of `look`, which also tells whether it is sure of it.
 
     Files come and go before or after the manifest says so. What seems to be missing is looked
     for again if anything has changed; edits alone, however many, are waited for by nobody.

@@ -237,7 +237,7 @@ class RecordChoices(Between, Latched, InStore, AsJson, Quiet):
 
 
 def row_of(report: RecordReport, path: object) -> dict[str, Any]:
-    """What is told in JSON of each recording."""
+    """A recorded log as a row of JSON."""
     from hybridlog.record.losses import losses_of
 
     entry = report.entry
@@ -272,7 +272,7 @@ def row_of(report: RecordReport, path: object) -> dict[str, Any]:
 
 
 def fields_of(row: Mapping[str, Any]) -> list[tuple[str, object]]:
-    """What is told to people of one recording."""
+    """The lines of one recorded log: name and value, without counts of zero."""
     cells = [(one, one.cell(row)) for one in COLUMNS]
     return [(one.name, cell) for one, cell in cells if not (one.varies and cell == "0")]
 

@@ -37,7 +37,7 @@ _SHOW_CURSOR: Final = "\r\x1b[K\x1b[?25h"
 """Clears the line of a progress bar."""
 
 _AWAY: Final = (BucketError, DatabaseError, ResourceError, StoreError)
-"""What may be over at a later look."""
+"""Errors that may have gone at a later look."""
 _LONGER: Final = 5
 """Pause after such an error, as a multiple of the usual one."""
 

@@ -151,7 +151,7 @@ class Matches:
         return self._times.nbytes + self._seqs.nbytes + self._held.nbytes
 
     def ticks(self, edges: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Of each pixel with matches, the log time of the first one, ns, and their number.
+        """Log time of the first match, ns, and number of matches, of each pixel that has any.
 
         The edges of the pixels are those of `aligned`.
         """

@@ -184,7 +184,7 @@ class Held(Struct, frozen=True):
 
     @property
     def may_go(self) -> bool:
-        """Whether its payloads may go before its group, unless they are pinned."""
+        """True if its payloads may go before its group, unless they are pinned."""
         return may_go(self.log) and not self.stays
 
     @property

@@ -475,7 +475,7 @@ class Rows:
 
 
 def _rest_of(part: Part, found: Tabled | None) -> list[Part]:
-    """What a table does not have of a part: all of it without a table."""
+    """The rest of a part that a table does not cover; all of it without a table."""
     rest = part if found is None else found.rest
     return [] if rest is None else [rest]
 

@@ -264,7 +264,7 @@ class TopicOfRecording:
 
 
 class Asked:
-    """What a query asks of messages: fields, and columns of the table itself.
+    """The fields and the columns of our own that a query asks for.
 
     Without `leaves`, all fields.
     """

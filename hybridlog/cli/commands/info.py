@@ -197,7 +197,7 @@ def _videos(store: Store, entry: RecordingEntry) -> dict[str, dict[str, Any]]:
 
 
 def _fields(store: Store, entry: RecordingEntry, about: dict[str, Any]) -> list[tuple[str, object]]:
-    """What is told to people of a recording."""
+    """The lines of a recording: name and value."""
     from hybridlog.entries import summary_of
     from hybridlog.query.answers.loss_words import line_of
     from hybridlog.query.times import format_duration
@@ -247,7 +247,7 @@ def _about(attachment: Mapping[str, Any]) -> tuple[str, str]:
 
 
 def _coverage_bar(entry: RecordingEntry) -> str:
-    """When something is lost, in letters on a terminal."""
+    """A bar of letters that shows where messages are lost; empty without a terminal."""
     if entry.span is None or not sys.stdout.isatty():
         return ""
     from hybridlog.query.answers.lost import lost_parts

@@ -112,7 +112,7 @@ def _parsed(header: bytes, start: int, end: int) -> _Record | None:
 
 
 _Row = tuple[int, int, int, int]
-"""Of a message, begin and length of its payload, and the places of its connection and time."""
+"""A message: begin and length of its payload, and where its connection id and its time lie."""
 
 
 def walk(data: bytes, pos: int) -> tuple[list[_Row], int]:

@@ -77,7 +77,7 @@ def coverage(entry: RecordingEntry, losses: Collection[Row]) -> str:
 
 
 def copies_of(entry: RecordingEntry) -> list[str]:
-    """Where payloads are that a recording lacks, in words."""
+    """Sentences that name the copies with payloads that a recording lacks."""
     return [f"{address} has more payloads of {entry.name}; ask there" for address in entry.copies]
 
 
