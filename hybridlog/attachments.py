@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.messages import Channel
-    from hybridlog_storage.segments.attachments import Attachment
+    from hybridlog_storage.segments.segment_format import Attachment
     from hybridlog_storage.segments.segment_reader import SegmentSummary
     from hybridlog_storage.segments.walk import Flushed
 

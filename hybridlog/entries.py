@@ -46,14 +46,13 @@ from hybridlog_storage.messages import (
     REDUCED,
     schema_hash,
 )
-from hybridlog_storage.segments.gone_log import GoneLog, open_log
 from hybridlog_storage.segments.segment_file import (
     Sealed,
     is_rows,
     sealed_name,
 )
 from hybridlog_storage.segments.segment_format import group_of
-from hybridlog_storage.segments.segment_reader import SegmentSummary
+from hybridlog_storage.segments.segment_reader import GoneLog, SegmentSummary, open_log
 from hybridlog_storage.summary import RecordingSummary, TopicType, hash_of, topics_to_json
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from hybridlog.schema.codecs import unindexed
 from hybridlog.session import Session
 from hybridlog.shared import Shared
 from hybridlog.snapshot import UNFINISHED, Snapshot
-from hybridlog_storage.disk import durability, files
+from hybridlog_storage.disk import files
 from hybridlog_storage.errors import DatabaseError, HybridlogError
 
 if TYPE_CHECKING:
@@ -137,7 +137,7 @@ class OpenStore(Shared):
     def _drop_list(self) -> None:
         self._has_changed = self.directory.is_writable and not self.catalog.is_in_memory
         if self._has_changed:
-            removing = durability.explained(self._list, "removing")
+            removing = files.explained(self._list, "removing")
             with removing, suppress(FileNotFoundError):
                 files.unlink(self._list)
 

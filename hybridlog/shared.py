@@ -15,13 +15,12 @@ from hybridlog.maintenance.opening import StoreFiles, open_catalog
 from hybridlog.maintenance.report import RepairReport
 from hybridlog.record.marks import MARK_SCHEMA
 from hybridlog.snapshot import UNFINISHED
-from hybridlog_storage.cache import Cache
+from hybridlog_storage.cache import Cache, lazy
 from hybridlog_storage.catalog import file_of
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import UsageError
-from hybridlog_storage.lazy import lazy
 from hybridlog_storage.messages import schema_hash
-from hybridlog_storage.segments.gone_log import open_log
+from hybridlog_storage.segments.segment_reader import open_log
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hybridlog_storage.lazy import lazy
+from hybridlog_storage.cache import lazy
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -704,6 +704,7 @@ class Store:
             SourceError: Nothing could be read.
             AlreadyRecordedError: Its content is in the store already.
         """
+        from hybridlog.follow.child import LOOK_S, FollowerProcess
         from hybridlog.formats.log_set import open_source
         from hybridlog.formats.reading import fingerprint
         from hybridlog.record.recorder import RecordOptions, record
@@ -715,7 +716,7 @@ class Store:
                 source,
                 self.directory,
                 self.catalog,
-                shared.index.index_to_record("Recording a log"),
+                FollowerProcess.of_short(shared, "Recording a log", LOOK_S),
                 shared.newest,
                 fingerprint=fingerprint(source.files),
                 options=options or RecordOptions(**choices),
@@ -732,17 +733,16 @@ class Store:
             options: Options of the recording.
             choices: Fields of `LiveOptions`, instead of `options`.
         """
-        from hybridlog.follow.follower import FollowerThread
+        from hybridlog.follow.child import FollowerProcess
         from hybridlog.live import LiveOptions, LiveRecording
         from hybridlog.live.recording import follow_interval_s
 
         chosen, shared = options or LiveOptions(**choices), self._itself()
         shared.recover()
-        about = self.directory, self.catalog
-        target = shared.index.index_to_record("Starting a recording")
         return LiveRecording(
-            *about,
-            partial(FollowerThread, *about, target, follow_interval_s(chosen)),
+            self.directory,
+            self.catalog,
+            FollowerProcess.of_short(shared, "Starting a recording", follow_interval_s(chosen)),
             name,
             chosen,
             known=shared.newest,

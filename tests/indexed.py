@@ -10,7 +10,7 @@ import hybridlog as hl
 from hybridlog.schema.codec import Codec
 from hybridlog.schema.index_bodies import BodyGroup, bodies_of, document_of
 from hybridlog_storage.messages import Batch
-from hybridlog_storage.mongo.collection_names import collection_of
+from hybridlog_storage.mongo.index_documents import collection_of
 
 EVERYTHING = {"_meta.seq": {"$gte": 0}}
 """A filter that every document satisfies."""

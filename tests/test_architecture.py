@@ -48,7 +48,7 @@ ALLOWED = {
     "mcap": (
         "hybridlog.formats.mcap",
         "hybridlog.formats.reading",
-        "hybridlog_storage.segments.attachments",
+        "hybridlog_storage.segments.segment_format",
         "hybridlog_storage.mcap.mcap_content",
         "hybridlog_storage.mcap.mcap_scan",
         "hybridlog_storage.segments.chunk",

@@ -1047,7 +1047,7 @@ def test_the_specification_names_what_there_is() -> None:
     from hybridlog_storage import manifest
     from hybridlog_storage.catalog import CATALOG
     from hybridlog_storage.disk import directory
-    from hybridlog_storage.mongo import index_state
+    from hybridlog_storage.mongo import index_documents
     from hybridlog_storage.segments import chunk_table, segment_format
     from hybridlog_storage.settings import FORMAT, StoreSettings
 
@@ -1072,7 +1072,7 @@ def test_the_specification_names_what_there_is() -> None:
     for part in (m.Manifest, m.File, m.Mark, m.Pin, m.Loss, m.LetGo):
         for name in part.__struct_fields__:
             assert f"`{name}`" in rows or name == "uncounted_marks", name
-    for name in (index_state.RECORDINGS, index_state.STORE):
+    for name in (index_documents.RECORDINGS, index_documents.STORE):
         assert f"`{name}`" in text
     for name in (
         CATALOG,

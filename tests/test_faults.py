@@ -26,7 +26,7 @@ from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.errors import DatabaseError, StoreError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.mongo.database import Database
-from hybridlog_storage.mongo.index_state import RECORDINGS
+from hybridlog_storage.mongo.index_documents import RECORDINGS
 from hybridlog_storage.mongo.mongod import EmbeddedMongod
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import independent, places

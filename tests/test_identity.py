@@ -35,7 +35,7 @@ from hybridlog_storage.manifest import replace
 from hybridlog_storage.manifests import MANIFEST_LOCK, manifests_at
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.mongo.database import Database
-from hybridlog_storage.mongo.index_state import IndexState
+from hybridlog_storage.mongo.index_documents import IndexState
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import logs, places
 from tests.copies import bring

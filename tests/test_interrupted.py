@@ -24,7 +24,7 @@ from hybridlog_storage.errors import (
 )
 from hybridlog_storage.manifest import replace
 from hybridlog_storage.mongo.database import Database
-from hybridlog_storage.mongo.index_state import IndexState
+from hybridlog_storage.mongo.index_documents import IndexState
 from tests import logs, places
 from tests.calls import Calls
 from tests.copies import bring

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
-from hybridlog_storage.mongo.collection_names import collection_of
 from hybridlog_storage.mongo.database import Database
+from hybridlog_storage.mongo.index_documents import collection_of
 from tests.calls import Calls
 from tests.many_topics import topic, write_log
 

@@ -49,7 +49,7 @@ from hybridlog_storage.manifest import Manifest
 from hybridlog_storage.manifest import replace as changed
 from hybridlog_storage.manifests import MANIFEST_OLD
 from hybridlog_storage.messages import Channel, Schema
-from hybridlog_storage.mongo.index_state import IndexState
+from hybridlog_storage.mongo.index_documents import IndexState
 from hybridlog_storage.mongo.mongod import EmbeddedMongod
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places

@@ -15,7 +15,7 @@ from hybridlog.query.topics import matcher
 from hybridlog_storage.catalog import CATALOG
 from hybridlog_storage.errors import TopicError
 from hybridlog_storage.messages import Channel
-from hybridlog_storage.mongo.collection_names import collection_of
+from hybridlog_storage.mongo.index_documents import collection_of
 from tests import places
 from tests.cli.running import run
 from tests.copies import bring

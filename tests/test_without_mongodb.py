@@ -16,7 +16,7 @@ from hybridlog_storage.errors import (
     StoreError,
     WithoutMongoError,
 )
-from hybridlog_storage.mongo.index_state import IndexState
+from hybridlog_storage.mongo.index_documents import IndexState
 from hybridlog_storage.segments.segment_reader import SegmentReader
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from hybridlog_storage.settings import (

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from benchmarks.backends.base import Backend, BackendFailedError, BackendMissingError, failing
 from benchmarks.usage import wait_for_mongods, working_below
 from hybridlog_storage.errors import HybridlogError, MissingDependencyError
-from hybridlog_storage.mongo.collection_names import collection_of
+from hybridlog_storage.mongo.index_documents import collection_of
 
 if TYPE_CHECKING:
     from hybridlog.live import LiveRecording

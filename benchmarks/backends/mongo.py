@@ -15,7 +15,7 @@ from benchmarks.backends.base import BackendMissingError, failing
 from benchmarks.backends.conversion import INSERTED_AT
 from benchmarks.backends.database import DatabaseBackend
 from benchmarks.backends.server import Server
-from hybridlog_storage.mongo.collection_names import collection_of
+from hybridlog_storage.mongo.index_documents import collection_of
 
 if TYPE_CHECKING:
     from bson.raw_bson import RawBSONDocument

@@ -16,7 +16,7 @@ from benchmarks.backends.base import BackendFailedError, failing, need
 from benchmarks.backends.conversion import T
 from benchmarks.backends.database import DatabaseBackend
 from benchmarks.backends.server import Server
-from hybridlog_storage.mongo.collection_names import collection_of
+from hybridlog_storage.mongo.index_documents import collection_of
 
 if TYPE_CHECKING:
     from psycopg import Connection, Copy

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, ClassVar
 from benchmarks.backends.base import BackendFailedError, failing, need
 from benchmarks.backends.conversion import T
 from benchmarks.backends.database import DatabaseBackend
-from hybridlog_storage.mongo.collection_names import collection_of
+from hybridlog_storage.mongo.index_documents import collection_of
 
 if TYPE_CHECKING:
     from hybridlog_storage.messages import Channel

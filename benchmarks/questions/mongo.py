@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from benchmarks.questions.base import ARM, GRIPPER, VIEWPOINT, Asker, Reading, sums
-from hybridlog_storage.mongo.collection_names import collection_of
+from hybridlog_storage.mongo.index_documents import collection_of
 
 if TYPE_CHECKING:
     import pandas as pd

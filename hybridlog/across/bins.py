@@ -20,7 +20,7 @@ from hybridlog.query.ranges import RangeResolver
 from hybridlog.schema.arrow_columns import numbers
 from hybridlog.schema.arrow_types import is_number, is_time
 from hybridlog_storage.errors import UsageError
-from hybridlog_storage.ordering import run_starts
+from hybridlog_storage.messages import run_starts
 from hybridlog_storage.times import placed
 
 if TYPE_CHECKING:

@@ -24,8 +24,8 @@ from hybridlog.schema.column import STAMP
 from hybridlog.tf.epochs import Epochs, epochs_of
 from hybridlog.tf.in_frame import stream
 from hybridlog.wording import listed
+from hybridlog_storage.cache import lazy
 from hybridlog_storage.errors import TimeError, UsageError
-from hybridlog_storage.lazy import lazy
 from hybridlog_storage.times import BEGIN, END, placed
 
 if TYPE_CHECKING:

@@ -408,7 +408,7 @@ def _limited(tables: Iterable[pa.Table], limit: int) -> Iterator[pa.Table]:
 
 def _print_rows(tables: Iterable[pa.Table], limit: int | None, noun: str) -> int:
     """Print rows for people to read, and whether there are none or more; gives their number."""
-    from hybridlog.frames.cells import MAX_CELL, MAX_LINE, cells
+    from hybridlog.frames.lines import MAX_CELL, MAX_LINE, cells
     from hybridlog.schema.arrow_types import is_text
 
     most = SCREEN_ROWS if limit is None else limit

@@ -28,7 +28,7 @@ def complete(context: click.Context, param: click.Parameter, incomplete: str) ->
     find = _KINDS.get(kind[0].rstrip(".") if kind else "")
     if find is None:
         return []
-    from hybridlog_storage.lazy import import_numpy_late
+    from hybridlog_storage.cache import import_numpy_late
 
     import_numpy_late()
     from hybridlog.opened import OpenStore

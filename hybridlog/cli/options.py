@@ -50,7 +50,7 @@ class InStore(Place):
 
     def opened(self, **how: Any) -> AbstractContextManager[Store]:
         """The open store; see `opened_store`."""
-        from hybridlog.cli.open_store import opened_store
+        from hybridlog.cli.app import opened_store
 
         return opened_store(self.store, self.mongo, **how)
 

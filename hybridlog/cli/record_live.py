@@ -27,7 +27,7 @@ from hybridlog.cli.record_choices import (
 )
 from hybridlog.cli.render import print_fields
 from hybridlog.cli.signals import handled, write_note
-from hybridlog.query.answers.loss_words import coverage, in_words
+from hybridlog.query.answers.lost import coverage, in_words
 from hybridlog.record.losses import Cause, losses_of
 from hybridlog_storage.errors import (
     DatabaseError,
@@ -82,7 +82,7 @@ def record_live(choices: RecordChoices) -> int:
 
 
 def _record(choices: RecordChoices) -> int:
-    from hybridlog.live.memory import frozen_objects
+    from hybridlog.live.policy import frozen_objects
     from hybridlog.live.recorder import Recorder, make_room
 
     # Wrong options are found before a store is made.
@@ -195,8 +195,7 @@ def recorder_options(choices: RecordChoices) -> RecorderOptions:
     """Options for the recorder from those of the command; patterns are checked."""
     from hybridlog.contract import Contract
     from hybridlog.follow.child import Trigger
-    from hybridlog.live.memory import default_budget
-    from hybridlog.live.policy import priority_rule, throttle_rule
+    from hybridlog.live.policy import default_budget, priority_rule, throttle_rule
     from hybridlog.live.recorder import RecorderOptions
 
     chosen, no_index = choices.matchers()

@@ -30,11 +30,10 @@ from hybridlog.columns.fields import (
 )
 from hybridlog.columns.layout import ABOUT, OWN, OWN_COLUMNS, About, Section
 from hybridlog.schema.arrow_types import is_bytes, is_list
-from hybridlog_storage.cache import Cache
+from hybridlog_storage.cache import Cache, lazy
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import HybridlogError, StoreError, exhausted
-from hybridlog_storage.lazy import lazy
 from hybridlog_storage.manifest import digest_of
 
 _OPEN_FILES: Final = 256

@@ -5,9 +5,8 @@ from __future__ import annotations
 import threading
 from typing import TYPE_CHECKING
 
-from hybridlog_storage.cache import Cache
+from hybridlog_storage.cache import Cache, lazy
 from hybridlog_storage.errors import SegmentError, StoreError
-from hybridlog_storage.lazy import lazy
 from hybridlog_storage.manifests import manifests_at
 
 if TYPE_CHECKING:

@@ -23,11 +23,10 @@ from hybridlog.index.indexing import ChunkIndexer
 from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.left import LeftCodec
 from hybridlog.schema.states import State
-from hybridlog_storage.cache import Cache
+from hybridlog_storage.cache import Cache, lazy
 from hybridlog_storage.errors import StoreError
-from hybridlog_storage.lazy import lazy
 from hybridlog_storage.manifest import File, Part, rows_line
-from hybridlog_storage.ordering import distinct, run_starts
+from hybridlog_storage.messages import distinct, run_starts
 from hybridlog_storage.segments.segment_file import rows_name
 
 if TYPE_CHECKING:

@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING, Any, Final
 import pyarrow as pa
 from msgspec.structs import replace
 
-from hybridlog.columns.clouds import PointColumns, is_cloud
 from hybridlog.columns.column_file import ColumnFileWriter
 from hybridlog.columns.fields import FieldShape, copied, joined
 from hybridlog.columns.folders import Addition, TableFolders
@@ -35,14 +34,14 @@ from hybridlog.columns.layout import (
     table_schema_of,
     type_prefix,
 )
-from hybridlog.columns.rows import Piece, as_table, columns_from, piece_of
+from hybridlog.columns.rows import Piece, PointColumns, as_table, columns_from, is_cloud, piece_of
 from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.codec import no_messages
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.left import LeftFields
 from hybridlog.schema.states import State, encoding_of, state_of
 from hybridlog_storage.disk import files
-from hybridlog_storage.ordering import order_of
+from hybridlog_storage.messages import order_of
 from hybridlog_storage.settings import read_settings
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ from hybridlog.schema.arrow_types import converted
 from hybridlog.schema.column import ranges
 from hybridlog.schema.states import State
 from hybridlog_storage.errors import StoreError
-from hybridlog_storage.ordering import order_of
+from hybridlog_storage.messages import order_of
 from hybridlog_storage.stopping import check_wanted
 from hybridlog_storage.times import placed, span_of
 

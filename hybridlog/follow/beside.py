@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import hybridlog
 from hybridlog.entries import put_entry
-from hybridlog.follow.child import ENDED, Followed, Task, Trigger
+from hybridlog.follow.child import ENDED, Task, Trigger
 from hybridlog.follow.follower import Follower, begin_again, make_rows_ahead
+from hybridlog.maintenance.report import Followed
 from hybridlog.maintenance.tables import missing
 from hybridlog.query.answers.follow import Arrivals
 from hybridlog.query.predicate.types import check

@@ -15,17 +15,25 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 from msgspec import Struct
 
 from hybridlog.entries import put_entry
+from hybridlog.maintenance.report import Followed
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.topics import TopicMatcher, matcher, split_topic
-from hybridlog_storage.errors import UsageError, WhereError
+from hybridlog_storage.errors import (
+    DiskFullError,
+    HybridlogError,
+    StoreError,
+    UsageError,
+    WhereError,
+)
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
 
+    from hybridlog.index.indexing import IndexTarget
     from hybridlog.query.predicate.tree import Predicate
+    from hybridlog.shared import Shared
     from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
-    from hybridlog_storage.errors import DatabaseError
     from hybridlog_storage.messages import Channel
 
 _START: Final = (
@@ -36,23 +44,12 @@ _PATIENCE_S: Final = 1.0  # then the user hears of what is left at the end
 _TRIES: Final = 5
 """So often in a row it may end before it has told how far it is."""
 _PAUSE_S: Final = 1.0
+LOOK_S: Final = 0.5  # between two looks at the recording of a log
+SHORT_S: Final = 2.0
+"""A recording that takes less is not worth a process."""
 _OF_SERVICE: Final = {"NOTIFY_SOCKET", "WATCHDOG_PID", "WATCHDOG_USEC"}
 ENDED: Final = "ended"
 """Tells it that the recording is sealed."""
-
-
-class Followed(NamedTuple):
-    """How far a follower is.
-
-    `is_wanted` tells whether the recording gets documents. `read` and `indexed` count messages, and
-    `missed` those that the index lacks after a `failure` of the database.
-    """
-
-    is_wanted: bool
-    read: int = 0
-    indexed: int = 0
-    missed: int = 0
-    failure: DatabaseError | None = None
 
 
 class Task(NamedTuple):
@@ -76,7 +73,8 @@ class FollowerProcess:
     """Evaluates triggers, then makes rows, tables and documents, by a process that ends with this.
 
     When it ends before the recording, as for want of memory, it is started again, and goes on
-    where it was.
+    where it was. With a `target`, a recording that has ended before `SHORT_S` is followed in this
+    process, at its end.
     `judged` has the numbers of the sealed files that triggers have read; it is None without
     triggers, or when the process is given up. At the end it is waited for `wait_s`, if that is not
     None, and `left` is told once how many messages are left.
@@ -87,13 +85,15 @@ class FollowerProcess:
         directory: StoreDirectory,
         catalog: Catalog,
         task: Task,
-        triggers: Sequence[Trigger],
         *,
         has_documents: bool,
-        hit: Callable[[str, int], object],
-        say: Callable[[str], None],
+        target: IndexTarget | None = None,
+        triggers: Sequence[Trigger] = (),
+        hit: Callable[[str, int], object] = lambda *_: None,
+        say: Callable[[str], None] | None = None,
     ) -> None:
         self.state = Followed(has_documents)
+        self.said: list[str] = []
         self.judged: Collection[int] | None = () if triggers else None
         self.wait_s: float | None = None
         self.left: Callable[[int], object] = lambda _: None
@@ -105,15 +105,42 @@ class FollowerProcess:
         self._has_seen = not triggers
         self._has_told = False
         self._why = "their process ends again and again"
+        self._target = target
         self._hit = hit
-        self._say = say
+        self._say = say or self.said.append
         self._orders: list[Channel | str] = []
         self._process: subprocess.Popen[bytes] | None = None
+        self._begun = time.monotonic()
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, name="hybridlog-follow", daemon=True)
 
+    @classmethod
+    def of_short(
+        cls, shared: Shared, purpose: str, interval_s: float | None
+    ) -> Callable[[RecordingEntry], FollowerProcess]:
+        """How to follow a recording that may be short; `purpose` is what needs the index."""
+        index = shared.index
+        target = index.index_to_record(purpose)
+
+        def start(entry: RecordingEntry) -> FollowerProcess:
+            place = shared.directory.address
+            task = Task(place, index.wanted, index.cache_mb, entry.id, (), interval_s)
+            followed = cls(
+                shared.directory,
+                shared.catalog,
+                task,
+                has_documents=target.is_wanted,
+                target=target,
+            )
+            followed.start()
+            return followed
+
+        return start
+
     def start(self) -> None:
         """Begin."""
+        import multiprocessing.connection  # noqa: F401 - not while messages come
+
         self._thread.start()
 
     def expect(self, channel: Channel) -> None:
@@ -127,6 +154,8 @@ class FollowerProcess:
 
     def finish(self, entry: RecordingEntry) -> RecordingEntry:
         """Wait until it has done everything, but no longer than wanted."""
+        if self._target is not None and time.monotonic() - self._begun < SHORT_S:
+            return self._finish_here(entry, self._target)
         self._is_finishing = True
         self.order(ENDED)
         begun, waited, is_told = time.monotonic(), 0.0, False
@@ -146,6 +175,17 @@ class FollowerProcess:
         self.abandon()
         return put_entry(self._directory, self._catalog, entry.id)
 
+    def _finish_here(self, entry: RecordingEntry, target: IndexTarget) -> RecordingEntry:
+        from hybridlog.follow.follower import Follower, make_rows_ahead
+
+        self.abandon()
+        with suppress(StoreError, DiskFullError):  # or else they are written when logs go
+            make_rows_ahead(self._directory, entry.id, lambda: True)
+        follower = Follower(self._directory, self._catalog, entry, target)
+        entry = follower.finish(entry)
+        self.state = follower.state
+        return entry
+
     def leave(self) -> bool:
         """Let `finish` wait no longer; False if it does not wait."""
         was_waiting, self._is_left = self._is_finishing and not self._is_left, self._is_finishing
@@ -159,10 +199,17 @@ class FollowerProcess:
         if self._thread.is_alive():
             self._thread.join()
 
-    def forget(self) -> None:
-        """Leave documents of a removed recording to the next connection, which finds them."""
+    def forget(self, entry: RecordingEntry) -> None:
+        """Remove the documents of a removed recording, or leave them to the next connection."""
+        if self._target is not None and self._target.database is not None:
+            from hybridlog_storage.mongo.index_documents import IndexState
+
+            with suppress(HybridlogError):
+                IndexState(self._target.database).forget([entry.key])
 
     def _run(self) -> None:
+        if self._target is not None and self._over.wait(SHORT_S):
+            return
         tries, deaths = _TRIES, 0
         while tries and not self._over.is_set():
             before, self._has_told, is_done = (self._task.seen, self.state), False, False

@@ -7,7 +7,6 @@ ends at any point costs nothing but the work of the next one.
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -17,28 +16,24 @@ from msgspec import Struct, field
 
 from hybridlog.columns.recording_logs import RecordingRows
 from hybridlog.entries import put_entry
-from hybridlog.follow.child import Followed
-from hybridlog.index.indexing import ChunkIndexer
-from hybridlog.index.sending import IndexTarget, Sender
+from hybridlog.index.indexing import ChunkIndexer, IndexTarget, Sender
 from hybridlog.maintenance.expiry import make_rows
-from hybridlog.maintenance.report import reporter
+from hybridlog.maintenance.report import Followed, reporter
 from hybridlog.maintenance.retention import Rules
 from hybridlog.maintenance.tables import missing
 from hybridlog_storage.catalog import WHOLE, ChannelStats, file_of
 from hybridlog_storage.errors import (
     DatabaseError,
-    DiskFullError,
     HybridlogError,
     SegmentError,
     StoreError,
     TopicError,
 )
-from hybridlog_storage.mongo.index_state import IndexState
+from hybridlog_storage.mongo.index_documents import IndexState
 from hybridlog_storage.segments.chunk_table import places_of
-from hybridlog_storage.segments.gone_log import open_log
+from hybridlog_storage.segments.segment_reader import open_log
 from hybridlog_storage.segments.walk import OpenSegment
 from hybridlog_storage.settings import read_settings
-from hybridlog_storage.stopping import Flag
 
 if TYPE_CHECKING:
     from hybridlog.maintenance.report import Progress
@@ -148,15 +143,6 @@ class Follower:
         read, indexed, failure = self.messages, self.indexed, self.failure
         missed = 0 if failure is None else read - indexed
         return Followed(self._target.is_wanted, read, indexed, missed, failure)
-
-    def forget(self) -> None:
-        """Remove the documents of a recording that is removed.
-
-        Where that fails, the next connection finds a recording without files.
-        """
-        if self._target.database is not None:
-            with suppress(HybridlogError):
-                IndexState(self._target.database).forget([self._entry.key])
 
     def follow(self) -> None:
         """Read what was flushed since the last time.
@@ -376,58 +362,6 @@ def make_rows_ahead(
     """
     if not Rules.of(read_settings(directory.path).retention).is_empty:
         make_rows(directory, recording, is_wanted)
-
-
-class FollowerThread(Follower):
-    """Follows on a thread of this process, which waits for it at the end only.
-
-    `interval_s` lies between two looks, seconds; with None it does everything at the end.
-    """
-
-    def __init__(
-        self,
-        directory: StoreDirectory,
-        catalog: Catalog,
-        target: IndexTarget,
-        interval_s: float | None,
-        entry: RecordingEntry,
-    ) -> None:
-        super().__init__(directory, catalog, entry, target)
-        self._interval_s = interval_s
-        self._ended_as: RecordingEntry | None = None
-        self._crash: BaseException | None = None
-        self._over = Flag()
-        self._thread = threading.Thread(target=self._run, name="hybridlog-index", daemon=True)
-        self._thread.start()
-
-    def finish(self, entry: RecordingEntry) -> RecordingEntry:
-        """As of `Follower`; errors of the thread are raised, too."""
-        self._ended_as = entry
-        self.abandon()
-        if self._crash is not None:
-            raise self._crash
-        return self._ended_as
-
-    def abandon(self) -> None:
-        """Stop it."""
-        self.is_stopped = True
-        self._over.set()
-        self._thread.join()
-
-    def _run(self) -> None:
-        try:
-            while not self._over.wait(self._interval_s):
-                with suppress(StoreError):  # the next look or `finish` sees it
-                    self.follow()
-            if self._ended_as is not None:
-                self.is_stopped = False
-                with suppress(StoreError, DiskFullError):  # or else they are written when logs go
-                    make_rows_ahead(self._directory, self._entry.id, lambda: not self.is_stopped)
-                self._ended_as = super().finish(self._ended_as)
-        except BaseException as error:
-            self._crash = error
-        finally:
-            self.discard()
 
 
 def bring(

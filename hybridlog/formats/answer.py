@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from hybridlog.attachments import Extras
     from hybridlog.message import Message
     from hybridlog_storage.messages import Batch, Channel
-    from hybridlog_storage.segments.attachments import Attachment
+    from hybridlog_storage.segments.segment_format import Attachment
 
 Line: TypeAlias = "str | Iterator[str]"
 """A line of JSON, or its pieces."""

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 from hybridlog.formats.answer import Answer
 from hybridlog.formats.writing import Sink, Target, Whole, failures, new_directory
-from hybridlog_storage.mongo.collection_names import collection_of
+from hybridlog_storage.mongo.index_documents import collection_of
 
 if TYPE_CHECKING:
     from hybridlog_storage.messages import Buffer

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from mcap.records import Metadata
 
     from hybridlog_storage.messages import Batch, Channel
-    from hybridlog_storage.segments.attachments import Attachment
+    from hybridlog_storage.segments.segment_format import Attachment
 
 
 BATCH_BYTES = 2 << 20

@@ -38,8 +38,7 @@ from hybridlog.schema.codec import stamp_array
 from hybridlog.schema.column import STAMP
 from hybridlog.schema.left import LeftFields
 from hybridlog_storage.errors import DefinitionError
-from hybridlog_storage.messages import Batch
-from hybridlog_storage.ordering import order_of
+from hybridlog_storage.messages import Batch, order_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

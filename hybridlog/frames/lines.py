@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+import functools
+from collections.abc import Callable, Iterable, Mapping
+from typing import TYPE_CHECKING, Any, Final
 
 import pyarrow as pa
+from pyarrow import types
 
 from hybridlog.formats.answer import Line
 from hybridlog.formats.jsonl import json_line, json_rows
@@ -13,8 +15,16 @@ from hybridlog.frames.answer import Decoder, leaves_of, text_column
 from hybridlog.frames.names import arranged, free_name
 from hybridlog.index.indexing import rows_by_channel
 from hybridlog.query.planner import Planner
+from hybridlog.query.times import format_duration, format_time
 from hybridlog.schema.arrow_columns import structs
-from hybridlog.schema.arrow_types import plain_values
+from hybridlog.schema.arrow_types import (
+    is_bytes,
+    is_list,
+    is_number,
+    numpy_type,
+    plain_values,
+    time_of_day,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -93,3 +103,122 @@ def _flat(message: Mapping[str, Any]) -> dict[str, Any]:
             path += "_"
         found[path] = value
     return found
+
+
+MAX_CELL: Final = 40
+"""Characters of a text in a table."""
+MAX_LINE: Final = 200
+"""Characters of a value on lines of its own."""
+_MAX_ITEMS: Final = 4
+UNITS: Final = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
+"""Nanoseconds of the units of timestamps."""
+
+
+def cells(table: pa.Table, *, exact: bool = False, most: int = MAX_CELL) -> list[list[str]]:
+    """The rows of a table, a text for each value, of `most` characters; empty for a null.
+
+    `exact` numbers have all digits that tell them apart, not six.
+    """
+    columns = [[_cell(value, exact=exact, most=most) for value in each] for each in table.columns]
+    return [list(row) for row in zip(*columns, strict=True)]
+
+
+def _cell(value: pa.Scalar, *, exact: bool, most: int = MAX_CELL) -> str:
+    """A value in few characters."""
+    kind, inner = value.type, functools.partial(_cell, exact=exact)
+    if not value.is_valid:
+        text = ""
+    elif types.is_floating(kind):
+        text = _exact(value) if exact else f"{value.as_py():.6g}"
+    elif types.is_timestamp(kind):
+        text = _time(value)
+    elif types.is_time(kind):
+        text = time_of_day(value)
+    elif types.is_duration(kind):
+        text = format_duration(value.value)
+    elif is_bytes(kind):
+        text = f"{len(value.as_py())} bytes"
+    elif types.is_map(kind):
+        text = _pairs((inner(item["key"]), inner(item["value"])) for item in value.values)
+    elif types.is_struct(kind):
+        text = _pairs((name, inner(item)) for name, item in value.items())
+    elif is_list(kind):
+        text = _list(value.values, inner)
+    else:
+        text = _cut(_plain(value), most)
+    return text
+
+
+def _plain(value: pa.Scalar) -> str:
+    try:
+        return str(value.as_py())
+    except OverflowError:  # DuckDB has infinite dates
+        return f"{value.value} days"
+
+
+def _exact(value: pa.Scalar) -> str:
+    """The shortest digits that give a number back in its type."""
+    return str(numpy_type(value.type).type(value.as_py())).removesuffix(".0")
+
+
+def _time(value: pa.Scalar) -> str:
+    ns = value.value * UNITS[value.type.unit]
+    try:
+        return format_time(ns)
+    except OverflowError:  # DuckDB has later years than 9999
+        return f"{ns} ns"
+
+
+def _pairs(pairs: Iterable[tuple[str, str]]) -> str:
+    return _cut("{" + ", ".join(f"{name}: {value}" for name, value in pairs) + "}", MAX_LINE)
+
+
+def _list(values: Any, shown: Callable[[pa.Scalar], str]) -> str:
+    is_short = len(values) <= _MAX_ITEMS
+    first = ", ".join(shown(item) for item in values[: _MAX_ITEMS if is_short else 2])
+    return _cut(f"[{first}]" if is_short else f"[{first}, … {len(values)} in all]", MAX_LINE)
+
+
+def _cut(text: str, most: int) -> str:
+    return text if len(text) <= most else text[: most - 1] + "…"
+
+
+def shown(table: pa.Table, most: int) -> dict[str, Any]:
+    """A table for people, as plain values by name.
+
+    `columns` are pairs of the name and whether it is a number, `columns_left_out` their number;
+    `rows`, texts; `times`, the log time of each row, ns since 1970, the last one of its microsecond
+    where only a timestamp tells it, and `recordings`, the name of its recording: both empty without
+    such columns.
+    """
+    first = table.select(range(min(table.num_columns, most)))
+    return {
+        "columns": [
+            [field.name, is_number(field.type) or pa.types.is_decimal(field.type)]
+            for field in first.schema
+        ],
+        "columns_left_out": table.num_columns - first.num_columns,
+        "rows": cells(first, exact=True),
+        "times": _times(table),
+        "recordings": _values(table, "recording", pa.types.is_string),
+    }
+
+
+def _times(table: pa.Table) -> list[int | None]:
+    if found := _values(table, "t", pa.types.is_int64):
+        return found
+    if not (column := _values(table, "log_time", pa.types.is_timestamp)):
+        return []
+    unit = UNITS[table.schema.field("log_time").type.unit]
+    return [None if value is None else value * unit + unit - 1 for value in column]
+
+
+def _values(table: pa.Table, name: str, fits: Callable[[pa.DataType], bool]) -> list[Any]:
+    """The values of a column, times as integers; none without it, or if its type is another."""
+    place = table.schema.get_field_index(name)
+    if place < 0 or not fits(table.schema.field(place).type):
+        return []
+    column = table.column(place)
+    if pa.types.is_timestamp(column.type):
+        column = column.cast(pa.int64())
+    return list(column.to_pylist())

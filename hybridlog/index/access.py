@@ -30,11 +30,11 @@ from hybridlog_storage.settings import (
 )
 
 if TYPE_CHECKING:
-    from hybridlog.index.sending import IndexTarget
+    from hybridlog.index.indexing import IndexTarget
     from hybridlog.maintenance.report import Progress
     from hybridlog.shared import Shared
     from hybridlog_storage.mongo.database import Database
-    from hybridlog_storage.mongo.index_state import Owner
+    from hybridlog_storage.mongo.index_documents import Owner
     from hybridlog_storage.mongo.mongod import EmbeddedMongod
 
 _P = ParamSpec("_P")
@@ -149,7 +149,7 @@ class IndexAccess:
 
     def index_to_record(self, purpose: str, *, brings: bool = True) -> IndexTarget:
         """The index, for a new recording; it may be unavailable, or without `brings` be behind."""
-        from hybridlog.index.sending import IndexTarget
+        from hybridlog.index.indexing import IndexTarget
 
         renew = partial(self.connect, brings=False)
         try:
@@ -196,7 +196,7 @@ class IndexAccess:
 
     def claim(self, database: Database) -> Owner:
         """Note in the index that it is of the store at this place."""
-        from hybridlog_storage.mongo.index_state import IndexState
+        from hybridlog_storage.mongo.index_documents import IndexState
 
         owner = IndexState(database).claim(self._directory.settings.store_id, self._own_place)
         self.id, self._owns = owner.made, True
@@ -304,7 +304,7 @@ class IndexAccess:
 
     def _open(self) -> Database:
         """The database, connected again if it is lost; it belongs to this store."""
-        from hybridlog_storage.mongo.index_state import IndexState, other_store
+        from hybridlog_storage.mongo.index_documents import IndexState, other_store
 
         if (database := self.connected) is not None:
             return database

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 from hybridlog.index.access import IndexAddress, again_if_lost
 from hybridlog.query.query import Query
 from hybridlog_storage.errors import TopicError, UsageError
-from hybridlog_storage.mongo.collection_names import collection_of
+from hybridlog_storage.mongo.index_documents import collection_of
 
 if TYPE_CHECKING:
     from hybridlog.maintenance.report import ArraysOfTopic, Progress

@@ -25,13 +25,13 @@ from hybridlog.entries import text as as_text
 from hybridlog.follow.child import FollowerProcess, Task
 from hybridlog.live.clocks import CLOCK, MachineClock, SimulatedTime
 from hybridlog.live.incidents import GROUPS, RULE, Incidents, Moment, Ring, Silence, SilenceWatch
-from hybridlog.live.memory import resident_bytes
 from hybridlog.live.policy import (
     SMALL_BYTES,
     WHOLE_BELOW,
     Rule,
     Throttle,
     first_fit,
+    resident_bytes,
 )
 from hybridlog.live.recording import LiveOptions, LiveRecording, follow_interval_s
 from hybridlog.live.state import RecorderState, StateFile, Tally, TopicCounts
@@ -228,8 +228,8 @@ class Recorder:
             self._directory,
             self._shared.catalog,
             task,
-            triggers,
             has_documents=index.is_wanted and options.derives,
+            triggers=triggers,
             hit=lambda text, time: self.fire(text, self._passed(time)),
             say=self.say,
         )

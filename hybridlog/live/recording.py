@@ -19,8 +19,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 import numpy as np
 from msgspec import Struct, field
 
-from hybridlog.live.memory import MIN_USER_BUDGET, default_budget
-from hybridlog.live.policy import SMALL_BYTES
+from hybridlog.live.policy import MIN_USER_BUDGET, SMALL_BYTES, default_budget
 from hybridlog.record.capture import Capture
 from hybridlog.record.losses import Cause, Ledger
 from hybridlog.record.recorder import RecordReport
@@ -34,7 +33,6 @@ from hybridlog_storage.segments.segment_writer import SegmentSettings
 
 if TYPE_CHECKING:
     from hybridlog.follow.child import FollowerProcess
-    from hybridlog.follow.follower import FollowerThread
     from hybridlog.query.topics import TopicMatcher
     from hybridlog.snapshot import Snapshot
     from hybridlog_storage.catalog import Catalog, RecordingEntry
@@ -122,7 +120,7 @@ class LiveRecording:
         self,
         directory: StoreDirectory,
         catalog: Catalog,
-        follow: Callable[[RecordingEntry], FollowerThread | FollowerProcess],
+        follow: Callable[[RecordingEntry], FollowerProcess],
         name: str,
         options: LiveOptions,
         *,
@@ -370,6 +368,7 @@ class LiveRecording:
             failure,
             0,
             time.monotonic() - self._started,
+            remarks=self.capture.follower.said,
         )
 
     def _cut_off(self) -> list[Loss]:

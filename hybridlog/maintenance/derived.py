@@ -29,7 +29,7 @@ from hybridlog_storage.errors import (
     unreadable,
 )
 from hybridlog_storage.messages import EXPIRED_IDS
-from hybridlog_storage.mongo.index_state import IndexState
+from hybridlog_storage.mongo.index_documents import IndexState
 from hybridlog_storage.settings import read_settings
 
 if TYPE_CHECKING:

@@ -30,7 +30,7 @@ from hybridlog_storage.manifest import (
     replace,
     with_mark,
 )
-from hybridlog_storage.mongo.index_state import IndexState
+from hybridlog_storage.mongo.index_documents import IndexState
 
 if TYPE_CHECKING:
     from hybridlog.opened import OpenStore

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Final
 
 from hybridlog.maintenance.report import reporter
 from hybridlog.record.losses import Cause
-from hybridlog_storage.disk import durability, files
+from hybridlog_storage.disk import files
 from hybridlog_storage.errors import ChangedError, DiskFullError, SegmentError, StoreError
 from hybridlog_storage.manifest import (
     LetGo,
@@ -30,8 +30,7 @@ from hybridlog_storage.manifest import (
     with_rows,
     with_totals,
 )
-from hybridlog_storage.segments.gone_log import front
-from hybridlog_storage.segments.segment_reader import SegmentReader
+from hybridlog_storage.segments.segment_reader import SegmentReader, front
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping
@@ -274,9 +273,9 @@ def write_rows(recording: Path, line: File, into: Path, *, version: int = 0) -> 
             return writer.close()
         except BaseException as error:
             writer.discard()
-            durability.remove(into, writer.names)
+            files.remove(into, writer.names)
             if isinstance(error, OSError):
-                raise durability.explain(error, into, "writing rows to") from error
+                raise files.explain(error, into, "writing rows to") from error
             raise
 
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from msgspec import Struct, field
 
 if TYPE_CHECKING:
+    from hybridlog_storage.errors import DatabaseError
     from hybridlog_storage.segments.recovery import Recovered
 
 Progress = Callable[[str, int, int], None]
@@ -74,3 +75,17 @@ class ArraysOfTopic(Struct):
     bytes_after: int = 0
     left: list[str] = field(default_factory=list)
     has_arrays: bool | None = None
+
+
+class Followed(NamedTuple):
+    """How far a follower is.
+
+    `is_wanted` tells whether the recording gets documents. `read` and `indexed` count messages, and
+    `missed` those that the index lacks after a `failure` of the database.
+    """
+
+    is_wanted: bool
+    read: int = 0
+    indexed: int = 0
+    missed: int = 0
+    failure: DatabaseError | None = None

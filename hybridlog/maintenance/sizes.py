@@ -18,7 +18,7 @@ from msgspec import Struct
 
 from hybridlog.columns.layout import type_prefix
 from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD
-from hybridlog_storage.mongo.collection_names import collection_of
+from hybridlog_storage.mongo.index_documents import collection_of
 
 if TYPE_CHECKING:
     from pathlib import Path

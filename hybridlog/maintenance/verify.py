@@ -40,12 +40,10 @@ from hybridlog_storage.errors import (
     UsageError,
 )
 from hybridlog_storage.manifest import encode, replace
-from hybridlog_storage.mongo.collection_names import collection_of
-from hybridlog_storage.mongo.index_state import IndexState
-from hybridlog_storage.segments.gone_log import open_log
+from hybridlog_storage.mongo.index_documents import IndexState, collection_of
 from hybridlog_storage.segments.recovery import damage_of, rebuild_summary
 from hybridlog_storage.segments.segment_file import SEALED_SUFFIX, is_rows
-from hybridlog_storage.segments.segment_reader import SegmentReader
+from hybridlog_storage.segments.segment_reader import SegmentReader, open_log
 from hybridlog_storage.settings import EMBEDDED, is_uri, read_settings, write_settings
 
 if TYPE_CHECKING:

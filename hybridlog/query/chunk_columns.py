@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from hybridlog_storage.lazy import lazy
-from hybridlog_storage.ordering import run_starts
+from hybridlog_storage.cache import lazy
+from hybridlog_storage.messages import run_starts
 from hybridlog_storage.segments.chunk_table import place_of
 from hybridlog_storage.times import BEGIN, END, placed
 

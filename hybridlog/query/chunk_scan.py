@@ -21,8 +21,7 @@ from msgspec import Struct, field
 from hybridlog.query.predicate.tree import is_meta
 from hybridlog.query.question import Counters
 from hybridlog_storage.errors import StoreError
-from hybridlog_storage.messages import interleave
-from hybridlog_storage.ordering import distinct, order_of
+from hybridlog_storage.messages import distinct, interleave, order_of
 from hybridlog_storage.stopping import check_wanted
 from hybridlog_storage.times import inside, placed, touches
 

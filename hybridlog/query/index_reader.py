@@ -18,9 +18,7 @@ from hybridlog.query.question import field_types
 from hybridlog.record.marks import MARKS
 from hybridlog.schema.column import STAMP
 from hybridlog_storage.errors import StoreError, TopicError, WhereError
-from hybridlog_storage.mongo.collection_names import collection_of
-from hybridlog_storage.mongo.index_documents import KEY_BYTES, between
-from hybridlog_storage.mongo.index_state import IndexState
+from hybridlog_storage.mongo.index_documents import KEY_BYTES, IndexState, between, collection_of
 from hybridlog_storage.stopping import check_wanted
 from hybridlog_storage.times import END
 

@@ -16,7 +16,7 @@ from msgspec import Struct
 from hybridlog.query.times import DurationLike, format_duration, format_time, parse_duration
 from hybridlog.schema.column import ranges
 from hybridlog_storage.errors import TopicError, UsageError
-from hybridlog_storage.ordering import run_starts
+from hybridlog_storage.messages import run_starts
 from hybridlog_storage.times import END, placed
 
 if TYPE_CHECKING:

@@ -20,8 +20,8 @@ from hybridlog.query.rows import RowBatch, Rows
 from hybridlog.schema.column import STAMP
 from hybridlog.schema.states import GONE
 from hybridlog.snapshot import UNFINISHED
+from hybridlog_storage.cache import lazy
 from hybridlog_storage.errors import TopicError, UsageError
-from hybridlog_storage.lazy import lazy
 from hybridlog_storage.times import END
 
 if TYPE_CHECKING:

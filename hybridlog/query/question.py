@@ -14,7 +14,7 @@ from msgspec.structs import asdict, replace
 
 from hybridlog.query.times import TimeLike
 from hybridlog.schema.states import State, encoding_of, state_of
-from hybridlog_storage.lazy import lazy
+from hybridlog_storage.cache import lazy
 from hybridlog_storage.times import BEGIN, END, span_of
 
 if TYPE_CHECKING:

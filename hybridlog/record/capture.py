@@ -41,7 +41,6 @@ from hybridlog_storage.segments.segment_writer import RecordingWriter, SegmentSe
 
 if TYPE_CHECKING:
     from hybridlog.follow.child import FollowerProcess
-    from hybridlog.follow.follower import FollowerThread
     from hybridlog.snapshot import Snapshot
     from hybridlog_storage.catalog import Catalog
     from hybridlog_storage.disk.directory import StoreDirectory
@@ -84,7 +83,7 @@ class Capture:
         self,
         directory: StoreDirectory,
         catalog: Catalog,
-        follow: Callable[[RecordingEntry], FollowerThread | FollowerProcess],
+        follow: Callable[[RecordingEntry], FollowerProcess],
         known: Callable[[], Snapshot],
         *,
         name: str,
@@ -232,7 +231,7 @@ class Capture:
             manifests.remove(entry.id)
         with suppress(HybridlogError):
             self.catalog.remove(entry.id)
-        self.follower.forget()
+        self.follower.forget(entry)
         self._held.close()
 
     def _begin(self, create: Callable[[Manifest], None], manifest: Manifest) -> RecordingEntry:

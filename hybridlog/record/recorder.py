@@ -29,10 +29,8 @@ from hybridlog_storage.errors import (
     TopicError,
 )
 from hybridlog_storage.manifest import Loss
-from hybridlog_storage.messages import Batch, Channel
-from hybridlog_storage.ordering import distinct
-from hybridlog_storage.segments.attachments import Attachment
-from hybridlog_storage.segments.segment_format import OUR_NAMES
+from hybridlog_storage.messages import Batch, Channel, distinct
+from hybridlog_storage.segments.segment_format import OUR_NAMES, Attachment
 from hybridlog_storage.segments.segment_writer import RecordingWriter, SegmentSettings
 from hybridlog_storage.stopping import at_safe_points, safe_point
 from hybridlog_storage.times import placed
@@ -40,14 +38,13 @@ from hybridlog_storage.times import placed
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from hybridlog.follow.child import FollowerProcess
     from hybridlog.formats.reading import Damage, Fingerprint, Source
-    from hybridlog.index.sending import IndexTarget
     from hybridlog.query.topics import TopicMatcher
     from hybridlog.snapshot import Snapshot
     from hybridlog_storage.catalog import Catalog
     from hybridlog_storage.disk.directory import StoreDirectory
 
-_FOLLOW_S = 0.5  # between two looks of the follower
 _MAX_PARTS = 1000  # of a log, whose fingerprints the recording has
 
 
@@ -114,7 +111,7 @@ def record(
     source: Source,
     directory: StoreDirectory,
     catalog: Catalog,
-    target: IndexTarget,
+    follow: Callable[[RecordingEntry], FollowerProcess],
     known: Callable[[], Snapshot],
     *,
     fingerprint: Fingerprint,
@@ -127,7 +124,7 @@ def record(
         source: The source, open and not yet read.
         directory: The store.
         catalog: Its catalog.
-        target: Where its index documents go.
+        follow: Starts the follower of the recording.
         known: Returns all recordings of the store.
         fingerprint: Fingerprint of the source's content.
         options: Options of the recording.
@@ -138,13 +135,11 @@ def record(
         SourceError: nothing could be read.
         DiskFullError: no space; nothing is stored.
     """
-    from hybridlog.follow.follower import FollowerThread  # a live recorder loads none of it
-
     started = time.monotonic()
     capture = Capture(
         directory,
         catalog,
-        partial(FollowerThread, directory, catalog, target, _FOLLOW_S),
+        follow,
         known,
         name=options.name or name_of(source.path),
         tags=options.tags,
@@ -179,7 +174,7 @@ def record(
         latched=copy.front.messages if copy.front is not None else 0,
         latched_left_out=copy.front.left_out if copy.front is not None else 0,
         attachments_left_out=copy.attachments_left_out,
-        remarks=list(source.remarks),
+        remarks=[*source.remarks, *capture.follower.said],
     )
 
 

@@ -18,7 +18,7 @@ from hybridlog.schema.wire_gather import Source
 from hybridlog.schema.wire_program import Wire, compile_type
 from hybridlog.schema.wire_scan import MisfitError, Scanner
 from hybridlog.schema.wire_walk import Walker
-from hybridlog_storage.ordering import distinct
+from hybridlog_storage.messages import distinct
 
 if TYPE_CHECKING:
     from collections.abc import Collection

@@ -17,7 +17,7 @@ from typing import Any, Final
 from msgspec import Struct
 
 from hybridlog.columns.layout import column_names
-from hybridlog_storage.mongo.collection_names import collection_of
+from hybridlog_storage.mongo.index_documents import collection_of
 
 TABLES: Final = ("recordings", "topics", "losses", "marks")
 """Tables about the store itself; their names are reserved."""

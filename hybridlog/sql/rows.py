@@ -18,11 +18,10 @@ import pyarrow.compute as pc
 from msgspec import Struct, field
 from pyarrow import acero
 
-from hybridlog.columns.clouds import NEEDED, PointColumns, is_cloud
 from hybridlog.columns.column_file import FIRST
 from hybridlog.columns.fields import records_of
 from hybridlog.columns.layout import POINTS
-from hybridlog.columns.rows import piece_of
+from hybridlog.columns.rows import NEEDED, PointColumns, is_cloud, piece_of
 from hybridlog.query.question import Counters, RecordedChannel
 from hybridlog.query.rows import offsets_by_chunk, places_of
 from hybridlog.schema.arrow_types import has_empty, is_array
@@ -30,8 +29,8 @@ from hybridlog.schema.left import LeftFields
 from hybridlog.schema.states import GONE, State
 from hybridlog.sql.columns import OWN, ViewColumn, absent, points_column
 from hybridlog.sql.names import EVERYTHING, Usage
+from hybridlog_storage.cache import lazy
 from hybridlog_storage.errors import ChangedError, StoreError
-from hybridlog_storage.lazy import lazy
 from hybridlog_storage.messages import EXPIRED_IDS
 from hybridlog_storage.segments.chunk import Placed
 from hybridlog_storage.times import BEGIN, END

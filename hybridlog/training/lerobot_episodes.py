@@ -16,7 +16,7 @@ from hybridlog.arrays.video import pyav
 from hybridlog.query.query import Query
 from hybridlog.query.question import Question
 from hybridlog.training.episodes import pictures
-from hybridlog_storage.disk.durability import write_new
+from hybridlog_storage.disk.files import write_new
 from hybridlog_storage.errors import MissingDependencyError, PayloadError, UsageError
 
 if TYPE_CHECKING:

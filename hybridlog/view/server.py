@@ -16,8 +16,7 @@ from starlette.staticfiles import StaticFiles
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from hybridlog.view.context import Context, broken_response
-from hybridlog.view.guard import Guard
-from hybridlog.view.loopback import HOST, Admission, listen, new_token
+from hybridlog.view.guard import HOST, Admission, Guard, listen, new_token
 
 if TYPE_CHECKING:
     from hybridlog.store import Store

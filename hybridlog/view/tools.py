@@ -16,7 +16,7 @@ from pydantic import Field
 from hybridlog.arrays.message_arrays import IMAGES, plain_type
 from hybridlog.drawing.images import Picture, picture
 from hybridlog.frames.lines import json_lines
-from hybridlog.query.answers.loss_words import coverage
+from hybridlog.query.answers.lost import coverage
 from hybridlog.query.planner import match_times
 from hybridlog.query.predicate.tokens import MAX_TEXT
 from hybridlog.query.times import format_duration, format_time

@@ -25,8 +25,8 @@ from hybridlog_storage.manifest import File
 from hybridlog_storage.manifests import RECORDINGS
 from hybridlog_storage.messages import EXPIRED_IDS, Channel, Schema, schema_hash
 from hybridlog_storage.segments.chunk_table import ChunkTable
-from hybridlog_storage.segments.gone_log import GoneLog, open_log
 from hybridlog_storage.segments.segment_file import listed_parts, sealed_name
+from hybridlog_storage.segments.segment_reader import GoneLog, open_log
 from hybridlog_storage.summary import (
     Int,
     RecordingSummary,

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, ClassVar, Final
 
 from msgspec import Struct
 
-from hybridlog_storage.disk import durability, files
+from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import (
     LOCK_WAIT_S,
     StoreDirectory,
@@ -170,7 +170,7 @@ class Source(Place):
         """A handle of a file, or of a copy of it that is gone in the end; errors as `pieces`."""
         with tempfile.TemporaryFile() as file:
             os.fchmod(file.fileno(), 0o666)  # which copies of it have, less their umask
-            with durability.explained(Path(tempfile.gettempdir()), "copying by way of"):
+            with files.explained(Path(tempfile.gettempdir()), "copying by way of"):
                 for piece in self.pieces(name, 0, size):
                     file.write(piece)
                 file.flush()
@@ -211,7 +211,7 @@ class Directory(Source):
     def send(self, sent: Sending) -> None:
         """As of `Place`; goes on behind the last byte that is there."""
         final, part = self._path / sent.name, self._path / sent.part
-        with durability.explained(final, "copying into"):
+        with files.explained(final, "copying into"):
             fd = files.open_file(part, os.O_RDWR | os.O_CREAT)
             try:
                 about = os.fstat(fd)
@@ -222,7 +222,7 @@ class Directory(Source):
                     raise sent.not_arrived(self)
             finally:
                 os.close(fd)
-            durability.publish(part, final)
+            files.publish(part, final)
 
     def _grown(self, fd: int, at: int, sent: Sending) -> bool:
         """Write a file from a byte on; True if it is on the disk, with its digest."""
@@ -281,7 +281,7 @@ class Directory(Source):
     def marked(self) -> Iterator[str]:
         """Make a small file in `manifests`, for a moment; gives its name."""
         path = self._path / MANIFESTS / f"{MARK}{secrets.token_hex(8)}"
-        with durability.explained(path, "copying from"):
+        with files.explained(path, "copying from"):
             os.close(files.open_file(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL))
         try:
             yield path.name

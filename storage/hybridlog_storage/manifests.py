@@ -25,7 +25,7 @@ from abc import ABC, abstractmethod
 from contextlib import ExitStack, contextmanager, suppress
 from typing import TYPE_CHECKING, ClassVar, Final
 
-from hybridlog_storage.disk import durability, files
+from hybridlog_storage.disk import files
 from hybridlog_storage.errors import (
     DiskFullError,
     HeldError,
@@ -268,7 +268,7 @@ class DiskManifests(Manifests):
         """
         if not self._bare():
             return
-        explained = durability.explained(self._folder, "clearing")
+        explained = files.explained(self._folder, "clearing")
         with suppress(HeldError), explained, self._all_locked(wait_s=0):
             for folder in self._bare():
                 with ExitStack() as held, suppress(FileNotFoundError, HeldError):
@@ -289,7 +289,7 @@ class DiskManifests(Manifests):
 
     @contextmanager
     def _all_locked(self, wait_s: float | None = None) -> Iterator[None]:
-        with durability.explained(self._folder, "making"):
+        with files.explained(self._folder, "making"):
             files.make_folders(self._folder)
             files.sync_folder(self._folder.parent)
         _make_file(self._folder / _ALL)
@@ -301,7 +301,7 @@ class DiskManifests(Manifests):
         if os.path.lexists(path):
             raise RecordingExistsError(f"There is a recording {manifest.id} already.")
         folder = self._recordings / manifest.id
-        with durability.explained(path, "writing"):
+        with files.explained(path, "writing"):
             self._make_lock(folder)
             with _locked(folder / MANIFEST_LOCK):
                 self._write(path, data)
@@ -332,7 +332,7 @@ class DiskManifests(Manifests):
     def _replace(self, recording: str, data: bytes, version: str) -> None:
         path = self.path(recording)
         _keep_old(path, self._recordings / recording)
-        with durability.explained(path, "writing"):
+        with files.explained(path, "writing"):
             self._write(path, data)
 
     def _write(self, path: Path, data: bytes) -> None:
@@ -360,7 +360,7 @@ class DiskManifests(Manifests):
 
     def _delete_files(self, recording: str) -> None:
         folder = self._recordings / recording
-        explained = durability.explained(folder, "deleting")
+        explained = files.explained(folder, "deleting")
         with explained, suppress(FileNotFoundError):  # or somebody else has finished
             for name in files.names(folder):
                 if name != MANIFEST_LOCK:
@@ -375,7 +375,7 @@ class DiskManifests(Manifests):
             with suppress(RecordingGoneError):
                 if says_so and self._read(recording)[0].status != "removed":
                     return
-            with durability.explained(self._folder, "deleting"):
+            with files.explained(self._folder, "deleting"):
                 self._drop(recording)
                 files.sync_folder(self._folder)
                 files.remove_tree(self._recordings / recording)
@@ -466,5 +466,5 @@ def _plainly(path: Path, changing: str = "") -> Iterator[None]:
                 f"{path} is a link, or of another kind than a store has there: move it out of the "
                 "store, then run `hybridlog verify --repair`."
             ) from error
-        explained = durability.explain(error, path, changing)
+        explained = files.explain(error, path, changing)
         raise (explained if changing else unreadable(error, path)) from error

@@ -147,7 +147,7 @@ def stop(frame, event, argument):
         os.kill(os.getpid(), signal.SIGINT)
 
 FILES = (
-    "commands/record.py", "open_store.py",
+    "commands/record.py", "cli/app.py",
     "formats/writing.py", "formats/raw.py", "mcap/writer.py", "rosbag1/writer.py", "unfinished.py",
 )
 MOMENT = sys.argv.pop(1)

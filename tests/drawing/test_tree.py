@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import hybridlog as hl
-from hybridlog.drawing.log import LEVELS, Kind, Line, filtered, kind_of, lines
 from hybridlog.drawing.tree import MAX_NODES, MAX_SHOWN, MAX_TEXT, tree
+from hybridlog.view.routes.messages import LEVELS, Kind, Line, filtered, kind_of, lines
 from tests.odd_messages import HOSTILE, LOGS, LONG, MS, START, log_time, ros_channel
 from tests.ros_values import ROS1, ROS2, message_of, plain_of
 

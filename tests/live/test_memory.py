@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.simulator.write import write_bag
-from hybridlog.live import memory as module
+from hybridlog.live import policy as module
 from hybridlog.live import recorder
 from hybridlog.live.recorder import RecorderOptions
 from hybridlog.live.recording import LiveOptions

@@ -26,8 +26,8 @@ from hybridlog.live import recording as live
 from hybridlog_storage.disk.files import System
 from hybridlog_storage.errors import DatabaseError, DiskFullError, UsageError
 from hybridlog_storage.messages import Channel, Schema
-from hybridlog_storage.mongo.collection_names import collection_of
 from hybridlog_storage.mongo.database import Database
+from hybridlog_storage.mongo.index_documents import collection_of
 from hybridlog_storage.segments.segment_file import SegmentFile
 from hybridlog_storage.segments.segment_writer import RecordingWriter, SegmentSettings
 from tests import places

@@ -13,7 +13,7 @@ from msgspec.structs import replace
 import hybridlog as hl
 from hybridlog.live.recorder import RecorderOptions
 from hybridlog_storage.messages import Channel, Schema
-from hybridlog_storage.mongo.index_state import RECORDINGS
+from hybridlog_storage.mongo.index_documents import RECORDINGS
 from hybridlog_storage.settings import write_settings
 from tests import places
 from tests.indexed import documents_of

@@ -21,8 +21,8 @@ from rosbags.typesys import Stores, get_typestore
 
 import hybridlog as hl
 from hybridlog.arrays.message_arrays import to_numpy
-from hybridlog.columns.clouds import PointColumns
 from hybridlog.columns.fields import FieldShape
+from hybridlog.columns.rows import PointColumns
 from hybridlog.query.planner import Planner
 from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.errors import PayloadError, StoreError, TopicError, UsageError

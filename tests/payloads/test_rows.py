@@ -25,8 +25,7 @@ from hybridlog_storage import manifest as truth
 from hybridlog_storage.errors import PayloadError, SegmentError, StoreError
 from hybridlog_storage.manifest import File
 from hybridlog_storage.messages import EXPIRED_IDS, REDUCED, Channel, Schema, left_channel
-from hybridlog_storage.segments.gone_log import GoneLog, open_log
-from hybridlog_storage.segments.segment_reader import SegmentReader
+from hybridlog_storage.segments.segment_reader import GoneLog, SegmentReader, open_log
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
 from tests.indexed import index_fields

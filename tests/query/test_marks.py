@@ -19,7 +19,7 @@ from starlette.testclient import TestClient
 import hybridlog as hl
 from hybridlog.query.answers.marks import marks_in
 from hybridlog.record.marks import mark_channel, mark_payload
-from hybridlog.view.loopback import Admission
+from hybridlog.view.guard import Admission
 from hybridlog.view.server import make_app
 from hybridlog_storage.errors import StoreError, TimeError, UsageError
 from hybridlog_storage.manifest import MAX_MARKS, Mark, replace

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
-from hybridlog.cli import app, open_store
+from hybridlog.cli import app
 from hybridlog_storage.settings import NONE
 from tests.calls import Calls
 from tests.cli.running import run
@@ -100,7 +100,7 @@ def seen(calls: Calls) -> list[dict[str, int]]:
         found.append(dict(asked[0].entry(LABEL).messages_by_topic()))
 
     calls.change(hl.Store, "snapshot", keep)
-    calls(open_store, "_repairs", look)
+    calls(app, "_repairs", look)
     return found
 
 

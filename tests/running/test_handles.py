@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
+from hybridlog.follow.follower import Follower
 from hybridlog.live import LiveOptions
 from hybridlog.maintenance.expiry import expire
 from hybridlog.maintenance.opening import StoreFiles
@@ -130,9 +131,17 @@ def test_chunks_that_are_flushed_while_the_index_is_made_are_not_damaged(
     settings = SegmentSettings(chunk_size=4096, segment_size=40_000, compression="none")
 
     def slow(_: object, reader: SegmentReader) -> None:
-        if threading.current_thread().name.startswith("hybridlog-index"):
+        if threading.current_thread() is following:
             time.sleep(0.05)
 
+    def follow() -> None:
+        follower = Follower(writer.directory, writer.catalog, recording.capture.entry)
+        while not is_over.is_set():
+            follower.follow()
+        follower.discard()
+
+    is_over = threading.Event()
+    following = threading.Thread(target=follow)
     calls.change(SegmentReader, "grow", slow)
     written, seen = 0, 0
     with (
@@ -141,7 +150,8 @@ def test_chunks_that_are_flushed_while_the_index_is_made_are_not_damaged(
     ):
         options = LiveOptions(settings=settings, flush_interval_s=0.01)
         with writer.start("live", options) as recording:
-            until = time.monotonic() + 3
+            following.start()
+            until = time.monotonic() + 1.5
             while time.monotonic() < until:
                 payload = b'{"n": %d, "pad": "%s"}' % (written, b"." * 300)
                 channel = (first, second)[written % 2]
@@ -154,6 +164,8 @@ def test_chunks_that_are_flushed_while_the_index_is_made_are_not_damaged(
                     assert found == [*range(len(found))]
                     assert seen <= len(found) <= store.topic("said").count()
                     seen = len(found)
+            is_over.set()
+            following.join()
         assert [json.loads(one.raw)["n"] for one in store.topic("said")] == [*range(written)]
         assert store.topic("said").count() == written
         assert not store.topic("said").completeness().has_losses

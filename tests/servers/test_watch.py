@@ -15,7 +15,7 @@ from pymongo import MongoClient
 
 import hybridlog as hl
 from hybridlog.session import Session
-from hybridlog_storage.mongo.index_state import IndexState
+from hybridlog_storage.mongo.index_documents import IndexState
 from tests import logs, places
 from tests.cli.running import COMMAND, environment
 from tests.servers.mongods import Mongod, eventually

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybridlog_storage.mongo.collection_names import CATALOG_PREFIX, collection_of
+from hybridlog_storage.mongo.index_documents import CATALOG_PREFIX, collection_of
 from tests.format_reader import collection_name
 
 # Few letters, so that names meet if they can.

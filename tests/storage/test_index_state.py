@@ -12,8 +12,7 @@ from msgspec.structs import replace
 from hybridlog_storage.catalog import ChannelStats, RecordingEntry, channel_entry
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.mongo.database import Database
-from hybridlog_storage.mongo.index_documents import key_bound
-from hybridlog_storage.mongo.index_state import IndexState
+from hybridlog_storage.mongo.index_documents import IndexState, key_bound
 
 ONE, OTHER = "0123456789abcdef" * 2, "fedcba9876543210" * 2
 HOUR = 3600 * 10**9

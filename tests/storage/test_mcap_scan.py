@@ -30,7 +30,7 @@ from hybridlog_storage.mcap.mcap_content import (
     read_record,
 )
 from hybridlog_storage.mcap.mcap_scan import Scan
-from hybridlog_storage.segments.attachments import Attachment, reader_of
+from hybridlog_storage.segments.segment_format import Attachment, reader_of
 from tests.data import DATA, needs_data
 from tests.independent import write_mcap
 from tests.work import calls_in

@@ -30,7 +30,6 @@ from hybridlog_storage.manifest import Loss, replace
 from hybridlog_storage.messages import Batch, Channel, LooseBatch, Schema
 from hybridlog_storage.segments import chunk as chunk_module
 from hybridlog_storage.segments import segment_writer
-from hybridlog_storage.segments.attachments import Attachment
 from hybridlog_storage.segments.chunk import StoredChunk
 from hybridlog_storage.segments.chunk_table import ChunkPlace
 from hybridlog_storage.segments.compression import FilePart
@@ -38,6 +37,7 @@ from hybridlog_storage.segments.recovery import Recovered, damage_of, recover_se
 from hybridlog_storage.segments.segment_file import Sealed, SegmentFile
 from hybridlog_storage.segments.segment_format import (
     RECORDING_METADATA,
+    Attachment,
     losses_record,
     trailer_of,
 )

@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from hybridlog_storage.lazy import lazy
+from hybridlog_storage.cache import lazy
 from hybridlog_storage.threads import Threads
 from tests.waiting import at_once
 

@@ -19,7 +19,7 @@ from starlette.testclient import TestClient
 import hybridlog as hl
 from benchmarks.simulator.topics import RobotConfig
 from benchmarks.simulator.write import write_bag
-from hybridlog.view.loopback import Admission
+from hybridlog.view.guard import Admission
 from hybridlog.view.server import ViewServer, make_app
 from tests.every_image import write_images
 from tests.odd_messages import write_odd

@@ -17,7 +17,7 @@ from click.testing import CliRunner
 import hybridlog as hl
 from hybridlog.cli.commands import fetch
 from hybridlog.drawing.tree import MAX_SHOWN
-from hybridlog.view.loopback import Admission
+from hybridlog.view.guard import Admission
 from hybridlog.view.routes import ask, export
 from hybridlog.view.server import make_app
 from hybridlog_storage.messages import Channel

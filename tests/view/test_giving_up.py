@@ -14,7 +14,7 @@ import pytest
 import hybridlog as hl
 from benchmarks.simulator.write import write_bag
 from hybridlog.view import context
-from hybridlog.view.loopback import Admission
+from hybridlog.view.guard import Admission
 from hybridlog.view.server import make_app
 from hybridlog_storage.cache import Kind
 from tests.limits import Limit

@@ -19,7 +19,7 @@ from urllib.parse import quote, urlencode, urlsplit
 import pytest
 
 import hybridlog as hl
-from hybridlog.view import loopback
+from hybridlog.view import guard
 from hybridlog.view.server import ROUTES
 from tests.limits import Limit
 from tests.view.conftest import served
@@ -27,7 +27,7 @@ from tests.view.conftest import served
 if TYPE_CHECKING:
     from playwright.sync_api import Page
 
-STATIC = Path(loopback.__file__).parent / "static"
+STATIC = Path(guard.__file__).parent / "static"
 
 
 class Answer(NamedTuple):
@@ -318,7 +318,7 @@ _READ = re.compile(r'params\.[a-z]+\(\s*"(\w+)"')
 
 def asked_by_routes() -> list[tuple[str, list[str]]]:
     """Path of each route with the parameters that its module, or what it shares, reads."""
-    view = Path(loopback.__file__).parent
+    view = Path(guard.__file__).parent
     common = {"recording", "topic", "at", "begin", "end", "pixels"}
     for path in view.glob("*.py"):
         common |= set(_READ.findall(path.read_text()))
@@ -493,7 +493,7 @@ def test_answers_do_not_wait_for_acknowledgements() -> None:
             found.append(peer.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY))
             writer.close()
 
-        listening = loopback.listen(0)
+        listening = guard.listen(0)
         async with await asyncio.start_server(accept, sock=listening):
             reader, writer = await asyncio.open_connection(*listening.getsockname())
             await reader.read()

@@ -14,7 +14,7 @@ from starlette.testclient import TestClient
 
 import hybridlog as hl
 from hybridlog.formats.slices import SliceFiles, write_mcap
-from hybridlog.view.loopback import Admission
+from hybridlog.view.guard import Admission
 from hybridlog.view.server import make_app
 from tests.independent import Seen, read_bag, read_mcap
 from tests.limits import Limit

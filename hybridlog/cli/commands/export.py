@@ -151,7 +151,7 @@ def _write_tables(query: Query, form: str, directory: Path, given: _Given) -> No
     """Write one file a topic, except topics that do not fit or have no message in the range."""
     from hybridlog.query.query import narrowed
     from hybridlog.query.ranges import RangeResolver
-    from hybridlog_storage.mongo.collection_names import collection_of
+    from hybridlog_storage.mongo.index_documents import collection_of
 
     RangeResolver(
         query.source.now(), query.question

@@ -133,7 +133,7 @@ def _show_recording(
 
 def _as_dict(store: Store, entry: RecordingEntry, *, with_videos: bool) -> dict[str, Any]:
     from hybridlog.entries import summary_of
-    from hybridlog.query.answers.loss_words import coverage
+    from hybridlog.query.answers.lost import coverage
     from hybridlog.query.periods import mean_rate
     from hybridlog.record.losses import losses_of
     from hybridlog.schema.codecs import unindexed
@@ -199,7 +199,7 @@ def _videos(store: Store, entry: RecordingEntry) -> dict[str, dict[str, Any]]:
 def _fields(store: Store, entry: RecordingEntry, about: dict[str, Any]) -> list[tuple[str, object]]:
     """The lines of a recording: name and value."""
     from hybridlog.entries import summary_of
-    from hybridlog.query.answers.loss_words import line_of
+    from hybridlog.query.answers.lost import line_of
     from hybridlog.query.times import format_duration
 
     status, source = status_text(summary_of(entry)), entry.source["kind"]

@@ -182,7 +182,7 @@ def _check_new_store(choices: RecordChoices, logs: Sequence[LogSet]) -> None:
     if is_uri(choices.mongo):
         # The new store stores the URI, so it has to be right.
         from hybridlog_storage.mongo.database import Database
-        from hybridlog_storage.mongo.index_state import IndexState, other_store
+        from hybridlog_storage.mongo.index_documents import IndexState, other_store
 
         with Database.connect(with_password(choices.mongo)) as database:
             owner = IndexState(database).owner()
@@ -366,7 +366,7 @@ def _told(path: Path, report: RecordReport) -> int:
         output.note(f"{path}: {left} from before the time range did not fit in memory.")
     output.remarks((*remarks_on(report), *report.remarks))
     if report.damage:
-        from hybridlog.query.answers.loss_words import coverage
+        from hybridlog.query.answers.lost import coverage
         from hybridlog.record.losses import losses_of
 
         code = SourceDamagedError.exit_code

@@ -23,9 +23,8 @@ from hybridlog_storage.errors import SourceError
 from hybridlog_storage.mcap import mcap_content
 from hybridlog_storage.mcap.mcap_content import MAGIC, ChunkContent
 from hybridlog_storage.mcap.mcap_scan import Item, Scan
-from hybridlog_storage.messages import MAX_CHANNELS, Channel, Schema
-from hybridlog_storage.ordering import distinct
-from hybridlog_storage.segments.attachments import Attachment, reader_of
+from hybridlog_storage.messages import MAX_CHANNELS, Channel, Schema, distinct
+from hybridlog_storage.segments.segment_format import Attachment, reader_of
 from hybridlog_storage.times import END, span_of
 
 if TYPE_CHECKING:

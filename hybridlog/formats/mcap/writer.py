@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from mcap.records import AttachmentIndex, Statistics
 
     from hybridlog_storage.messages import Batch, Channel, Schema
-    from hybridlog_storage.segments.attachments import Attachment
+    from hybridlog_storage.segments.segment_format import Attachment
 
 
 def source_metadata(channel: Channel) -> dict[str, str]:

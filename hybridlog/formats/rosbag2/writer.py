@@ -24,7 +24,7 @@ from hybridlog_storage.errors import DiskFullError, HybridlogError, UsageError
 
 if TYPE_CHECKING:
     from hybridlog_storage.messages import Batch, Channel
-    from hybridlog_storage.segments.attachments import Attachment
+    from hybridlog_storage.segments.segment_format import Attachment
 
 MAX_FILE: Final = 2 << 30
 """Bytes of payload at which a file ends."""

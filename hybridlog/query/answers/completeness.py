@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, Any, Final
 
 from msgspec import Struct
 
-from hybridlog.query.answers.loss_words import (
+from hybridlog.query.answers.lost import (
     MAX_NAMES,
     NOT_LOST,
     about_losses,
     copies_of,
+    losses_in,
     number_of,
 )
-from hybridlog.query.answers.lost import losses_in
 from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.record.losses import Cause

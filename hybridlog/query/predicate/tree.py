@@ -11,7 +11,7 @@ from typing import Final, Literal, NamedTuple, TypeAlias
 
 from msgspec import Struct
 
-from hybridlog_storage.lazy import lazy
+from hybridlog_storage.cache import lazy
 
 Value: TypeAlias = bool | int | float | str | None
 """The operand of a comparison; times and durations are integer nanoseconds."""

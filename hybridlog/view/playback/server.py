@@ -22,7 +22,7 @@ from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 
 from hybridlog.live.sources.foxglove.protocol import SUBPROTOCOLS
-from hybridlog.view.loopback import Admission, listen
+from hybridlog.view.guard import Admission, listen
 from hybridlog.view.playback import protocol
 from hybridlog.view.playback.played import PlaybackClock
 from hybridlog_storage.errors import HybridlogError

@@ -123,7 +123,7 @@ def sql(context: Context, params: RequestParams) -> dict[str, Any]:
 
 def sql_answer(context: Context, text: str, seconds: float) -> dict[str, Any]:
     """The first rows of a query, worked out in the process for SQL."""
-    from hybridlog.frames.cells import shown
+    from hybridlog.frames.lines import shown
 
     with closing(context.store.sql_engine.connect(SQL_MEMORY, only_reads=True)) as connection:
         answer = connection.query(text, timeout=seconds)

@@ -29,7 +29,7 @@ from msgspec import Struct, structs
 from msgspec.structs import replace
 
 from hybridlog_storage.cells import Cells
-from hybridlog_storage.disk import durability, files
+from hybridlog_storage.disk import files
 from hybridlog_storage.errors import HeldError, StoreError, TopicError, unreadable
 from hybridlog_storage.manifest import File, Manifest
 from hybridlog_storage.manifests import (
@@ -167,7 +167,7 @@ class StoreDirectory:
         """
         if path.exists() and not path.is_dir():
             raise StoreError(f"{path} is a file; a store is a directory. Choose another name.")
-        with durability.explained(path, "making the store"):
+        with files.explained(path, "making the store"):
             if not (path / SETTINGS).exists():
                 path.mkdir(parents=True, exist_ok=True)
                 # Of several processes, one creates the store and the others open it.
@@ -220,7 +220,7 @@ class StoreDirectory:
         """Change settings of the store."""
         with self.manifests.creating():
             settings = structs.replace(read_settings(self.path), **changes)
-            with durability.explained(self.path, "writing settings of"):
+            with files.explained(self.path, "writing settings of"):
                 write_settings(self.path, settings)
             self.settings = settings
 
@@ -277,7 +277,7 @@ class StoreDirectory:
 
     def drop(self, recording: str, names: Collection[str]) -> None:
         """Remove files of a recording, if they are there."""
-        durability.remove(self.recording(recording), names)
+        files.remove(self.recording(recording), names)
 
     def listed_bytes(self) -> int | None:
         """Bytes of all files, by manifests alone; None where the disk says it."""
@@ -361,19 +361,19 @@ class StoreDirectory:
             except FileNotFoundError as error:
                 if not makes and recording not in self.looks([recording]):
                     raise gone(name or recording) from error
-                with durability.explained(path.parent, "making"):  # copies leave out empty ones
+                with files.explained(path.parent, "making"):  # copies leave out empty ones
                     files.make_folders(path.parent)
                     files.sync_folder(self.path)
                     files.sync_folder(self.recordings)
                 continue
             except OSError as error:
-                raise durability.explain(error, path, "locking") from error
+                raise files.explain(error, path, "locking") from error
             is_mine = False
             try:
                 with suppress(BlockingIOError):
                     fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
                     is_mine = True
-                with durability.explained(path, "locking"):
+                with files.explained(path, "locking"):
                     is_there = files.is_at(fd, path)
                 if not is_there and makes:
                     continue

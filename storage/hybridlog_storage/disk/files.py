@@ -22,15 +22,16 @@ import resource
 import secrets
 import stat
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, cast
 
-from hybridlog_storage.errors import StoreError
+from hybridlog_storage.errors import NO_SPACE, DiskFullError, HybridlogError, StoreError, exhausted
 
 if TYPE_CHECKING:
     from hybridlog_storage.messages import Buffer
+
 
 _STORE = "hybridlog.toml"
 _LEVELS = 5  # of folders in a store
@@ -345,3 +346,51 @@ def user_directory(variable: str, below_home: str, purpose: str) -> Path:
         raise StoreError(
             f"This user has no home directory to keep {purpose} in: set {variable}."
         ) from error
+
+
+def explain(error: OSError, path: Path, doing: str) -> HybridlogError:
+    """Map an operating system error on a file of the store to a hybridlog error."""
+    if error.errno in NO_SPACE:
+        return DiskFullError(
+            f"No space left while {doing} {path}. Free some space and run the command again."
+        )
+    short = exhausted(error.errno, f"{doing} {path}")
+    if short is not None:
+        return short
+    if error.errno in {errno.EROFS, errno.EACCES, errno.EPERM}:
+        return StoreError(
+            f"Not allowed to write while {doing} {path}: {error.strerror}. "
+            "Check the owner and the mount of the store, or choose another with --store."
+        )
+    return StoreError(f"Error while {doing} {path}: {error.strerror or error}.")
+
+
+@contextmanager
+def explained(path: Path, doing: str) -> Iterator[None]:
+    """Raise operating system errors of a block as hybridlog errors."""
+    try:
+        yield
+    except OSError as error:
+        raise explain(error, path, doing) from error
+
+
+def publish(temporary: Path, final: Path) -> None:
+    """Durably give a synced file its final name in its folder; a file of that name is replaced."""
+    rename(temporary, final)
+    sync_folder(final.parent)
+
+
+def remove(folder: Path, names: Collection[str]) -> None:
+    """Remove files, if they are there; after an error, the next opening removes the others."""
+    with explained(folder, "removing files of"):
+        for name in names:
+            with suppress(FileNotFoundError):
+                unlink(folder / name)
+        if names:
+            sync_folder(folder)
+
+
+def write_new(final: Path, content: bytes) -> None:
+    """Write a small file atomically."""
+    with explained(final, "writing"):
+        write_file(final, content)

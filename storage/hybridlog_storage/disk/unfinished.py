@@ -35,7 +35,7 @@ class Unfinished:
 
         It replaces a file, or as a directory an empty directory.
         """
-        from hybridlog_storage.disk.durability import publish
+        from hybridlog_storage.disk.files import publish
 
         publish(self.path, final)
         _published.add(final)

@@ -18,8 +18,8 @@ from mcap.opcode import Opcode
 from mcap.summary import Summary
 from msgspec import Struct
 
+from hybridlog_storage.cache import RowType
 from hybridlog_storage.errors import SegmentError
-from hybridlog_storage.lazy import RowType
 from hybridlog_storage.messages import MAX_PAYLOAD, Batch
 from hybridlog_storage.segments.compression import is_implausible
 

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 from mcap.opcode import Opcode
 from mcap.records import McapRecord
 
+from hybridlog_storage.cache import lazy
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.errors import SegmentError
-from hybridlog_storage.lazy import lazy
 from hybridlog_storage.mcap.mcap_content import (
     HEAD,
     LAST_KNOWN,
@@ -36,7 +36,6 @@ from hybridlog_storage.mcap.mcap_content import (
     read_record,
 )
 from hybridlog_storage.messages import MAX_PAYLOAD
-from hybridlog_storage.segments.attachments import MAX_HEAD, Attachment, parse_attachment
 from hybridlog_storage.segments.compression import (
     MAX_UNCOMPRESSED,
     FilePart,
@@ -44,6 +43,7 @@ from hybridlog_storage.segments.compression import (
     decompress,
     decompress_pieces,
 )
+from hybridlog_storage.segments.segment_format import MAX_HEAD, Attachment, parse_attachment
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -36,7 +36,7 @@ from pathlib import Path
 from typing import Self
 from urllib.parse import quote
 
-from hybridlog_storage.disk import durability, files
+from hybridlog_storage.disk import files
 from hybridlog_storage.errors import (
     DatabaseError,
     DiskFullError,
@@ -400,7 +400,7 @@ def _odd_file(path: Path, directory: Path) -> StoreError:
 def _directory_error(directory: Path, error: OSError) -> HybridlogError:
     if error.errno in {errno.ELOOP, errno.ENOTDIR, errno.EISDIR}:
         return _odd_file(Path(directory, error.filename or ""), directory)
-    return durability.explain(error, directory, "starting the index in")
+    return files.explain(error, directory, "starting the index in")
 
 
 def _answers(path: str) -> bool:

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from msgspec import Struct
 
+from hybridlog_storage.cache import lazy
 from hybridlog_storage.errors import (
     BucketError,
     MissingDependencyError,
@@ -30,7 +31,6 @@ from hybridlog_storage.errors import (
     ObjectExistsError,
     UsageError,
 )
-from hybridlog_storage.lazy import lazy
 from hybridlog_storage.remote import address_of
 
 try:

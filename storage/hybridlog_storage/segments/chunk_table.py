@@ -13,10 +13,9 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
+from hybridlog_storage.cache import RowType
 from hybridlog_storage.errors import SegmentError
-from hybridlog_storage.lazy import RowType
-from hybridlog_storage.messages import EXPIRED_IDS, MARKS_CHANNEL
-from hybridlog_storage.ordering import run_starts
+from hybridlog_storage.messages import EXPIRED_IDS, MARKS_CHANNEL, run_starts
 from hybridlog_storage.segments.compression import checked_frame, decompress
 
 if TYPE_CHECKING:

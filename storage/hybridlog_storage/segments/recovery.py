@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from msgspec import Struct, field
 
-from hybridlog_storage.disk import durability, files
+from hybridlog_storage.disk import files
 from hybridlog_storage.disk.append_file import BLOCK, AppendFile
 from hybridlog_storage.errors import SegmentError, StoreError
 from hybridlog_storage.manifest import hasher
@@ -81,7 +81,7 @@ def recover_segment(
             rest.seal(recording, lambda sealed: on_sealing(sealed, found))
             return found
     except OSError as error:
-        raise durability.explain(error, path, "recovering") from error
+        raise files.explain(error, path, "recovering") from error
 
 
 def rebuild_summary(path: Path, digest: str) -> bool:
@@ -94,7 +94,7 @@ def rebuild_summary(path: Path, digest: str) -> bool:
         with _Rest.of(path, int(path.name.partition(".")[0])) as rest:
             return rest.seal_again(digest)
     except OSError as error:
-        raise durability.explain(error, path, "rebuilding") from error
+        raise files.explain(error, path, "rebuilding") from error
 
 
 class _Rest:

@@ -23,14 +23,13 @@ from mcap.records import (
 )
 
 from hybridlog_storage.checksum import crc32
-from hybridlog_storage.disk import durability, files
+from hybridlog_storage.disk import files
 from hybridlog_storage.disk.append_file import AppendFile
 from hybridlog_storage.errors import HybridlogError, StoreError
 from hybridlog_storage.manifest import Channel as ListedChannel
 from hybridlog_storage.manifest import File, Loss, Part
 from hybridlog_storage.mcap.mcap_content import MAGIC, RECORD_HEAD, ChunkHead, chunk_head_of
 from hybridlog_storage.messages import EXPIRED_IDS, schema_hash
-from hybridlog_storage.segments.attachments import Attachment
 from hybridlog_storage.segments.chunk import PackedChunk
 from hybridlog_storage.segments.chunk_table import ChunkTable, TableBuilder
 from hybridlog_storage.segments.segment_format import (
@@ -40,6 +39,7 @@ from hybridlog_storage.segments.segment_format import (
     OUR_NAMES,
     RECORDING_METADATA,
     START,
+    Attachment,
     arrival_record,
     channel_record,
     definitions_chunk,
@@ -191,7 +191,7 @@ class SegmentFile:
         disk when this returns.
         """
         path = directory / f"{number:06d}{OPEN_SUFFIX}"
-        with durability.explained(path, "creating"):
+        with files.explained(path, "creating"):
             file = AppendFile.create(path)
         segment = cls(path, number, file, group=group)
         try:
@@ -388,7 +388,7 @@ class SegmentFile:
             self._file.append(parts)
 
     def _explained(self, doing: str) -> AbstractContextManager[None]:
-        return durability.explained(self.path, doing)
+        return files.explained(self.path, doing)
 
     def tail(self, at: int) -> bytes:
         """The last records of a file with `at` bytes of data: the end of data, the summary."""
