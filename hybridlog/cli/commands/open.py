@@ -69,8 +69,6 @@ class _Given(Filtered, Forced, Served):
         type=click.FloatRange(0.01, 100),
         needs=_PLAYED,
     )
-    loop: bool = option("With websocket: begin again at the end.", needs=_PLAYED)
-    paused: bool = option("With websocket: wait until a viewer plays.", needs=_PLAYED)
 
 
 @command(_Given)
@@ -140,8 +138,6 @@ def _play(given: _Given) -> None:
     options = PlaybackOptions(
         port=_PORT if given.port is None else given.port,
         speed=given.speed or 1.0,
-        loops=given.loop,
-        is_paused=given.paused,
         origins=given.origins,
     )
     with given.opened() as store:

@@ -27,12 +27,10 @@ class PlayedChannel(Struct, frozen=True):
     Attributes:
         id: Its number, from 1 on.
         channel: The first of them.
-        publishers: Nodes that have published it, as far as the recordings name them.
     """
 
     id: int
     channel: Channel
-    publishers: tuple[str, ...]
 
 
 Blocks: TypeAlias = "Generator[Batch, None, None]"
@@ -84,9 +82,7 @@ class PlayedLog:
         merged = []
         for number, group in enumerate(alike.values(), 1):
             self._ids.update({(one.recording.id, one.channel_id): number for one in group})
-            names = (one.channel.metadata.get("callerid", "") for one in group)
-            publishers = tuple(dict.fromkeys(name for name in names if name))
-            merged.append(PlayedChannel(number, group[0].channel, publishers))
+            merged.append(PlayedChannel(number, group[0].channel))
         return merged
 
     def next_covered(self, position: int) -> int:

@@ -28,8 +28,7 @@ _PLAY, _PAUSE = 0, 1
 
 PLAYING, PAUSED, ENDED = 0, 1, 3
 """States of a playback."""
-WARNING, ERROR = 1, 2
-"""Severity of a status message."""
+_ERROR = 2  # severity of a status
 
 
 class RequestError(Exception):
@@ -58,14 +57,6 @@ class Unsubscribe(msgspec.Struct, tag_field="op", tag="unsubscribe"):
     subscriptions: list[_Number] = msgspec.field(name="subscriptionIds")
 
 
-class SubscribeGraph(msgspec.Struct, tag_field="op", tag="subscribeConnectionGraph"):
-    """A request for the publishers of the topics."""
-
-
-class UnsubscribeGraph(msgspec.Struct, tag_field="op", tag="unsubscribeConnectionGraph"):
-    """An end of that, which changes nothing: the graph never changes."""
-
-
 class Control(NamedTuple):
     """A request, by its id: play or pause, a speed, and a log time to go to; None to stay."""
 
@@ -75,7 +66,7 @@ class Control(NamedTuple):
     id: bytes
 
 
-_Text = Subscribe | Unsubscribe | SubscribeGraph | UnsubscribeGraph
+_Text = Subscribe | Unsubscribe
 Request = _Text | Control
 
 
@@ -85,7 +76,7 @@ def server_info(name: str, session: str, begin: int, end: int) -> str:
         {
             "op": "serverInfo",
             "name": name,
-            "capabilities": ["playbackControl", "time", "connectionGraph"],
+            "capabilities": ["playbackControl", "time"],
             "sessionId": session,
             "dataStartTime": {"sec": begin // 10**9, "nsec": begin % 10**9},
             "dataEndTime": {"sec": end // 10**9, "nsec": end % 10**9},
@@ -111,20 +102,9 @@ def _described(each: PlayedChannel) -> dict[str, Any]:
     return {**found, **more}
 
 
-def connection_graph(channels: Iterable[PlayedChannel]) -> str:
-    """The message with the publishers of the topics, as far as the recordings name them."""
-    publishers: dict[str, list[str]] = {}
-    for each in channels:
-        publishers.setdefault(each.channel.topic, []).extend(each.publishers)
-    published = [{"name": t, "publisherIds": p} for t, p in publishers.items() if p]
-    others = ("subscribedTopics", "advertisedServices", "removedTopics", "removedServices")
-    graph = {"op": "connectionGraphUpdate", "publishedTopics": published}
-    return json.dumps({**graph, **{name: [] for name in others}})
-
-
-def status(level: int, text: str) -> str:
-    """A message for the user of the client."""
-    return json.dumps({"op": "status", "level": level, "message": text})
+def problem(text: str) -> str:
+    """A message for the user of the client: what went wrong."""
+    return json.dumps({"op": "status", "level": _ERROR, "message": text})
 
 
 def message_data(subscription: int, log_time: int, payload: memoryview) -> bytes:
