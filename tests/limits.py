@@ -23,7 +23,6 @@ PLACES = {
     "group_rows": "hybridlog.follow.follower._GROUP_ROWS",
     "json_text_piece_bytes": "hybridlog.formats.json_text.PIECE_BYTES",
     "bag_window_bytes": "hybridlog.formats.rosbag1.reader._WINDOW",
-    "slices_bytes": "hybridlog.formats.slices.MAX_BYTES",
     "output_held_bytes": "hybridlog.formats.tables.HELD_BYTES",
     "tables_piece_bytes": "hybridlog.formats.tables.PIECE_BYTES",
     "frame_block_rows": "hybridlog.frames.answer._BLOCK_ROWS",

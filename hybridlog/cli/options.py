@@ -257,13 +257,6 @@ class Served:
         type=click.IntRange(0, 65535),
         needs=("viewer=websocket",),
     )
-    origins: tuple[str, ...] = option(
-        "Let web pages of this origin read what is served, such as https://viewer.example; "
-        "Foxglove's may.",
-        "URL",
-        name="--allow-origin",
-        needs=("viewer=websocket", "mcap"),
-    )
 
 
 @dataclass(frozen=True, kw_only=True)

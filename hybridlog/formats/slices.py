@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import pickle
-import threading
 from collections.abc import Iterator, Sequence
 from copy import copy
 from typing import TYPE_CHECKING, Final
@@ -12,15 +11,10 @@ from typing import TYPE_CHECKING, Final
 from msgspec import Struct
 from msgspec.structs import replace
 
-from hybridlog.attachments import extras_of
-from hybridlog.formats import OUTPUTS
 from hybridlog.formats.answer import Answer
 from hybridlog.query.planner import Planner
-from hybridlog_storage.disk.unfinished import Unfinished, scratch_directory
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from hybridlog.attachments import Extras
     from hybridlog.query.query import Query
     from hybridlog_storage.messages import Batch, Channel
@@ -80,37 +74,3 @@ def profile_of(query: Query) -> str:
 def log_of(query: Query, front: Front = IN_FORCE, extras: Extras | None = None) -> Answer:
     """A slice as a log."""
     return Answer(batches=batches_of(query, front), extras=extras, profile=profile_of(query))
-
-
-def write_mcap(query: Query, path: Path) -> None:
-    """Write a slice as an MCAP file, as `hybridlog export` does; all of it or nothing."""
-    OUTPUTS["mcap"].write(log_of(query, extras=extras_of(query.source.now(), query.question)), path)
-
-
-MAX_BYTES: Final = 16 << 30
-"""Bytes of the files of slices that are kept beside the latest one."""
-
-
-class SliceFiles:
-    """The MCAP files of slices that others read by ranges, as long as this object lives.
-
-    A file is the same, byte for byte, whenever it is written for the same state of the recordings.
-    """
-
-    def __init__(self) -> None:
-        self._folder: Unfinished | None = None
-        self._files: dict[str, Path] = {}
-        self._writing = threading.Lock()  # one at a time: they would compete for the disk
-
-    def get(self, query: Query) -> tuple[Path, str]:
-        """The file of a slice, which is written if there is none, and the digest of its content."""
-        digest = fingerprint(query)
-        with self._writing:
-            if digest not in self._files:
-                self._folder = self._folder or scratch_directory()
-                path = self._folder.path / f"{digest}.mcap"
-                write_mcap(query, path)
-                while sum(one.stat().st_size for one in self._files.values()) > MAX_BYTES:
-                    self._files.pop(next(iter(self._files))).unlink()
-                self._files[digest] = path
-            return self._files[digest], digest

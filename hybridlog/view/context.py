@@ -20,7 +20,6 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 from starlette.routing import Route
 
-from hybridlog.formats.slices import SliceFiles
 from hybridlog.query.answers.current import next_time
 from hybridlog.query.answers.infer_fields import infer_fields
 from hybridlog.query.query import field_types
@@ -68,7 +67,6 @@ class Context:
         turns: Held by each answer that is worked out.
         matching: Held while matches are looked for.
         sql: Answers SQL.
-        slices: Files for other viewers.
     """
 
     def __init__(self, store: Store) -> None:
@@ -77,7 +75,6 @@ class Context:
         self.turns = threading.BoundedSemaphore(MAX_WORKING)
         self.matching = threading.Lock()
         self.sql = SqlProcess(store)
-        self.slices = SliceFiles()
 
     def of_now(self) -> Context:
         """The same context for an answer, whose store is of the moment that begins now."""

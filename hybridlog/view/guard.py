@@ -1,7 +1,8 @@
 """Keeps everyone but the user's own page away from the server.
 
-Each request must carry the token in its path, name this server as its host, and come from no
-other origin: see `loopback`.
+Other users of the machine, and pages of other sites in the user's browser, can reach a port of the
+loopback interface. So each request must carry the token in its path, name this server as its host,
+and come from no other origin.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from urllib.parse import SplitResult, urlsplit
 
 from msgspec import Struct
 from starlette.datastructures import Headers, MutableHeaders
-from starlette.responses import PlainTextResponse, Response
+from starlette.responses import PlainTextResponse
 
 from hybridlog_storage.errors import UsageError
 
@@ -37,28 +38,19 @@ HEADERS: Final = {
 """Headers of every answer that does not set its own."""
 
 _METHODS: Final = frozenset({"GET", "HEAD"})
-_PREFLIGHT: Final = "OPTIONS"
 _ONCE: Final = ("host", "origin")
 
 
 class Guard:
     """Refuses requests that are not the page's own.
 
-    The application behind it sees paths below the token. Such paths that begin with one of `shared`
-    may be read by pages of guests, too.
+    The application behind it sees paths below the token.
     """
 
-    def __init__(
-        self,
-        app: ASGIApp,
-        rules: Admission,
-        *,
-        shared: Collection[str] = (),
-    ) -> None:
+    def __init__(self, app: ASGIApp, rules: Admission) -> None:
         self._app = app
         self.rules = rules
         self._root = f"/{rules.token}"
-        self._shared = tuple(shared)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request."""
@@ -67,17 +59,11 @@ class Guard:
             return
         if scope["type"] != "http":
             return  # a web socket is closed without an answer
-        headers = Headers(scope=scope)
-        path: str = scope["path"]
-        refusal = self._refusal(scope["method"], headers, path)
+        refusal = self._refusal(scope["method"], Headers(scope=scope), scope["path"])
         if refusal is not None:
             code, reason = refusal
             response = PlainTextResponse(f"{reason}\n", code, headers=HEADERS)
             await response(scope, receive, send)
-            return
-        origin = headers.get("origin")
-        if scope["method"] == _PREFLIGHT:
-            await _allowed(str(origin))(scope, receive, send)
             return
 
         async def guarded(message: Message) -> None:
@@ -85,14 +71,9 @@ class Guard:
                 answered = MutableHeaders(scope=message)
                 for name, value in HEADERS.items():
                     answered.setdefault(name, value)
-                if self._is_guest(origin):
-                    _let_read(answered, str(origin))
             await send(message)
 
         await self._app({**scope, "root_path": self._root}, receive, guarded)
-
-    def _is_guest(self, origin: str | None) -> bool:
-        return origin is not None and bool(self._shared) and self.rules.is_guest(origin)
 
     def _refusal(self, method: str, headers: Headers, path: str) -> tuple[int, str] | None:
         """Status and reason; None for a request of the page."""
@@ -102,38 +83,18 @@ class Guard:
             return 421, "This server answers to 127.0.0.1 only."
         if not self.rules.knows(path):
             return 404, "Open the address that `hybridlog view` printed; it has a token."
-        if not self._is_own(headers, path.removeprefix(self._root)):
+        if not self._is_own(headers):
             return 403, "Pages of other sites may not read this store."
-        preflight = method == _PREFLIGHT and self._is_guest(headers.get("origin"))
-        if method not in _METHODS and not preflight:
+        if method not in _METHODS:
             return 405, "This server only answers GET: it never changes the store."
         return None
 
-    def _is_own(self, headers: Headers, below: str) -> bool:
+    def _is_own(self, headers: Headers) -> bool:
         origin = headers.get("origin")
-        if self._is_guest(origin):
-            return below.startswith(self._shared)
         if origin is not None and not self.rules.is_own(origin):
             return False
         site = headers.get("sec-fetch-site", "same-origin")
         return site in {"same-origin", "none"} or headers.get("sec-fetch-mode") == "navigate"
-
-
-def _allowed(origin: str) -> Response:
-    """The answer to a browser that asks whether a page may read ranges."""
-    headers = MutableHeaders(HEADERS)
-    _let_read(headers, origin)
-    headers["Access-Control-Allow-Methods"] = "GET, HEAD"
-    headers["Access-Control-Allow-Headers"] = "Range, If-Range, If-Match, If-None-Match"
-    headers["Access-Control-Allow-Private-Network"] = "true"
-    return Response(status_code=204, headers=headers)
-
-
-def _let_read(headers: MutableHeaders, origin: str) -> None:
-    headers["Access-Control-Allow-Origin"] = origin
-    headers["Access-Control-Expose-Headers"] = "Accept-Ranges, Content-Range, Content-Length, ETag"
-    headers["Cross-Origin-Resource-Policy"] = "cross-origin"
-    headers.add_vary_header("Origin")
 
 
 HOST: Final = "127.0.0.1"
@@ -147,16 +108,13 @@ class Admission(Struct, frozen=True, kw_only=True):
     Attributes:
         port: The port that hosts name; None for any: a request may come through a tunnel.
         token: The first part of every path; None without one.
-        origins: Web origins that are welcome beside its own.
-        viewers: So are pages of Foxglove.
-        local: So are pages of this computer, and desktop programs.
+        origins: Web origins that are welcome as guests, beside those of Foxglove and of this
+            computer.
     """
 
     port: int | None = None
     token: str | None = None
     origins: Collection[str] = ()
-    viewers: bool = False
-    local: bool = False
 
     def is_host(self, host: str | None) -> bool:
         """True for a name of this computer, as the header `Host` has it."""
@@ -174,10 +132,8 @@ class Admission(Struct, frozen=True, kw_only=True):
         host = parts.hostname or ""
         if origin in self.origins:
             return True
-        if self.viewers and parts.scheme == "https" and host.endswith(_FOXGLOVE):
+        if parts.scheme == "https" and host.endswith(_FOXGLOVE):
             return True
-        if not self.local:
-            return False
         # A scheme such as file:// is a program's; a page in a sandbox has "null".
         return host in _OWN_HOSTS if parts.scheme in {"http", "https"} else bool(parts.scheme)
 

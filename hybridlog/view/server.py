@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Collection
 from contextlib import nullcontext
 from importlib import import_module
 from pathlib import Path
@@ -27,19 +26,16 @@ _MAX_CONNECTIONS: Final = 256
 class ViewServer:
     """A server for one open store; the port of 127.0.0.1 (0 for a free one) is taken at once.
 
-    Foxglove (`viewers`) and pages of `origins` may read selections as MCAP. The URL has the token.
+    The URL has the token.
     """
 
-    def __init__(
-        self, store: Store, port: int = 0, *, viewers: bool = False, origins: Collection[str] = ()
-    ) -> None:
+    def __init__(self, store: Store, port: int = 0) -> None:
         self._socket = listen(port)
         self.port: int = self._socket.getsockname()[1]
         token = new_token()
         self.url = f"http://{HOST}:{self.port}/{token}/"
-        rules = Admission(port=self.port, token=token, viewers=viewers, origins=origins)
         config = uvicorn.Config(
-            make_app(store, rules),
+            make_app(store, Admission(port=self.port, token=token)),
             log_level="critical",
             access_log=False,
             lifespan="off",
@@ -80,19 +76,14 @@ _STATIC: Final = Path(__file__).parent / "static"
 
 
 def make_app(store: Store, rules: Admission) -> Guard:
-    """The application, behind its guard.
-
-    Guests of the rules may read the routes below `mcap/`; without any, these do not exist.
-    """
-    has_guests = rules.viewers or bool(rules.origins)
-    names = (*ROUTES, "mcap") if has_guests else ROUTES
+    """The application, behind its guard."""
     routes = [
-        route for name in names for route in import_module(f"hybridlog.view.routes.{name}").routes
+        route for name in ROUTES for route in import_module(f"hybridlog.view.routes.{name}").routes
     ]
     routes.append(Mount("/", StaticFiles(directory=_STATIC, html=True), name="page"))
     app = Starlette(routes=routes, exception_handlers={Exception: broken_response})
     app.state.context = Context(store)
-    return Guard(app, rules, shared=("/mcap/",) if has_guests else ())
+    return Guard(app, rules)
 
 
 MAX_UNKNOWN_CLIENTS: Final = 64

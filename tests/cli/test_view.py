@@ -58,8 +58,6 @@ def test_what_is_refused_before_anything_is_served(store: Path) -> None:
     assert "is in use. Give another one with --port, or 0 for any." in taken.err
     unknown = run("view", "monday", store=store, code=2)
     assert (unknown.out, "monday" in unknown.err) == ("", True)
-    alone = run("view", "--allow-origin", "http://localhost:8080", store=store, code=2)
-    assert "--allow-origin is for --mcap" in alone.err
 
 
 def test_of_several_stores_none_is_guessed(tmp_path: Path) -> None:
@@ -69,25 +67,3 @@ def test_of_several_stores_none_is_guessed(tmp_path: Path) -> None:
     _, errors = running.communicate(timeout=20)
     assert running.returncode == 5
     assert errors.endswith("Below this folder: --store one or --store two.\n")
-
-
-def test_mcap_for_other_viewers(store: Path) -> None:
-    running = start("--store", store, "--mcap", "--allow-origin", "http://localhost:8080")
-    assert running.stdout is not None
-    assert running.stderr is not None
-    url = running.stdout.readline().strip()
-    said = [running.stderr.readline().strip() for _ in range(4)]
-    assert said[1] == f"MCAP file: {url}mcap/slice.mcap?recording=RECORDING"
-    assert said[2].startswith(
-        "In Foxglove: https://app.foxglove.dev/?ds=remote-file&ds.url=http%3A"
-    )
-    assert said[3] == f"For a remote data loader: {url}mcap/manifest"
-    headers = {"Origin": "http://localhost:8080"}
-    asked = urllib.request.Request(f"{url}mcap/manifest?recording=x", headers=headers)
-    with pytest.raises(urllib.error.HTTPError) as missing:
-        urllib.request.urlopen(asked)
-    with missing.value as answer:
-        assert answer.code == 404
-        assert answer.headers["Access-Control-Allow-Origin"] == "http://localhost:8080"
-    running.send_signal(signal.SIGINT)
-    running.communicate(timeout=20)

@@ -110,9 +110,9 @@ def unpacked(body: bytes) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 @contextmanager
-def served(store: hl.Store, *origins: str) -> Iterator[str]:
+def served(store: hl.Store) -> Iterator[str]:
     """Serve the view of a store; gives its address."""
-    server = ViewServer(store, origins=origins)
+    server = ViewServer(store)
     thread = threading.Thread(target=server.run)
     thread.start()
     try:

@@ -63,6 +63,13 @@ class _Given(Filtered, Forced, Served):
         short="-o",
         needs=("viewer=foxglove", "viewer=lichtblick", "viewer=rerun"),
     )
+    origins: tuple[str, ...] = option(
+        "With websocket: let web pages of this origin connect, such as https://viewer.example; "
+        "Foxglove's may.",
+        "URL",
+        name="--allow-origin",
+        needs=_PLAYED,
+    )
     speed: float | None = option(
         "With websocket: times as fast as recorded, 0.01 to 100; viewers can change it.",
         "N",
@@ -160,23 +167,19 @@ async def _until_signal(server: PlaybackServer) -> None:
 
 
 def _print_address(port: int) -> None:
+    from urllib.parse import quote
+
     address = f"ws://127.0.0.1:{port}"
     output.say(address)
     sys.stdout.flush()
     output.remarks(
         [
             f"In Foxglove or Lichtblick: Open connection, Foxglove WebSocket, {address}",
-            f"In a browser: {foxglove('foxglove-websocket', address)}",
+            "In a browser: https://app.foxglove.dev/?ds=foxglove-websocket&ds.url="
+            f"{quote(address, safe='')}",
             "Ctrl-C ends it.",
         ]
     )
-
-
-def foxglove(source: str, url: str) -> str:
-    """The address at which Foxglove opens a source."""
-    from urllib.parse import quote
-
-    return f"https://app.foxglove.dev/?ds={source}&ds.url={quote(url, safe='')}"
 
 
 def unplayed(query: Query) -> list[str]:

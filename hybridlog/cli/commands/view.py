@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 from hybridlog.cli import output
 from hybridlog.cli.binder import command, option
-from hybridlog.cli.commands.open import foxglove
 from hybridlog.cli.options import AsJson, InStore, Served, one_recording
 from hybridlog.cli.signals import ended_by_signal
 from hybridlog_storage.errors import MissingDependencyError
@@ -19,7 +18,6 @@ class _Given(InStore, AsJson, Served):
         "Show this one first; without, the list of recordings.", "[RECORDING]"
     )
     opens: bool = option("Open the page in the browser.", name="--open")
-    mcap: bool = option("Also serve selections as MCAP, to Foxglove and Lichtblick.")
 
 
 @command(_Given)
@@ -40,26 +38,15 @@ def view_command(given: _Given) -> None:
             "The view needs starlette and uvicorn: pip install 'hybridlog[view]'"
         ) from error
     with given.opened() as store:
-        server = ViewServer(store, given.port or 0, viewers=given.mcap, origins=given.origins)
+        server = ViewServer(store, given.port or 0)
         url = server.url
-        name = ""
         if given.recording is not None:
             entry = store.entry(given.recording)
-            name = quote(entry.name, safe="")
-            url += f"#recording={name}"
+            url += f"#recording={quote(entry.name, safe='')}"
         shown: dict[str, object] = {"url": url, "port": server.port}
-        notes = ["Open this address in a browser. Ctrl-C ends the server."]
-        if given.mcap:
-            mcap = f"{server.url}mcap/"
-            shown["mcap"] = mcap
-            file = f"{mcap}slice.mcap?recording={name or 'RECORDING'}"
-            notes += [
-                f"MCAP file: {file}",
-                f"In Foxglove: {foxglove('remote-file', file)}",
-                f"For a remote data loader: {mcap}manifest",
-            ]
         output.tell(shown, [url])
-        output.notes([] if given.as_json else notes)
+        if not given.as_json:
+            output.note("Open this address in a browser. Ctrl-C ends the server.")
         sys.stdout.flush()
         if given.opens:
             threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()

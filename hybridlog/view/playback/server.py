@@ -68,7 +68,7 @@ class PlaybackServer:
         self._log = log
         self._options = options
         self._say = say
-        self._rules = Admission(origins=options.origins, viewers=True, local=True)
+        self._rules = Admission(origins=options.origins)
         session = secrets.token_hex(8)
         self._about = protocol.server_info(name, session, log.begin, log.end)
         self._viewers = 0

@@ -36,21 +36,11 @@ def ask(context: Context, params: RequestParams) -> dict[str, Any]:
 
 
 def file(context: Context, params: RequestParams) -> Response:
-    """A part of a recording as an MCAP file."""
+    """A part of a recording as an MCAP file, made while it is sent."""
     question = _question(context, params)
-    return mcap_response(question.query(), question.file_name())
-
-
-def mcap_response(query: Query, name: str) -> Response:
-    """The messages of a query as an MCAP file, made while it is sent.
-
-    Args:
-        query: The query.
-        name: Name of the file, of plain characters.
-    """
-    pieces = pieces_of(query)
+    pieces = pieces_of(question.query())
     first = next(pieces)  # most errors come before it, and can still be told
-    headers = {"Content-Disposition": f'attachment; filename="{name}"'}
+    headers = {"Content-Disposition": f'attachment; filename="{question.file_name()}"'}
     sent = _sent(first, pieces)
     return StreamingResponse(sent, headers=headers, media_type="application/octet-stream")
 
