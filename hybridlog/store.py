@@ -99,7 +99,8 @@ def open_store(
         cache_mb: Size of the embedded MongoDB's cache in MiB, from 256; by default
             `HYBRIDLOG_CACHE_SIZE`, the store's own setting, or 256. A new store keeps it. A
             MongoDB that runs already is not changed.
-        read_only: Never write a byte in it, as if this user could not, and use no MongoDB.
+        read_only: Never write a byte in it, as if this user could not, and use no MongoDB; so it
+            is where `HYBRIDLOG_READ_ONLY` is set.
 
     Raises:
         UsageError: MongoDB does not accept such a cache.
@@ -107,6 +108,7 @@ def open_store(
         DatabaseError: MongoDB does not answer and `require_database` is set.
     """
     where = store_path(path)
+    read_only = read_only or "HYBRIDLOG_READ_ONLY" in os.environ
     wanted = NONE if read_only else mongo or os.environ.get("HYBRIDLOG_MONGO_URI")
     cache = None
     if address_of(where) is not None:

@@ -97,7 +97,7 @@ ALLOWED = {
         "hybridlog_storage.cells",
     ),
     "mcp": ("hybridlog.view.tool_server",),
-    "pydantic": ("hybridlog.view.tools",),
+    "pydantic": ("hybridlog.view.tool_server",),
     "starlette": ("hybridlog.view",),
     "uvicorn": ("hybridlog.view.server",),
     "websockets": ("hybridlog.view.playback.server",),

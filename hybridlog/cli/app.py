@@ -200,7 +200,8 @@ def _repairs(store: Store, doing: str, *, verifies: bool) -> list[str]:
         for recording, reason in repairs.unreadable.items()
         if not (verifies and "`hybridlog verify --repair`" in reason)
     )
-    if not (store.directory.is_writable or store.directory.is_remote):
+    directory = store.directory
+    if not (directory.is_writable or directory.is_remote or directory.read_only):
         found.append(f"The store {store.directory.path} is read-only; its segments answer.")
     if repairs.damage:
         found.append("The data files of the embedded MongoDB were damaged, and were replaced.")

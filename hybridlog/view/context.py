@@ -51,8 +51,6 @@ if TYPE_CHECKING:
 MAX_WORKING: Final = 4
 """Number of answers that are worked out at once; others wait for their turn."""
 
-SQL_MEMORY: Final = 512 << 20
-"""Bytes that DuckDB may use for all queries together."""
 REFRESH_S: Final = 2.0
 """Least time between two looks for new recordings."""
 REFRESH_SHARE: Final = 0.1

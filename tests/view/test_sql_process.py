@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,10 +15,9 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.sql.duck import OWN_MEMORY
-from hybridlog.view.context import SQL_MEMORY
-from hybridlog.view.sql_process import SqlProcess
+from hybridlog.view.sql_process import SQL_MEMORY, SqlProcess
 from hybridlog_storage.errors import HybridlogError, ResourceError, StoreError
-from hybridlog_storage.stopping import GivenUpError, check_wanted, until_given_up
+from hybridlog_storage.stopping import GivenUpError, until_given_up
 from tests.imports import ROOT
 from tests.waiting import wait_for
 
@@ -41,26 +39,24 @@ if __name__ == "__main__":
 """
 
 
-def pid(_context: object) -> int:
+def pid(_store: object) -> int:
     return os.getpid()
 
 
-def peak(_context: object) -> int:
+def peak(_store: object) -> int:
     status = Path("/proc/self/status").read_text()
     return int(status.split("VmHWM:")[1].split()[0]) << 10
 
 
-def wait(_context: object) -> None:
-    while True:
-        check_wanted()
-        time.sleep(0.01)
+def wait(_store: object) -> None:
+    threading.Event().wait()
 
 
-def end(_context: object) -> None:
+def end(_store: object) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def refuse(_context: object) -> None:
+def refuse(_store: object) -> None:
     raise HybridlogError("no")
 
 
@@ -98,29 +94,19 @@ def test_a_query_takes_no_more_than_it_may(client: TestClient, demo_store: hl.St
     assert psutil.Process().memory_info().rss - before < 200 << 20
 
 
-def test_all_questions_share_one_process(process: SqlProcess) -> None:
+def test_what_nobody_waits_for_ends_with_its_process(process: SqlProcess) -> None:
     number = process.ask(pid)
-    stopped = threading.Event()
-    problems: list[BaseException] = []
-
-    def ask() -> None:
-        try:
-            with until_given_up(stopped):
-                process.ask(wait)
-        except GivenUpError as error:
-            problems.append(error)
-
-    thread = threading.Thread(target=ask)
-    thread.start()
-    try:
-        assert process.ask(pid) == number != os.getpid()
-    finally:
-        stopped.set()
-        thread.join()
-    assert len(problems) == 1
     with pytest.raises(HybridlogError, match="no"):
         process.ask(refuse)
-    assert process.ask(pid) == number
+    assert process.ask(pid) == number != os.getpid()
+    stopped = threading.Event()
+    timer = threading.Timer(0.2, stopped.set)
+    timer.start()
+    with pytest.raises(GivenUpError), until_given_up(stopped):
+        process.ask(wait)
+    timer.join()
+    assert_ends(number)
+    assert process.ask(pid) != number
 
 
 def test_a_process_that_has_ended_is_started_again(process: SqlProcess) -> None:

@@ -11,8 +11,9 @@ from hybridlog.drawing.times import Match, Matches, aligned
 from hybridlog.query.predicate.completion import complete
 from hybridlog.query.predicate.tokens import MAX_TEXT
 from hybridlog.query.topics import resolve
-from hybridlog.view.context import SQL_MEMORY, Context, known_fields, route, start_of
+from hybridlog.view.context import Context, known_fields, route, start_of
 from hybridlog.view.question import program, question_of
+from hybridlog.view.sql_process import SQL_MEMORY
 from hybridlog_storage.errors import HybridlogError, TopicError
 from hybridlog_storage.stopping import held
 from hybridlog_storage.times import END
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from hybridlog.sql.rows import Reading
+    from hybridlog.store import Store
     from hybridlog.view.context import RequestParams
     from hybridlog.view.question import PageQuestion
 
@@ -88,7 +90,7 @@ def completion(context: Context, params: RequestParams) -> dict[str, Any]:
     text = params.text("text", "", longest=MAX_TEXT)
     place = min(params.integer("place", 0, MAX_TEXT), len(text))
     if params.word("language", ("predicate", "sql"), "predicate") == "sql":
-        return context.sql.ask(sql_completion, text, place)
+        return sql_completion(context.store, text, place)
     recording = context.recording(params)
     own = params.text("topic")
     topics = {channel.topic for channel in recording.channels}
@@ -104,12 +106,12 @@ def completion(context: Context, params: RequestParams) -> dict[str, Any]:
     return {"begin": begin, "candidates": candidates}
 
 
-def sql_completion(context: Context, text: str, place: int) -> dict[str, Any]:
-    """Candidates for completing SQL, worked out in the process for SQL."""
+def sql_completion(store: Store, text: str, place: int) -> dict[str, Any]:
+    """Candidates for completing SQL: names of views, tables and columns."""
     from hybridlog.sql.names import candidates, word_before
 
     word = word_before(text[:place])
-    with closing(context.store.sql_engine.connect(SQL_MEMORY, only_reads=True)) as connection:
+    with closing(store.sql_engine.connect(SQL_MEMORY, only_reads=True)) as connection:
         found = candidates(connection.names(), connection.schema, text, word)
     offered = [[name, "word", ""] for name in found[:_MAX_CANDIDATES]]
     return {"begin": place - len(word), "candidates": offered}
@@ -121,27 +123,27 @@ def sql(context: Context, params: RequestParams) -> dict[str, Any]:
     return context.sql.ask(sql_answer, text, SQL_SECONDS)
 
 
-def sql_answer(context: Context, text: str, seconds: float) -> dict[str, Any]:
+def sql_answer(store: Store, text: str, seconds: float) -> dict[str, Any]:
     """The first rows of a query, worked out in the process for SQL."""
     from hybridlog.frames.lines import shown
 
-    with closing(context.store.sql_engine.connect(SQL_MEMORY, only_reads=True)) as connection:
+    with closing(store.sql_engine.connect(SQL_MEMORY, only_reads=True)) as connection:
         answer = connection.query(text, timeout=seconds)
         table, is_cut = answer.first(SQL_ROWS, _SQL_BYTES)
         body = f"    print(store.sql({text!r}).to_pandas())\n"
         found = shown(table, SQL_COLUMNS)
         found["at"], found["recordings"] = _moments(
-            context, found.pop("times"), found["recordings"], answer.reading
+            store, found.pop("times"), found["recordings"], answer.reading
         )
         return found | {
             "more": is_cut,
             "remarks": answer.sentences(),
-            "python": program(context.store, body),
+            "python": program(store, body),
         }
 
 
 def _moments(
-    context: Context, times: Sequence[int | None], names: Sequence[str | None], read: Reading
+    store: Store, times: Sequence[int | None], names: Sequence[str | None], read: Reading
 ) -> tuple[list[str | None], list[str | None]]:
     """The time since the start of its recording, ns, as text, and the recording of each row.
 
@@ -155,7 +157,7 @@ def _moments(
     spans = {}
     for name in {*named} - {None}:
         with suppress(HybridlogError):  # there is no such recording, or it is damaged
-            spans[name] = context.store.entry(str(name)).span
+            spans[name] = store.entry(str(name)).span
     found: list[str | None] = []
     for time, name in zip(times, named, strict=True):
         first, last = spans.get(name) or (0, -1)
