@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import socket
 import threading
-import xmlrpc.client
 from collections.abc import Callable
 from socketserver import ThreadingMixIn
 from typing import Any
@@ -46,13 +45,12 @@ class _Server(ThreadingMixIn, SimpleXMLRPCServer):
 
 
 class FakeMaster:
-    """Knows publishers; tells subscribers of new ones unless told not to."""
+    """Knows publishers."""
 
-    def __init__(self, host: str = "127.0.0.1", port: int = 0, *, tells: bool = True) -> None:
-        self.host, self.port, self.tells = host, port, tells
+    def __init__(self, host: str = "127.0.0.1", port: int = 0) -> None:
+        self.host, self.port = host, port
         self.publishers: dict[str, dict[str, str]] = {}
         self.types: dict[str, str] = {}
-        self.subscribers: dict[str, dict[str, str]] = {}
         self.calls: list[str] = []
         self.server: _Server | None = None
 
@@ -62,8 +60,7 @@ class FakeMaster:
         for name, function in {
             "getSystemState": self._state,
             "getTopicTypes": self._topic_types,
-            "registerSubscriber": self._register,
-            "unregisterSubscriber": self._unregister,
+            "lookupNode": self._look_up,
         }.items():
             self.server.register_function(function, name)
         self.server.__enter__()
@@ -82,36 +79,23 @@ class FakeMaster:
     def add(self, topic: str, type_name: str, node: str, uri: str) -> None:
         self.types.setdefault(topic, type_name)
         self.publishers.setdefault(topic, {})[node] = uri
-        self.tell(topic)
 
     def remove(self, topic: str, node: str) -> None:
         self.publishers[topic].pop(node, None)
-        self.tell(topic)
-
-    def tell(self, topic: str) -> None:
-        if self.tells:
-            uris = list(self.publishers.get(topic, {}).values())
-            for api in list(self.subscribers.get(topic, {}).values()):
-                with xmlrpc.client.ServerProxy(api) as node:
-                    node.publisherUpdate("/master", topic, uris)
 
     def _state(self, _: str) -> list[Any]:
         self.calls.append("getSystemState")
         publishers = [[t, list(nodes)] for t, nodes in self.publishers.items() if nodes]
-        return [1, "", [publishers, [[t, list(s)] for t, s in self.subscribers.items()], []]]
+        return [1, "", [publishers, [], []]]
 
     def _topic_types(self, _: str) -> list[Any]:
         return [1, "", [list(pair) for pair in self.types.items()]]
 
-    def _register(self, caller: str, topic: str, type_name: str, api: str) -> list[Any]:
-        assert type_name == "*"
-        self.subscribers.setdefault(topic, {})[caller] = api
-        self.calls.append(f"registerSubscriber {topic}")
-        return [1, "", list(self.publishers.get(topic, {}).values())]
-
-    def _unregister(self, caller: str, topic: str, _: str) -> list[Any]:
-        self.subscribers.get(topic, {}).pop(caller, None)
-        return [1, "", 1]
+    def _look_up(self, _: str, node: str) -> list[Any]:
+        for nodes in self.publishers.values():
+            if node in nodes:
+                return [1, "", nodes[node]]
+        return [-1, "unknown node", ""]
 
 
 class FakePublisher:
@@ -122,13 +106,14 @@ class FakePublisher:
         script: Callable[[socket.socket], None],
         *,
         topic: str = "/topic",
-        node: str = "/node",
+        node: str = "",
         host: str = "127.0.0.1",
         fields: dict[str, str] | None = None,
         greets: bool = True,
         offer: list[Any] | None = None,
     ) -> None:
-        self.script, self.topic, self.node, self.host = script, topic, node, host
+        self.script, self.topic, self.host = script, topic, host
+        self.node = node = node or ("/node" if topic == "/topic" else f"/node{topic}")
         self.fields = {
             "callerid": node,
             "latching": "0",

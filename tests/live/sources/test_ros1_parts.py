@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import asyncio
-import gc
 import random
 import select
 import socket
 import struct
-import warnings
-from contextlib import suppress
 
 import pytest
 
 from hybridlog.live.sources.base import Cause, PeerError, one_line
 from hybridlog.live.sources.network import endpoint_of
-from hybridlog.live.sources.ros1.rpc import RpcServer
 from hybridlog.live.sources.ros1.stream import Stream
 from hybridlog.live.sources.ros1.subscription import (
     channel_of,
@@ -212,25 +207,3 @@ def test_a_connection_that_is_reset() -> None:
     (loss,) = sink.losses
     assert (loss.cause, loss.count) == (Cause.CONNECTION, None)
     assert "the connection broke" in ends[0]
-
-
-@pytest.mark.parametrize("turns", range(6))
-def test_who_calls_while_the_server_is_stopped_is_hung_up_on(turns: int) -> None:
-    async def stopped_after_turns() -> socket.socket:
-        listening = socket.create_server(("127.0.0.1", 0))
-        listening.setblocking(False)
-        place = listening.getsockname()
-        server = await RpcServer({}).start(listening)
-        caller = socket.create_connection(place)
-        for _ in range(turns):
-            await asyncio.sleep(0)
-        server.close()
-        return caller
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a call that has just come is closed by the collector
-        with asyncio.run(stopped_after_turns()) as caller:
-            gc.collect()
-            caller.settimeout(5)
-            with suppress(ConnectionResetError):  # nobody had taken the call yet
-                assert caller.recv(1) == b""

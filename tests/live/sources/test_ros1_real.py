@@ -103,11 +103,6 @@ class _Master:
         except OSError:
             return False
 
-    def subscribers(self, topic: str) -> list[str]:
-        with xmlrpc.client.ServerProxy(self.uri) as master:
-            _, _, (_, subscribers, _) = master.getSystemState("/test")  # type: ignore[misc]
-        return [node for name, nodes in subscribers if name == topic for node in nodes]
-
 
 class _Publisher:
     def __init__(
@@ -186,7 +181,6 @@ def test_payloads_are_those_that_were_published(
     numbers = [taken.sequence for taken in sink.taken]
     assert numbers == ([None] * count if type_name == "text" else list(range(1, count + 1)))
     assert sink.losses == []
-    assert master.subscribers(topic) == []
 
 
 def test_a_late_subscriber_gets_what_is_latched(master: _Master) -> None:

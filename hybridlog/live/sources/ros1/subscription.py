@@ -1,9 +1,12 @@
 """One topic and the connections to its publishers, which reconnect after failures.
 
-Subscribing is a call, a TCP connection and an exchange of headers. A connection header of TCPROS is
-its length, then fields `key=value`, each after its own length. All lengths are 4 bytes,
-little-endian. After both headers the publisher sends messages, each after its length, until one
-side closes.
+Subscribing is a call, a TCP connection and an exchange of headers. A call is XML-RPC in HTTP 1.0
+(one call a connection, no chunks). The client of the standard library blocks, trusts any length
+and reads without limit, but peers are untrusted; so it is used only for XML.
+
+A connection header of TCPROS is its length, then fields `key=value`, each after its own length.
+All lengths are 4 bytes, little-endian. After both headers the publisher sends messages, each after
+its length, until one side closes.
 """
 
 from __future__ import annotations
@@ -11,13 +14,22 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
-from typing import TYPE_CHECKING, Final
+import xmlrpc.client
+from typing import TYPE_CHECKING, Any, Final
+from urllib.parse import urlsplit
+from xml.parsers.expat import ExpatError
 
 from msgspec import Struct
 
 from hybridlog.live.sources.base import PeerError, one_line
-from hybridlog.live.sources.network import PATIENCE_S, Endpoint, Network, UnreachedError, reason_of
-from hybridlog.live.sources.ros1.rpc import call
+from hybridlog.live.sources.network import (
+    PATIENCE_S,
+    Endpoint,
+    Network,
+    UnreachedError,
+    endpoint_of,
+    reason_of,
+)
 from hybridlog.live.sources.ros1.stream import Stream, u32
 from hybridlog_storage.messages import Channel, Schema
 
@@ -27,16 +39,14 @@ if TYPE_CHECKING:
     from hybridlog.live.sources.base import Sink
     from hybridlog.live.sources.ros1.stream import Reader
 
-_FIRST_PAUSE_S: Final = 0.25
-_MAX_PAUSE_S: Final = 10.0
-_STABLE_S: Final = 10.0
+_PAUSE_S: Final = 1.0  # between two connections to a publisher
 
 
 class Context(Struct, frozen=True):
     """Parts that all subscriptions of a source share.
 
-    `spawn` runs a coroutine until the source stops; `look_again` asks the master for the publishers
-    of a topic soon.
+    `spawn` runs a coroutine until the source stops; `forget` asks the master again for the node of
+    an address.
     """
 
     network: Network
@@ -45,15 +55,14 @@ class Context(Struct, frozen=True):
     reader: Reader
     max_message_bytes: int
     spawn: Callable[[Coroutine[None, None, None]], object]
-    look_again: Callable[[str], None]
+    forget: Callable[[str], None]
 
 
 class Subscription:
-    """A wanted topic; `nodes` are its publishers at the last registration, None before."""
+    """A wanted topic."""
 
     def __init__(self, context: Context, topic: str) -> None:
         self.topic = topic
-        self.nodes: frozenset[str] | None = None
         self._context = context
         self._links: dict[str, _Link] = {}
         self._type = ""
@@ -69,12 +78,12 @@ class Subscription:
             self._type = type_name
         listed = set(uris)
         for uri, link in tuple(self._links.items()):
-            link.list(is_listed=uri in listed)
+            link.is_listed = uri in listed
             if link.has_ended and not link.is_listed:
                 del self._links[uri]
         for uri in sorted(listed - set(self._links)):
             link = self._links[uri] = _Link(self, uri)
-            self._context.spawn(self._reconnect(uri, link))
+            self._context.spawn(self._connect(uri, link))
         self.report()
 
     def report(self) -> None:
@@ -110,7 +119,7 @@ class Subscription:
             )
         return self._context.sink.wants(self.topic, type_name)
 
-    async def _reconnect(self, uri: str, link: _Link) -> None:
+    async def _connect(self, uri: str, link: _Link) -> None:
         await link.run(self._context)
         link.is_up, link.has_ended = False, True
         if not link.is_listed:
@@ -127,33 +136,24 @@ class _Link:
         self.has_ended = False
         self._subscription = subscription
         self._uri = uri
-        self._failures = 0
-        self._has_reported = False
-        self._told: set[bool] = set()  # that it cannot be reached, that it does wrong
-        self._hurry = asyncio.Event()
-
-    def list(self, *, is_listed: bool) -> None:
-        """Updates `is_listed`; a new listing retries at once."""
-        if is_listed and not self.is_listed:
-            self._hurry.set()
-        self.is_listed = is_listed
+        self._told: set[str] = set()  # kinds of problems
 
     async def run(self, context: Context) -> None:
         """Connects and reconnects until the publisher is neither listed nor reachable."""
-        topic = self._subscription.topic
+        topic, failures = self._subscription.topic, 0
         while True:
             try:
-                connected, fields = await subscribe(
-                    context.network, context.caller, topic, self._uri
-                )
+                about = context.network, context.caller, topic, self._uri
+                connected, fields = await subscribe(*about)
             except (OSError, PeerError) as error:
                 if not self.is_listed:
                     return
-                self._failures += 1
+                failures += 1
                 # A single failure is normal: a node that ends is listed a little longer.
-                if self._failures >= 2:
+                if failures >= 2:
                     self._say_problem(context, error)
             else:
+                failures = 0
                 try:
                     channel = self._subscription.channel(fields)
                 except BaseException:
@@ -164,27 +164,29 @@ class _Link:
                     return
                 await self._serve(context, connected, channel)
             self._set_up(is_up=False)
-            # It may have returned under another address, which only the master knows.
-            context.look_again(topic)
-            await self._pause()
+            context.forget(self._uri)
+            await asyncio.sleep(_PAUSE_S)
 
     def _say_problem(self, context: Context, error: OSError | PeerError) -> None:
-        """Tells the user that a publisher fails, once for each kind of failure."""
-        is_unreachable = isinstance(error, UnreachedError)
-        if is_unreachable in self._told:
-            return
-        self._told.add(is_unreachable)
+        """Tells the user that a publisher fails."""
         uri, reason = one_line(self._uri), reason_of(error)
-        if is_unreachable:
-            context.sink.say(
-                f"the publisher {uri} cannot be reached: {reason}; trying again. Is it dead "
-                "(`rosnode cleanup`), or on a computer with an unknown name (set ROS_IP there)?"
+        if isinstance(error, UnreachedError):
+            self._say(
+                context,
+                f"the publisher {uri} cannot be reached",
+                f"{reason}; trying again. Is it dead (`rosnode cleanup`), or on a computer with "
+                "an unknown name (set ROS_IP there)?",
             )
-            return
-        context.sink.say(
-            f"{one_line(self._subscription.topic)}: cannot subscribe at its publisher {uri}: "
-            f"{reason}; trying again"
-        )
+        else:
+            topic = one_line(self._subscription.topic)
+            what = f"{topic}: cannot subscribe at its publisher {uri}"
+            self._say(context, what, f"{reason}; trying again")
+
+    def _say(self, context: Context, what: str, why: str) -> None:
+        """Tells the user of a problem, the first time."""
+        if what not in self._told:
+            self._told.add(what)
+            context.sink.say(f"{what}: {why}")
 
     async def _serve(self, context: Context, connected: socket.socket, channel: Channel) -> None:
         """Lets the reader read a connection until it ends."""
@@ -198,35 +200,18 @@ class _Link:
         def closed(failure: str) -> None:
             loop.call_soon_threadsafe(settle, failure)
 
-        began = loop.time()
         stream = Stream(connected, channel, context.sink, context.max_message_bytes, closed)
         self._set_up(is_up=True)
         context.reader.add(stream)
-        failure = await ended
-        if loop.time() - began > _STABLE_S:
-            self._failures, self._has_reported = 0, False
-        else:
-            self._failures += 1
-        # Repeated failures of a publisher are reported once; the ledger has all.
-        if failure and not self._has_reported:
-            self._has_reported = True
-            name = channel.metadata.get("callerid", "an unnamed node")
-            context.sink.say(
-                f"{one_line(self._subscription.topic)}: lost the connection to {one_line(name)} at "
-                f"{one_line(self._uri)}: {failure}; connecting again"
-            )
+        if failure := await ended:
+            name = one_line(channel.metadata.get("callerid", "an unnamed node"))
+            topic, uri = one_line(self._subscription.topic), one_line(self._uri)
+            lost = f"{topic}: lost the connection to {name} at {uri}"
+            self._say(context, lost, f"{failure}; connecting again")
 
     def _set_up(self, *, is_up: bool) -> None:
         self.is_up = is_up
         self._subscription.report()
-
-    async def _pause(self) -> None:
-        """Waits longer after each failure, unless the master lists the publisher again."""
-        self._hurry.clear()
-        pause = min(_FIRST_PAUSE_S * 2 ** min(self._failures, 10), _MAX_PAUSE_S)
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(pause):
-                await self._hurry.wait()
 
 
 MAX_HEADER: Final = 4 << 20
@@ -351,3 +336,86 @@ async def _exactly(connected: socket.socket, count: int) -> bytes:
             raise PeerError("it closed the connection within its header")
         got += data
     return bytes(got)
+
+
+class RefusedError(PeerError):
+    """A peer refuses a valid call."""
+
+
+_MAX_ANSWER: Final = 32 << 20
+_END: Final = b"\r\n\r\n"
+
+
+async def call(network: Network, uri: str, method: str, *arguments: Any) -> object:
+    """Calls a method of the master or of a node, which has 10 s, and returns its value."""
+    endpoint = endpoint_of(uri)
+    path = urlsplit(uri).path or "/RPC2"
+    body = xmlrpc.client.dumps(arguments, method).encode(errors="replace")
+    head = (
+        f"POST {path} HTTP/1.0\r\nHost: {endpoint}\r\nContent-Type: text/xml\r\n"
+        f"Content-Length: {len(body)}\r\n\r\n"
+    )
+    try:
+        async with asyncio.timeout(2 * PATIENCE_S):
+            reader, writer = await asyncio.open_connection(sock=await network.connect(endpoint))
+            with contextlib.closing(writer):
+                writer.write(head.encode("ascii") + body)
+                answer = await _answer(reader)
+    except OSError as error:
+        raise UnreachedError(reason_of(error)) from error
+    match _parsed(answer):
+        case ([1, _, value],):
+            return value
+        case ([int(), text, _],):
+            raise RefusedError(f"it refuses: {one_line(str(text))}")
+    raise PeerError("its answer is not that of a ROS node")
+
+
+async def _answer(reader: asyncio.StreamReader) -> bytes:
+    """The body of an answer; without a length, all that comes."""
+    try:
+        first, *fields = (await reader.readuntil(_END)).removesuffix(_END).split(b"\r\n")
+    except (asyncio.IncompleteReadError, asyncio.LimitOverrunError) as error:
+        raise PeerError("it does not speak HTTP") from error
+    version, _, status = first.partition(b" ")
+    if not version.startswith(b"HTTP/"):
+        raise PeerError("it does not speak HTTP")
+    if status.split()[:1] != [b"200"]:
+        raise PeerError(f"it answers {one_line(status)}")
+    told = dict(line.lower().partition(b":")[::2] for line in fields).get(b"content-length")
+    if told is not None and not told.strip().isdigit():
+        raise PeerError("it sends an invalid content length")
+    length = None if told is None else int(told.strip()[:20])
+    got = bytearray()
+    while length is None or len(got) < length:
+        if max(length or 0, len(got)) > _MAX_ANSWER:
+            raise PeerError(f"its answer is longer than {_MAX_ANSWER >> 20} MiB")
+        data = await reader.read(64 << 10)
+        if not data:
+            break
+        got += data
+    if length is not None and len(got) < length:
+        raise PeerError("it closed in the middle of its answer")
+    return bytes(got[:length])
+
+
+def _parsed(body: bytes) -> tuple[object, ...]:
+    """The values of an XML-RPC text."""
+    # ROS nodes send none, and entities let small texts expand.
+    if b"<!DOCTYPE" in body or b"<!ENTITY" in body:
+        raise PeerError("it sends XML with a document type")
+    try:
+        return xmlrpc.client.loads(body)[0]
+    except xmlrpc.client.Fault as fault:
+        raise PeerError(f"it answers: {one_line(str(fault.faultString))}") from fault
+    except (
+        ExpatError,
+        xmlrpc.client.ResponseError,
+        ArithmeticError,
+        AttributeError,
+        LookupError,
+        TypeError,
+        ValueError,
+    ) as error:
+        # The library raises all of these for malformed XML-RPC.
+        raise PeerError("it sends malformed XML-RPC") from error
