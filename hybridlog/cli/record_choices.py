@@ -104,9 +104,6 @@ class RecordChoices(Between, Latched, InStore, AsJson, Quiet):
         excludes=_OF_LOGS,
     )
     ros2: bool = option("Record a running ROS 2 robot; needs rclpy.", excludes=_OF_LOGS)
-    qos: Path | None = _live(
-        "With --ros2: YAML file of QoS overrides, as for rosbag2.", "FILE", needs=("ros2",)
-    )
     foxglove: str | None = option(
         "Record what a Foxglove WebSocket server sends.", "URL", excludes=_OF_LOGS
     )

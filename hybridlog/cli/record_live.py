@@ -244,7 +244,7 @@ def sources_of(choices: RecordChoices) -> list[LiveSource]:
     if choices.ros2:
         from hybridlog.live.sources.ros2.source import Ros2Source
 
-        found.append(Ros2Source(qos_overrides=choices.qos))
+        found.append(Ros2Source())
     if choices.foxglove is not None:
         from hybridlog.live.sources.foxglove.source import FoxgloveSource
 

@@ -302,15 +302,12 @@ def test_triggers_have_a_process_that_ends_with_the_recorder(
         ("--replay {bag} --flush-interval 2h", "--flush-interval must be at most 1h, not 2h."),
         ("{bag} --duration 3s --throttle /a 5Hz", "--duration is for --ros1"),
         ("{bag} --ring 3s", "--ring is for --ros1"),
-        ("{bag} --split-size 5GB --qos f", "--qos is for --ros2"),
-        ("--ros1 http://localhost:1 --qos f", "--qos is for --ros2"),
         ("--ros1 http://localhost:1 --speed 2", "--speed is for --replay"),
         ("--ros1 127.0.0.1:11311", "'127.0.0.1:11311' is not an address like http://host:port"),
         ("--ros1 localhost", "'localhost' is not an address like http://host:port"),
         ("--ros1 '' --duration 1s", "looks like http://host:11311; this one is empty"),
         ("--ros1 {bag}", "is not an address like http://host:port"),
         ("--foxglove http://robot", "does not begin with ws://"),
-        ("--ros2 --qos /nowhere/qos.yaml", "/nowhere/qos.yaml cannot be read"),
     ],
 )
 def test_options_that_make_no_sense_leave_no_store(

@@ -194,7 +194,6 @@ from hybridlog.live.sources.ros2.child.outbox import *
 
 peer = socket.socket(fileno=int(sys.argv[-1]))
 file = peer.makefile("rb")
-settings = json.loads(file.readline())
 starts = os.path.join({folder!r}, "starts")
 with open(starts, "a") as log:
     log.write("%d\\n" % os.getpid())

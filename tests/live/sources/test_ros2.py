@@ -15,7 +15,6 @@ from hybridlog.live.sources.ros2.source import (
     PYTHON_VARIABLE,
     Ros2Source,
     candidates,
-    read_overrides,
 )
 from hybridlog_storage.errors import MissingDependencyError, SourceError, UsageError
 from tests.limits import Limit
@@ -89,25 +88,6 @@ def test_messages_and_events_reach_the_sink(
     assert heard.losses == [Loss(Cause.TRANSPORT, "/a", 3, 1, 2, "from ?[31m/n")]
     assert heard.said == ["ROS 2: a b"]
     assert heard.ends == []
-
-
-def test_the_child_gets_its_settings(tmp_path: Path) -> None:
-    path = tmp_path / "qos.yaml"
-    path.write_text("/a: {depth: 5}\nb: {reliability: Best_Effort}")
-    child = fake_child(
-        tmp_path,
-        """
-        hello()
-        event(event="say", text=json.dumps(settings))
-        wait()
-        """,
-    )
-    heard = Heard()
-    with Ros2Source(child, path) as source:
-        source.start(heard)
-        heard.wait(lambda: heard.said, "it should say")
-    said = 'ROS 2: {"overrides": {"/a": {"depth": 5}, "/b": {"reliability": 2}}}'
-    assert heard.said == [said]
 
 
 def test_a_child_that_does_not_listen_is_ended(tmp_path: Path, limit: Limit) -> None:
@@ -298,70 +278,6 @@ def test_which_pythons_are_tried(tmp_path: Path) -> None:
     found = candidates({"ROS_DISTRO": "kilted", "PATH": str(tmp_path)})
     assert found[0] == str(python)
     assert found[-1] == sys.executable
-
-
-def test_overrides_as_rosbag2_has_them(tmp_path: Path) -> None:
-    path = tmp_path / "qos.yaml"
-    path.write_text(
-        """
-/scan:
-  history: keep_all
-  depth: 10
-  reliability: best_effort
-  durability: transient_local
-  deadline:
-    sec: 1
-    nsec: 5
-  lifespan: {sec: 9999999999999, nsec: 0}
-  liveliness: manual_by_topic
-  liveliness_lease_duration: {sec: 0, nsec: 0}
-  avoid_ros_namespace_conventions: true
-"""
-    )
-    assert read_overrides(path) == {
-        "/scan": {
-            "history": 2,
-            "depth": 10,
-            "reliability": 2,
-            "durability": 1,
-            "deadline": 1_000_000_005,
-            "lifespan": 2**63 - 1,
-            "liveliness": 3,
-            "liveliness_lease_duration": 0,
-            "avoid_ros_namespace_conventions": True,
-        }
-    }
-    path.write_text("")
-    assert read_overrides(path) == {}
-
-
-@pytest.mark.parametrize(
-    ("text", "reason"),
-    [
-        ("[1, 2]", "topics with policies"),
-        ("/a: 5", "a topic with policies"),
-        ("5: {depth: 1}", "a topic with policies"),
-        ("/a: {depth: many}", "depth is a number"),
-        ("/a: {depth: 0}", "depth is a number"),
-        ("/a: {depth: true}", "depth is a number"),
-        ("/a: {reliability: reliabel}", "one of system_default, reliable, best_effort"),
-        ("/a: {reliability: [1]}", "one of"),
-        ("/a: {color: red}", "unknown policy 'color'"),
-        ("/a: {5: red}", "unknown policy 5"),
-        ("/a: {deadline: 5}", "is a duration"),
-        ("/a: {deadline: {sec: 1}}", "is a duration"),
-        ("/a: {deadline: {sec: -1, nsec: 0}}", "is a duration"),
-        ("/a: {avoid_ros_namespace_conventions: 1}", "true or false"),
-        ("/a: [", "invalid YAML"),
-        ("\x00", "invalid YAML"),
-        ("[" * 1000, "invalid YAML"),
-    ],
-)
-def test_overrides_that_are_none(tmp_path: Path, text: str, reason: str) -> None:
-    path = tmp_path / "qos.yaml"
-    path.write_text(text)
-    with pytest.raises(UsageError, match=reason):
-        Ros2Source(qos_overrides=path).start(Heard())
 
 
 def test_a_child_that_floods_is_ended(tmp_path: Path, limit: Limit) -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import io
 import os
-import reprlib
 import shutil
 import signal
 import socket
@@ -20,11 +19,9 @@ from contextlib import suppress
 from json import dumps
 from pathlib import Path
 from threading import Event, Thread
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
-from hybridlog.formats.yaml_values import YamlError, parse_yaml, read_yaml
 from hybridlog.live.sources.base import Cause, ThreadedSource, one_line
-from hybridlog.live.sources.ros2.child.middleware import DURATIONS, FOREVER, Profile
 from hybridlog.live.sources.ros2.child.outbox import (
     ENTRY,
     EVENT,
@@ -58,18 +55,15 @@ class Ros2Source(ThreadedSource):
         python: An interpreter with rclpy. None for the one in the environment variable
             `HYBRIDLOG_ROS2_PYTHON`; else `python3` if a ROS environment is sourced; else
             the current one.
-        qos_overrides: YAML file with QoS profiles by topic, in the format of rosbag2.
     """
 
     kind = "ROS 2"
 
-    def __init__(self, python: str | None = None, qos_overrides: Path | None = None) -> None:
+    def __init__(self, python: str | None = None) -> None:
         super().__init__()
         self.address = f"domain {os.environ.get('ROS_DOMAIN_ID') or '0'}"
         self._python = python
-        self._overrides = qos_overrides
         self._child: Process | None = None
-        self._settings: dict[str, object] = {}
         self._outages: dict[str, int] = {}
 
     def check(self) -> None:
@@ -88,10 +82,8 @@ class Ros2Source(ThreadedSource):
         domain = self.address.partition(" ")[2]
         if not (domain.isascii() and domain.isdigit() and int(domain) <= MAX_DOMAIN):
             raise UsageError(f"ROS 2 has domains from 0 to {MAX_DOMAIN}, not {domain[:40]!r}")
-        overrides = {} if self._overrides is None else read_overrides(self._overrides)
-        settings = self._settings = {"overrides": overrides}
         try:
-            child, self._python = launch(self._python, settings, self._stopping)
+            child, self._python = launch(self._python, self._stopping)
         except ChildError as error:
             raise SourceError(
                 f"ROS 2 does not start: {one_line(str(error))}; does `ros2 topic list` work?"
@@ -163,7 +155,7 @@ class Ros2Source(ThreadedSource):
         while not self._stopping.wait(pause):
             pause = min(2 * pause, _MAX_PAUSE_S)
             try:
-                child, _ = launch(self._python, self._settings, self._stopping)
+                child, _ = launch(self._python, self._stopping)
             except (ChildError, MissingDependencyError) as error:
                 if self._stopping.is_set():
                     break
@@ -348,14 +340,13 @@ class ChildMissingError(ChildError):
 class Process:
     """A running child, which has sent its greeting, `hello`.
 
-    `settings` is its first line of input; `cancelled` is set to give up waiting for the greeting. A
-    Python that does not exist, or has no rclpy, raises ChildMissingError.
+    `cancelled` is set to give up waiting for the greeting. A Python that does not exist, or has no
+    rclpy, raises ChildMissingError.
     """
 
     def __init__(
         self,
         python: str,
-        settings: Mapping[str, Any],
         environment: Mapping[str, str],
         cancelled: Event,
     ) -> None:
@@ -384,7 +375,7 @@ class Process:
         self._listener.start()
         self.pid = self._process.pid
         try:
-            self.hello = self._greet(python, settings)
+            self.hello = self._greet(python)
         except BaseException:
             self.end()
             raise
@@ -395,11 +386,10 @@ class Process:
             while line := output.readline(1 << 12):
                 self._lines.append(line.decode(errors="replace").strip()[:_MAX_LINE])
 
-    def _greet(self, python: str, settings: Mapping[str, Any]) -> dict[str, Any]:
+    def _greet(self, python: str) -> dict[str, Any]:
         deadline = time.monotonic() + HELLO_S
         self.peer.settimeout(_POLL_S)
         try:
-            self.peer.sendall(dumps(settings).encode("ascii") + b"\n")
             kind, length = HEADER.unpack(self._receive(HEADER.size, deadline))
             check_frame(kind, length)
             if kind != EVENT or length > _MAX_HELLO:
@@ -472,9 +462,7 @@ class Process:
         self.peer.close()
 
 
-def launch(
-    python: str | None, settings: Mapping[str, Any], cancelled: Event
-) -> tuple[Process, str]:
+def launch(python: str | None, cancelled: Event) -> tuple[Process, str]:
     """Starts a child under the first Python that has rclpy; returns also its interpreter.
 
     Of `candidates`, or `python` alone if it is given; `cancelled` is set to give up.
@@ -483,7 +471,7 @@ def launch(
     for name in [python] if python else candidates(os.environ):
         try:
             environment = environment_for(name)
-            return Process(name, settings, environment, cancelled), name
+            return Process(name, environment, cancelled), name
         except ChildMissingError as error:
             tried.append(str(error))
     raise MissingDependencyError(
@@ -511,64 +499,3 @@ def environment_for(python: str) -> dict[str, str]:
         # The wheels set this once they have found their libraries, and the child has others.
         found.pop("_ROS_WHEELS_BOOTSTRAP_COMPLETE", None)
     return found
-
-
-MAX_DEPTH = 1_000_000
-
-_POLICIES: Final[dict[object, dict[str, int]]] = {
-    "history": {"system_default": 0, "keep_last": 1, "keep_all": 2},
-    "reliability": {"system_default": 0, "reliable": 1, "best_effort": 2},
-    "durability": {"system_default": 0, "transient_local": 1, "volatile": 2},
-    "liveliness": {"system_default": 0, "automatic": 1, "manual_by_topic": 3},
-}
-_VALUES: Final[dict[object, str]] = {
-    **{name: f"one of {', '.join(words)}" for name, words in _POLICIES.items()},
-    **dict.fromkeys(DURATIONS, "a duration, {sec: 1, nsec: 0}"),
-    "depth": f"a number from 1 to {MAX_DEPTH}",
-    "avoid_ros_namespace_conventions": "true or false",
-}
-"""Values that a policy may have, in words, by its name."""
-
-
-def read_overrides(path: Path) -> dict[str, dict[str, Any]]:
-    """Reads the overrides: fields of `Profile` by topic."""
-    data = read_yaml(path, "QoS overrides")
-    try:
-        root = parse_yaml(data)
-    except YamlError as error:
-        raise UsageError(f"{path}: invalid YAML: {error}") from error
-    if root is None:
-        return {}
-    if not isinstance(root, dict):
-        raise UsageError(f"{path}: topics with policies below them are expected")
-    found = {}
-    for topic, policies in root.items():
-        if not isinstance(topic, str) or not isinstance(policies, dict):
-            raise UsageError(
-                f"{path}: {reprlib.repr(topic)}: a topic with policies below it is expected"
-            )
-        name = topic if topic.startswith("/") else f"/{topic}"
-        found[name] = {
-            str(key): _policy(key, value, f"{path}: {topic}") for key, value in policies.items()
-        }
-    return found
-
-
-def _policy(name: object, value: object, where: str) -> int:
-    """The number of a policy; of a duration, ns."""
-    match value:
-        case bool() if name == "avoid_ros_namespace_conventions":
-            return value
-        case bool():
-            pass
-        case int() if name == "depth" and 0 < value <= MAX_DEPTH:
-            return value
-        case str() if value.lower() in _POLICIES.get(name, ()):
-            return _POLICIES[name][value.lower()]
-        case {"sec": int(sec), "nsec": int(nsec), **more} if name in DURATIONS and not more:
-            if min(sec, nsec) >= 0:
-                return min(sec * 1_000_000_000 + nsec, FOREVER)
-    if name not in _VALUES:
-        known = ", ".join(Profile._fields)
-        raise UsageError(f"{where}: unknown policy {name!r}; choose one of {known}")
-    raise UsageError(f"{where}: {name} is {_VALUES[name]}, not {reprlib.repr(value)}")

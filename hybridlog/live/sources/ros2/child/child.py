@@ -18,7 +18,7 @@ from typing import Any
 
 from hybridlog.live.sources.ros2.child.definitions import Definitions, share_folders
 from hybridlog.live.sources.ros2.child.middleware import Middleware
-from hybridlog.live.sources.ros2.child.outbox import MAX_EVENT, Outbox, WireError, parse_object
+from hybridlog.live.sources.ros2.child.outbox import Outbox, WireError, parse_object
 from hybridlog.live.sources.ros2.child.topics import Topics
 
 _LOOK_S = 0.5
@@ -122,9 +122,6 @@ def run(number: int) -> int:
     """The program, with the file descriptor of its socket; returns the exit code."""
     peer = socket.socket(fileno=number)
     peer.set_inheritable(False)
-    # The recorder sends no command before the greeting.
-    with peer.makefile("rb") as file:
-        settings = parse_object(file.readline(MAX_EVENT))
     outbox = Outbox(peer)
     try:
         middleware = Middleware()
@@ -134,8 +131,7 @@ def run(number: int) -> int:
         outbox.event("failed", missing=isinstance(error, ImportError), why=why)
         outbox.send()
         return 1
-    overrides = settings.get("overrides", {})
-    topics = Topics(middleware, outbox, Definitions(share_folders()), overrides)
+    topics = Topics(middleware, outbox, Definitions(share_folders()))
     child = Child(middleware, topics, outbox)
     outbox.event("hello", middleware=middleware.implementation)
     signal.signal(signal.SIGTERM, lambda _number, _frame: child.stop())

@@ -28,7 +28,6 @@ _INCLUDE = re.compile(
 _BYTES = re.compile(
     rb"^\s*(?:u?int8|byte|char)\[\]|sequence<\s*(?:u?int8|octet|char)\s*>", re.MULTILINE
 )
-_ARRAYS = re.compile(rb"^\s*\w[\w/<=]*\[\]|sequence<", re.MULTILINE)
 _PRIMITIVE = frozenset(
     [
         "bool",
@@ -77,14 +76,12 @@ class Definition(NamedTuple):
         encoding: `ros2msg` or `ros2idl`.
         text: The definition with all definitions that it needs.
         has_bytes: Some field is a byte array of any length, as in images.
-        has_arrays: Some field is an array of any length.
         type_hash: Hash of the installed type; empty in older releases.
     """
 
     encoding: str
     text: bytes
     has_bytes: bool
-    has_arrays: bool
     type_hash: str = ""
 
     def of(self, type_hash: str) -> Definition:
@@ -150,7 +147,6 @@ class Definitions:
             encoding,
             b"".join(parts),
             has_bytes=any(_BYTES.search(found) for _, found in waiting),
-            has_arrays=any(_ARRAYS.search(found) for _, found in waiting),
             type_hash=self._type_hash(root),
         )
 

@@ -22,15 +22,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Sequence
 
     from hybridlog.live.sources.ros2.child.definitions import TypeName
 
 _ID = 16
 """Length of a publisher's id in bytes; some releases pad it with zeros."""
-
-_MAX_INVALID = 100
-_MAX_NODES = 4  # so many types of a topic are heard at the same time
 
 
 class Offer(NamedTuple):
@@ -51,12 +48,8 @@ class Offer(NamedTuple):
 class Subscription:
     """A raw subscription; `take` returns the next message and its information, or None."""
 
-    def __init__(
-        self, middleware: Middleware, node: Any, handle: Any, kind: TypeName, profile: Profile
-    ) -> None:
+    def __init__(self, middleware: Middleware, handle: Any, profile: Profile) -> None:
         self.profile = profile
-        self.node = node
-        self.topic_and_type = (handle.topic_name, kind)
         self.take: Callable[[], tuple[bytes, dict[str, Any]] | None] = partial(
             handle.handle.take_message, handle.msg_type, True
         )
@@ -72,12 +65,8 @@ class Subscription:
 class Middleware:
     """A node without services, parameters or log topic.
 
-    Fast DDS allows a program one type for each topic name. So further nodes, with participants
-    of their own, subscribe to topics that have several types at the same time.
-
     Attributes:
         implementation: Name of the middleware, such as `rmw_fastrtps_cpp`.
-        invalid: Topics with names that ROS refuses, and the errors.
     """
 
     def __init__(self) -> None:
@@ -91,29 +80,21 @@ class Middleware:
         self._native = rclpy_implementation
         self._silent = _no_callbacks()
         name = f"hybridlog_recorder_{os.getpid()}"
-        self._names = [name, *(f"{name}_{number}" for number in range(1, _MAX_NODES))]
-        self._own = frozenset(f"/{name}" for name in self._names)
+        self._own = f"/{name}"
         with default_profile():
             rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
             self._context = rclpy.get_default_context()
-            self._node = self._new_node(name, self._context)
-        self._nodes = [self._node]
-        self._contexts: list[Any] = []
+            self._node = rclpy.create_node(
+                name,
+                use_global_arguments=False,
+                enable_rosout=False,
+                start_parameter_services=False,
+            )
         self._guard = self._node.create_guard_condition(lambda: None)
         self._wait_set: Any = None
         self._open: list[Subscription] = []
         self._at: dict[int, Subscription] = {}
-        self.invalid: dict[str, str] = {}
         self.implementation = str(rclpy.get_rmw_implementation_identifier())
-
-    def _new_node(self, name: str, context: Any) -> Any:
-        return self._rclpy.create_node(
-            name,
-            context=context,
-            use_global_arguments=False,
-            enable_rosout=False,
-            start_parameter_services=False,
-        )
 
     def wake(self) -> None:
         """Ends a wait; thread safe, even while the node closes."""
@@ -121,73 +102,37 @@ class Middleware:
             self._guard.trigger()
 
     def publishers(self) -> dict[tuple[str, str], list[Offer]]:
-        """All publishers of other nodes, by topic and type.
-
-        DDS programs without ROS may have names that ROS refuses; these go to `invalid`.
-        """
+        """All publishers of other nodes, by topic and type."""
         found: dict[tuple[str, str], list[Offer]] = {}
         for topic, _ in self._node.get_topic_names_and_types():
-            try:
-                offers = self.offers(topic)
-            except Exception as error:
-                # rclpy raises errors of many kinds; each concerns only this topic.
-                if len(self.invalid) < _MAX_INVALID:
-                    self.invalid[topic] = " ".join(str(error).split())
-                continue
-            for kind, offer in offers:
-                found.setdefault((topic, kind), []).append(offer)
-        return found
-
-    def offers(self, topic: str) -> list[tuple[str, Offer]]:
-        """Other programs' publishers of a topic, with types; raises any error of rclpy."""
-        found = []
-        for info in self._node.get_publishers_info_by_topic(topic):
-            offer = _offer(info)
-            if offer.node not in self._own:
-                found.append((str(info.topic_type), offer))
+            # rclpy raises errors of many kinds, such as for a name of DDS that ROS refuses.
+            with suppress(Exception):
+                for info in self._node.get_publishers_info_by_topic(topic):
+                    offer = _offer(info)
+                    if offer.node != self._own:
+                        found.setdefault((topic, str(info.topic_type)), []).append(offer)
         return found
 
     def subscribe(self, topic: str, kind: TypeName, profile: Profile) -> Subscription:
         """Subscribes to serialized messages; raises ImportError, or any error of rclpy."""
-        message = message_class(kind)
-        node = self._node_for(topic, kind)
-        handle = node.create_subscription(
-            message,
+        handle = self._node.create_subscription(
+            message_class(kind),
             topic,
             lambda _: None,  # never called: the node does not spin
             self._quality(profile),
             raw=True,
             event_callbacks=self._silent,
         )
-        found = Subscription(self, node, handle, kind, profile)
+        found = Subscription(self, handle, profile)
         self._open.append(found)
         self._wait_set = None
         return found
-
-    def _node_for(self, topic: str, kind: TypeName) -> Any:
-        """A node that has no subscription to another type of a topic."""
-        others = {
-            id(sub.node)
-            for sub in self._open
-            if sub.topic_and_type[0] == topic and sub.topic_and_type[1] != kind
-        }
-        for node in self._nodes:
-            if id(node) not in others:
-                return node
-        if len(self._nodes) == _MAX_NODES:
-            raise RuntimeError(f"it has had more than {_MAX_NODES} types")
-        with default_profile():
-            context = self._rclpy.Context()
-            context.init(args=[])
-            self._contexts.append(context)
-            self._nodes.append(self._new_node(self._names[len(self._nodes)], context))
-        return self._nodes[-1]
 
     def remove(self, subscription: Subscription, inner: Any) -> None:
         """Ends a subscription; only `Subscription.close` calls it."""
         self._open = [other for other in self._open if other is not subscription]
         self._wait_set = None
-        subscription.node.destroy_subscription(inner)
+        self._node.destroy_subscription(inner)
 
     def wait(self, seconds: float) -> list[Subscription]:
         """Waits, with a time limit, and returns the subscriptions that have messages."""
@@ -208,10 +153,7 @@ class Middleware:
     def close(self) -> None:
         """Removes the nodes from the graph."""
         self._wait_set = None
-        for node in self._nodes:
-            node.destroy_node()
-        for context in self._contexts:
-            context.shutdown()
+        self._node.destroy_node()
         self._rclpy.shutdown()
 
     def _quality(self, profile: Profile) -> Any:
@@ -374,22 +316,16 @@ def default_profile(environment: MutableMapping[str, str] = os.environ) -> Itera
         Path(name).unlink(missing_ok=True)
 
 
-KEEP_LAST, KEEP_ALL = 1, 2
+KEEP_LAST = 1
 RELIABLE, BEST_EFFORT = 1, 2
 TRANSIENT_LOCAL, VOLATILE = 1, 2
-AUTOMATIC, MANUAL_BY_TOPIC = 1, 3
+AUTOMATIC = 1
 
-FOREVER = 2**63 - 1
-"""Duration that means no limit in rmw, ns."""
-
-DEPTH = 10_000
+DEPTH = 1000
 """Messages that the middleware queues for a subscription, enough for a burst.
 
 The queue takes memory only for messages that it holds.
 """
-
-DEPTH_OF_ARRAYS = 1000
-"""The same for types with arrays of any length, which may be large."""
 
 DEPTH_OF_BYTES = 256
 """The same for types with byte arrays, such as images and point clouds, which are large."""
@@ -401,13 +337,13 @@ class Profile(NamedTuple):
     """Quality of service of one end of a topic.
 
     Attributes:
-        history: `KEEP_LAST`, `KEEP_ALL`, or 0 or 3 when unknown.
-        depth: Length of the queue, for `KEEP_LAST`.
+        history: 1 for keep last, 2 for keep all, or 0 or 3 when unknown.
+        depth: Length of the queue, for keep last.
         reliability: `RELIABLE`, `BEST_EFFORT`, or another number that is unknown.
         durability: `TRANSIENT_LOCAL`, `VOLATILE`, or another number.
-        deadline: Maximum time between two messages, ns; 0 or `FOREVER` for none.
+        deadline: Maximum time between two messages, ns; 0 or the greatest number for none.
         lifespan: Time for which a message is delivered, ns.
-        liveliness: `AUTOMATIC`, `MANUAL_BY_TOPIC`, or another number.
+        liveliness: `AUTOMATIC`, 3 for manual by topic, or another number.
         liveliness_lease_duration: Time after which a silent publisher counts as dead, ns.
         avoid_ros_namespace_conventions: The DDS topic has the plain name.
     """
@@ -426,41 +362,19 @@ class Profile(NamedTuple):
 DURATIONS = ("deadline", "lifespan", "liveliness_lease_duration")
 
 
-def request(offers: Sequence[Profile], depth: int, override: Mapping[str, Any]) -> Profile:
+def request(offers: Sequence[Profile], depth: int) -> Profile:
     """A request that is compatible with all publishers, of which there is at least one.
 
     It has the reliability and durability that all of them offer. A deadline or a lease would only
-    exclude publishers. `override` has fields of `Profile` that the user has set.
+    exclude publishers.
     """
     reliable = all(offer.reliability == RELIABLE for offer in offers)
     lasting = all(offer.durability == TRANSIENT_LOCAL for offer in offers)
-    found = Profile(
+    return Profile(
         depth=depth,
         reliability=RELIABLE if reliable else BEST_EFFORT,
         durability=TRANSIENT_LOCAL if lasting else VOLATILE,
     )
-    return found._replace(**override)
-
-
-def conflicts(offer: Profile, wanted: Profile) -> list[str]:
-    """Names of the policies that make a publisher incompatible."""
-    found = []
-    if wanted.reliability == RELIABLE and offer.reliability == BEST_EFFORT:
-        found.append("reliability")
-    if wanted.durability == TRANSIENT_LOCAL and offer.durability == VOLATILE:
-        found.append("durability")
-    if _limit(offer.deadline) > _limit(wanted.deadline):
-        found.append("deadline")
-    if wanted.liveliness == MANUAL_BY_TOPIC and offer.liveliness == AUTOMATIC:
-        found.append("liveliness")
-    if _limit(offer.liveliness_lease_duration) > _limit(wanted.liveliness_lease_duration):
-        found.append("liveliness_lease_duration")
-    return found
-
-
-def _limit(duration: int) -> int:
-    """A duration, with `FOREVER` for none."""
-    return FOREVER if duration <= 0 else duration
 
 
 def offered_text(offers: Sequence[Profile]) -> str:
