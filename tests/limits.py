@@ -59,7 +59,7 @@ PLACES = {
     "matches": "hybridlog.drawing.times.MAX_MATCHES",
     "direct_flag": "hybridlog_storage.disk.append_file.DIRECT",
     "copy_wait_s": "hybridlog_storage.copy_places.LOCK_WAIT_S",
-    "server_copy_wait_s": "hybridlog_storage.sftp.LOCK_WAIT_S",
+    "server_copy_wait_s": "hybridlog_storage.server.LOCK_WAIT_S",
     "manifest_bytes": "hybridlog_storage.manifest.MAX_BYTES",
     "manifest_wait_s": "hybridlog_storage.manifests.WAIT_S",
     "inserted_documents": "hybridlog_storage.mongo.database.BATCH_DOCUMENTS",

@@ -132,7 +132,7 @@ class Copying:
     def _opened(self) -> Iterator[tuple[Place, Callable[[str], str]]]:
         """The place to copy to, and what makes a name that no recording there has."""
         if str(self.to).startswith("ssh://"):
-            from hybridlog_storage.sftp import Server
+            from hybridlog_storage.server import Server
 
             with Server(str(self.to), self.options.ssh) as server:
                 server.begin()

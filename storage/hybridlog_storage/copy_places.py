@@ -2,7 +2,7 @@
 
 A place makes a file visible under its name only when all of it has arrived and is proved: its
 bytes were read back, or the server has told their checksum. In a directory it grows beside, as
-`.DIGEST.part`, where the next copy goes on. Others are in `remote.store` and `sftp`.
+`.DIGEST.part`, where the next copy goes on. Others are in `remote.store` and `server`.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 import os
 import secrets
 import stat
-import tempfile
 from abc import ABC, abstractmethod
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -165,17 +164,6 @@ class Source(Place):
     def pieces(self, name: str, at: int, size: int) -> Iterator[bytes]:
         """Bytes of a file below the store; `RefusedError` if none of `size` bytes is there."""
 
-    @contextmanager
-    def opened(self, name: str, size: int) -> Iterator[int]:
-        """A handle of a file, or of a copy of it that is gone in the end; errors as `pieces`."""
-        with tempfile.TemporaryFile() as file:
-            os.fchmod(file.fileno(), 0o666)  # which copies of it have, less their umask
-            with files.explained(Path(tempfile.gettempdir()), "copying by way of"):
-                for piece in self.pieces(name, 0, size):
-                    file.write(piece)
-                file.flush()
-            yield file.fileno()
-
 
 class Directory(Source):
     """The directory of a store."""
@@ -255,12 +243,6 @@ class Directory(Source):
         return True
 
     def pieces(self, name: str, at: int, size: int) -> Iterator[bytes]:
-        """As of `Source`."""
-        with self.opened(name, size) as fd:
-            yield from read(fd, at, size)
-
-    @contextmanager
-    def opened(self, name: str, size: int) -> Iterator[int]:
         """As of `Source`; what cannot be read of it is refused, too."""
         path = self._path / name
         with ExitStack() as stack:
@@ -273,7 +255,7 @@ class Directory(Source):
                     raise RefusedError(
                         f"{path} is damaged: it has {found} bytes instead of {size}."
                     )
-                yield fd
+                yield from read(fd, at, size)
             except OSError as error:
                 raise RefusedError(f"{path} cannot be copied: {error.strerror}.") from error
 

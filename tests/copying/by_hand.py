@@ -26,8 +26,8 @@ from hybridlog_storage.manifest import (
 )
 from hybridlog_storage.remote.bucket import Bucket
 from hybridlog_storage.remote.store import BucketStore
+from hybridlog_storage.server import Server
 from hybridlog_storage.settings import StoreSettings, write_settings
-from hybridlog_storage.sftp import Server
 from tests.copying.server import Sshd
 from tests.places import begin
 from tests.remote.conftest import new_address
@@ -37,7 +37,6 @@ PAIRS = [
     ("directory", "directory"),
     ("directory", "bucket"),
     ("directory", "shell"),
-    ("directory", "sftp"),
     ("bucket", "directory"),
 ]
 MORE_PAIRS = [*PAIRS, ("bucket", "bucket"), ("bucket", "shell")]

@@ -174,7 +174,7 @@ def test_follows_a_store(robots: Path, tmp_path: Path) -> None:
 def test_a_watch_goes_on_after_a_cut(
     robots: Path, tmp_path: Path, sshd: dict[str, Sshd], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pauses, server = [], sshd["sftp"]
+    pauses, server = [], sshd["shell"]
 
     def pause(seconds: float) -> None:
         server.reset()  # the connection is there again

@@ -176,7 +176,7 @@ def test_links_of_the_source_are_not_followed(
     assert not target.is_there()
 
 
-@pytest.mark.parametrize("kind", ["directory", "bucket", "shell", "sftp"])
+@pytest.mark.parametrize("kind", ["directory", "bucket", "shell"])
 def test_hostile_manifests(make: Makes, kind: str) -> None:
     source, target = make("directory"), make(kind)
     source.begin(SMALL)
@@ -206,7 +206,7 @@ def test_hostile_manifests(make: Makes, kind: str) -> None:
             copy(source.source, target.place, recording_id)
 
 
-@pytest.mark.parametrize("kind", ["directory", "shell", "sftp", "bucket"])
+@pytest.mark.parametrize("kind", ["directory", "shell", "bucket"])
 def test_a_manifest_without_end_is_not_read_to_its_end(make: Makes, kind: str) -> None:
     source, target = make("directory"), make(kind)
     source.begin(SMALL)
@@ -222,7 +222,7 @@ def test_a_manifest_without_end_is_not_read_to_its_end(make: Makes, kind: str) -
         target.place.manifests.read(RECORDING)
 
 
-@pytest.mark.parametrize("kind", ["directory", "shell", "sftp"])
+@pytest.mark.parametrize("kind", ["directory", "shell"])
 def test_what_is_left_of_a_file_that_no_longer_comes_goes(make: Makes, kind: str) -> None:
     source, target = make("directory"), make(kind)
     source.begin(SMALL)

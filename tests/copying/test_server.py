@@ -11,7 +11,7 @@ from hybridlog_storage.copy import copy
 from hybridlog_storage.copy_places import Directory
 from hybridlog_storage.errors import HeldError, StoreError, UsageError
 from hybridlog_storage.manifest import Manifest, Note, new_id, replace
-from hybridlog_storage.sftp import Server
+from hybridlog_storage.server import Server
 from tests.copying.by_hand import RECORDING, Makes, recording
 from tests.copying.server import Sshd
 from tests.copying.test_any_place import as_of
@@ -33,7 +33,12 @@ def test_urls(sshd: dict[str, Sshd], tmp_path: Path) -> None:
     ):
         with pytest.raises(UsageError):
             Server(wrong)
-    server = sshd["sftp"]
+    with (
+        pytest.raises(StoreError, match="flock and sha256sum"),
+        Server(sshd["sftp"].url(tmp_path), sshd["sftp"].ssh),
+    ):
+        pass
+    server = sshd["shell"]
     with pytest.raises(StoreError, match="not reached"), Server("ssh://127.0.0.1:1/x", server.ssh):
         pass
     with (
@@ -46,9 +51,8 @@ def test_urls(sshd: dict[str, Sshd], tmp_path: Path) -> None:
         pass
 
 
-@pytest.mark.parametrize("kind", ["shell", "sftp"])
-def test_recordings_are_removed_there_alone(make: Makes, kind: str) -> None:
-    source, target = make("directory"), make(kind)
+def test_recordings_are_removed_there_alone(make: Makes) -> None:
+    source, target = make("directory"), make("shell")
     source.begin(recording())
     assert target.place.manifests.ids() == []
     copy(source.source, target.place, RECORDING)
@@ -103,9 +107,8 @@ def noted(now: Manifest, at: int) -> Manifest:
     return replace(now, notes=(*now.notes, Note(at, "")))
 
 
-@pytest.mark.parametrize("kind", ["shell", "sftp"])
-def test_a_store_is_made_there(make: Makes, kind: str, tmp_path: Path) -> None:
-    target = make(kind)
+def test_a_store_is_made_there(make: Makes) -> None:
+    target = make("shell")
     assert isinstance(target.place, Server)
     settings = target.read("hybridlog.toml")
     target.place.begin()
@@ -119,9 +122,8 @@ def test_a_store_is_made_there(make: Makes, kind: str, tmp_path: Path) -> None:
         target.place.begin()
 
 
-@pytest.mark.parametrize("kind", ["shell", "sftp"])
-def test_names_there(make: Makes, kind: str) -> None:
-    source, target = make("directory"), make(kind)
+def test_names_there(make: Makes) -> None:
+    source, target = make("directory"), make("shell")
     assert isinstance(target.place, Server)
     assert target.place.names() == set()
     for name in ('a"b', "back\\slash", "\u00e4 \U0001f916", "tab\there"):

@@ -23,7 +23,7 @@ To = Callable[[Path], dict[str, Any]]
 """Where a copy goes, and by what program, for the path of a store."""
 
 
-@pytest.fixture(params=["directory", "shell", "sftp"])
+@pytest.fixture(params=["directory", "shell"])
 def to(request: pytest.FixtureRequest) -> Iterator[To]:
     if request.param == "directory":
         yield lambda path: {"to": path}
