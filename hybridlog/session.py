@@ -12,7 +12,6 @@ from collections.abc import (
     Sequence,
 )
 from contextlib import suppress
-from itertools import accumulate
 from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import numpy as np
@@ -394,21 +393,6 @@ class Session:
             columns = self._chunk_columns(recording, number, channels)
             found += columns.chunks(columns.within(bounds, clock, timed=timed))
         return found
-
-    def chunks_before(
-        self, recording: RecordingEntry, channels: Sequence[int], latest: int
-    ) -> Iterator[tuple[Chunk, int]]:
-        """Chunks that may hold the last message of some channels by a time, ns.
-
-        With each comes the greatest log time, ns, that it or any later chunk may hold.
-        """
-        spans = sorted(recording.spans_with(channels), key=lambda span: span[1])
-        spans = [span for span in spans if span[1] <= latest]
-        lasts = [BEGIN, *accumulate((last for _, _, last in spans), max)]
-        for place in reversed(range(len(spans))):
-            columns = self._chunk_columns(recording, spans[place][0], channels)
-            for chunk, last in columns.before(latest):
-                yield chunk, max(last, lasts[place])
 
     def _chunk_columns(
         self, recording: RecordingEntry, number: int, channels: Collection[int]

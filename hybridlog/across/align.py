@@ -5,28 +5,28 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from itertools import chain, count
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import pyarrow as pa
 from msgspec.structs import replace
 
-from hybridlog.across.bins import AGGREGATES, Bins, RegularTimes, with_numbers
 from hybridlog.across.match import HOWS
 from hybridlog.across.topic_reader import (
     RECORDING,
     TIME,
     Beside,
+    Block,
     Empty,
     TopicReader,
     concatenated,
 )
 from hybridlog.frames.answer import text_column
 from hybridlog.query.answers.completeness import completeness_of
-from hybridlog.query.answers.remarks import remarks
 from hybridlog.query.question import Counters
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import DurationLike, parse_duration
+from hybridlog.schema.arrow_columns import numbers
 from hybridlog.schema.arrow_types import common_schema
 from hybridlog.snapshot import UNFINISHED
 from hybridlog.wording import counted, listed
@@ -41,6 +41,9 @@ if TYPE_CHECKING:
     from hybridlog.session import Session
 
 _MAX_NAMES = 20  # remarks about empty columns
+MAX_TIMES = 100_000_000
+"""Maximum number of rows of `resample`."""
+_GRID_ROWS = 65_536
 
 
 class Aligned:
@@ -76,22 +79,17 @@ class Aligned:
 
     def remarks(self) -> list[str]:
         """Sentences about the last answer, those of `Query.remarks` about each topic."""
-        questions = [reader.question for reader in self._readers]
         rows = counted(self.rows, "row")
         lines = [
             f"{name}: {number} of {rows} {'is' if number == 1 else 'are'} empty: {reason}."
             for name, reasons in self.empty.items()
             for reason, number in reasons.items()
         ]
-        found = lines[:_MAX_NAMES]
         if len(lines) > _MAX_NAMES:
-            found.append(
-                f"{counted(len(lines) - _MAX_NAMES, 'more column')} are empty in some rows."
-            )
-        found += dict.fromkeys(text for one in self._readers for text in one.remarks)
-        for question in questions:
-            found += remarks(self._session, question, is_empty=False)
-        return [*dict.fromkeys([*found, *self.completeness().sentences])]
+            more = counted(len(lines) - _MAX_NAMES, "more column")
+            lines[_MAX_NAMES:] = [f"{more} are empty in some rows."]
+        lines += [text for one in self._readers for text in one.remarks]
+        return [*dict.fromkeys([*lines, *self.completeness().sentences])]
 
     def completeness(self) -> Completeness:
         """Return what the rows lack, as `Query.completeness` does, after they were read."""
@@ -182,6 +180,36 @@ class Aligned:
         return common_schema(self.to_tables())
 
 
+class RegularTimes:
+    """Regular times as rows: from the beginning of each recording, or of the asked range.
+
+    The recordings and the range of the question count; the step is in ns, not zero.
+    """
+
+    empty: Final = pa.table({TIME: numbers(np.empty(0, np.int64), "time")})
+
+    def __init__(self, session: Session, question: Question, step: int) -> None:
+        if step == 0:
+            raise UsageError("A step of 0 gives no times: name a duration, such as 100ms.")
+        self.question = question
+        self.step = step
+        spans: dict[str, list[tuple[int, int]]] = {}
+        for summary, span in RangeResolver(session, question).spans():
+            spans.setdefault(summary.id, []).append(span)
+        self._spans = spans
+        rows = sum((end - begin) // step for found in spans.values() for begin, end in found)
+        if rows > MAX_TIMES:
+            raise UsageError(f"There would be {rows} rows; use a longer step or a time range.")
+
+    def rows(self, recording: str) -> Iterator[Block]:
+        """The times in a recording."""
+        for begin, end in self._spans.get(recording, []):
+            for first in range(begin, end, _GRID_ROWS * self.step):
+                last = min(end, first + _GRID_ROWS * self.step)
+                times = np.arange(first, last, self.step, dtype=np.int64)
+                yield times, pa.table({TIME: numbers(times, "time")})
+
+
 def side_by_side(
     session: Session,
     base: Question,
@@ -200,7 +228,7 @@ def side_by_side(
             f"The rows are the messages of one topic, not of {len(base.topics)}: name one of "
             f"{listed(base.topics)}."
         )
-    near = _checked(how, tolerance, HOWS)
+    near = _checked(how, tolerance)
     chosen: Clock = clock  # type: ignore[assignment]
     (prefix, one), *named = _named([base, *others])
     rows = TopicReader(session, one, chosen, prefix=prefix)
@@ -221,24 +249,18 @@ def resampled(
 ) -> Aligned:
     """An alignment of topics to regular times; see `Query.resample`."""
     times = RegularTimes(session, replace(question, predicate=None), parse_duration(step))
-    near = _checked(how, tolerance, (*HOWS, *AGGREGATES))
-    named = [(prefix, with_numbers(session, one, how)) for prefix, one in _named([question])]
-    beside: list[Beside] = []
-    for prefix, one in named:
-        own = prefix if len(named) > 1 else ""
-        if how in AGGREGATES:
-            beside.append(Bins(session, one, how=how, grid=times, prefix=own))
-        else:
-            beside.append(Beside(session, one, how=how, tolerance=near, prefix=own))
+    near, named = _checked(how, tolerance), _named([question])
+    beside = [
+        Beside(session, one, how=how, tolerance=near, prefix=prefix if len(named) > 1 else "")
+        for prefix, one in named
+    ]
     return Aligned(session, times, beside, how)
 
 
-def _checked(how: str, tolerance: DurationLike | None, hows: Sequence[str]) -> int | None:
-    """The tolerance, ns, of one of some ways."""
-    if how not in hows:
-        raise UsageError(f"Unknown way {how!r}; choose {', '.join(hows)}.")
-    if how in AGGREGATES and tolerance is not None:
-        raise UsageError(f"{how} is of the messages between two rows: leave out tolerance.")
+def _checked(how: str, tolerance: DurationLike | None) -> int | None:
+    """The tolerance, ns, of one of the ways to match."""
+    if how not in HOWS:
+        raise UsageError(f"Unknown way {how!r}; choose {', '.join(HOWS)}.")
     return None if tolerance is None else parse_duration(tolerance)
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from array import array
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, TypeAlias, overload
 
@@ -17,7 +17,6 @@ from msgspec.structs import replace
 from hybridlog.across.topic_reader import TopicReader
 from hybridlog.message import messages_in
 from hybridlog.query.answers.completeness import completeness_of
-from hybridlog.query.answers.current import message_at
 from hybridlog.query.answers.video import picture_of
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.planner import Planner
@@ -37,8 +36,8 @@ if TYPE_CHECKING:
 
 
 _Times: TypeAlias = "NDArray[np.int64]"
-"""int64[4, n] of messages: time on the clock, ns; log time, ns; place among the messages of that
-log time that the question finds; 1 if the topic has no other message of that log time."""
+"""int64[3, n] of messages: time on the clock, ns; log time, ns; place among the messages of that
+log time that the question finds."""
 
 
 class Synced(Sequence[tuple["Message", ...]]):
@@ -75,20 +74,17 @@ class Synced(Sequence[tuple["Message", ...]]):
         self._sessions: dict[int, Session] = {os.getpid(): session}  # by process
         self.topics = tuple(question.topics[0] for question in questions)
         limit = None if tolerance is None else parse_duration(tolerance)
-        chosen = [set(session.chosen(question).tolist()) for question in questions]
-        places = set.intersection(*chosen)
+        places = set.intersection(*(set(session.chosen(one).tolist()) for one in questions))
         summaries = session.snapshot().summaries
         in_range = set.union(*(_in_range(session, question) for question in questions))
         near = [one for place in sorted(places) if (one := summaries[place].id) in in_range]
         asked = (replace(question, recordings=tuple(near)) for question in questions)
         readers = [TopicReader(session, question, clock) for question in asked]
         ids: list[str] = []
-        # By topic int64[4, n] of each recording, as of `_Times`.
-        found = [[np.empty((4, 0), np.int64)] for _ in questions]
-        timed = np.zeros(len(questions), np.int64)  # messages with a time
+        # By topic int64[3, n] of each recording, as of `_Times`.
+        found = [[np.empty((3, 0), np.int64)] for _ in questions]
         for recording in near:
             read = [reader.moments(recording) for reader in readers]
-            timed += [len(one.time) for one in read]
             if not all(len(one.time) for one in read):
                 continue
             epochs = readers[0].epochs(recording)
@@ -98,22 +94,13 @@ class Synced(Sequence[tuple["Message", ...]]):
             for n, one in enumerate(read):
                 message = one.place[rows[:, n]]
                 log = one.log_time[message]
-                first = one.log_time.searchsorted(log)
-                behind = one.log_time.searchsorted(log, "right")
-                is_whole = questions[n].is_unbounded and questions[n].predicate is None
                 own = one.time[rows[:, n]] - epochs.offsets(log)
-                is_alone = (behind - first == 1) & is_whole
-                found[n].append(np.stack([own, log, message - first, is_alone]))
+                found[n].append(np.stack([own, log, message - one.log_time.searchsorted(log)]))
         for reader in readers:
             self.counters.add(reader.counters)
         self._restarts = readers[0].remarks
         self.recordings = tuple(ids)
-        left_out = [
-            _left_out(session, question, own - places, number, len(ids))
-            for question, own, number in zip(questions, chosen, timed.tolist(), strict=True)
-        ]
-        self.left_out = tuple(messages for messages, _ in left_out)
-        self._why_left_out = [why for _, why in left_out if why]
+        self.left_out = tuple(_count(session, question) - len(ids) for question in questions)
         by_topic = [np.concatenate(parts, axis=1) for parts in found]
         self.times: NDArray[np.int64] = np.stack([times[0] for times in by_topic], axis=1)
         self._topics = list(zip(questions, by_topic, strict=True))
@@ -135,7 +122,9 @@ class Synced(Sequence[tuple["Message", ...]]):
 
     def remarks(self) -> list[str]:
         """Sentences about the sets: messages that are in none, and what the topics may lack."""
-        session, found = self._opened(), [*self._why_left_out, *self._restarts]
+        session, found = self._opened(), [*self._restarts]
+        named = zip(self.topics, self.left_out, strict=True)
+        found += (f"In no set: {counted(n, 'message')} of {topic}." for topic, n in named if n)
         for question, _ in self._topics:
             found += completeness_of(session, question).sentences
         return [*dict.fromkeys(found)]
@@ -170,18 +159,11 @@ class Synced(Sequence[tuple["Message", ...]]):
     def _read(
         self, session: Session, question: Question, times: _Times, recording: str, row: int
     ) -> Message:
-        _, time, number, is_alone = map(int, times[:, row])
-        question = replace(question, recordings=(recording,))
-        if is_alone:  # as those of most sets are, and ten times faster
-            found = message_at(session, replace(question, clock="log"), self.counters, time)
-            if found is not None and found.log_time_ns == time:
-                return found
+        _, time, number = map(int, times[:, row])
         span = Intervals([(recording, np.array([[*span_of(time, time), 1]], np.int64))])
-        own, counters = replace(question, during=span), Counters()
-        picture = picture_of(session)
-        runs = Planner(session, own, counters).runs()
-        messages = [message for run in runs for message in messages_in(run, picture)]
-        self.counters.add(counters)
+        own = replace(question, recordings=(recording,), during=span, limit=number + 1)
+        runs = Planner(session, own, self.counters).runs(keeps=True)
+        messages = [one for run in runs for one in messages_in(run, picture_of(session))]
         if number >= len(messages):
             raise StoreError(
                 f"A message of {question.topics[0]} is not in the store any more: make the "
@@ -197,32 +179,10 @@ def _in_range(session: Session, question: Question) -> set[str]:
     return set()
 
 
-def _left_out(
-    session: Session, question: Question, apart: Collection[int], timed: int, sets: int
-) -> tuple[int, str]:
-    """The number of messages of a topic that are in no set, and a sentence about them.
-
-    Recordings at places `apart` lack another topic; in the others, so many messages are `timed`.
-    """
-    summaries = session.snapshot().summaries
-
-    def count(question: Question) -> int:
-        with suppress(TimeError):  # the range does not touch the recordings
-            return Planner(session, question).count()
-        return 0
-
-    beside = tuple(summaries[place].id for place in apart)
-    total = count(question)
-    away = count(replace(question, recordings=beside)) if beside else 0
-    left_out = total - sets
-    if not left_out:
-        return 0, ""
-    are = "is" if left_out == 1 else "are"
-    text = f"{left_out} of {counted(total, 'message')} of {question.topics[0]} {are} in no set"
-    why = [f"{away} in recordings without another of the topics"] if away else []
-    if total - away > timed:
-        why.append(f"{total - away - timed} without a time on the clock")
-    return left_out, f"{': '.join([text, ', '.join(why)] if why else [text])}."
+def _count(session: Session, question: Question) -> int:
+    with suppress(TimeError):  # the range does not touch the recordings
+        return Planner(session, question).count()
+    return 0
 
 
 def approximate_sets(

@@ -23,7 +23,6 @@ from hybridlog.schema.arrow_types import column_of, common_schema
 from hybridlog.schema.column import STAMP
 from hybridlog.tf.epochs import Epochs, epochs_of
 from hybridlog.tf.in_frame import stream
-from hybridlog.wording import listed
 from hybridlog_storage.cache import lazy
 from hybridlog_storage.errors import TimeError, UsageError
 from hybridlog_storage.times import BEGIN, END, placed
@@ -58,7 +57,6 @@ _WHY_NEAR: Final = {
 }
 _PIECE_BYTES = 32 << 20  # messages of a topic that rows get together
 _SKIPPED_BYTES = 1 << 20  # messages between needed ones that are read along
-_MAX_NAMES: Final = 3  # recordings in a message
 
 
 class Moments(NamedTuple):
@@ -227,20 +225,10 @@ class TopicReader:
 
     def elsewhere(self, recording: str) -> str | None:
         """The reason why no message can be beside a recording's rows; None if one may be."""
-        snapshot = self._session.snapshot()
-        place, places = snapshot.by_id[recording], self._session.chosen(self.question)
-        if self.is_apart or place in places:
+        place = self._session.snapshot().by_id[recording]
+        if self.is_apart or place in self._session.chosen(self.question):
             return None
-        is_near = (snapshot.begin[places] < snapshot.end[place]) & (
-            snapshot.begin[place] < snapshot.end[places]
-        )
-        names = [snapshot.summaries[n].name for n in places[is_near].tolist()]
-        if not names:
-            return "the messages are of other recordings"
-        return (
-            "the messages of that time are of other recordings "
-            f"({listed(names, _MAX_NAMES)}), which --beside or across_recordings takes"
-        )
+        return "the messages are of other recordings, which --beside or across_recordings takes"
 
     def _beside(self, recording: str) -> Question:
         """The question about the messages that may be beside the rows of a recording."""

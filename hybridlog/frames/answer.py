@@ -139,7 +139,7 @@ class Decoder:
     """
 
     def __init__(self, planner: Planner) -> None:
-        _check(planner.examples)
+        check_definitions(planner.examples)
         self._examples = planner.examples
         self._counters = planner.counters
         self._chosen = planner.question.fields
@@ -271,7 +271,8 @@ def _to_decode(
     return frozenset(wanted | {STAMP} if "stamp" in own else wanted)
 
 
-def _check(channels: Sequence[RecordedChannel]) -> None:
+def check_definitions(channels: Sequence[RecordedChannel]) -> None:
+    """Refuse topics without fields."""
     for channel in channels:
         if channel.codec.reason is not None:
             raise DefinitionError(

@@ -13,6 +13,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
 
 
 _types = pa.types
-_NOTHING: NDArray[Any] = np.empty(0)
 
 
 def frame_of(table: pa.Table) -> pd.DataFrame:
@@ -58,12 +58,12 @@ def _array(column: pa.ChunkedArray[Any]) -> Any:
     if is_text(kind):
         return _string_dtype().__from_arrow__(column.cast(pa.large_string()))
     cells = np.empty(len(column), object)
-    place, shared = 0, None
+    place = 0
     for chunk in filter(len, column.chunks):
         rows = slice(place, place + len(chunk))
         place += len(chunk)
         if is_list(kind) and _is_plain(chunk):
-            shared = _fill(cells[rows], chunk, shared)
+            cells[rows] = _arrays(chunk)
         else:
             cells[rows] = _objects(chunk)
     return cells
@@ -90,44 +90,16 @@ def _is_plain(chunk: pa.Array[Any]) -> bool:
     return is_numeric(chunk.type.value_type) and not chunk.flatten().null_count
 
 
-def _fill(cells: NDArray[Any], chunk: pa.Array[Any], shared: NDArray[Any] | None) -> NDArray[Any]:
-    """Fill in the arrays of a chunk; equal ones, such as covariances, share one array.
-
-    `shared` is what all rows so far are equal to, empty if they differ, None at first; it is
-    returned for the next chunk.
-    """
+def _arrays(chunk: pa.Array[Any]) -> NDArray[Any]:
+    """The lists of a chunk as arrays; None for null."""
     values = chunk.flatten().to_numpy(zero_copy_only=False)
     values.flags.writeable = False
-    missing = missing_of(chunk)
-    is_fixed = _types.is_fixed_size_list(chunk.type)
-    lengths = np.empty(0, np.int64) if is_fixed and missing is None else lengths_of(chunk)
-    if missing is None and (is_fixed or bool((lengths == lengths[0]).all())):
-        table = values.reshape(len(chunk), len(values) // len(chunk))
-        shared = table[0] if shared is None else shared
-        if _all_equal(table, shared):
-            cells.fill(shared)
-            return shared
-        cells[:] = list(table)
-        return _NOTHING
-    ends = np.cumsum(lengths)
-    starts = (ends - lengths).tolist()
-    cells[:] = [values[a:b] for a, b in zip(starts, ends.tolist(), strict=True)]
-    if missing is not None:
+    ends = np.cumsum(lengths_of(chunk)).tolist()
+    cells = np.empty(len(chunk), object)
+    cells[:] = [values[begin:end] for begin, end in pairwise([0, *ends])]
+    if (missing := missing_of(chunk)) is not None:
         cells[missing] = None
-    return _NOTHING
-
-
-def _all_equal(table: NDArray[Any], row: NDArray[Any]) -> bool:
-    """True if all rows equal one row, bit by bit: NaN equals NaN, -0.0 differs from 0.0."""
-    if table.shape[1] != len(row) or not len(row):
-        return False
-    bits = table.view(f"u{table.itemsize}")
-    first = row.view(bits.dtype)
-    if not (np.array_equal(bits[0], first) and np.array_equal(bits[-1], first)):
-        return False
-    flat = bits.reshape(-1)
-    # Each row is compared with the next in flat form: several times faster than by rows.
-    return np.array_equal(flat[len(row) :], flat[: -len(row)])
+    return cells
 
 
 def _objects(chunk: pa.Array[Any]) -> NDArray[Any]:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -108,25 +107,6 @@ class ChunkColumns:
         if clock == "publish":
             inside &= np.isin(own["channel"], np.fromiter(timed, np.int64, len(timed)))
         return np.logical_or.reduceat(inside, self._starts)
-
-    def before(self, latest: int) -> Iterator[tuple[Chunk, int]]:
-        """Chunks that begin by a time, ns, the latest first.
-
-        With each comes the greatest log time that it or any later one may hold.
-        """
-        order, first, last_by = self._by_first
-        for place in reversed(range(bisect_right(first, latest))):
-            yield self._chunk(order[place]), last_by[place]
-
-    @lazy
-    def _by_first(self) -> tuple[list[int], list[int], list[int]]:
-        """Rows by the time at which they begin, these times, and the greatest time so far.
-
-        Lists, since single numbers are looked up: numpy takes ten times as long.
-        """
-        order = np.argsort(self.first, kind="stable")
-        last_by = np.maximum.accumulate(self.last[order])
-        return order.tolist(), self.first[order].tolist(), last_by.tolist()
 
 
 def log_bounds(bounds: tuple[int, int], stats: Collection[ChannelStats]) -> tuple[int, int] | None:

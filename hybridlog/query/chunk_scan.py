@@ -148,7 +148,10 @@ def with_payloads(run: MessageRun, counters: Counters) -> MessageRun:
 
 
 class ChunkScan:
-    """Executes a plan; reading `ahead` is unnecessary for a caller that takes few messages."""
+    """Executes a plan; reading `ahead` is unnecessary for a caller that takes few messages.
+
+    One who looks around in a log `keeps` chunks in the cache. Their buffers are read-only.
+    """
 
     def __init__(
         self,
@@ -156,10 +159,12 @@ class ChunkScan:
         session: Session,
         *,
         ahead: bool = True,
+        keeps: bool = False,
     ) -> None:
         self._plan = plan
         self._session = session
-        self._reads_ahead = ahead
+        self._reads_ahead = ahead and not keeps
+        self._keeps = keeps
 
     def runs(self) -> Iterator[MessageRun]:
         """All messages, in order."""
@@ -217,7 +222,8 @@ class ChunkScan:
             check_wanted()
             task, loaded = loading.popleft()
             run, chunk, unreadable, expired = loaded()
-            counters.add_chunk(chunk)
+            if not self._keeps:
+                counters.add_chunk(chunk)
             counters.unreadable += unreadable
             counters.without_arrays += expired
             yield task, run, loading[0][0] if loading else None
@@ -234,7 +240,12 @@ class ChunkScan:
             yield from group
 
     def _load(self, task: ChunkTask) -> _Loaded:
-        chunk = self._session.read_chunk(*task.key[:2], task.chunk.place)
+        segment, place = task.chunk.segment, task.chunk.place
+        if self._keeps:
+            count = self._plan.counters.add_chunk
+            chunk = self._session.chunk(task.scan.recording, segment, place, count)
+        else:
+            chunk = self._session.read_chunk(task.scan.recording.id, segment, place)
         undecided = self._plan.filtered(task)
         run = self._wanted(task, chunk, undecided)
         run, unreadable, expired = self._filtered(run, undecided)
@@ -267,7 +278,7 @@ class ChunkScan:
         windows = task.scan.windows
         if windows is not None:
             mask &= inside(batch.log_time, windows)
-        if mask.all():
+        if mask.all() and not self._keeps:
             batch.channel = channel
             return MessageRun(batch, seq, self._plan.channels)
         rows = np.flatnonzero(mask)

@@ -30,8 +30,6 @@ if TYPE_CHECKING:
 Span = tuple[int, int]
 """`[begin, end)` in nanoseconds."""
 
-MAX_PIECES = 10_000_000
-"""Maximum number of intervals that `Intervals.cut` makes."""
 _ROWS_PER_BATCH = 10_000  # intervals whose columns become Python numbers together
 
 
@@ -134,34 +132,6 @@ class Intervals:
         least = parse_duration(length)
         return self._each(lambda _, rows: rows[rows[:, 1] - rows[:, 0] >= least])
 
-    def cut(self, length: DurationLike) -> Intervals:
-        """Each interval cut into as many pieces of exactly this length as fit.
-
-        The first piece begins where the interval begins, each next one where the last ends.
-        A shorter rest is dropped. `messages` remains that of the whole interval.
-
-        Raises:
-            TimeError: the length is no duration.
-            UsageError: the length is zero, or there would be too many pieces.
-        """
-        size = parse_duration(length)
-        if size == 0:
-            raise UsageError("Intervals cannot be cut into pieces of length 0.")
-        pieces = sum(int(((r[:, 1] - r[:, 0]) // size).sum()) for r in self._rows.values())
-        if pieces > MAX_PIECES:
-            raise UsageError(
-                f"The cut makes {pieces} intervals; use a greater length or a time range."
-            )
-
-        def cut(_: str, rows: Rows) -> Rows:
-            count = (rows[:, 1] - rows[:, 0]) // size
-            found = np.repeat(rows, count, axis=0)
-            found[:, 0] += size * ranges(np.zeros_like(count), count)
-            found[:, 1] = found[:, 0] + size
-            return found
-
-        return self._each(cut)
-
     def widened(self, before: DurationLike = 0, after: DurationLike = 0) -> Intervals:
         """Intervals that begin earlier and end later by these times; they may overlap.
 
@@ -214,33 +184,6 @@ class Intervals:
             return _common(self.of_recording(name), edges.reshape(-1, 2))
 
         return self._each(left)
-
-    def until_next(self, times: Mapping[str, NDArray[np.int64]]) -> Intervals:
-        """Each extended to the first of some times of its recording after it, or without end.
-
-        Args:
-            times: int64[n], log times, ns, ascending, by id of the recording.
-        """
-
-        def extended(name: str, rows: Rows) -> Rows:
-            known = np.append(times.get(name, _no_rows()[:, 0]), END)
-            end = known[np.searchsorted(known[:-1], rows[:, 1])]
-            return np.stack([rows[:, 0], end, rows[:, 2]], axis=1)
-
-        return self._each(extended).merged()
-
-    def counted(self, times: Mapping[str, NDArray[np.int64]]) -> Intervals:
-        """The same with the number of some times in each as `messages`.
-
-        Args:
-            times: int64[n], log times, ns, ascending, by id of the recording.
-        """
-
-        def counted(name: str, rows: Rows) -> Rows:
-            places = np.searchsorted(times.get(name, _no_rows()[:, 0]), rows[:, :2])
-            return np.stack([rows[:, 0], rows[:, 1], places[:, 1] - places[:, 0]], axis=1)
-
-        return self._each(counted)
 
     def containing(self, events: Any) -> Intervals:
         """The intervals that contain the log time of at least one message of a question.

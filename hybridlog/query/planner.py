@@ -122,23 +122,24 @@ class Planner(Rows):
         """Ids of the recordings that have a message in the answer."""
         return {part.recording.id for part in self.parts() if self.count_of([part])}
 
-    def runs(self) -> Iterator[MessageRun]:
-        """The messages of the answer, in order."""
+    def runs(self, *, keeps: bool = False) -> Iterator[MessageRun]:
+        """The messages of the answer, in order; `keeps` as of `ChunkScan`."""
         question = self.question
         if question.limit == 0:
             self._ranges.resolve()  # a range that is outside is refused all the same
             return
-        runs = self._runs()
+        runs = self._runs(keeps=keeps)
         for run in runs if question.returns_all else _decimated(runs, question):
             self.counters.add_messages(run.batch)
             yield run
 
-    def _runs(self) -> Iterator[MessageRun]:
+    def _runs(self, *, keeps: bool) -> Iterator[MessageRun]:
         """All messages that match, in order; recordings are read when their turn comes."""
         limit = self.question.limit
         ahead = limit is None or limit > _READ_AHEAD_FROM
         for group in self.groups():
-            yield from ChunkScan(self.plan(group), self.session, ahead=ahead).runs()
+            plan = self.plan(group)
+            yield from ChunkScan(plan, self.session, ahead=ahead, keeps=keeps).runs()
 
     def plan(self, parts: Sequence[Part]) -> ScanPlan:
         """The plan for reading the matching messages of some parts, in the answer's order."""

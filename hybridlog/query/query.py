@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -29,7 +28,6 @@ from hybridlog_storage.errors import (
     DefinitionError,
     HybridlogError,
     PayloadError,
-    TimeError,
     TopicError,
     UsageError,
 )
@@ -478,19 +476,16 @@ class Query:
         """The topics at regular log times: every `step` from the beginning of each recording.
 
         With `between` or `during`, from the beginning of the range. Columns are those of
-        `Store.align`; those of a single topic have no prefix. With an aggregate, `count` is in
-        place of `distance`: the number of messages from a row to the next, or to the end.
+        `Store.align`; those of a single topic have no prefix.
 
         Args:
             step: Time between two rows, a duration.
-            how: `asof`, `nearest` or `interpolate`, as for `Store.align`. Or an aggregate of
-                the messages from a row to the next: `count`; `first` or `last`, their fields;
-                `min`, `max` or `mean` of finite numbers, null without any.
+            how: `asof`, `nearest` or `interpolate`, as for `Store.align`.
             tolerance: Greatest distance in time; None for any.
 
         Raises:
-            UsageError: an unknown way, a step of 0, a tolerance for an aggregate, a field that
-                has none, another clock than the log's, or limit, every or reverse.
+            UsageError: an unknown way, a step of 0, another clock than the log's, or limit,
+                every or reverse.
             TimeError: no duration, or a range outside of all recordings.
         """
         from hybridlog.across.align import resampled
@@ -551,8 +546,7 @@ class Query:
                 from a loss to the next stored message. Without, what the stored messages say.
 
         Returns:
-            Intervals; their `messages` are those that satisfy the predicate, with `state` all
-            of the topic in them.
+            Intervals; their `messages` are those of this state, none where it is unknown.
 
         Raises:
             UsageError: several topics, `limit`, `every`, `reverse`, another clock than the
@@ -625,26 +619,16 @@ class Query:
         """Completeness of the last answer, or, without one, of an answer given now.
 
         Losses of topics in conditions count as an unknown number. Its sentences also tell of
-        topics that lack fields of the predicate, header stamps of another epoch, and likely
-        causes of an empty answer.
+        topics that lack fields of the predicate, and likely causes of an empty answer.
 
         Args:
             is_empty: Whether the answer was empty; without, if `counters` has no messages.
         """
         from hybridlog.query.answers.completeness import completeness_of
-        from hybridlog.query.answers.remarks import remarks
 
-        session = self.source.now()
-        others = ((one.question, one.counters) for one in self.conditions)
-        found = completeness_of(session, self.question, self.counters, *others)
-        sentences = [*found.sentences]
-        with suppress(TimeError):  # nothing is in the range
-            for one in self.conditions:
-                nothing = self.question.during is not None and not self.question.during
-                sentences += remarks(session, one.question, is_empty=nothing)
-            nothing = not self.counters.messages if is_empty is None else is_empty
-            sentences += remarks(session, self.question, is_empty=nothing)
-        return replace(found, sentences=tuple(dict.fromkeys(sentences)))
+        session, others = self.source.now(), [(q.question, q.counters) for q in self.conditions]
+        nothing = not self.counters.messages if is_empty is None else is_empty
+        return completeness_of(session, self.question, self.counters, *others, is_empty=nothing)
 
     def _intervals(self) -> IntervalQueries:
         from hybridlog.query.answers.interval_queries import IntervalQueries

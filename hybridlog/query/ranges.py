@@ -14,9 +14,7 @@ from hybridlog.query.times import (
     is_relative,
     parse_range,
     parse_time,
-    units_of,
 )
-from hybridlog.wording import listed
 from hybridlog_storage.errors import TimeError, UsageError
 from hybridlog_storage.times import BEGIN, END, span_of
 
@@ -77,8 +75,12 @@ class RangeResolver:
         begin, _ = self._question.bounds
         if self._question.clock != "log" or not is_early(begin) or not first:
             return
-        if min(first) - parse_time(begin, start=None, end=None) > _FAR_NS:
-            raise TimeError(f"The range begins long before any message.{units_of(begin)}")
+        at = parse_time(begin, start=None, end=None)
+        if min(first) - at > _FAR_NS:
+            raise TimeError(
+                f"{begin} is {format_time(at)}, long before any message; +{begin} is that long "
+                "after the beginning of a recording."
+            )
 
     def _shared_bounds(self) -> Span | None:
         """The range by the log clock if it is the same in each recording, ns."""
@@ -184,19 +186,4 @@ class RangeResolver:
         if not spans:
             start, end = self._clock_span(chosen[0])
             parse_range(begin, stop, start=start, end=end)
-        raise TimeError(
-            f"Nothing was recorded between {begin} and {stop}: {'; '.join(spans)}.{self.others()}"
-            f"{units_of(begin, stop)}"
-        )
-
-    def others(self) -> str:
-        """A sentence about recordings that span the range and were not asked; or nothing."""
-        shared = None if self._question.bounds is None else self._shared_bounds()
-        if self._question.recordings is None or shared is None:
-            return ""
-        snapshot = self._session.snapshot()
-        places = snapshot.having(self._question.topics).tolist()
-        known = (snapshot.summaries[place] for place in places)
-        inside = (one for one in known if not self._is_outside(shared, one))
-        names = [one.name for one in inside if one.id not in self._question.recordings]
-        return f" Other recordings span that time: {listed(names, _MAX_NAMES)}." if names else ""
+        raise TimeError(f"Nothing was recorded between {begin} and {stop}: {'; '.join(spans)}.")

@@ -117,17 +117,6 @@ def parse_time(text: TimeLike, *, start: int | None, end: int | None) -> int:
     return _checked(_from_datetime64(text), text)
 
 
-def units_of(*times: TimeLike | None) -> str:
-    """A sentence about the unit, if one of some times may have been meant in another; or none."""
-    for one in times:
-        if isinstance(one, Integral) and 0 < int(one) < _NANOSECONDS_FROM:
-            return f" A whole number is nanoseconds; {float(one)!r} is seconds."
-        if is_early(one):
-            at = format_time(parse_time(one, start=None, end=None))
-            return f" {one} is {at}; +{one} is that long after the beginning of a recording."
-    return ""
-
-
 def is_relative(time: TimeLike | None) -> bool:
     """True if a time depends on the recording: `+5s`, `-10s`, `500ms`, `start`, `end`."""
     if not isinstance(time, str):

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 from msgspec.structs import replace
 
 from hybridlog.arrays.message_arrays import attributes, plain_type
@@ -22,7 +21,6 @@ from hybridlog.frames import answer
 from hybridlog.message import messages_in
 from hybridlog.query.planner import Planner
 from hybridlog.query.times import decoded_time
-from hybridlog.schema.arrow_types import with_values
 from hybridlog.tf.reader import Trees
 from hybridlog.tf.transform import Transform, placed, unknown
 from hybridlog_storage.errors import DefinitionError, PayloadError, TopicError, UsageError
@@ -59,18 +57,16 @@ class _Places(NamedTuple):
     """Columns of a topic's messages that are in the frame of their header.
 
     Attributes:
-        lists: Poses of the elements of lists, such as of a path, by the name of the list.
         stamp: Path of the time.
         frame: Path of the frame.
     """
 
     poses: Sequence[_Pose]
-    lists: Mapping[str, Sequence[_Pose]]
     stamp: str
     frame: str
 
     def columns(self) -> Iterator[str]:
-        yield from (self.stamp, self.frame, *self.lists)
+        yield from (self.stamp, self.frame)
         for pose in self.poses:
             yield from (f"{pose.position}.{axis}" for axis in "xyz")
             yield from (f"{pose.rotation}.{axis}" for axis in ("xyzw" if pose.rotation else ""))
@@ -243,18 +239,12 @@ def _places_in(planner: Planner) -> _Places | None:
     """The poses of a topic; None without any, or without a time or a frame of theirs."""
     question = planner.question
     known = planner.session.field_types(question.topics, question.recordings) or {}
-    poses, lists = [*_poses_among(known)], {}
-    for name, kind in known.items():
-        if kind.endswith("[]") and "[" not in name:
-            begin = f"{name}[]."
-            inside = {p.removeprefix(begin): k for p, k in known.items() if p.startswith(begin)}
-            if found := [*_poses_among(inside)]:
-                lists[name] = found
+    poses = [*_poses_among(known)]
     stamp = next((name for name in _STAMPS if name in known), None)
     frame = next((name for name in _FRAMES if name in known), None)
-    if not (poses or lists) or stamp is None or frame is None:
+    if not poses or stamp is None or frame is None:
         return None
-    return _Places(poses, lists, stamp, frame)
+    return _Places(poses, stamp, frame)
 
 
 def _tables_of_poses(planner: Planner) -> Iterator[pa.Table]:
@@ -285,20 +275,9 @@ def _tables_of_poses(planner: Planner) -> Iterator[pa.Table]:
         times = table[stamp].cast(pa.int64()).fill_null(0).to_numpy()
         log_time = table["log_time"].cast(pa.int64()).to_numpy()
         columns = {name: table[name].combine_chunks() for name in table.column_names}
-        if found.poses:
-            moved = looked.transforms(recordings, frames, times, log_time)
-            for pose in found.poses:
-                columns |= _pose_in_frame(columns, pose, moved)
-        for name, inside in found.lists.items():
-            columns[name] = _list_in_frame(
-                columns[name],
-                inside,
-                looked,
-                recordings=recordings,
-                frames=frames,
-                times=times,
-                log_time=log_time,
-            )
+        moved = looked.transforms(recordings, frames, times, log_time)
+        for pose in found.poses:
+            columns |= _pose_in_frame(columns, pose, moved)
         columns[frame] = pa.array([question.frame] * table.num_rows, pa.string())
         yield pa.table({name: column for name, column in columns.items() if name not in hidden})
 
@@ -330,44 +309,6 @@ def _pose_in_frame(
             turned.reshape(-1), 36, mask=pa.array(lost)
         )
     return made
-
-
-def _list_in_frame(
-    column: Any,
-    poses: Sequence[_Pose],
-    looked: _Looked,
-    *,
-    recordings: Sequence[str],
-    frames: Sequence[str],
-    times: NDArray[np.int64],
-    log_time: NDArray[np.int64],
-) -> Any:
-    """A list of structures with poses, in frames of their own or that of their messages."""
-    values, rows = column.flatten(), pc.list_parent_indices(column).to_pylist()
-    columns = answer.flat(values)
-    frame = next((name for name in _FRAMES if name in columns), None)
-    own = columns[frame].to_pylist() if frame else [None] * len(rows)
-    pairs = [(row, one or frames[row]) for row, one in zip(rows, own, strict=True)]
-    number = {pair: place for place, pair in enumerate(dict.fromkeys(pairs))}
-    of = [row for row, _ in number]
-    asked = [recordings[row] for row in of], [f for _, f in number]
-    found = looked.transforms(*asked, times[of], log_time[of])
-    places = [number[pair] for pair in pairs]
-    moved = Transform(found.translation[places], found.rotation[places])
-    for pose in poses:
-        columns |= _pose_in_frame(columns, pose, moved)
-    if frame:
-        columns[frame] = pa.array([looked.target] * len(rows), pa.string())
-    return with_values(column, _nested("", values.type, columns))
-
-
-def _nested(path: str, kind: Any, columns: Mapping[str, Any]) -> Any:
-    """The array of a structure from the columns of its fields."""
-    if not pa.types.is_struct(kind):
-        return columns[path]
-    stem = f"{path}." if path else ""
-    arrays = [_nested(f"{stem}{one.name}", one.type, columns) for one in kind]
-    return pa.StructArray.from_arrays(arrays, [one.name for one in kind])
 
 
 def _numbers(columns: Mapping[str, Any], path: str, axes: str) -> NDArray[np.float64]:

@@ -28,7 +28,6 @@ from hybridlog_storage.times import BEGIN, END
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.query.times import DurationLike
     from hybridlog.session import Session
     from hybridlog_storage.summary import RecordingSummary
 
@@ -107,8 +106,6 @@ class Trees:
         source: str,
         times: NDArray[np.int64],
         log_time: NDArray[np.int64],
-        *,
-        extrapolate: DurationLike | None = None,
     ) -> Lookup:
         """Transforms between frames of a topic's tree, as of `FrameTree.lookup`.
 
@@ -117,13 +114,13 @@ class Trees:
         number = self.epochs.number(log_time)
         epochs = np.unique(number).tolist() or [-1]
         if len(epochs) == 1:
-            return self.tree(topic, *epochs).lookup(target, source, times, extrapolate=extrapolate)
+            return self.tree(topic, *epochs).lookup(target, source, times)
         made = unknown(len(times))
         missing = Counter[str]()
         for epoch in epochs:
             own, tree = np.flatnonzero(number == epoch), self.tree(topic, epoch)
             try:
-                found = tree.lookup(target, source, times[own], extrapolate=extrapolate)
+                found = tree.lookup(target, source, times[own])
             except TopicError:
                 missing["no such frame before its stamps start again, or after"] += len(own)
                 continue
@@ -223,7 +220,7 @@ def _frames(rows: pa.Table, topics: Sequence[str], invalid: Counter[str]) -> dic
             continue
         conflict = _conflict(name, topics, rows.take(pa.array(own)))
         # As in tf2, the first transform decides whether a frame is static.
-        is_static, repeated, late = bool(static[own[0]]), 0, 0
+        is_static, late = bool(static[own[0]]), 0
         if other := int((static[own] != is_static).sum()):
             here, there = ("static", "moving") if is_static else ("moving", "static")
             invalid[f"{there}, while {name} is {here}"] += other
@@ -236,9 +233,7 @@ def _frames(rows: pa.Table, topics: Sequence[str], invalid: Counter[str]) -> dic
             before = np.maximum.accumulate(stamps[own])
             late = int((before - stamps[own] > _LATE_NS).sum())
             own = own[np.argsort(stamps[own], kind="stable")]
-            is_first = np.concatenate(([True], np.diff(stamps[own]) != 0))
-            repeated = int((~is_first).sum())
-            own = own[is_first]
+            own = own[np.concatenate(([True], np.diff(stamps[own]) != 0))]
         codes = list(dict.fromkeys(parent[own][::-1].tolist()))[::-1]
         place_of = {code: place for place, code in enumerate(codes)}
         made[name] = Frame(
@@ -248,7 +243,6 @@ def _frames(rows: pa.Table, topics: Sequence[str], invalid: Counter[str]) -> dic
             times[own],
             np.array([place_of[code] for code in parent[own].tolist()], np.intp),
             Transform(pose.translation[own] + (np.nan if conflict else 0), pose.rotation[own]),
-            repeated,
             late,
             conflict,
         )

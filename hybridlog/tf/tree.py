@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from msgspec import Struct, field
 
-from hybridlog.query.times import format_time, parse_duration, parse_time, units_of
+from hybridlog.query.times import format_time, parse_time
 from hybridlog.tf.transform import Transform, identity, interpolated, unknown
 from hybridlog.wording import counted, listed
 from hybridlog_storage.errors import TopicError, TransformError, UsageError
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from numpy.typing import ArrayLike, NDArray
 
-    from hybridlog.query.times import DurationLike, TimeLike
+    from hybridlog.query.times import TimeLike
 
     Times = NDArray[np.int64]
     Places = NDArray[np.intp]
@@ -45,7 +45,6 @@ class Frame(Struct, frozen=True, eq=False):
             differ from the one before.
         parent: intp[n], the place in `parents` of each.
         poses: The n transforms from the frame to its parent.
-        repeated: Transforms that were left out because of an equal stamp.
         late: Transforms more than 100 ms older than one that came before them.
         conflict: The parents that different topics give it at the same time, as words; it has no
             transform then.
@@ -57,7 +56,6 @@ class Frame(Struct, frozen=True, eq=False):
     stamps: Times
     parent: Places
     poses: Transform
-    repeated: int = 0
     late: int = 0
     conflict: str = ""
 
@@ -81,7 +79,7 @@ class Frame(Struct, frozen=True, eq=False):
             return np.broadcast_to(self.parent[-1], times.shape)
         return self.parent[np.maximum(self.stamps.searchsorted(times, "right") - 1, 0)]
 
-    def pose_at(self, times: Times, extrapolate_ns: int) -> Transform:
+    def pose_at(self, times: Times) -> Transform:
         """The transforms to the parent at some times; NaN where there are none."""
         stamps = self.stamps
         if self.is_static:
@@ -100,27 +98,18 @@ class Frame(Struct, frozen=True, eq=False):
             Transform(translation[after], rotation[after]),
             share,
         )
-        early, late = self._outside(times, extrapolate_ns)
-        found.translation[early | late] = found.rotation[early | late] = np.nan
+        outside = (times < stamps[0]) | (times > stamps[-1])
+        found.translation[outside] = found.rotation[outside] = np.nan
         return found
 
-    def _outside(
-        self, times: Times, extrapolate_ns: int
-    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Masks of the times before the first transform, and of those after the last one."""
-        begin, end = int(self.stamps[0]) - extrapolate_ns, int(self.stamps[-1]) + extrapolate_ns
-        limits = np.iinfo(np.int64)
-        return times < max(begin, limits.min), times > min(end, limits.max)
-
-    def why_not(self, times: Times, extrapolate_ns: int) -> Iterator[tuple[str, NDArray[np.bool_]]]:
+    def why_not(self, times: Times) -> Iterator[tuple[str, NDArray[np.bool_]]]:
         """Reasons why there is no transform, and at which of the times."""
         if self.conflict:
             yield self.conflict, np.ones(len(times), np.bool_)
         elif not self.is_static:
-            early, late = self._outside(times, extrapolate_ns)
-            begin, end = (format_time(int(stamp)) for stamp in self.stamps[[0, -1]])
-            yield f"before the first transform of {self.name}, {begin}", early
-            yield f"after the last transform of {self.name}, {end}", late
+            begin, end = self.stamps[[0, -1]].tolist()
+            yield f"before the first transform of {self.name}, {format_time(begin)}", times < begin
+            yield f"after the last transform of {self.name}, {format_time(end)}", times > end
 
 
 class Lookup(Transform, frozen=True, eq=False):
@@ -213,11 +202,6 @@ class FrameTree(Struct, frozen=True, eq=False):
                 )
             if len(one.parents) > 1:
                 found.append(f"{one.name} has several parents: {listed(one.parents)}.")
-            if one.repeated:
-                found.append(
-                    f"{one.name} has {counted(one.repeated, 'further transform')} of stamps that "
-                    "it has already; the first of each counts."
-                )
         loops: set[frozenset[str]] = set()
         for name in self.frames:
             path = [name]
@@ -233,14 +217,7 @@ class FrameTree(Struct, frozen=True, eq=False):
             )
         return found
 
-    def lookup(
-        self,
-        target: str,
-        source: str,
-        times: ArrayLike,
-        *,
-        extrapolate: DurationLike | None = None,
-    ) -> Lookup:
+    def lookup(self, target: str, source: str, times: ArrayLike) -> Lookup:
         """Transforms from one frame to another.
 
         Args:
@@ -248,8 +225,6 @@ class FrameTree(Struct, frozen=True, eq=False):
             source: The frame in which points are given.
             times: n times on the clock of header stamps: integers, ns since the epoch, or
                 datetimes of numpy, pandas or Arrow. Zero is not set, and has no transform.
-            extrapolate: How long before the first and after the last transform of a frame
-                that one holds; None for not at all.
 
         Returns:
             n transforms, NaN where none is known, with the reasons.
@@ -257,11 +232,9 @@ class FrameTree(Struct, frozen=True, eq=False):
         Raises:
             TopicError: no such frame.
             UsageError: `times` are floats or texts.
-            TimeError: `extrapolate` is no duration.
         """
         wanted, given = self.check(target), self.check(source)
         times = _nanoseconds(times)
-        hold = 0 if extrapolate is None else parse_duration(extrapolate)
         made = unknown(len(times))
         known = np.flatnonzero(times)
         unset = len(times) - len(known)
@@ -274,7 +247,7 @@ class FrameTree(Struct, frozen=True, eq=False):
                     if used is None:
                         missing[f"no way between {given} and {wanted}"] += len(own)
                         continue
-                    found = self._between(used, times[own], hold, missing)
+                    found = self._between(used, times[own], missing)
                     made.translation[own], made.rotation[own] = found.translation, found.rotation
         return Lookup(made.translation, made.rotation, times, dict(missing))
 
@@ -320,9 +293,7 @@ class FrameTree(Struct, frozen=True, eq=False):
                 rows[-1] |= {"longest_gap_ns": gap[1] - gap[0], "longest_gap_begin": gap[0]}
         return pa.Table.from_pylist(rows, pa.schema(kinds))
 
-    def transform(
-        self, target: str, source: str, time: TimeLike, *, extrapolate: DurationLike | None = None
-    ) -> Transform:
+    def transform(self, target: str, source: str, time: TimeLike) -> Transform:
         """The transform from one frame to another at one time, such as `+3s`; see `lookup`.
 
         Raises:
@@ -330,11 +301,11 @@ class FrameTree(Struct, frozen=True, eq=False):
         """
         start, end = self.span
         at = parse_time(time, start=start, end=end)
-        found = self.lookup(target, source, [at], extrapolate=extrapolate)
+        found = self.lookup(target, source, [at])
         if found.missing:
             raise TransformError(
                 f"There is no transform from {source} to {target} at {format_time(at)}: "
-                f"{next(iter(found.missing))}.{units_of(time)}"
+                f"{next(iter(found.missing))}."
             )
         return Transform(found.translation[0], found.rotation[0])
 
@@ -366,20 +337,18 @@ class FrameTree(Struct, frozen=True, eq=False):
         for place in np.unique(parent):
             yield from self._paths(one.parents[place], times, rows[parent == place], way)
 
-    def _between(
-        self, ways: tuple[Way, Way], at: Times, hold: int, missing: Counter[str]
-    ) -> Transform:
+    def _between(self, ways: tuple[Way, Way], at: Times, missing: Counter[str]) -> Transform:
         """The transforms at times that share both ways; counts those that are missing."""
         parts = []
         for way in ways:
             part = identity(len(at))
             for name in way:
-                part = self.frames[name].pose_at(at, hold) @ part
+                part = self.frames[name].pose_at(at) @ part
             parts.append(part)
         found = parts[1].inverse() @ parts[0]
         left = ~found.is_known
         for name in (*ways[0], *ways[1]):
-            for why, where in self.frames[name].why_not(at, hold):
+            for why, where in self.frames[name].why_not(at):
                 if number := int((left & where).sum()):
                     missing[why] += number
                 left &= ~where

@@ -175,7 +175,7 @@ def test_messages_of_other_recordings_are_named(logs: Logs) -> None:
     aligned = logs.store.align("base", "right/pose", how="nearest")
     found = aligned.to_arrow()
     (why,) = aligned.empty["/right/pose"]
-    assert "other recordings (b), which --beside" in why
+    assert "of other recordings, which --beside" in why
     assert aligned.empty["/right/pose"][why] == found["right/pose.distance"].null_count == 130
     assert aligned.remarks()[0] == f"/right/pose: 130 of 260 rows are empty: {why}."
 

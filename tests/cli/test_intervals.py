@@ -17,7 +17,6 @@ def test_intervals_as_a_table(store: Path) -> None:
     assert done.lines[0].split() == ["recording", "begin", "end", "duration", "messages"]
     assert len(done.lines) == 2
     assert run(*asked, "--count", "-q", store=store).out == "1\n"
-    assert run(*asked, "--length", "1s", "--count", "-q", store=store).out == "5\n"
     assert run(*asked, "--at-least", "1min", store=store).out == ""
     none = run(*asked, "--at-least", "1min", store=store)
     assert none.err.startswith("No interval.")

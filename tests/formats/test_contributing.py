@@ -41,8 +41,8 @@ with hl.open(sys.argv[1], create=True) as store:
     half = store.topic("/half")
     where = half.where("r.max > 24 and x >= 49").count()
     ((x, r),) = store.sql("select max(x), sum(list_sum(r)) from half").rows()
-    (mean,) = half.resample("1s", "mean").to_arrow()["x"].to_pylist()
-    print(json.dumps({"where": where, "x": x, "r": r, "mean": mean}))
+    (asof,) = half.resample("1s").to_arrow()["x"].to_pylist()
+    print(json.dumps({"where": where, "x": x, "r": r, "asof": asof}))
     print([*json_lines(half.limit(2))][1])
 """
 
@@ -129,7 +129,7 @@ def test_a_field_type(extended: Path, tmp_path: Path) -> None:
     write_mcap(log, said)
     found = execute(extended, "-c", HALF, str(tmp_path / "store"), str(log))[0]
     assert list(map(json.loads, found.splitlines())) == [
-        {"where": 2, "x": 49.5, "r": sum(n * (n - 1) / 8 for n in range(100)), "mean": 24.75},
+        {"where": 2, "x": 49.5, "r": sum(n * (n - 1) / 8 for n in range(100)), "asof": 0.0},
         {"log_time_ns": 1_000_000_001, "topic": "/half", "x": 0.5, "r": [0]},
     ]
 

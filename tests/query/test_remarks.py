@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import hybridlog as hl
-from hybridlog_storage.errors import TimeError, UsageError
+from hybridlog_storage.errors import TimeError
 from hybridlog_storage.messages import Channel, Schema
 
 SECOND = 10**9
@@ -71,8 +71,6 @@ def test_an_answer_that_lacks_nothing_has_no_remarks(store: hl.Store) -> None:
     [
         ("/n", "n > 1", "1 message could not be tested: it does not fit its definition, or has"),
         ("/opaque", "n > 1", "6 messages could not be tested: they do not fit their definition"),
-        ("/j", "speed > 1", "No message of /j has a field 'speed'."),
-        ("/j", "list.dep == 1", "No message of /j has a field 'list.dep'; did you mean list.deep?"),
     ],
 )
 def test_what_a_predicate_did_not_see(
@@ -98,29 +96,15 @@ def test_a_topic_that_lacks_a_field_of_the_predicate(store: hl.Store) -> None:
     ]
 
 
-def test_columns_of_messages_without_a_definition(store: hl.Store) -> None:
-    query = store.topic("/j").fields("speed", "n", "seq", "list[].deep", "long.min")
-    assert query.to_arrow().num_rows
-    assert [*query.completeness().sentences] == ["No message of /j has a field 'speed'."]
-    assert "n" in store.topic("/j").fields("n").resample("1s", how="mean").to_arrow().column_names
-    with pytest.raises(UsageError, match="list of /j is no single number"):
-        store.topic("/j").fields("n", "list").resample("1s", how="mean").to_arrow()
-
-
-def test_header_stamps_of_another_epoch(store: hl.Store) -> None:
+def test_messages_at_no_time_of_the_header_clock(store: hl.Store) -> None:
     for query, want in (
         (store.topic("/early").clock("header").between("start", "end"), 5),
         (store.topic("/early").clock("header").between(BEGIN, None), 0),
     ):
         assert query.count() == want
-        epoch, missing = query.completeness().sentences
-        assert epoch.startswith(
-            "Header stamps of /early are from 1970-01-01T00:00:01Z to 1970-01-01T00:00:05Z, its "
-            "log times from 2023-11-14T22:13:20Z to"
-        )
-        assert missing == (
-            "1 message is at no time of the header clock: it has no header stamp, or one of zero."
-        )
+        assert [*query.completeness().sentences] == [
+            "1 message is at no time of the header clock: no header stamp, or one of zero."
+        ]
     by_log = store.topic("/early").between("start", "end")
     assert by_log.count() == 6
     assert not by_log.completeness().sentences
@@ -134,8 +118,7 @@ def test_why_an_answer_is_empty(store: hl.Store) -> None:
     late = store.topic("/n").in_recording("monday").between(BEGIN + 15 * SECOND, None)
     assert remarks(late) == [
         "No message of /n is in that time; it has messages from 2023-11-14T22:13:20Z to "
-        "2023-11-14T22:13:25Z.",
-        "Other recordings span that time: tuesday.",
+        "2023-11-14T22:13:25Z."
     ]
     # A relative time is another one in each recording.
     relative = store.topic("/n").in_recording("monday").between("+15s", None)
@@ -145,10 +128,10 @@ def test_why_an_answer_is_empty(store: hl.Store) -> None:
         "Nothing matched the condition that gives the times: no time is left to look at."
     ]
     day = BEGIN + 86_400 * SECOND
-    with pytest.raises(TimeError, match=r"monday spans .* Other recordings span .*: tuesday\."):
+    with pytest.raises(TimeError, match=r"Nothing was recorded .*: monday spans "):
         store.topic("/n").in_recording("monday").between(day, day + 1).count()
-    for begin, stop in (("10", "12s"), ("10", "12"), ("10.5", None)):  # "+10" is meant
-        with pytest.raises(TimeError, match=r" 10\S* is 1970-\S+; \+10\S* is that long after"):
+    for begin, stop in (("10", "12s"), ("10.5", None)):  # "+10" is meant
+        with pytest.raises(TimeError, match=r"10\S* is 1970-\S+, .*; \+10\S* is that long after"):
             store.topic("/n").between(begin, stop).count()
     assert (
         store.topic("/n").between("0", "3s").count() == store.topic("/n").between(10, "3s").count()

@@ -311,8 +311,8 @@ COMMANDS: dict[str, list[Asked]] = {
             lambda k: [(own, near) for _, own, _, near in beside(k, "/arm", "/said")],
         ),
         asked(
-            "align said --step 100ms --how count -F jsonl",
-            lines("log_time_ns", "count"),
+            "align said --step 100ms -F jsonl",
+            lines("log_time_ns", "distance"),
             lambda k: regular(k, "/said", SECOND // 10),
         ),
     ],

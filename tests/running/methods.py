@@ -193,7 +193,7 @@ def regular(known: Known, topic: str, step: int) -> Any:
     first, last = known.span
     times = [one.log_time for one in known.of(topic)]
     grid = range(first, last + 1, step)
-    return [(t, sum(t <= at < t + step for at in times)) for t in grid]
+    return [(t, max((at - t for at in times if at <= t), default=None)) for t in grid]
 
 
 def in_force(known: Known, time: int) -> Any:
@@ -452,9 +452,7 @@ METHODS: dict[str, Rule] = {
         lambda s: [s.entry(one).name for one in s.topic("arm").recordings], lambda _: [LABEL]
     ),
     "resample": Rule(
-        lambda s: _table(
-            s.topic("said").resample("100ms", "count").to_arrow(), "log_time", "count"
-        ),
+        lambda s: _table(s.topic("said").resample("100ms").to_arrow(), "log_time", "distance"),
         lambda k: regular(k, "/said", SECOND // 10),
     ),
     "reverse": Rule(lambda s: rows(s.all_topics().reverse()), lambda k: sent(reversed(k.of()))),

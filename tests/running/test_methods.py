@@ -118,9 +118,6 @@ CALLS: dict[str, Callable[[hl.Store], list[int]]] = {
         *range(sum(one.messages for one in s.topic("said").where("n >= 0").intervals()))
     ],
     "stats": lambda s: [*range(s.topic("said").stats("n")[0].count)],
-    "resample": lambda s: [
-        *range(sum(s.topic("said").resample("1s", "count").to_arrow().column("count").to_pylist()))
-    ],
     "sql": lambda s: [n for (n,) in s.sql("select n from said").rows()],
     "entry": lambda s: [*range(s.entry(LABEL).messages_by_topic()["/said"])],
     "synced": lambda s: [

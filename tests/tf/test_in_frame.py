@@ -22,8 +22,6 @@ from tests.cli.running import run
 from tests.data import DATA, needs_data
 from tests.formats.test_places import read_ply
 from tests.tf.test_oracle import Oracle
-from tests.tf.test_tree import S
-from tests.tf.test_trees import TYPES, Said, header, moved, recorded
 
 TILT = DATA / "real/tilt_laser.bag"
 
@@ -153,59 +151,6 @@ def test_poses_of_many_rows(demo: Path, store: hl.Store) -> None:
     plain = store.align(store.topic("battery"), store.topic("odom")).to_arrow()
     by_stamp = {row["header.stamp"]: row["pose.pose.position.x"] for row in rows}
     assert asof.to_pylist() == [by_stamp.get(one) for one in plain["odom.header.stamp"].to_pylist()]
-
-
-def test_lists_of_poses(tmp_path: Path) -> None:
-    """A path and an array of poses: each pose by its own frame, or by that of the message."""
-    names = ("PoseStamped", "Pose", "Point", "Quaternion")
-    stamped, pose, place, turn = (TYPES[f"geometry_msgs/msg/{name}"] for name in names)
-    half = float(np.sqrt(0.5))
-
-    def at(x: float) -> Any:
-        return pose(place(x=x, y=1.0, z=0.0), turn(x=0.0, y=0.0, z=0.0, w=1.0))
-
-    links = [moved("map", name, S, x) for name, x in (("odom", 10.0), ("other", 20.0))]
-    for link in links:
-        link.transform.rotation = turn(x=0.0, y=0.0, z=half, w=half)
-    own = [
-        stamped(header(name, S), at(float(n)))
-        for n, name in enumerate(["odom", "", "other", "nowhere"])
-    ]
-    path, array = TYPES["nav_msgs/msg/Path"], TYPES["geometry_msgs/msg/PoseArray"]
-    sent: list[Said] = [
-        ("/tf_static", TYPES["tf2_msgs/msg/TFMessage"](links), S),
-        ("/path", path(header("odom", S), []), S),
-        ("/path", path(header("odom", S), own), S),
-        ("/path", path(header("nowhere", S), [stamped(header("", S), at(0.0))]), S),
-        ("/array", array(header("odom", S), [at(0.0), at(1.0)]), S),
-        ("/array", array(header("other", S), [at(2.0)]), S),
-    ]
-    with hl.open(tmp_path / "store", create=True, mongo="none") as made:
-        recorded(made, "x", sent)
-        query = made.topic("/path").in_frame("map")
-        table = query.to_arrow()
-        plain = made.topic("/path").to_arrow()
-        assert table.schema.field("poses").type.equals(plain.schema.field("poses").type)
-        empty, found, lost = table["poses"].to_pylist()
-        assert empty == []
-        places = [[one["pose"]["position"][axis] for axis in "xyz"] for one in found]
-        # A quarter turn to the left makes x of y.
-        assert places[3] == [None] * 3
-        np.testing.assert_allclose(places[:3], [[9, 0, 0], [9, 1, 0], [19, 2, 0]], atol=1e-12)
-        rotation = [found[0]["pose"]["orientation"][axis] for axis in "xyzw"]
-        np.testing.assert_allclose(rotation, [0, 0, half, half])
-        assert {one["header"]["frame_id"] for one in found} == {"map"}
-        assert lost[0]["pose"]["position"] == dict.fromkeys("xyz")
-        assert (
-            dict(query.counters.no_transform)
-            == {"to map: no frame 'nowhere' among the transforms": 1}
-            or sum(n for _, n in query.counters.no_transform) == 2
-        )
-        arrays = made.topic("/array").in_frame("map").fields("poses").to_arrow()
-        assert arrays.column_names == ["log_time", "poses"]
-        listed = [one for row in arrays["poses"].to_pylist() for one in row]
-        found = [[one["position"][axis] for axis in "xyz"] for one in listed]
-        np.testing.assert_allclose(found, [[9, 0, 0], [9, 1, 0], [19, 2, 0]], atol=1e-12)
 
 
 def test_formats_and_refusals(demo: Path, store: hl.Store) -> None:

@@ -118,14 +118,9 @@ def test_there_is_no_transform_outside(log: Log) -> None:
     assert sorted(found.missing.values()) == [1, 1]
     with pytest.raises(TransformError, match="after the last transform of base, 2023"):
         tree.transform("odom", "base", int(times[-1]))
-    with pytest.raises(TransformError, match=r"1700000001\.0 is seconds"):
-        tree.transform("odom", "base", 1_700_000_001)
     for odd in ([1_700_000_001.5], ["+1s"], [object()]):
         with pytest.raises(UsageError, match="whole nanoseconds"):
             tree.lookup("odom", "base", odd)
-    held = tree.lookup("odom", "base", at(-1.1, 0, 5, 5.1), extrapolate="2s")
-    assert held.is_known.tolist() == [False, True, True, False]
-    assert held.translation[1:3, 0].tolist() == [0, 2]
 
 
 def test_a_frame_that_changes_its_parent(log: Log) -> None:
@@ -185,7 +180,6 @@ def test_what_is_no_transform_is_left_out_and_counted(log: Log) -> None:
         "a rotation that is no unit quaternion": 1,
         "moving, while fixed is static": 1,
     }
-    assert "1 further transform of stamps" in " ".join(tree.problems())
 
 
 def test_names(log: Log) -> None:

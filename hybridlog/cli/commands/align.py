@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from hybridlog.query.query import Query
     from hybridlog.store import Store
 
-_BESIDE = ("asof", "nearest", "interpolate")
-
 
 @dataclass(frozen=True, kw_only=True)
 class _Given(Verbose, Filtered, InFrame, Tabular):
@@ -36,10 +34,8 @@ class _Given(Verbose, Filtered, InFrame, Tabular):
         "Instead: rows at regular times, such as 100ms.", "DURATION", excludes=("base", "frame")
     )
     how: str = option(
-        "The last message not after the row, the nearest one, or between the last and the "
-        "next. With --step also of the messages from a row to the next: their number, the first, "
-        "the last, or the least, greatest or mean of each number.",
-        type=click.Choice([*_BESIDE, "count", "first", "last", "min", "max", "mean"]),
+        "The last message not after the row, the nearest one, or between the last and the next.",
+        type=click.Choice(["asof", "nearest", "interpolate"]),
         default="asof",
     )
     tolerance: str | None = option(

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from hybridlog.query.query import Query
 
 
-_OF_A_PREDICATE = ("length", "max_gap", "state")
+_OF_A_PREDICATE = ("max_gap", "state")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,9 +46,6 @@ class _Given(Verbose, Filtered, Listing):
         needs=("gaps",),
     )
     at_least: str | None = option("Only those of at least this length, such as 60s.", "DURATION")
-    length: str | None = option(
-        "Cut each into as many of exactly this length as fit, one after the other.", "DURATION"
-    )
     max_gap: str | None = option(
         "A message is valid for at most this long; without, until the next one.", "DURATION"
     )
@@ -102,8 +99,7 @@ def _intervals(given: _Given, query: Query) -> Intervals:
     else:
         state = given.state and given.state.replace("-", " ")
         found = query.intervals(given.max_gap, state)
-    found = found if given.at_least is None else found.at_least(given.at_least)
-    return found if given.length is None else found.cut(given.length)
+    return found if given.at_least is None else found.at_least(given.at_least)
 
 
 def _duration(row: Mapping[str, int]) -> str:

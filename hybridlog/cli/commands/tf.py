@@ -48,10 +48,6 @@ class _Given(Strict, Verbose, Topics, Tabular):
         "At the header stamps of this topic, or the log times of one without."
     )
     tf_topic: tuple[str, ...] = tf_topic()
-    extrapolate: str | None = option(
-        "So long before its first and after its last, a transform holds; without, it does not.",
-        "DURATION",
-    )
 
 
 @command(_Given)
@@ -92,7 +88,7 @@ def tf_command(given: _Given) -> None:
 def _show_transforms(given: _Given, target: str, trees: Trees, query: Query | None) -> None:
     from hybridlog.tf.reader import frames_and_stamps
 
-    source, extrapolate = given.source, given.extrapolate
+    source = given.source
     topic = None if query is None else query.topics[0]
     tree = trees.tree(topic)
     if query is None:
@@ -106,9 +102,9 @@ def _show_transforms(given: _Given, target: str, trees: Trees, query: Query | No
         raise UsageError("A transform has two frames: name TARGET and SOURCE.")
     shown = slice(given.limit)  # reasons are about the rows that are given
     asked_at = stamps[shown], log_time[shown]
-    found = trees.lookup(topic, target, source, *asked_at, extrapolate=extrapolate)
+    found = trees.lookup(topic, target, source, *asked_at)
     if len(stamps) == len(found) == 1 and found.missing:
-        tree.transform(target, source, int(stamps[0]), extrapolate=extrapolate)
+        tree.transform(target, source, int(stamps[0]))
     given.answer([found.to_arrow()])
     sys.stdout.flush()
     remarks(

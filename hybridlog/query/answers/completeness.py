@@ -1,4 +1,4 @@
-"""Completeness of an answer: what it lacks, as a value and in sentences.
+"""Completeness of an answer: what it lacks, as a value and in sentences, and why it may be empty.
 
 An answer may lack messages that are lost (see `lost.py`), not written or not indexed yet, or
 that it could not read.
@@ -9,10 +9,12 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from itertools import islice
 from typing import TYPE_CHECKING, Any, Final
 
 from msgspec import Struct
 
+from hybridlog.frames.names import is_part
 from hybridlog.query.answers.lost import (
     MAX_NAMES,
     NOT_LOST,
@@ -22,7 +24,10 @@ from hybridlog.query.answers.lost import (
     number_of,
 )
 from hybridlog.query.planner import Planner
+from hybridlog.query.predicate.tree import is_meta
+from hybridlog.query.question import field_types
 from hybridlog.query.ranges import RangeResolver
+from hybridlog.query.times import format_time
 from hybridlog.record.losses import Cause
 from hybridlog.schema.states import CAUSES, GONE, State, without_fields, without_payload
 from hybridlog.snapshot import UNFINISHED
@@ -31,11 +36,13 @@ from hybridlog_storage.errors import HybridlogError, IncompleteError, TimeError,
 from hybridlog_storage.times import BEGIN, END
 
 if TYPE_CHECKING:
-    from hybridlog.query.question import Counters, Question
+    from hybridlog.query.predicate.tree import Predicate
+    from hybridlog.query.question import Counters, Question, RecordedChannel, Span
     from hybridlog.session import Session
     from hybridlog_storage.summary import RecordingSummary
 
 _INTERVAL_S: Final = 1.0  # flush interval of recorders that do not say it
+_MAX_RECORDINGS: Final = 100  # looked at for remarks
 
 
 class Completeness(Struct, frozen=True):
@@ -54,7 +61,7 @@ class Completeness(Struct, frozen=True):
         unindexed: Messages that the index lacks, where MongoDB must answer.
         problems: What is not as it should be besides losses, in sentences: messages that are not
             written or indexed yet, or lack a transform or what the predicate asks for.
-        sentences: Everything that the answer lacks, in sentences.
+        sentences: Everything that the answer lacks, in sentences, and what may not have been meant.
     """
 
     messages: int
@@ -127,6 +134,7 @@ def completeness_of(
     question: Question,
     counters: Counters | None = None,
     *others: tuple[Question, Counters | None],
+    is_empty: bool = False,
 ) -> Completeness:
     """Completeness of an answer.
 
@@ -137,6 +145,7 @@ def completeness_of(
             nothing that comes later.
         others: Questions that the answer depends on. What they have lost counts as an unknown
             number.
+        is_empty: The answer has no messages: sentences tell likely causes.
     """
     answered = [(question, counters), *others]
     given = 0 if counters is None else counters.messages
@@ -158,6 +167,10 @@ def completeness_of(
     if gone:
         found = RangeResolver(session, question).resolve()
         sentences += [f"{what}." for one in found for what in copies_of(session.entry_of(one[0]))]
+    with suppress(TimeError):  # nothing is in the range
+        for one, _ in reversed(answered):
+            sentences += _remarks(session, one)
+        sentences += _causes(session, question) if is_empty and question.limit != 0 else ()
     is_exact = not unread and all(row["count"] is not None for row in lost)
     is_exact &= all(row["cause"] in NOT_LOST for rows in ledgers[1:] for row in rows)
     dropped = sum(row["count"] or 0 for row in ledgers[0] if row["cause"] == Cause.DEGRADE)
@@ -219,8 +232,8 @@ def _left_out(session: Session, question: Question, counters: Counters) -> Itera
     if counters.lacking or counters.without_arrays:  # a copy may be waiting for them
         gone = _gone(session, question)
         expired = ", or ".join(CAUSES[state] for state in gone) or CAUSES[State.REDUCED]
-    if counters.unreadable > counters.without_arrays:
-        yield _unreadable(counters.unreadable - counters.without_arrays, question)
+    if (unreadable := counters.unreadable - counters.without_arrays) > 0:
+        yield _unreadable(unreadable, question.predicate)
     if counters.without_arrays:
         its = "its payload was" if counters.without_arrays == 1 else "their payloads were"
         yield (
@@ -239,19 +252,18 @@ def _left_out(session: Session, question: Question, counters: Counters) -> Itera
     yield from counters.of_frames
 
 
-def _unreadable(messages: int, question: Question) -> str:
+def _unreadable(messages: int, predicate: Predicate | None) -> str:
     """A number of messages whose fields could not be read."""
-    one, predicate = messages == 1, question.predicate
+    one = messages == 1
     if predicate is None or not predicate.asks_fields:
         return (
             f"{unfit(messages)} and {'is' if one else 'are'} not in this answer; --format raw, "
             "mcap or bag gives the payloads."
         )
+    why = "it does not fit its definition, or has none"
     if predicate.filters:
         why = "it has no fields in the index" if one else "they have no fields in the index"
-    elif one:
-        why = "it does not fit its definition, or has none"
-    else:
+    elif not one:
         why = "they do not fit their definition, or have none"
     return f"{counted(messages, 'message')} could not be tested: {why}."
 
@@ -348,3 +360,58 @@ def _not_indexed(lacks: Counter[str]) -> Iterator[str]:
             "nor in this answer of MongoDB; `hybridlog index rebuild` brings in those of "
             "recordings that have ended."
         )
+
+
+# What may not have been meant.
+
+
+def _remarks(session: Session, question: Question) -> Iterator[str]:
+    """Messages at no time of the header clock, and topics without a field of the predicate."""
+    topics = {*question.topics}
+    if question.clock == "header" and question.bounds is not None:
+        entries = map(session.entry_of, session.summaries_of(question)[:_MAX_RECORDINGS])
+        channels = (
+            c for one in entries if one.is_decoded for c in session.channels_of(one, topics)
+        )
+        stats = [channel.stats for channel in channels]
+        if missing := sum(one.messages - one.stamped + one.unset for one in stats):
+            are = "message is" if missing == 1 else "messages are"
+            none = "no header stamp, or one of zero"
+            yield f"{missing} {are} at no time of the header clock: {none}."
+    conditions = () if question.predicate is None else question.predicate.conditions()
+    asked = [one.field for one in conditions if one.operands and not is_meta(one.field.path)]
+    by_topic: dict[str, list[RecordedChannel]] = defaultdict(list)
+    for channel in Planner(session, question).examples if asked else ():
+        by_topic[channel.channel.topic].append(channel)
+    for topic, own in by_topic.items():
+        known = field_types(tuple(one for one in own if one.codec.indexed)) or {}
+        plain = [name.replace("[]", "") for name in known]
+        for path in dict.fromkeys(one.names for one in asked if known):
+            if not any(is_part(path, name) for name in plain):
+                yield f"No message of {topic} has a field {path!r}."
+
+
+def _causes(session: Session, question: Question) -> Iterator[str]:
+    """Likely causes of an empty answer: topics without a message in its time."""
+    if question.during is not None and not len(question.during):
+        yield "Nothing matched the condition that gives the times: no time is left to look at."
+        return
+    if question.bounds is None or not question.is_by_log_time:
+        return
+    spans: dict[str, list[Span]] = defaultdict(list)
+    inside: set[str] = set()
+    for summary, bounds, _ in islice(RangeResolver(session, question).resolve(), _MAX_RECORDINGS):
+        for channel in session.channels_of(session.entry_of(summary), {*question.topics}):
+            topic, stats = channel.channel.topic, channel.stats
+            if stats.first is None or stats.last is None:
+                continue
+            spans[topic].append((stats.first, stats.last))
+            if bounds is None or (stats.first < bounds[1] and stats.last >= bounds[0]):
+                inside.add(topic)
+    for topic, found in spans.items():
+        if topic not in inside:
+            first, last = min(low for low, _ in found), max(high for _, high in found)
+            yield (
+                f"No message of {topic} is in that time; it has messages from "
+                f"{format_time(first)} to {format_time(last)}."
+            )

@@ -90,37 +90,19 @@ def _last_of(
     span: Span,
 ) -> Message | None:
     """The last message of a recording in `[start, latest]`, ns."""
-    if question.predicate is not None:
-        start, latest = span
-        for begin in earlier(latest, start):
-            narrow = just_before(question, recording.id, begin, latest)
-            for run in Planner(session, narrow, counters).runs():
-                return next(messages_in(run, picture_of(session)))
+    start, latest = span
+    ids = [one.channel_id for one in session.channels_of(recording, {*question.topics})]
+    begins = [first for _, first, _ in recording.spans_with(ids) if first <= latest]
+    if not begins:
         return None
-    channels = session.channels_of(recording, {*question.topics})
-    number = {channel.channel_id: row for row, channel in enumerate(channels)}
-    best: tuple[int, int, Batch] | None = None
-    for entry, last in session.chunks_before(recording, [*number], span[1]):
-        if best is not None and last < best[0]:
-            break
-        chunk = session.chunk(recording, entry.segment, entry.place, counters.add_chunk)
-        fits = chunk.batch.log_time <= span[1]
-        if not number.keys() >= {*entry.place.channels}:
-            fits &= np.isin(chunk.batch.channel, [*number])
-        (rows,) = fits.nonzero()
-        if len(rows):
-            # Rows are in order of arrival: of equal times, the last one is wanted.
-            row = int(rows[-1 - chunk.batch.log_time[rows][::-1].argmax()])
-            place = int(chunk.batch.log_time[row]), int(chunk.seq[row])
-            if best is None or place > best[:2]:
-                best = *place, chunk.batch.take(slice(row, row + 1))
-    if best is None:
-        return None
-    _, seq, batch = best
-    counters.add_messages(batch)
-    batch.channel = np.array([number[batch.channel.item()]], np.int32)
-    run = MessageRun(batch, np.array([seq], np.int64), channels)
-    return next(messages_in(run, picture_of(session)))
+    # Of the chunks that begin by then, none later than the last one has an earlier message.
+    firsts = session.parts(recording, ids, (max(begins), latest + 1))["first"]
+    near = int(max(firsts[firsts <= latest], default=start))
+    for begin in (near, *earlier(near, start)):
+        narrow = just_before(question, recording.id, begin, latest)
+        for run in Planner(session, narrow, counters).runs(keeps=True):
+            return next(messages_in(run, picture_of(session)))
+    return None
 
 
 _FIRST_LOOK = 1 << 30  # ns, about a second

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from functools import partial
 from itertools import groupby
 from operator import itemgetter
@@ -20,7 +20,7 @@ from hybridlog.query.times import DurationLike, parse_duration
 from hybridlog.record.losses import extent_of
 from hybridlog.wording import listed
 from hybridlog_storage.errors import UsageError
-from hybridlog_storage.times import END, earlier, placed
+from hybridlog_storage.times import END, earlier, inside, placed
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from hybridlog.query.question import Counters, Part, Question, Span
     from hybridlog.query.rows import RowBatch
     from hybridlog.session import Session
-    from hybridlog_storage.summary import RecordingSummary
 
 _NONE = np.empty(0, np.int64)
 
@@ -43,49 +42,35 @@ class IntervalQueries:
 
     def states(self, max_gap: DurationLike | None, state: str | None = None) -> Intervals:
         """Intervals in which the predicate holds, or in another state; see `Query.intervals`."""
-        self._check("A state")
-        if state is not None:
-            return self._certain(max_gap, state)
-        return Intervals(self.held(max_gap))
+        if state is None:
+            return Intervals(self.held(max_gap))
+        if state not in {"held", "not held", "unknown"}:
+            raise UsageError(f"Unknown state {state!r}; choose held, not held or unknown.")
+        # What was lost before the range may have changed the state at its beginning.
+        everywhere = replace(self._question, bounds=None, during=None)
+        lost = lost_times(self._session, everywhere)
+        if state != "unknown":
+            return Intervals(self.held(max_gap, lost, is_held=state == "held"))
+        spans = RangeResolver(self._session, self._question).spans()
+        known = [*self.held(max_gap, lost), *self.held(max_gap, lost, is_held=False)]
+        return Intervals((one.id, np.array([[*span, 0]], np.int64)) for one, span in spans).without(
+            Intervals(known)
+        )
 
-    def held(self, max_gap: DurationLike | None) -> Iterator[tuple[str, NDArray[np.int64]]]:
-        """The intervals in which the predicate holds, some at a time; see `Query.intervals`."""
+    def held(
+        self, max_gap: DurationLike | None, lost: Intervals | None = None, *, is_held: bool = True
+    ) -> Iterator[tuple[str, NDArray[np.int64]]]:
+        """The intervals in which the predicate holds, or does not, some at a time.
+
+        From what is lost to the next stored message, nothing is known.
+        """
         self._check("A state")
         gap = None if max_gap is None else parse_duration(max_gap)
         if gap == 0:
             raise UsageError("max_gap is 0; a state needs a gap of more than 0.")
         for part, span in self._spans():
-            yield part.recording.id, self._states_in(part, span, gap)
-
-    def _certain(self, max_gap: DurationLike | None, state: str) -> Intervals:
-        """The time in which a state is certain, or the time in which none is."""
-        if state not in {"held", "not held", "unknown"}:
-            raise UsageError(f"Unknown state {state!r}; choose held, not held or unknown.")
-        plain = IntervalQueries(
-            self._session, replace(self._question, predicate=None), self._planner.counters
-        )
-        spans = RangeResolver(self._session, self._question).spans()
-        by_recording = plain.times_in(summary for summary, _ in spans)
-        whole = Intervals(
-            (summary.id, np.array([[begin, end, 0]], np.int64)) for summary, (begin, end) in spans
-        )
-        # What was lost before the range may have changed the state at its beginning.
-        everywhere = replace(self._question, bounds=None, during=None)
-        lost = lost_times(self._session, everywhere).until_next(by_recording)
-        known = plain.states(max_gap).without(lost)
-        if state == "unknown":
-            return whole.without(known).counted(by_recording)
-        held = self.states(max_gap)
-        found = held.common(known) if state == "held" else known.without(held)
-        return found.counted(by_recording)
-
-    def times_in(self, summaries: Iterable[RecordingSummary]) -> dict[str, NDArray[np.int64]]:
-        """Log times of the messages of recordings, at any time, ns, ascending, by id."""
-        return {
-            summary.id: self._planner.times(part)
-            for summary in {one.id: one for one in summaries}.values()
-            for part in self._planner.parts_in(summary, None, None)
-        }
+            own = None if lost is None else lost.of_recording(part.recording.id)
+            yield part.recording.id, self._states_in(part, span, gap, own, is_held=is_held)
 
     def changes(self, fields: Sequence[str], pause: DurationLike, tolerance: float) -> Intervals:
         """Intervals in which fields change; see `Query.changes`."""
@@ -149,13 +134,28 @@ class IntervalQueries:
             for span in spans:
                 yield part, span
 
-    def _states_in(self, part: Part, span: Span, gap: int | None) -> NDArray[np.int64]:
+    def _states_in(
+        self,
+        part: Part,
+        span: Span,
+        gap: int | None,
+        lost: NDArray[np.int64] | None,
+        *,
+        is_held: bool,
+    ) -> NDArray[np.int64]:
         # The last message before the range determines the state at its beginning.
         last = self._last_before(part, span, self._planner.outcomes)
         outcomes = self._planner.outcomes(_bounded(part, span))
         found = [(one.log_time, one.holds) for one in outcomes]
         begun = (last.log_time[-1:], last.holds[-1:]) if last else (_NONE, _NONE.astype(np.bool_))
         time, holds = (np.concatenate(column) for column in zip(begun, *found, strict=True))
+        holds = holds == is_held
+        if lost is not None and len(time):
+            holds &= ~inside(time, lost)
+            begins = lost[lost[:, 0] >= time[0], 0]
+            time = np.concatenate([time, begins])
+            order = np.argsort(time, kind="stable")
+            time, holds = time[order], np.append(holds, np.zeros(len(begins), np.bool_))[order]
         end = extent_of(part.recording)[1]
         return clipped(holding(time, holds, end, gap, before=len(begun[0])), span)
 

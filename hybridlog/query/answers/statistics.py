@@ -19,20 +19,18 @@ from msgspec.structs import replace
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.periods import GAP_PERIODS, mean_rate, usual_period
 from hybridlog.query.planner import Planner
-from hybridlog.query.question import field_types
 from hybridlog.query.ranges import RangeResolver
-from hybridlog.query.rows import summaries_in
 from hybridlog.query.times import DurationLike, parse_duration
 from hybridlog.record.losses import topics_of
 from hybridlog.schema.kinds import NUMBERS
 from hybridlog.wording import listed
-from hybridlog_storage.errors import DefinitionError, UsageError
+from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
     import pyarrow as pa
     from numpy.typing import NDArray
 
-    from hybridlog.query.question import Counters, Part, Question, RecordedChannel, Span
+    from hybridlog.query.question import Counters, Part, Question, Span
     from hybridlog.session import Session
     from hybridlog_storage.summary import RecordingSummary
 
@@ -113,19 +111,11 @@ class _Running:
 
 def statistics(session: Session, question: Question, counters: Counters) -> list[FieldStatistics]:
     """Statistics of numeric fields; see `Query.stats`."""
-    from hybridlog.frames.answer import columns
+    from hybridlog.frames.answer import check_definitions, columns
 
     _check_all(question)
     planner = Planner(session, question, counters)
     found: dict[str, dict[str, _Running]] = {topic: {} for topic in question.topics}
-    blind: DefinitionError | None = None
-    for channel in planner.examples:
-        try:
-            _add(found[channel.channel.topic], question, _columns_of(channel, question))
-        except DefinitionError as error:
-            blind = error
-    if blind is not None and (question.fields is not None or len(question.topics) == 1):
-        raise blind  # otherwise, those of the topics that have fields
     for part in planner.parts():
         if part.predicate is None and not part.has_fields:
             continue
@@ -135,7 +125,9 @@ def statistics(session: Session, question: Question, counters: Counters) -> list
         for rows in columns(planner, part, fields, partial=True):
             counters.messages += len(rows.log_time)
             _add(found[part.topic], question, rows.records)
-    if question.fields is not None and not any(found.values()):
+    if not any(found.values()):
+        check_definitions(planner.examples)
+    if question.fields is not None and counters.messages and not any(found.values()):
         raise UsageError(f"{', '.join(question.fields)}: no field with numbers.")
     return [
         values.result(topic, name)
@@ -149,20 +141,6 @@ def _numbers(types: Mapping[str, str] | None) -> list[str] | None:
     if types is None:
         return None
     return [path for path, kind in types.items() if kind in NUMBERS and "[" not in path]
-
-
-def _columns_of(channel: RecordedChannel, question: Question) -> pa.StructArray:
-    """The columns of a channel, without rows."""
-    import pyarrow as pa
-
-    from hybridlog.frames.answer import leaves_of
-    from hybridlog.schema.arrow_columns import structs
-
-    types = field_types((channel,))
-    fields = _numbers(types) if question.fields is None else question.fields
-    arrays = {path.rpartition(".")[0] for path in summaries_in(fields, types)}
-    empty = pa.array([], channel.arrow_type(None if fields is None else {*fields, *arrays}))
-    return structs(leaves_of(empty, fields), 0)
 
 
 def _add(running: dict[str, _Running], question: Question, records: pa.StructArray) -> None:
