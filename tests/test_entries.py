@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import sqlite3
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
@@ -20,12 +19,10 @@ from hybridlog.entries import (
     Inventory,
     ended,
     listed,
-    loss_values,
     lost_in_crash,
     made_again,
     put_entry,
     read_summary,
-    recording_metadata,
     sealed_of,
     see,
     take_inventory,
@@ -34,7 +31,7 @@ from hybridlog.entries import (
 from hybridlog.maintenance.opening import StoreFiles
 from hybridlog.maintenance.report import RepairReport
 from hybridlog.snapshot import Snapshot
-from hybridlog_storage.catalog import CATALOG, WHOLE, Catalog, RecordingEntry
+from hybridlog_storage.catalog import WHOLE, Catalog, RecordingEntry
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.errors import CatalogError, ManifestError, SegmentError
@@ -203,26 +200,6 @@ def check(entry: RecordingEntry, *missing: int) -> None:
 # What is whole.
 
 
-def test_a_whole_recording(made: Made) -> None:
-    inventory = made.inventory()
-    assert (inventory.id, inventory.problems) == (made.id, {})
-    entry = made.entry()
-    check(entry)
-    # What is noted within a segment is in the ledger.
-    assert entry.end["losses"] == [loss_values(LOSS)]
-    assert entry.stored_bytes == sum(path.stat().st_size for path in made.segments)
-    assert entry.span == (0, 79 * SECOND)
-    assert [(c.topic, c.stats.payload_bytes) for c in entry.channels] == [
-        (topic, 8 * count) for topic, count in sorted(by_topic(0, 1, 2, 3).items())
-    ]
-    assert (entry.id, entry.name) == (made.id, "run")
-    assert (entry.tags, entry.created, entry.key) == ({"place": "lab"}, 77, made.id[-16:])
-    assert recording_metadata(entry) == made.said
-    assert entry.chunks == sum(
-        len(read_summary(path, number).table.chunks) for number, path in enumerate(made.segments)
-    )
-
-
 def test_while_it_is_written_it_is_open(made: Made) -> None:
     # Whoever holds one that has ended does something else with it.
     with made.recorded():
@@ -290,36 +267,7 @@ def test_one_that_lies_there_twice_under_a_number_of_its_own(made: Made) -> None
     check(made.entry())
 
 
-def test_any_flipped_bit_of_a_summary_costs_that_segment(made: Made) -> None:
-    """Or nothing at all: no other answer comes of it."""
-    path = made.segments[3]
-    whole = path.read_bytes()
-    end = read_summary(path, 3).start
-    for at in range(end, len(whole), 7):
-        data = bytearray(whole)
-        data[at] ^= 1 << at % 8
-        path.write_bytes(data)
-        check(made.entry(3), 3)
-
-
 # Manifests that are not what they should be.
-
-
-def test_a_manifest_that_was_made_again_is_told(made: Made) -> None:
-    before = made.entry()
-    places.manifest_of(made.path).unlink()
-    inventory = made.inventory()
-    assert (inventory.id, inventory.name) == (made.id, "run")
-    places.write_in(made.path, made_again(inventory, None))
-    inventory = made.inventory()
-    assert made.manifest().logs.keys() == {0, 1, 2, 3}
-    assert inventory.problems == {}
-    assert plain(made.entry()) == unproven(before)
-    # From here on it is watched over again.
-    made.segments[3].unlink()
-    entry = made.entry()
-    assert entry.status == "damaged"
-    assert lost(entry) == by_topic(3)
 
 
 def test_a_manifest_that_was_made_again_says_what_the_old_one_said(made: Made) -> None:
@@ -482,25 +430,6 @@ def test_a_byte_that_changes_behind_the_catalog(made: Made) -> None:
         assert [m.raw for m in store.all_topics()] == [payload(n) for n in range(60)]
     (entry,), _ = opened(made.directory)
     check(entry, 3)
-
-
-@pytest.mark.parametrize("kind", ["summary", "topics", "schema"])
-@pytest.mark.parametrize("harm", ["DELETE FROM cells", "UPDATE cells SET body = body || 'x'"])
-def test_an_answer_needs_nothing_that_the_catalog_has_lost(
-    made: Made, kind: str, harm: str
-) -> None:
-    """What it has lost is made again, and no server is asked."""
-    wanted = [payload(n) for n in range(80)]
-    with hl.open(made.directory.path) as store:
-        assert [m.raw for m in store.all_topics()] == wanted
-    with closing(sqlite3.connect(made.directory.path / CATALOG)) as changed, changed:
-        assert changed.execute(f"{harm} WHERE kind = ?", (kind,)).rowcount
-    with hl.open(made.directory.path) as store:
-        assert [m.raw for m in store.all_topics()] == wanted
-        assert [m.decode().data for m in store.topic("/b")] == [f"{n:04d}" for n in range(1, 80, 3)]
-        (entry,) = store.recordings()
-        check(entry)
-        assert store.shared.index.connected is None
 
 
 def test_chunks_of_another_segment_are_refused(made: Made) -> None:

@@ -329,11 +329,6 @@ def test_columns_of_ours(store: hl.Store) -> None:
 
 # --- other libraries --------------------------------------------------------------------
 
-EVERY = [
-    *("/j", "/k", "/a", "/opt", "/ints", "/ints2", "/mix"),
-    *("/zoo", "/cam", "/raw", "/pc", "/log", "/c", "/own", "/plain"),
-]
-
 
 def test_missing_null_empty_nan_and_false_are_five_things(store: hl.Store) -> None:
     query = store.topic("/opt").in_recording("json_optional_keys")

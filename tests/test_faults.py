@@ -6,31 +6,23 @@ import os
 import random
 import resource
 import signal
-import struct
 import threading
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from zlib import crc32
 
 import pymongo
 import pytest
-from mcap.opcode import Opcode
 
 import hybridlog as hl
 from benchmarks.simulator.topics import RobotConfig
 from benchmarks.simulator.write import write_bag
-from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.errors import DatabaseError, StoreError
-from hybridlog_storage.messages import Channel
-from hybridlog_storage.mongo.database import Database
 from hybridlog_storage.mongo.index_documents import RECORDINGS
 from hybridlog_storage.mongo.mongod import EmbeddedMongod
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import independent, places
-from tests.calls import Calls
 from tests.cli.running import run, started
 from tests.waiting import wait_for
 
@@ -227,25 +219,6 @@ def test_a_disk_that_fills_up(path: Path, robot: Path) -> None:
 # Segments that are lost or altered after sealing.
 
 
-@dataclass(frozen=True)
-class Place:
-    """A chunk of the recording `short`."""
-
-    segment: int
-    path: Path
-    number: int
-    offset: int
-    length: int
-
-
-def lost(entry: RecordingEntry) -> Counter[str]:
-    """Messages that the ledger says are missing, by topic."""
-    found: Counter[str] = Counter()
-    for row in entry.end.get("losses", ()):
-        found[row["topic"]] += row["count"]
-    return found
-
-
 def topics_of(messages: Counter[Message]) -> Counter[str]:
     found: Counter[str] = Counter()
     for message, count in messages.items():
@@ -255,50 +228,6 @@ def topics_of(messages: Counter[Message]) -> Counter[str]:
 
 def reopened(store: hl.Store) -> hl.Store:
     return hl.open(store.directory.path, require_database=True)
-
-
-def flip(place: Place) -> None:
-    data = bytearray(place.path.read_bytes())
-    data[place.offset + place.length - 5] ^= 0x10
-    place.path.write_bytes(data)
-
-
-def list_otherwise(path: Path, place: int, change: Callable[[int], int]) -> None:
-    """Forge eight bytes of the first chunk index of a segment, its checksum included."""
-    data = bytearray(path.read_bytes())
-    at = start = int(struct.unpack_from("<Q", data, len(data) - 28)[0])
-    while data[at] != Opcode.CHUNK_INDEX:
-        at += 9 + int(struct.unpack_from("<Q", data, at + 1)[0])
-    (was,) = struct.unpack_from("<Q", data, at + 9 + place)
-    struct.pack_into("<Q", data, at + 9 + place, change(was))
-    struct.pack_into("<I", data, len(data) - 12, crc32(data[start:-12]))
-    path.write_bytes(data)
-
-
-@pytest.mark.parametrize(
-    ("place", "change"),
-    [
-        (0, lambda was: was - 5), (0, lambda was: was + 5), (8, lambda was: was + 5),
-        (38, lambda was: was + 5), (16, lambda _: 1 << 30), (16, lambda _: (1 << 64) - 1),
-    ],
-    ids=["first-", "first+", "last", "message index", "offset", "far offset"],
-)  # fmt: skip
-def test_a_chunk_that_is_listed_otherwise_than_it_is(
-    store: hl.Store, said: Counter[Message], place: int, change: Callable[[int], int]
-) -> None:
-    """Checksum and all: the manifest knows the file by its digest."""
-    (_, path), *_ = places.segments(
-        store.directory.path, places.id_of(store.directory.path, "short")
-    )
-    list_otherwise(path, place, change)
-    with reopened(store) as opened:
-        assert content(fetched(opened, "short")) == said
-        assert [path.name in f.place for f in opened.verify().findings] == [True]
-        opened.verify(repair=True)
-        (entry,) = opened.recordings()
-        assert entry.status == "complete"
-        assert content(fetched(opened, "short")) == said
-        assert opened.verify().findings == []
 
 
 # An index that is altered behind our back.
@@ -371,9 +300,6 @@ def shared(tmp_path_factory: pytest.TempPathFactory, short: Path) -> Iterator[hl
     with hl.open(tmp_path_factory.mktemp("shared") / "store", create=True) as opened:
         opened.record(short)
         yield opened
-
-
-# Stores and databases that are not what they should be.
 
 
 # Several at once.
@@ -449,42 +375,6 @@ def test_while_the_index_is_made_anew_others_answer_as_always(
         store.index.rebuild(progress=ask)
         assert asked > 14
     assert store.verify().findings == []
-
-
-def test_opening_does_not_take_the_directory_of_a_recording_that_begins(
-    path: Path, short: Path, calls: Calls
-) -> None:
-    """Another process opens the store after the directory is made, before it is locked."""
-    from hybridlog_storage.manifests import DiskManifests
-
-    def made(found: None, *_: object) -> None:
-        with hl.open(path, require_database=True) as other:
-            assert other.recordings() == []
-
-    calls.change(DiskManifests, "_make_lock", made)
-    with hl.open(path, require_database=True) as store:
-        store.record(short)
-        assert store.verify().findings == []
-
-
-def test_each_message_that_is_missing_in_the_index_is_counted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Those of chunks that were sent in vain, and those of chunks that were not sent then."""
-    log = tmp_path / "a.mcap"
-    channel = Channel("/a", "json", None)
-    independent.write_mcap(log, [(channel, at, b'{"x": "%0100d"}' % at) for at in range(8000)])
-
-    def refused(*_: object, **__: object) -> int:
-        raise DatabaseError("MongoDB refuses it.")
-
-    with hl.open(tmp_path / "store", create=True, require_database=True) as store:
-        with monkeypatch.context() as broken:
-            broken.setattr(Database, "insert_raw", refused)
-            report = store.record(log, settings=SegmentSettings(chunk_size=6000))
-        assert (report.indexed, report.missed, report.entry.messages) == (0, 8000, 8000)
-    with hl.open(tmp_path / "store", require_database=True) as store:
-        assert store.topic("/a").where("x exists").count() == 8000
 
 
 def test_mongod_killed_and_not_to_be_had_again(

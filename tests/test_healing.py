@@ -345,9 +345,6 @@ def test_a_user_who_may_only_read_can_ask_everything(
         assert documents(opened) == want
 
 
-LIMITED = ["prlimit", "--nofile=24:24"]
-
-
 @pytest.mark.parametrize("has_catalog", [True, False])
 def test_a_store_without_handles_is_not_a_damaged_one(store: Path, *, has_catalog: bool) -> None:
     def ask() -> tuple[int, int]:

@@ -362,22 +362,6 @@ def test_the_commands(tmp_path: Path, bag: Path) -> None:
     for command in commands:
         run(*command, store=store, code=None)
         victims.check()
-    shutil.rmtree(store / "mongod")
-    run(
-        "record",
-        "--replay",
-        bag,
-        "--name",
-        "live",
-        "--duration",
-        "1s",
-        "-q",
-        store=store,
-        code=None,
-    )
-    for command in commands:
-        run(*command, store=store, code=None)
-        victims.check()
 
 
 def test_every_kind_of_file_is_tried(tmp_path: Path, bag: Path) -> None:

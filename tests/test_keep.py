@@ -34,7 +34,7 @@ from hybridlog_storage.errors import (
     StoreError,
     TimeError,
 )
-from hybridlog_storage.manifest import File, Manifest, new_id, replace
+from hybridlog_storage.manifest import File, new_id, replace
 from hybridlog_storage.manifests import DiskManifests
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segments.segment_writer import SegmentSettings
@@ -349,48 +349,32 @@ def test_a_pin_outside_of_its_recording_is_refused(store: Path) -> None:
 
 
 @pytest.mark.parametrize("what", ["pin", "tag"])
-@pytest.mark.parametrize("when", ["expire", "write_rows"])
-def test_what_is_said_meanwhile_stops_what_is_not_listed(
+@pytest.mark.parametrize("when", ["expire", "write_rows", "remove"])
+def test_what_is_said_meanwhile_keeps_what_is_not_gone(
     store: Path, monkeypatch: pytest.MonkeyPatch, when: str, what: str
 ) -> None:
-    """Before the fields are written, and when they are listed and segments are to be replaced."""
-
-    def said(now: Manifest) -> Manifest:
-        if what == "tag":
-            return replace(now, tags={"stay": "yes"})
-        return replace(now, pins=(pin_of("now", (None, None), None, ""),))
-
-    module: Any = keeping if when == "expire" else expiry
-    work = getattr(module, when)
+    """Before the fields are written, when segments are to be replaced, and before the removal."""
+    rule = "--fields-age" if when == "remove" else "--max-age"
+    if when == "remove":
+        keep("--max-age", "0s", store=store)
+    before = payloads(store)
+    said = {
+        "tag": {"tags": {"stay": "yes"}},
+        "pin": {"pins": (pin_of("now", (None, None), None, ""),)},
+    }
+    place: Any = {"expire": keeping, "write_rows": expiry, "remove": DiskManifests}[when]
+    work = getattr(place, when)
 
     def said_before(*words: Any, **options: Any) -> Any:
-        places.change_in(places.folder(store, "run"), said)
+        places.change_in(places.folder(store, "run"), lambda now: replace(now, **said[what]))
         return work(*words, **options)
 
-    monkeypatch.setattr(module, when, said_before)
-    found = keep("--max-age", "0s", "--never-tag", "stay", store=store)
-    assert "was set meanwhile" in found.err
-    assert all(raw == image(n) for n, raw in payloads(store).items())
-    check_answers(store)
-
-
-@pytest.mark.parametrize("what", ["pin", "tag"])
-def test_what_is_said_meanwhile_keeps_a_recording(
-    store: Path, monkeypatch: pytest.MonkeyPatch, what: str
-) -> None:
-    keep("--max-age", "0s", store=store)
-    remove = DiskManifests.remove
-
-    def said_before(*words: Any) -> Manifest:
-        pin = pin_of("now", (None, None), None, "")
-        said = {"tags": {"stay": "yes"}} if what == "tag" else {"pins": (pin,)}
-        places.change_in(places.folder(store, "run"), lambda now: replace(now, **said))
-        return remove(*words)
-
-    monkeypatch.setattr(DiskManifests, "remove", said_before)
-    found = keep("--fields-age", "0s", "--never-tag", "stay", store=store)
+    monkeypatch.setattr(place, when, said_before)
+    found = keep(rule, "0s", "--never-tag", "stay", store=store)
     assert "was set meanwhile" in found.err
     assert places.names(store) == ["run"]
+    assert payloads(store) == before
+    check_answers(store)
 
 
 def test_what_may_have_lost_pins_is_left_alone_and_named(store: Path) -> None:

@@ -125,16 +125,6 @@ def test_each_chunk_is_read_once(store: hl.Store, robot: Truth, topic: str) -> N
     assert backwards.counters.chunks_read == counters.chunks_read
 
 
-def test_all_topics_at_once_read_each_chunk_once(store: hl.Store) -> None:
-    query = store.all_topics().in_recording("robot")
-    entry = store.entry("robot")
-    times = [m.log_time_ns for m in query]
-    assert times == sorted(times)
-    assert query.counters.chunks_read == entry.chunks
-    assert query.counters.messages == entry.messages
-    assert query.counters.bytes_read <= entry.stored_bytes
-
-
 def test_a_slice_reads_only_chunks_with_its_times(store: hl.Store, robot: Truth) -> None:
     start = start_of(store)
     begin, end = start + SECOND, start + SECOND + 100_000_000
@@ -161,12 +151,6 @@ def test_a_limit_bounds_what_is_read(store: hl.Store, robot: Truth) -> None:
     query = query.limit(0)
     assert list(query) == []
     assert query.counters.chunks_read == 0
-
-
-# What it answers.
-
-
-# Which messages.
 
 
 # What is refused.

@@ -19,11 +19,9 @@ from msgspec.structs import replace
 import hybridlog as hl
 from hybridlog.live.recorder import Recorder, RecorderOptions, make_room
 from hybridlog_storage.errors import DiskFullError, PayloadError
-from tests import places
 from tests.live.speaker import Speaker
 from tests.live.test_play import CHANNELS, payload
-from tests.live.test_retention import has_expired, store_with
-from tests.waiting import wait_for
+from tests.live.test_retention import store_with
 
 FLUSH_S = 0.3
 
@@ -168,31 +166,3 @@ def test_a_recorder_outlives_a_disk_that_is_filled(disk: Path, tmp_path: Path) -
                 assert told >= len(own), (name, topic, told, len(own))
         assert gone
         assert opened.verify().findings == []
-
-
-@pytest.mark.exhaustive
-def test_500_questions_are_answered_while_a_recorder_deletes(tmp_path: Path) -> None:
-    store, log = tmp_path / "store", tmp_path / "sent"
-    store_with(store, quota="20MB").close()
-    process = begin(store, log, "drive", 0.01)
-    wait_for(lambda: has_expired(places.folder(store, "drive")))
-    counts, expired = [0], [0]
-    with hl.open(store, mongo="none") as lasting:
-        for number in range(500):
-            asked = lasting if number % 2 else hl.open(store, mongo="none")
-            assert [one.name for one in asked.recordings()] == ["drive"]
-            arms = asked.topic("/arm")
-            counts.append(arms.count())
-            assert counts[-1] >= counts[-2]
-            assert [m.fields["n"] for m in arms.between("-1s", "end")]
-            if number % 20 == 0:
-                found = [message.fields["n"] for message in arms]
-                assert found == [*range(len(found))]
-                assert len(found) >= counts[-1]
-                state = [one.state for one in asked.topic("/camera")]
-                expired.append(gone := state.count("expired"))
-                assert state == ["expired"] * gone + ["whole"] * (len(state) - gone)
-            if asked is not lasting:
-                asked.close()
-    stop(process)
-    assert len({*expired}) > 3, expired  # files went while it was asked

@@ -298,6 +298,7 @@ def test_a_number_of_more_than_32_bits_is_kept_by_its_lower_ones(store: hl.Store
         )
     (report,) = running.recorder.stop()
     assert report.entry.messages == 4
+    assert len(report.entry.channels) == 1  # as of a publisher that connects again
     assert not report.entry.end["losses"]
     with places.segment(store.directory.path, report.entry.name).open("rb") as file:
         found = [m.sequence for _, _, m in make_reader(file).iter_messages()]
@@ -469,16 +470,6 @@ def test_a_standard_type_without_its_definition(store: hl.Store) -> None:
     assert channels["/chatter"].metadata[SUPPLIED] == "noetic, fits the messages"
     reasons = unindexed(store.session.definitions(store.entry(robot.recorder.name)))
     assert "no definition in the source" in reasons[channels["/odd"].id]
-
-
-def test_a_publisher_that_connects_again_and_again_is_one_channel(store: hl.Store) -> None:
-    robot = Running(store)
-    for number in range(10_000):
-        robot.speaker.say(text_channel(), text(str(number)), SECOND + number)
-    assert len(robot.recorder.look().topics) == 1
-    (report,) = robot.recorder.stop()
-    assert len(report.entry.channels) == 1
-    assert report.entry.messages == 10_000
 
 
 def test_fields_land_when_no_payload_finds_room(store: hl.Store, calls: Calls) -> None:

@@ -131,6 +131,3 @@ def test_who_changes_a_message_does_not_change_what_is_kept(
         with pytest.raises(ValueError, match="read-only"):
             scan.decode().ranges[0] = 1.0
         assert opened.topic("/base/scan").at("end").raw == before
-
-
-# What is kept.

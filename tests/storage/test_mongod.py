@@ -389,16 +389,6 @@ def inside(directory: Path) -> list[str]:
     return sorted(p.name for p in directory.iterdir() if not p.name.endswith(".lock"))
 
 
-def test_damaged_data_files_are_replaced(directory: Path) -> None:
-    used_once(directory)
-    (directory / "data" / "WiredTiger.turtle").write_bytes(b"\0" * 100)
-    with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
-        assert "Fatal assertion" in str(user.damage)
-        assert kept(user.start()) == 0
-        assert user.damage is None, "told once"
-        assert inside(directory) == ["data", "mongod.log"], "nothing is left"
-
-
 def test_data_files_are_replaced_once_and_then_the_log_is_told(
     directory: Path, fake: Callable[[str], None], tmp_path: Path
 ) -> None:

@@ -252,27 +252,6 @@ def test_a_group_that_cannot_be_listed_is_sealed_later(tmp_path: Path) -> None:
     assert [message for _, message in read_in(made.folder)] == of_rows(made.rows)
 
 
-def test_a_group_is_sealed_after_a_full_disk(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    made = Recorded(tmp_path / "r")
-    made.write(0, 50)
-    made.write(1, 900, 5)
-    real, fails = SegmentFile.complete, [True]
-
-    def complete(segment: SegmentFile) -> Sealed:
-        if segment.number == 1 and fails:
-            fails.clear()
-            raise DiskFullError("no room for a summary")
-        return real(segment)
-
-    monkeypatch.setattr(SegmentFile, "complete", complete)
-    with pytest.raises(DiskFullError, match="summary"):
-        made.close()
-    made.writer.close_truncated([])
-    assert [[sealed.file.number for sealed in group] for group in made.groups] == [[0, 1, 2]]
-
-
 def test_losses_that_found_no_room_come_in_the_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

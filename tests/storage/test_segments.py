@@ -10,7 +10,6 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -28,8 +27,6 @@ from hybridlog_storage.disk.append_file import BLOCK
 from hybridlog_storage.errors import DiskFullError, SegmentError, StoreError, UsageError
 from hybridlog_storage.manifest import Loss, replace
 from hybridlog_storage.messages import Batch, Channel, LooseBatch, Schema
-from hybridlog_storage.segments import chunk as chunk_module
-from hybridlog_storage.segments import segment_writer
 from hybridlog_storage.segments.chunk import StoredChunk
 from hybridlog_storage.segments.chunk_table import ChunkPlace
 from hybridlog_storage.segments.compression import FilePart
@@ -395,28 +392,6 @@ def test_a_segment_whose_head_found_no_room_can_be_made_again(tmp_path: Path) ->
     assert segment.prepare(sync=False).file.name == segment.publish().name == "000000.mcap"
 
 
-def test_old_chunks_are_flushed_and_young_ones_are_not(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    chunks: list[StoredChunk] = []
-    now = 100.0
-    for module in (chunk_module, segment_writer):
-        monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: now))
-    writer = recorder(tmp_path, chunks)
-    writer.append(batch_of([(0, b"old", 1, 1, 1)]), CHANNELS)
-    now = 101.0
-    writer.append(batch_of([(1, bytes(5000), 1, 1, 1)]), CHANNELS)
-    writer.flush_older(1.5)
-    writer._drain(limit=0)
-    assert not chunks
-    now = 101.5
-    writer.flush_older(1.5)
-    writer._drain(limit=0)
-    assert [chunk.batch.channel.tolist() for chunk in chunks] == [[1]]
-    writer.close()
-    assert len(chunks) == 2
-
-
 # What proves a segment
 
 
@@ -501,26 +476,6 @@ def test_no_flipped_bit_changes_an_answer_and_each_is_found(tmp_path: Path, turn
             assert start or None not in found, at
 
 
-def test_the_summary_tells_what_the_chunks_hold(tmp_path: Path) -> None:
-    whole, chunks = sample(tmp_path / "a")
-    with SegmentReader(tmp_path / "a" / "000000.mcap", 0) as reader:
-        summary = reader.summary()
-        assert [chunk.number for chunk in chunks] == list(range(len(chunks)))
-        for chunk, place in zip(chunks, summary.chunks, strict=True):
-            assert content_of(reader.read_chunk(place)) == content_of(chunk)
-            assert place.number == chunk.number
-            assert place.channels == tuple(sorted(set(chunk.batch.channel.tolist())))
-            assert place.first == chunk.batch.log_time.min()
-            assert place.last == chunk.batch.log_time.max()
-            for channel, times in reader.read_times(place).items():
-                of = chunk.batch.log_time[chunk.batch.channel == channel]
-                assert times.tolist() == sorted(of.tolist())
-    assert summary.size == len(whole)
-    assert summary.losses == [LOSS]
-    # The footer says where the summary starts.
-    assert struct.unpack_from("<Q", whole, len(whole) - 28)[0] == summary.start
-
-
 def test_a_table_that_does_not_end_before_the_summary_is_refused(tmp_path: Path) -> None:
     chunks: list[StoredChunk] = []
     writer = recorder(tmp_path, chunks, SegmentSettings(chunk_size=1024))
@@ -538,14 +493,11 @@ def test_a_table_that_does_not_end_before_the_summary_is_refused(tmp_path: Path)
 
 
 @pytest.mark.parametrize("version", [5, "x", 3])
-@pytest.mark.parametrize("with_table", [True, False])
 def test_a_segment_of_another_format_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, version: object, with_table: bool
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, version: object
 ) -> None:
     message = f"format {version}, and this hybridlog knows format 4"
     monkeypatch.setattr("hybridlog_storage.segments.segment_file.FORMAT_VERSION", version)
-    if not with_table:
-        monkeypatch.setattr("hybridlog_storage.segments.segment_file.CHUNK_TABLE_OPCODE", 0xF0)
     (path,), _ = write(tmp_path / "a", [many(30)])
     with SegmentReader(path, 0) as reader, pytest.raises(SegmentError, match=message):
         reader.summary()

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
 
 S = 10**9
-MS = 10**6
 WHOLE = {"begin": 0, "end": 20 * S, "pixels": 100}
 SCAN = {"recording": "robot", "topic": "/base/scan"}
 NEAR = {**SCAN, "where": "ranges.min < 0.8"}
