@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,8 @@ from hybridlog_storage.disk.append_file import BLOCK
 from hybridlog_storage.errors import DiskFullError, SegmentError, StoreError, UsageError
 from hybridlog_storage.manifest import Loss, replace
 from hybridlog_storage.messages import Batch, Channel, LooseBatch, Schema
+from hybridlog_storage.segments import chunk as chunk_module
+from hybridlog_storage.segments import segment_writer
 from hybridlog_storage.segments.chunk import StoredChunk
 from hybridlog_storage.segments.chunk_table import ChunkPlace
 from hybridlog_storage.segments.compression import FilePart
@@ -390,6 +393,28 @@ def test_a_segment_whose_head_found_no_room_can_be_made_again(tmp_path: Path) ->
     assert not list(tmp_path.iterdir())
     segment = SegmentFile.create(tmp_path, 0, RECORDING)
     assert segment.prepare(sync=False).file.name == segment.publish().name == "000000.mcap"
+
+
+def test_old_chunks_are_flushed_and_young_ones_are_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    chunks: list[StoredChunk] = []
+    now = 100.0
+    for module in (chunk_module, segment_writer):
+        monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: now))
+    writer = recorder(tmp_path, chunks)
+    writer.append(batch_of([(0, b"old", 1, 1, 1)]), CHANNELS)
+    now = 101.0
+    writer.append(batch_of([(1, bytes(5000), 1, 1, 1)]), CHANNELS)
+    writer.flush_older(1.5)
+    writer._drain(limit=0)
+    assert not chunks
+    now = 101.5
+    writer.flush_older(1.5)
+    writer._drain(limit=0)
+    assert [chunk.batch.channel.tolist() for chunk in chunks] == [[1]]
+    writer.close()
+    assert len(chunks) == 2
 
 
 # What proves a segment

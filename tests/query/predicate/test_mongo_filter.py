@@ -102,3 +102,22 @@ def test_values_become_plain() -> None:
     assert [type(value) for value in plain["a"]] == [int, int, float, str, bool]  # type: ignore[attr-defined]
     assert plain["b"] == Regex.from_native(query["b"])  # type: ignore[type-var]
     assert [*plain["c"]] == ["$regex", "$not"]  # type: ignore[call-overload]
+
+
+def test_the_paths_it_asks_for() -> None:
+    query: Document = {
+        "a": 1,
+        "b": {"$exists": True},
+        "$or": [{"c.0": {"$gt": 1}}, {"d": {"$eq": {"e": 1}}}],
+        "f": {"$elemMatch": {"g": 1}},
+        "$expr": {"$gt": [{"$size": "$h.i"}, "$$ROOT.j"]},
+        "_meta.seq": {"$in": [1]},
+    }
+    (node,) = mongo_filter(query, None).filters
+    assert dict(node.paths) == {
+        **dict.fromkeys(("a", "c.0", "f", "f.g", "_meta.seq"), "value"),
+        **dict.fromkeys(("d", "h.i", "j"), "whole"),
+        "b": "exists",
+    }
+    assert node.asks_fields
+    assert not mongo_filter({"_meta.error": {"$exists": True}}, None).asks_fields

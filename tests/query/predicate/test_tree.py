@@ -7,7 +7,7 @@ import pickle
 
 from hybridlog.query.predicate.mongo_filter import mongo_filter
 from hybridlog.query.predicate.parser import parse
-from hybridlog.query.predicate.tree import Condition, Field, Predicate
+from hybridlog.query.predicate.tree import And, Condition, Field, Predicate
 
 TEXTS = [
     "x < 5",
@@ -45,6 +45,20 @@ def test_predicates_are_equal_when_they_ask_for_the_same() -> None:
     assert one == other == parse("x == nan")
     assert hash(one) == hash(other)
     assert parse("x == 1") != 1
+
+
+def test_joined() -> None:
+    everything = mongo_filter({}, None)
+    one, two = parse("x < 5"), parse("y > 1 and z == 2")
+    assert not everything
+    assert one
+    assert one & everything is one
+    assert everything & one is one
+    assert not everything & everything
+    assert one & two == parse("x < 5 and y > 1 and z == 2")
+    assert parse((one & two).text).fields() == ["x", "y", "z"]
+    assert (two & one).fields() == ["y", "z", "x"]
+    assert isinstance((one & two).root, And)
 
 
 def test_a_predicate_does_not_change_with_its_filter() -> None:
