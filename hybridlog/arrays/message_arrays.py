@@ -57,8 +57,7 @@ def to_numpy(type_name: str, message: object) -> NDArray[Any]:
       first. `compressedDepth` gives the depth image: uint16 millimetres or float32 metres (NaN for
       missing measurements).
     * `LaserScan`: shape (n,), fields `range` (metres), `intensity` (if present) and `angle`
-      (radians), float32. Ranges without an intensity have NaN. `MultiEchoLaserScan` has a row for
-      each echo, beam after beam, and `echo`, its number.
+      (radians), float32. Ranges without an intensity have NaN.
     * `PointCloud2`: shape (width,) or, for an organised cloud, (height, width), with the cloud's
       own fields, which may overlap; `PointCloud`: shape (n,), `x`, `y`, `z` and the channels, NaN
       where a channel ends early.

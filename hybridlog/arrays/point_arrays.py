@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Mapping
-from itertools import chain, repeat
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -71,56 +70,22 @@ def view_of(
 
 
 def _laser_scan(message: Any) -> NDArray[Any]:
-    angles = _angles(len(message.ranges), message.angle_min, message.angle_increment)
-    return _scan(angles, message.ranges, message.intensities)
+    return _scan(message, float(message.angle_min), float(message.angle_increment))
 
 
 def _foxglove_scan(message: Any) -> NDArray[Any]:
-    count = len(message.ranges)
-    step = (float(message.end_angle) - float(message.start_angle)) / max(count - 1, 1)
-    return _scan(_angles(count, message.start_angle, step), message.ranges, message.intensities)
+    start, gaps = float(message.start_angle), max(len(message.ranges) - 1, 1)
+    return _scan(message, start, (float(message.end_angle) - start) / gaps)
 
 
-def _multi_echo_scan(message: Any) -> NDArray[Any]:
-    ranges = [np.asarray(beam.echoes, np.float32) for beam in message.ranges]
-    counts = [len(beam) for beam in ranges]
-    angles = _angles(len(ranges), message.angle_min, message.angle_increment).repeat(counts)
-    echoes = np.arange(len(angles)) - (np.cumsum(counts, dtype=np.intp) - counts).repeat(counts)
-    given = chain((beam.echoes for beam in message.intensities), repeat(()))
-    intensities = [_fill(some, count) for some, count in zip(given, counts, strict=False)]
-    none = np.empty(0, np.float32)
-    measured = np.concatenate([none, *intensities])
-    return _scan(
-        angles,
-        np.concatenate([none, *ranges]),
-        none if np.isnan(measured).all() else measured,
-        echoes,
-    )
-
-
-def _angles(count: int, start: float, step: float) -> NDArray[np.float64]:
+def _scan(message: Any, start: float, step: float) -> NDArray[Any]:
+    """One row for each range (m, at an angle in rad); there may be fewer intensities, or none."""
+    count, columns = len(message.ranges), {"range": message.ranges}
+    if len(message.intensities):
+        columns["intensity"] = _fill(message.intensities, count)
     with np.errstate(over="ignore", invalid="ignore"):
-        return float(start) + np.arange(count, dtype=np.float64) * float(step)
-
-
-def _scan(
-    angles: NDArray[np.float64],
-    ranges: Any,
-    intensities: Any,
-    echoes: NDArray[np.intp] | None = None,
-) -> NDArray[Any]:
-    """One row for each range (m, at an angle in rad); there may be fewer intensities, or none.
-
-    `echoes` are numbers of the ranges among the echoes of their beams.
-    """
-    columns: dict[str, Any] = {"range": ranges}
-    if len(intensities):
-        columns["intensity"] = _fill(intensities, len(angles))
-    columns["angle"] = angles
-    if echoes is not None:
-        columns["echo"] = echoes
-    scan = np.empty(len(angles), [(name, np.float32) for name in columns])
-    with np.errstate(over="ignore", invalid="ignore"):
+        columns["angle"] = start + np.arange(count, dtype=np.float64) * step
+        scan = np.empty(count, [(name, np.float32) for name in columns])
         for name, values in columns.items():
             scan[name] = np.asarray(values, np.float32)
     return scan
@@ -226,7 +191,6 @@ def _point_cloud(message: Any) -> NDArray[Any]:
 
 POINT_MAKERS: Final[Mapping[str, Callable[[Any], NDArray[Any]]]] = {
     "sensor_msgs/LaserScan": _laser_scan,
-    "sensor_msgs/MultiEchoLaserScan": _multi_echo_scan,
     "sensor_msgs/PointCloud2": _point_cloud2,
     "sensor_msgs/PointCloud": _point_cloud,
     "foxglove.LaserScan": _foxglove_scan,

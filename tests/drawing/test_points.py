@@ -260,30 +260,6 @@ def test_scans() -> None:
     assert got["values"]["range"].tolist() == [1, 0.25, 8, 2]
 
 
-def echoes(*beams: list[float]) -> list[SimpleNamespace]:
-    return [SimpleNamespace(echoes=np.array(beam, np.float32)) for beam in beams]
-
-
-def test_scans_with_several_echoes() -> None:
-    message = scan([])
-    message.ranges = echoes([1, 2], [], [3, 9, 4])
-    message.intensities = echoes([10, 20], [], [30])
-    got = points_of("sensor_msgs/MultiEchoLaserScan", message)
-    last = -1.5 + 2 * 0.5
-    wanted = [(r * math.cos(a), r * math.sin(a), 0) for r, a in ((1, -1.5), (2, -1.5), (3, last))]
-    wanted.append((4 * math.cos(last), 4 * math.sin(last), 0))
-    assert np.allclose(got["xyz"], wanted, rtol=0, atol=1e-6)
-    assert got["dropped"] == {"out of range": 1}
-    assert got["values"]["echo"].tolist() == [0, 1, 0, 2]
-    assert got["values"]["intensity"][:3].tolist() == [10, 20, 30]
-    assert math.isnan(got["values"]["intensity"][3])
-    message.intensities = []
-    got = points_of("sensor_msgs/MultiEchoLaserScan", message)
-    assert got["names"] == ("range", "angle", "echo")
-    message.ranges = []
-    assert points_of("sensor_msgs/MultiEchoLaserScan", message)["total"] == 0
-
-
 POSE = {
     "position": {"x": 10.0, "y": 20.0, "z": 0.5},
     # A quarter to the left, not normalised.

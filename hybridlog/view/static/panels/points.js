@@ -13,7 +13,6 @@ import { ofTypes } from "./types.js";
 
 const accepts = ofTypes(
   "sensor_msgs/LaserScan",
-  "sensor_msgs/MultiEchoLaserScan",
   "sensor_msgs/PointCloud2",
   "sensor_msgs/PointCloud",
   "foxglove.LaserScan",
