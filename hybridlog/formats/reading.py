@@ -34,9 +34,6 @@ BATCH_BYTES = 2 << 20
 BATCH_MESSAGES = 16384
 """Most messages of one batch."""
 
-MAX_CHUNK = 4 << 30
-"""Largest chunk that a source unpacks, in uncompressed bytes; large ones in parts."""
-
 MAX_PLACES = 10_000
 """Damaged places of a file that are reported one by one."""
 

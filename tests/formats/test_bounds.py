@@ -226,6 +226,7 @@ def write(path: Path, *parts: bytes) -> Path:
     return path
 
 
+GOOD = chunk("", message(), len(message()))
 Data = Callable[[], tuple[bytes, int]]
 """Makes compressed data and the number of bytes that it stands for."""
 
@@ -233,19 +234,19 @@ Data = Callable[[], tuple[bytes, int]]
 @pytest.mark.parametrize(
     ("codec", "made", "claim", "reason"),
     [
-        ("zstd", lambda: zstd(zeros(GIB)), None, "the record at byte 0 of its content has no kind"),
-        ("lz4", lambda: lz4_(zeros(GIB)), None, "the record at byte 0 of its content has no kind"),
-        ("zstd", lambda: zstd(zeros(PIECE)), 100, "to more bytes, not 100 as it claims"),
-        ("lz4", lambda: lz4_(zeros(GIB)), 100, "to more bytes, not 100 as it claims"),
+        ("zstd", lambda: zstd(zeros(PIECE)), None, "the record at byte 0 of its content has no"),
+        ("zstd", lambda: zstd(zeros(GIB)), None, "which is not believed of its"),
+        ("lz4", lambda: lz4_(zeros(GIB)), None, "which is not believed of its"),
+        ("zstd", lambda: zstd(zeros(PIECE)), 100, "zstd data is damaged"),
+        ("lz4", lambda: lz4_(zeros(GIB)), 100, "to 100 bytes as it claims"),
         ("zstd", lambda: zstd(zeros(PIECE)), 8 << 30, "more than the limit of"),
-        ("lz4", lambda: lz4_(zeros(PIECE)), 4 << 30, "bytes of lz4 cannot hold"),
-        ("zstd", lambda: zstd(private(3 * GIB)), 2 * GIB, "runs over the end at 2147483648"),
+        ("lz4", lambda: lz4_(zeros(PIECE)), 1 << 29, "which is not believed of its"),
+        ("zstd", lambda: zstd(private(3 * GIB)), 2 * GIB, "more than the limit of"),
         ("zstd", lambda: zstd(repeat(record(0x90, b""))), None, "too many records for its size"),
         ("zstd", lambda: zstd(repeat(schema(2))), None, "too many records for its size"),
         ("zstd", lambda: zstd(repeat(message())), None, "too many records for its size"),
         ("zstd", lambda: zstd(repeat(message(), 5 << 19)), None, "too many records for its size"),
-        ("zstd", lambda: zstd(private(300 << 20, 5)), None, "too many to be believed"),
-        ("zstd", lambda: zstd(noisy(99 << 20)), 100 << 20, "bytes, not 104857600"),
+        ("zstd", lambda: zstd(noisy(99 << 20)), 100 << 20, "to 104857600 bytes as it claims"),
     ],
 )
 def test_chunks_of_any_kind_are_bounded(
@@ -260,41 +261,26 @@ def test_chunks_of_any_kind_are_bounded(
     assert reason in damage[0][0]
 
 
-@pytest.mark.parametrize(
-    "size", [100 << 20, pytest.param(1200 << 20, marks=pytest.mark.exhaustive)]
-)
 @pytest.mark.parametrize("codec", ["zstd", "lz4"])
-def test_large_chunks_are_read_in_little_memory(tmp_path: Path, codec: str, size: int) -> None:
-    parts = [message(payload=os.urandom(PIECE))] * (size // PIECE)
+def test_large_chunks_are_read_in_little_memory(tmp_path: Path, codec: str) -> None:
+    parts = [message(payload=os.urandom(PIECE))] * 100
     data, size = zstd(iter(parts)) if codec == "zstd" else lz4_(iter(parts))
     crc = 0
     for part in parts:
         crc = zlib.crc32(part, crc)
     path = write(tmp_path / "a.mcap", chunk(codec, data, size, crc))
     assert read(path)[::2] == (len(parts), [])
-    path = write(tmp_path / "b.mcap", chunk(codec, data, size, crc ^ 1), message())
+    path = write(tmp_path / "b.mcap", chunk(codec, data, size, crc ^ 1), GOOD)
     messages, _, damage = read(path)
     assert messages == 1
     assert damage == [["a chunk is damaged: its checksum differs", None]]
-    path = write(tmp_path / "c.mcap", chunk(codec, data, size))
-    os.truncate(path, path.stat().st_size // 2)
-    messages, _, damage = read(path)
-    assert len(parts) // 3 < messages < len(parts)
-    assert f"{messages} messages of its beginning were read" in damage[0][0]
-
-
-def test_messages_before_damage_in_a_large_chunk_are_not_lost(tmp_path: Path) -> None:
-    data, size = zstd([message(payload=os.urandom(PIECE))] * 70 + [bytes(PIECE)])
-    messages, _, damage = read(write(tmp_path / "a.mcap", chunk("zstd", data, size)))
-    assert messages == 70
-    assert "has no kind; 70 messages of its beginning were read" in damage[0][0]
 
 
 def test_segments_keep_to_the_ratio_that_readers_believe() -> None:
     large = bytes(300 << 20)
     assert Compressor("zstd").compress(large) == ("", large)
     assert Compressor("zstd").compress(large[: 100 << 20])[0] == "zstd"
-    with pytest.raises(SegmentError, match="more than 1000 times its"):
+    with pytest.raises(SegmentError, match="is not believed of its"):
         decompress("zstd", zstandard.compress(large), len(large))
 
 

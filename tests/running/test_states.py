@@ -17,8 +17,7 @@ import hybridlog as hl
 from hybridlog.attachments import extras_of
 from hybridlog.maintenance.expiry import expire
 from hybridlog_storage.disk.directory import StoreDirectory
-from hybridlog_storage.segments.compression import FilePart
-from hybridlog_storage.segments.segment_format import Attachment
+from hybridlog_storage.segments.segment_format import Attachment, FilePart
 from tests import places
 from tests.cli.running import complete
 from tests.cli.within import answer

@@ -11,8 +11,7 @@ from msgspec.structs import asdict
 
 from hybridlog_storage.mcap.mcap_content import RECORD_HEAD
 from hybridlog_storage.segments import walk
-from hybridlog_storage.segments.compression import FilePart
-from hybridlog_storage.segments.segment_format import Attachment, losses_record
+from hybridlog_storage.segments.segment_format import Attachment, FilePart, losses_record
 from hybridlog_storage.segments.segment_reader import SegmentReader, SegmentSummary
 from hybridlog_storage.segments.segment_writer import RecordingWriter, SegmentSettings
 from hybridlog_storage.segments.walk import OpenSegment

@@ -32,12 +32,12 @@ from hybridlog_storage.segments import chunk as chunk_module
 from hybridlog_storage.segments import segment_writer
 from hybridlog_storage.segments.chunk import StoredChunk
 from hybridlog_storage.segments.chunk_table import ChunkPlace
-from hybridlog_storage.segments.compression import FilePart
 from hybridlog_storage.segments.recovery import Recovered, damage_of, recover_segment
 from hybridlog_storage.segments.segment_file import Sealed, SegmentFile
 from hybridlog_storage.segments.segment_format import (
     RECORDING_METADATA,
     Attachment,
+    FilePart,
     losses_record,
     trailer_of,
 )

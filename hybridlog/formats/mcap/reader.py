@@ -10,7 +10,6 @@ from mcap import records
 from msgspec.structs import replace
 
 from hybridlog.formats.reading import (
-    MAX_CHUNK,
     TOO_MANY_CHANNELS,
     TOO_MANY_SILENT,
     Damage,
@@ -68,7 +67,7 @@ class McapSource(Source):
                 f"{self.path}: not an MCAP file, it does not start with the bytes of one; "
                 "check that the file was copied whole"
             )
-        scan = Scan(read, self.size_bytes, MAX_CHUNK)
+        scan = Scan(read, self.size_bytes)
         self._definitions = _Definitions(self.channels, scan.summary)
         if scan.summary is not None and scan.summary.statistics is not None:
             self.message_count = scan.summary.statistics.message_count

@@ -20,8 +20,7 @@ from msgspec import Struct
 
 from hybridlog_storage.cache import RowType
 from hybridlog_storage.errors import SegmentError
-from hybridlog_storage.messages import MAX_PAYLOAD, Batch
-from hybridlog_storage.segments.compression import is_implausible
+from hybridlog_storage.messages import Batch
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator
@@ -57,7 +56,6 @@ _DEFINITIONS = frozenset({int(Opcode.SCHEMA), int(Opcode.CHANNEL)})
 _PAYLOAD = MESSAGE_HEAD.itemsize
 _FIELDS = _PAYLOAD - RECORD_HEAD.size
 _TIME_LIMIT = 1 << 63
-_PART = 4 << 20  # bytes of content that are read together
 _SEARCHED = 1 << 20  # bytes searched at once for the next record
 
 MIN_RECORDS = 1 << 16
@@ -128,7 +126,7 @@ class Damage(Struct, frozen=True):
 
 
 class ChunkContent(NamedTuple):
-    """The records of one uncompressed chunk, or of a part of it.
+    """The records of one uncompressed chunk, or of a run outside of chunks.
 
     Attributes:
         batch: Its messages, in order; `channel` is the MCAP channel id, payload offsets
@@ -140,7 +138,6 @@ class ChunkContent(NamedTuple):
             time replaces it.
         unreadable: The problem of each definition that could not be read.
         end: Byte of the buffer behind the last record.
-        records: Number of all records.
     """
 
     batch: Batch
@@ -149,24 +146,20 @@ class ChunkContent(NamedTuple):
     unpublished: int
     unreadable: list[str]
     end: int
-    records: int
 
 
-def parse_content(
-    buffer: Buffer, *, torn: bool = False, loose: bool = False, most: int = 1 << 62
-) -> ChunkContent:
+def parse_content(buffer: Buffer, *, loose: bool = False, most: int = 1 << 62) -> ChunkContent:
     """Read the records of an uncompressed chunk. Other kinds are skipped, as MCAP requires.
 
-    If it is `torn`, the end is missing: an incomplete record is omitted. `loose` stops, without
-    error, at the first record that is neither a whole message nor a definition that fills its
-    record. More than `most` records, one that runs over the end, or one of the invalid kind 0 raise
-    a `SegmentError` that names the offset.
+    `loose` stops, without error, at the first record that is neither a whole message nor a whole
+    definition. More than `most` records, one that runs over the end, or one of the invalid kind 0
+    raise a `SegmentError` that names the offset.
     """
     walk = _Walk(buffer)
     starts = np.fromiter(walk.messages(most, loose=loose), np.int64)
     if walk.records > most:
         raise SegmentError("it holds too many records for its size")
-    if not (torn or loose) and walk.end != len(buffer):
+    if not loose and walk.end != len(buffer):
         problem = f"runs over the end at {len(buffer)}" if buffer[walk.end] else "has no kind"
         raise SegmentError(f"the record at byte {walk.end} of its content {problem}")
     batch, good, unpublished = _batch(buffer, starts)
@@ -174,62 +167,7 @@ def parse_content(
     if not good.all():  # rows count valid messages only
         before = np.concatenate(([0], np.cumsum(good)))
         definitions = [Definition(int(before[one.row]), one.record) for one in definitions]
-    return ChunkContent(
-        batch, definitions, starts[~good], unpublished, walk.unreadable, walk.end, walk.records
-    )
-
-
-def parse_parts(
-    pieces: Iterator[Buffer], size: int, compressed: int, *, torn: bool = False
-) -> Iterator[ChunkContent]:
-    """Read the records of a chunk of any size, in parts of `_PART` bytes or more: bounded memory.
-
-    `pieces` are its uncompressed content, `size` the bytes that it claims, `compressed` those of
-    its compressed content; if it is `torn`, the end is missing. After an error only the rest is
-    lost.
-    """
-    held, base, most = bytearray(), 0, MIN_RECORDS + compressed
-    wanted = _PART  # bytes to read at once
-    damage: SegmentError | None = None
-    piece: Buffer = b"more"
-    while piece:
-        try:
-            piece = next(pieces, b"")
-        except SegmentError as error:
-            damage, piece = error, b""
-        held += piece
-        if base + len(held) > size:
-            raise SegmentError(f"it decompresses to more bytes, not {size} as it claims")
-        if piece and len(held) < min(wanted, max(size - base, 1)):
-            continue
-        part = parse_content(held, torn=True, most=most)
-        most -= part.records
-        base += part.end
-        held = held[part.end :]  # the batch keeps the old one
-        yield part
-        if piece and len(held) >= RECORD_HEAD.size:
-            wanted = max(_PART, _believed(held, base, size, compressed))
-    if damage is not None:
-        raise damage
-    found = base + len(held)
-    if not torn and found < size:
-        raise SegmentError(f"it decompresses to only {found} bytes, not {size}")
-    if not torn and held:
-        raise SegmentError(f"the record at byte {base} of its content runs over the end")
-
-
-def _believed(held: bytearray, base: int, size: int, compressed: int) -> int:
-    """Bytes of the incomplete record at the end of what was read, if its head is believed."""
-    opcode, length = RECORD_HEAD.unpack_from(held)
-    length += RECORD_HEAD.size
-    where = f"the record at byte {base} of its content"
-    if not opcode:
-        raise SegmentError(f"{where} has no kind")
-    if base + length > size:
-        raise SegmentError(f"{where} runs over the end at {size}")
-    if length > MAX_PAYLOAD or is_implausible(length, compressed):
-        raise SegmentError(f"{where} claims {length} bytes, too many to be believed")
-    return int(length)
+    return ChunkContent(batch, definitions, starts[~good], unpublished, walk.unreadable, walk.end)
 
 
 class _Walk:
@@ -256,27 +194,23 @@ class _Walk:
             if opcode == _MESSAGE:
                 yield at
                 row += 1
-            elif not opcode or not self._other(row, opcode, at + head_size, end, loose=loose):
+            elif not opcode or (loose and opcode not in _DEFINITIONS):
                 break
             else:
                 skipped += 1
+                if opcode in _DEFINITIONS:
+                    self._define(row, opcode, at + head_size, end)
             at = end
         self.end, self.records = at, row + skipped
 
-    def _other(self, row: int, opcode: int, start: int, end: int, *, loose: bool) -> bool:
-        """Take another record; False if it ends the messages."""
-        if opcode not in _DEFINITIONS:
-            return not loose
+    def _define(self, row: int, opcode: int, start: int, end: int) -> None:
         try:
-            record, used = read_record(opcode, memoryview(self._buffer)[start:end])
+            record, _ = read_record(opcode, memoryview(self._buffer)[start:end])
         except SegmentError as error:
-            if not loose:
-                self.unreadable.append(str(error))
-            return not loose
-        if loose and used != end - start:
-            return False
-        self.definitions.append(Definition(row, cast("records.Schema | records.Channel", record)))
-        return True
+            self.unreadable.append(str(error))
+        else:
+            found = cast("records.Schema | records.Channel", record)
+            self.definitions.append(Definition(row, found))
 
 
 def _batch(buffer: Buffer, starts: NDArray[np.int64]) -> tuple[Batch, NDArray[np.bool_], int]:

@@ -47,7 +47,6 @@ last log time, first and last publish time, times in ns."""
 _HEAD = struct.Struct("<II")  # rows of chunks and parts
 _CHUNK_ROW = struct.Struct("<QQQqqI")
 _DTYPES = (CHUNK, PART)
-_MAX_BYTES = 1 << 28
 _MAX_FILE = 1 << 62
 _MAX_CHANNEL = 65535
 
@@ -130,7 +129,7 @@ class ChunkTable(Struct, frozen=True, eq=False):
         counts = _HEAD.unpack_from(body)
         sizes = [n * dtype.itemsize for n, dtype in zip(counts, _DTYPES, strict=True)]
         try:
-            raw = decompress("zstd", memoryview(body)[_HEAD.size :], sum(sizes), limit=_MAX_BYTES)
+            raw = decompress("zstd", memoryview(body)[_HEAD.size :], sum(sizes))
         except SegmentError as error:
             raise SegmentError(f"the chunk table is damaged: {error}") from error
         arrays: list[NDArray[np.void]] = []

@@ -42,7 +42,7 @@ from hybridlog_storage.mcap.mcap_content import (
 )
 from hybridlog_storage.messages import Batch, Buffer, Channel, Schema, run_starts
 from hybridlog_storage.segments.chunk_table import PART
-from hybridlog_storage.segments.compression import FilePart, checked_frame, decompress
+from hybridlog_storage.segments.compression import checked_frame, decompress
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -400,6 +400,14 @@ _SIZE = struct.Struct("<Q")
 _CRC = struct.Struct("<I")
 
 
+class FilePart(NamedTuple):
+    """A part of a file, or of memory; `read` takes an offset and a length."""
+
+    read: Callable[[int, int], Buffer]
+    start: int
+    size: int
+
+
 class Attachment(Struct, frozen=True):
     """An attachment record of a file; times are ns, 0 if unknown. `data` is in the file.
 
@@ -414,13 +422,11 @@ class Attachment(Struct, frozen=True):
 
     def pieces(self) -> Iterator[bytes]:
         """The content, in pieces of at most `PIECE` bytes."""
-        part = self.data.again()
-        left = len(part)
-        while left:
-            piece = part.read(PIECE)
-            if not piece:
-                raise SegmentError(f"{left} bytes of the attachment {self.name!r} are missing")
-            left -= len(piece)
+        read, start, size = self.data
+        for at in range(0, size, PIECE):
+            piece = bytes(read(start + at, min(PIECE, size - at)))
+            if len(piece) < min(PIECE, size - at):
+                raise SegmentError(f"bytes of the attachment {self.name!r} are missing")
             yield piece
 
     def record(self) -> Iterator[bytes]:
@@ -433,11 +439,11 @@ class Attachment(Struct, frozen=True):
                 name,
                 _TEXT.pack(len(media_type)),
                 media_type,
-                _SIZE.pack(len(self.data)),
+                _SIZE.pack(self.data.size),
             )
         )
         crc = crc32(fields)
-        size = len(fields) + len(self.data) + _CRC.size
+        size = len(fields) + self.data.size + _CRC.size
         yield RECORD_HEAD.pack(Opcode.ATTACHMENT, size) + fields
         for piece in self.pieces():
             crc = crc32(piece, crc)
@@ -451,7 +457,7 @@ class Attachment(Struct, frozen=True):
             length=length,
             create_time=self.create_time,
             log_time=self.log_time,
-            data_size=len(self.data),
+            data_size=self.data.size,
             name=self.name,
             media_type=self.media_type,
         )
@@ -473,10 +479,11 @@ def parse_attachment(
     except (struct.error, UnicodeDecodeError) as error:
         raise SegmentError("an attachment record is damaged") from error
     at += _SIZE.size
-    if at + size + _CRC.size > len(part):
+    if at + size + _CRC.size > part.size:
         raise SegmentError("an attachment record is damaged (its content runs over its end)")
-    found = Attachment(log_time, create_time, name, media_type, part.section(at, size))
-    (crc,) = _CRC.unpack(part.section(at + size, _CRC.size).read())
+    data = FilePart(part.read, part.start + at, size)
+    found = Attachment(log_time, create_time, name, media_type, data)
+    (crc,) = _CRC.unpack(part.read(data.start + size, _CRC.size))
     if crc or needs_crc:
         of_content = crc32(memoryview(head)[:at])
         for piece in found.pieces():

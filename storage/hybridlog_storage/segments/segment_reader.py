@@ -37,7 +37,7 @@ from hybridlog_storage.mcap.mcap_content import (
 from hybridlog_storage.messages import EXPIRED_IDS, Buffer, Channel, distinct, with_expired
 from hybridlog_storage.segments.chunk import StoredChunk
 from hybridlog_storage.segments.chunk_table import ChunkPlace, ChunkTable, places_of
-from hybridlog_storage.segments.compression import FilePart, decompress
+from hybridlog_storage.segments.compression import decompress
 from hybridlog_storage.segments.segment_format import (
     CHUNK_TABLE_OPCODE,
     FORMAT_VERSION,
@@ -46,6 +46,7 @@ from hybridlog_storage.segments.segment_format import (
     OUR_NAMES,
     RECORDING_METADATA,
     Attachment,
+    FilePart,
     channel_of,
     json_of,
     losses_in,
