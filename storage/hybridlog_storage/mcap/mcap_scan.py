@@ -11,7 +11,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 from mcap.opcode import Opcode
-from mcap.records import McapRecord
+from mcap.records import ChunkIndex, McapRecord
 
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.errors import SegmentError
@@ -86,8 +86,8 @@ class Scan:
         self._bytes = RecordFile(lambda *place: memoryview(read(*place)), size, _WINDOW)
         self.summary: Summary | None = None
         self._has_end = self._read_summary()
-        listed = () if self.summary is None else self.summary.chunk_indexes
-        self._listed: list[int] = sorted(one.chunk_start_offset for one in listed)
+        listed = self.summary.chunk_indexes if self.summary is not None else list[ChunkIndex]()
+        self._listed = sorted(one.chunk_start_offset for one in listed)
         self._chunked = bool(self._listed)
         self._needs_crc = False  # messages have no checksum of their own
         self._is_damaged = False

@@ -6,18 +6,16 @@ skip. Then the summary is written, as the recorder would have done.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import NamedTuple
 
 from msgspec import Struct, field
 
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.append_file import BLOCK, AppendFile
 from hybridlog_storage.errors import SegmentError, StoreError
-from hybridlog_storage.manifest import hasher
-from hybridlog_storage.mcap.mcap_content import Damage
 from hybridlog_storage.messages import Schema
 from hybridlog_storage.segments.segment_file import (
     OPEN_SUFFIX,
@@ -31,12 +29,7 @@ from hybridlog_storage.segments.segment_format import (
     group_of,
 )
 from hybridlog_storage.segments.segment_reader import SegmentReader, check_format
-from hybridlog_storage.segments.walk import Walk
-
-if TYPE_CHECKING:
-    from hybridlog_storage.segments.segment_reader import SegmentSummary
-
-_PIECE = 4 << 20  # bytes read at once for a digest
+from hybridlog_storage.segments.walk import MENDED, Walk
 
 
 class Recovered(Struct):
@@ -66,146 +59,98 @@ def recover_segment(
     """
     number = int(path.name.removesuffix(OPEN_SUFFIX))
     final = path.with_name(sealed_name(number))
-    try:
+    with files.explained(path, "recovering"):
         with suppress(FileNotFoundError):
             files.status(final)
             raise StoreError(
                 f"{final} is sealed, and {path} lies beside it. Move one of them out of the store."
             )
-        with _Rest.of(path, number) as rest:
-            if rest.is_empty:
+        with SegmentReader(path, number) as reader:
+            walk = _walked(reader)
+            damage = [f"byte {one.offset}: {one.reason}" for one in walk.damaged]
+            if not (walk.recording or walk.chunks or walk.attachments or damage):
+                found = Recovered(None, cut_bytes=_torn(walk, 0))
                 files.unlink(path)
                 files.sync_folder(path.parent)
-                return Recovered(None, cut_bytes=rest.cut_bytes, damage=rest.told)
-            found = Recovered(final, rest.messages, rest.cut_bytes, rest.told)
-            rest.seal(recording, lambda sealed: on_sealing(sealed, found))
-            return found
-    except OSError as error:
-        raise files.explain(error, path, "recovering") from error
-
-
-def rebuild_summary(path: Path, digest: str) -> bool:
-    """Write the damaged summary of a sealed segment again, if the file then has its digest.
-
-    The summary is a function of the data before it. False if the segment was not repaired: it is
-    unchanged. After an error it can be repaired again.
-    """
-    try:
-        with _Rest.of(path, int(path.name.partition(".")[0])) as rest:
-            return rest.seal_again(digest)
-    except OSError as error:
-        raise files.explain(error, path, "rebuilding") from error
-
-
-class _Rest:
-    """The whole part of a segment, and the writer that goes on behind it.
-
-    `messages` are in whole chunks; `cut_bytes` are behind the last whole record, and of no summary.
-    """
-
-    def __init__(self, segment: SegmentFile, reader: SegmentReader) -> None:
-        self._segment = segment
-        self._reader = reader
-        self._walk = walk = Walk(reader, reads=True)
-        walk.go_on()
-        if walk.recording is not None:
-            check_format(walk.recording, segment.path)
-            segment.group = group_of(walk.recording, segment.number)
-        self._damage = walk.damaged
-        for number, one in walk.schemas.items():
-            segment.schemas[number] = Schema(one.name, one.encoding, bytes(one.data))
-        segment.channels |= {n: (walk.schema_ids[n], one) for n, one in walk.channels.items()}
-        segment.note_extras(walk.metadata, walk.attachments)
-        segment.losses += walk.losses
-        segment.table = walk.table
-        for chunk in walk.chunks:
-            segment.note_index(chunk.offset, chunk.head, chunk.indexes)
-        self.messages = sum(walk.table.build().counts().values())
-        self.cut_bytes = self._torn()
-
-    @classmethod
-    @contextmanager
-    def of(cls, path: Path, number: int) -> Iterator[_Rest]:
-        """Open a file; it is closed at the end."""
-        with SegmentReader(path, number) as reader:
-            segment = SegmentFile(path, number, AppendFile.reopen(path))
+                return found
+            messages = sum(walk.table.build().counts().values())
+            found = Recovered(final, messages, _torn(walk, walk.end), damage)
+            segment = _reopened(path, number, walk)
             try:
-                yield cls(segment, reader)
+                _mend(segment, walk, recording)
+                on_sealing(segment.prepare(sync=True), found)
+                segment.publish()
             finally:
                 segment.abandon()
+    return found
 
-    @property
-    def told(self) -> list[str]:
-        """Descriptions of the damage, in the order of the file."""
-        found = sorted(self._damage, key=lambda one: one.offset)
-        return [f"byte {one.offset}: {one.reason}" for one in found]
 
-    @property
-    def is_empty(self) -> bool:
-        """True if there is nothing but the beginning of a segment."""
-        walk = self._walk
-        return not (walk.recording or walk.chunks or walk.attachments or self._damage)
+def _walked(reader: SegmentReader) -> Walk:
+    walk = Walk(reader, reads=True)
+    walk.go_on()
+    return walk
 
-    def _torn(self) -> int:
-        """Bytes behind the last whole record, but for the zeros that fill the last block."""
-        end = 0 if self.is_empty else self._walk.end
-        rest = self._reader.size - end
-        is_room = 0 <= rest < BLOCK and not any(self._reader.read(end, rest))
-        return 0 if is_room or self._walk.is_complete else rest
 
-    def seal(
-        self, recording: Mapping[str, object] | None, on_sealing: Callable[[Sealed], object]
-    ) -> None:
-        """Write what is missing, and give the file its name."""
-        walk, segment = self._walk, self._segment
-        if walk.recording is None and recording is None:
-            raise SegmentError(
-                f"{segment.path} was left open, and what it says of its recording is damaged. "
-                "Move it out of the store, and see what is left with `mcap recover`."
-            )
-        start = bytes(self._reader.read(0, len(START)))
-        if start != START:
-            self._damage.append(Damage(0, len(START), "the beginning of the file was damaged"))
-        if walk.recording is None:
-            segment.cut(walk.end)
-            segment.add_recording(recording or {})
-        # Only now: what is damaged looks well behind this.
-        for one in self._damage:
-            if one.offset == 0:
-                segment.rewrite(0, START)
-            elif one.offset < walk.end:
-                segment.rewrite(one.offset, damaged_head(one.length))
-        if walk.recording is not None:
-            self._put_summary(segment.tail(walk.end))
-        on_sealing(segment.prepare(sync=True))
-        segment.publish()
+def _damage(walk: Walk) -> dict[int, str]:
+    """Reasons of damage by the byte where it starts, without what a recovery has mended."""
+    return {one.offset: one.reason for one in walk.damaged if one.reason != MENDED}
 
-    def seal_again(self, digest: str) -> bool:
-        """Write the summary of a sealed file, if the file then has its digest."""
-        walk, segment, end = self._walk, self._segment, self._walk.end
-        if not walk.is_complete or walk.recording is None:
-            return False  # more is missing than the summary
-        found = hasher()
-        for at in range(0, end, _PIECE):
-            found.update(self._reader.read(at, min(_PIECE, end - at)))
-        tail = segment.tail(end)
-        found.update(tail)
-        if found.hexdigest() != digest:
-            return False
-        self._put_summary(tail)
-        segment.prepare(sync=True)
-        return True
 
-    def _put_summary(self, tail: bytes) -> None:
-        """Write the summary in place, if the file is long enough; else it is appended later."""
-        segment, end = self._segment, self._walk.end
-        if self._reader.size < end + len(tail):
-            segment.cut(end)
-            return
-        if bytes(self._reader.read(end, len(tail))) != tail:
-            segment.rewrite(end, tail)
-        segment.cut(end + len(tail))
-        segment.note_complete()
+def _torn(walk: Walk, end: int) -> int:
+    """Bytes behind the last whole record, but for the zeros that fill the last block."""
+    rest = walk.reader.size - end
+    is_room = rest < BLOCK and not any(walk.reader.read(end, rest))
+    return 0 if is_room or walk.is_complete else rest
+
+
+def _reopened(path: Path, number: int, walk: Walk) -> SegmentFile:
+    """The writer that goes on behind the whole part of a segment."""
+    if walk.recording is not None:
+        check_format(walk.recording, path)
+    segment = SegmentFile(path, number, AppendFile.reopen(path))
+    if walk.recording is not None:
+        segment.group = group_of(walk.recording, number)
+    for schema_id, one in walk.schemas.items():
+        segment.schemas[schema_id] = Schema(one.name, one.encoding, bytes(one.data))
+    segment.channels |= {n: (walk.schema_ids[n], one) for n, one in walk.channels.items()}
+    segment.note_extras(walk.metadata, walk.attachments)
+    segment.losses += walk.losses
+    segment.table = walk.table
+    for chunk in walk.chunks:
+        segment.note_index(chunk.offset, chunk.head, chunk.indexes)
+    return segment
+
+
+def _mend(segment: SegmentFile, walk: Walk, recording: Mapping[str, object] | None) -> None:
+    """Cut what is not whole, and let readers skip what is damaged."""
+    if walk.recording is None and recording is None:
+        raise SegmentError(
+            f"{segment.path} was left open, and what it says of its recording is damaged. "
+            "Move it out of the store, and see what is left with `mcap recover`."
+        )
+    segment.cut(walk.end)
+    if walk.recording is None:
+        segment.add_recording(recording or {})
+    # Only now: what is damaged looks well behind this.
+    if bytes(walk.reader.read(0, len(START))) != START:
+        segment.rewrite(0, START)
+    for one in walk.damaged:
+        if one.offset < walk.end:
+            segment.rewrite(one.offset, damaged_head(one.length))
+
+
+def rebuild_summary(path: Path) -> bool:
+    """Seal a segment again of which the summary alone is damaged; False if more is."""
+    number = int(path.name.partition(".")[0])
+    with SegmentReader(path, number) as reader:
+        walk = _walked(reader)
+    if _damage(walk) or walk.recording is None or not walk.is_complete:
+        return False
+    opened = path.with_name(f"{number:06d}{OPEN_SUFFIX}")
+    with files.explained(path, "rebuilding"):
+        files.rename(path, opened)
+    recover_segment(opened)
+    return True
 
 
 class SegmentDamage(NamedTuple):
@@ -222,46 +167,35 @@ class SegmentDamage(NamedTuple):
 def damage_of(
     path: Path, digest: str = "", progress: Callable[[int], None] | None = None
 ) -> tuple[list[SegmentDamage], bool]:
-    """All damage in a sealed segment. Its chunks are read only if the digest differs.
+    """All damage in a sealed segment; its records are read only if the digest differs.
 
     It is in file order, but for a damaged summary, which comes first; with it comes whether the
     summary is whole. `digest` is that of the manifest; empty if it lists none. `progress` is called
     with the number of bytes read so far.
     """
     with SegmentReader(path, 0) as reader:
+        if reader.digest(progress) == digest:
+            return [], True
+        walk = Walk(reader, reads=True)
         try:
             summary = reader.summary()
         except SegmentError as error:
-            walk = Walk(reader)
             walk.go_on()
-            damaged = [SegmentDamage(one.offset, one.reason) for one in walk.damaged]
-            return [SegmentDamage(max(reader.size - 1, 0), str(error)), *damaged], False
-        if reader.digest(progress) == digest:
-            return [], True
-        found = sorted(_unreadable(reader, summary))
+            found = [SegmentDamage(*one) for one in _damage(walk).items()]
+            return [SegmentDamage(max(reader.size - 1, 0), str(error)), *found], False
+        walk.channels |= summary.channels
+        walk.go_on()
+    why, whole, found = _damage(walk), {chunk.offset for chunk in walk.chunks}, []
+    for place in summary.chunks:
+        if place.offset not in whole:
+            parts = summary.table.chunk_parts(place.number)[["channel", "messages"]].tolist()
+            lost = [f"{summary.channels[channel].topic} {count}" for channel, count in parts]
+            topics = ", ".join(lost[:5]) + (f" and {len(lost) - 5} more" if lost[5:] else "")
+            reason = why.pop(place.offset, "it cannot be read")
+            problem = f"chunk {place.number} is lost (messages: {topics}): {reason}"
+            found.append(SegmentDamage(place.offset, problem, place.number))
+    found = sorted([*found, *(SegmentDamage(*one) for one in why.items())])
     if digest and not found:
         problem = "it is not the file that the manifest lists: their digests differ"
         found = [SegmentDamage(0, problem)]
     return found, True
-
-
-def _unreadable(reader: SegmentReader, summary: SegmentSummary) -> Iterator[SegmentDamage]:
-    """Chunks, attachments and metadata records that are lost."""
-    for place in summary.chunks:
-        try:
-            reader.read_chunk(place)
-        except SegmentError as error:
-            parts = summary.table.chunk_parts(place.number)[["channel", "messages"]].tolist()
-            lost = [f"{summary.channels[channel].topic} {count}" for channel, count in parts]
-            topics = ", ".join(lost[:5]) + (f" and {len(lost) - 5} more" if lost[5:] else "")
-            problem = f"chunk {place.number} is lost (messages: {topics}): {error}"
-            yield SegmentDamage(place.offset, problem, place.number)
-    reads: list[tuple[Callable[[Any], object], list[Any]]] = [
-        (reader.attachment, summary.attachments),
-        (reader.metadata, summary.metadata),
-    ]
-    for read, record in ((read, record) for read, records in reads for record in records):
-        try:
-            read(record)
-        except SegmentError as error:
-            yield SegmentDamage(record.offset, str(error))

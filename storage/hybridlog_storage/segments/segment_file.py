@@ -350,27 +350,21 @@ class SegmentFile:
         """Write the summary, without renaming the file or forcing it to the disk."""
         if self._sealed is None:
             # In one write: without room the file is unchanged, and can be sealed again.
-            self._append([self.tail(self.position)])
-            self.note_complete()
-        assert self._sealed is not None
+            self._append([self._tail(self.position)])
+            with self._explained("reading"):
+                digest = self._file.digest()
+            self._sealed = Sealed.of(
+                (self.number, self.group),
+                (self.position, digest),
+                self.table.build(),
+                {number: channel for number, (_, channel) in self.channels.items()},
+                extras=(
+                    len(self._attachment_indexes),
+                    sum(not one.name.startswith(OUR_NAMES) for one in self._metadata_indexes),
+                ),
+                losses=self.losses,
+            )
         return self._sealed
-
-    def note_complete(self) -> None:
-        """Note that the summary is in the file."""
-        channels = {number: channel for number, (_, channel) in self.channels.items()}
-        with self._explained("reading"):
-            digest = self._file.digest()
-        self._sealed = Sealed.of(
-            (self.number, self.group),
-            (self.position, digest),
-            self.table.build(),
-            channels,
-            extras=(
-                len(self._attachment_indexes),
-                sum(not one.name.startswith(OUR_NAMES) for one in self._metadata_indexes),
-            ),
-            losses=self.losses,
-        )
 
     def trim(self) -> None:
         """Give a complete file its length: of several, before the first is forced to the disk."""
@@ -390,7 +384,7 @@ class SegmentFile:
     def _explained(self, doing: str) -> AbstractContextManager[None]:
         return files.explained(self.path, doing)
 
-    def tail(self, at: int) -> bytes:
+    def _tail(self, at: int) -> bytes:
         """The last records of a file with `at` bytes of data: the end of data, the summary."""
         end = record_bytes(DataEnd(data_section_crc=0))
         start = at = at + len(end)

@@ -72,11 +72,11 @@ METADATA_CHECK: Final = "hybridlog.crc32"
 """Last key of each metadata record: eight hexadecimal digits of a CRC-32."""
 
 INDEX_HEAD: Final = struct.Struct("<BQHI")
-ARRIVALS: Final = struct.Struct("<QII")
-"""Fields of an arrival record: byte of its chunk, CRC-32 of the chunk's head and of its indexes."""
-ARRIVAL_HEAD: Final = RECORD_HEAD.size + ARRIVALS.size
-"""Bytes of an arrival record without its numbers."""
+ARRIVAL_HEAD: Final = struct.Struct("<BQQII")
+"""Head of an arrival record: opcode, length, byte of its chunk, CRC-32 of the chunk's head and of
+its indexes."""
 
+_INDEX: Final = bytes([Opcode.MESSAGE_INDEX])
 _INDEX_ENTRY = RowType(("log_time", "<u8"), ("offset", "<u8"))
 _COUNTS = struct.Struct("<II")  # parts and messages of a chunk
 
@@ -273,8 +273,7 @@ def definitions_chunk(content: bytes, offset: int) -> bytes:
         compression="zstd",
         compressed_size=len(packed),
     )
-    nothing = pack_arrivals(np.empty(0, PART), np.empty(0, np.int64))
-    arrivals = arrival_record(offset, crc32(head), 0, nothing)
+    arrivals = arrival_record(offset, crc32(head), 0, _packed_arrivals(b"", 0, 0))
     return b"".join((head, packed, arrivals))
 
 
@@ -282,16 +281,20 @@ def pack_arrivals(parts: NDArray[np.void], seq: NDArray[np.int64]) -> bytes:
     """Pack `PART`[c] of a chunk, and its arrival numbers in chunk order, with a checksum."""
     steps = seq.astype("<i8")
     steps[1:] -= seq[:-1]
-    return _COUNTS.pack(len(parts), len(steps)) + checked_frame(parts.tobytes() + steps.tobytes())
+    return _packed_arrivals(parts.tobytes() + steps.tobytes(), len(parts), len(steps))
 
 
-def arrival_record(chunk: int, head_crc: int, indexes_crc: int, packed: Buffer) -> bytes:
+def _packed_arrivals(rows: bytes, parts: int, messages: int) -> bytes:
+    return _COUNTS.pack(parts, messages) + checked_frame(rows)
+
+
+def arrival_record(chunk: int, head_crc: int, indexes_crc: int, packed: bytes) -> bytes:
     """The record behind a chunk that starts at a byte of the file, from `pack_arrivals`.
 
     Checksums are CRC-32: of the chunk record before its content, and of its message indexes.
     """
-    head = RECORD_HEAD.pack(ARRIVAL_OPCODE, ARRIVALS.size + len(packed))
-    return b"".join((head, ARRIVALS.pack(chunk, head_crc, indexes_crc), packed))
+    length = ARRIVAL_HEAD.size - RECORD_HEAD.size + len(packed)
+    return ARRIVAL_HEAD.pack(ARRIVAL_OPCODE, length, chunk, head_crc, indexes_crc) + packed
 
 
 def group_of(recording: Mapping[str, object], number: int) -> int:
@@ -301,16 +304,15 @@ def group_of(recording: Mapping[str, object], number: int) -> int:
 
 
 class Trailer(NamedTuple):
-    """The records behind a chunk, `length` bytes.
+    """The whole records behind a chunk, `length` bytes.
 
     `head_crc` is the CRC-32 of the chunk record before its content. `indexes` are channel id and
-    entries (`log_time`, `offset`) of each message index; None if they have changed. `packed` is
-    from `pack_arrivals`.
+    entries (`log_time`, `offset`) of each message index. `packed` is from `pack_arrivals`.
     """
 
     length: int
     head_crc: int
-    indexes: list[tuple[int, NDArray[np.void]]] | None
+    indexes: list[tuple[int, NDArray[np.void]]]
     packed: memoryview
 
     def arrivals(self) -> tuple[NDArray[np.void], NDArray[np.int64]]:
@@ -323,70 +325,47 @@ class Trailer(NamedTuple):
             raw = decompress("zstd", self.packed[_COUNTS.size :], size + messages * 8)
         except SegmentError as error:
             raise SegmentError(f"its arrival numbers are damaged: {error}") from error
+        # An empty frame is not checked for bytes behind it.
+        if not messages and len(self.packed) != len(_packed_arrivals(b"", 0, 0)):
+            raise SegmentError("its arrival numbers are damaged")
         steps = np.frombuffer(raw, "<i8", messages, size)
         return np.frombuffer(raw, PART, parts), np.cumsum(steps, dtype=np.int64)
 
-    def starts(self) -> NDArray[np.int64] | None:
-        """Start of each message record in the chunk, ascending; None if the indexes changed."""
-        if not self.indexes:
-            return None
+    def batch(self, content: Buffer) -> Batch:
+        """The messages of the chunk, whose uncompressed content is given."""
         found = [entries["offset"].astype(np.int64) for _, entries in self.indexes]
         # Each channel's starts are sorted already; merging sorted runs is ten times as fast.
-        return np.sort(np.concatenate(found), kind="stable")
+        starts = np.sort(np.concatenate(found), kind="stable")
+        if starts[0] == 0 and int(starts[-1]) + MESSAGE_HEAD.itemsize <= len(content):
+            heads = heads_at(content, starts)
+            sizes = heads["length"].astype(np.int64)
+            ends = starts + sizes + RECORD_HEAD.size
+            if (
+                int(ends[-1]) == len(content)
+                and (ends[:-1] == starts[1:]).all()
+                and (heads["opcode"] == int(Opcode.MESSAGE)).all()
+                and (sizes >= MESSAGE_HEAD.itemsize - RECORD_HEAD.size).all()
+            ):
+                return batch_of(content, starts, heads)
+        raise SegmentError("its message indexes are those of another one")
 
 
 def trailer_of(data: Buffer, chunk: int) -> Trailer:
-    """Parse the records behind a chunk, whatever follows them; `chunk` is the byte where it starts.
-
-    Its message indexes may be damaged: the arrival record says where its chunk starts, and is found
-    by that.
-    """
-    raw, owner = bytes(data), chunk.to_bytes(8, "little")
-    at = raw.find(owner)
-    while at >= 0:
-        start = at - RECORD_HEAD.size
-        if start >= 0 and raw[start] == ARRIVAL_OPCODE and at + ARRIVALS.size <= len(raw):
-            end = at + RECORD_HEAD.unpack_from(raw, start)[1]
-            if at + ARRIVALS.size <= end <= len(raw):
-                _, head_crc, crc = ARRIVALS.unpack_from(raw, at)
-                indexes = _indexes_of(raw[:start]) if crc32(raw[:start]) == crc else None
-                packed = memoryview(raw)[at + ARRIVALS.size : end]
-                return Trailer(end, head_crc, indexes, packed)
-        at = raw.find(owner, at + 1)
-    raise SegmentError("its arrival numbers are missing")
-
-
-def _indexes_of(data: bytes) -> list[tuple[int, NDArray[np.void]]] | None:
-    """Channel id and entries of message indexes; None if they are wrong."""
-    found: list[tuple[int, NDArray[np.void]]] = []
-    at = 0
-    while at + INDEX_HEAD.size <= len(data):
-        opcode, length, channel, size = INDEX_HEAD.unpack_from(data, at)
-        start = at + INDEX_HEAD.size
-        at = start + size
-        is_index = opcode == Opcode.MESSAGE_INDEX and size + 6 == length
-        if not is_index or not size or size % _INDEX_ENTRY.itemsize or at > len(data):
-            return None
-        found.append((channel, np.frombuffer(data[start:at], _INDEX_ENTRY)))
-    return found if at == len(data) else None
-
-
-def messages_at(content: Buffer, starts: NDArray[np.int64]) -> Batch | None:
-    """The messages of an uncompressed chunk, by the starts of their records, int64[n], ascending.
-
-    None if these are wrong, that is, if the records do not cover the content from the first byte to
-    the last.
-    """
-    if not len(starts) or starts[0] != 0 or int(starts[-1]) + MESSAGE_HEAD.itemsize > len(content):
-        return None
-    heads = heads_at(content, starts)
-    sizes = heads["length"].astype(np.int64)
-    ends = starts + sizes + RECORD_HEAD.size
-    whole = bool((heads["opcode"] == int(Opcode.MESSAGE)).all())
-    whole = whole and bool((ends[:-1] == starts[1:]).all()) and int(ends[-1]) == len(content)
-    if not whole or bool((sizes < MESSAGE_HEAD.itemsize - RECORD_HEAD.size).any()):
-        return None
-    return batch_of(content, starts, heads)
+    """Parse the records behind a chunk; `chunk` is the byte where it starts."""
+    raw, at = bytes(data), 0
+    places: list[tuple[int, int, int]] = []  # channel, number of entries, and their start
+    while raw[at : at + 1] == _INDEX and at + INDEX_HEAD.size <= len(raw):
+        _, _, channel, size = INDEX_HEAD.unpack_from(raw, at)
+        places.append((channel, size // _INDEX_ENTRY.itemsize, at + INDEX_HEAD.size))
+        at += INDEX_HEAD.size + size
+    packed = at + ARRIVAL_HEAD.size
+    if packed <= len(raw):
+        opcode, length, owner, head_crc, crc = ARRIVAL_HEAD.unpack_from(raw, at)
+        is_whole = (opcode, owner, crc) == (ARRIVAL_OPCODE, chunk, crc32(raw[:at]))
+        if is_whole and at + RECORD_HEAD.size + length == len(raw):
+            indexes = [(c, np.frombuffer(raw, _INDEX_ENTRY, *place)) for c, *place in places]
+            return Trailer(len(raw), head_crc, indexes, memoryview(raw)[packed:])
+    raise SegmentError("its message indexes or arrival numbers are damaged")
 
 
 PIECE = 4 << 20

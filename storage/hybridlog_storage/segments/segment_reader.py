@@ -31,7 +31,6 @@ from hybridlog_storage.mcap.mcap_content import (
     ChunkHead,
     chunk_head_of,
     footer_of,
-    parse_content,
     parse_summary,
 )
 from hybridlog_storage.messages import EXPIRED_IDS, Buffer, Channel, distinct, with_expired
@@ -50,7 +49,6 @@ from hybridlog_storage.segments.segment_format import (
     channel_of,
     json_of,
     losses_in,
-    messages_at,
     metadata_of,
     parse_attachment,
     reader_of,
@@ -260,11 +258,7 @@ class SegmentReader:
         )
 
     def read_chunk(self, place: ChunkPlace) -> StoredChunk:
-        """Read, decompress and check one chunk.
-
-        Damaged message indexes are ignored: messages and arrival numbers have checksums of their
-        own.
-        """
+        """Read, decompress and check one chunk."""
         check_wanted()
         data = self.read(place.offset, place.length + place.trailer)
         try:
@@ -272,10 +266,7 @@ class SegmentReader:
             if (head.first, head.last) != (place.first, place.last):
                 raise SegmentError("its times are not those of the chunk table")
             trailer = trailer_of(data[place.length :], place.offset)
-            starts = trailer.starts()
-            batch = None if starts is None else messages_at(content, starts)
-            batch = parse_content(content).batch if batch is None else batch
-            seq = trailer.arrivals()[1]
+            batch, seq = trailer.batch(content), trailer.arrivals()[1]
             if len(seq) != len(batch):
                 raise SegmentError(f"it has {len(seq)} arrival numbers for {len(batch)} messages")
         except SegmentError as error:
@@ -290,19 +281,14 @@ class SegmentReader:
         )
 
     def read_times(self, place: ChunkPlace) -> dict[int, NDArray[np.int64]]:
-        """Log times of a chunk's messages, int64[n], ns, ascending, by channel id, of its indexes.
-
-        If these are damaged, the chunk is read instead.
-        """
-        with suppress(SegmentError):
-            behind = self.read(place.offset + place.length, place.trailer)
+        """Log times of a chunk's messages, int64[n], ns, ascending, by channel id."""
+        check_wanted()
+        behind = self.read(place.offset + place.length, place.trailer)
+        try:
             indexes = trailer_of(behind, place.offset).indexes
-            if indexes:
-                check_wanted()
-                return {channel: rows["log_time"].astype(np.int64) for channel, rows in indexes}
-        batch = self.read_chunk(place).batch
-        channels = distinct(batch.channel).tolist()
-        return {c: np.sort(batch.log_time[batch.channel == c]) for c in channels}
+        except SegmentError as error:
+            raise self._damaged(place, error) from error
+        return {channel: rows["log_time"].astype(np.int64) for channel, rows in indexes}
 
     def digest(self, progress: Callable[[int], None] | None = None) -> str:
         """BLAKE3 of all bytes, which are read for it; `progress` gets the number read so far."""
@@ -450,6 +436,12 @@ class GoneLog(SegmentReader):
 
     def fetch(self, places: Iterable[ChunkPlace]) -> None:
         """Nothing: rows are read in larger pieces."""
+
+    def read_times(self, place: ChunkPlace) -> dict[int, NDArray[np.int64]]:
+        """As of a segment."""
+        batch = self.read_chunk(place).batch
+        channels = distinct(batch.channel).tolist()
+        return {c: np.sort(batch.log_time[batch.channel == c]) for c in channels}
 
     def read_chunk(self, place: ChunkPlace) -> StoredChunk:
         """The rows that are left of a chunk."""

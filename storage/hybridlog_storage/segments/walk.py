@@ -33,7 +33,6 @@ from hybridlog_storage.mcap.mcap_content import (
 from hybridlog_storage.segments.chunk_table import ChunkTable, TableBuilder, check_parts
 from hybridlog_storage.segments.segment_file import OPEN_SUFFIX, sealed_name
 from hybridlog_storage.segments.segment_format import (
-    ARRIVAL_HEAD,
     ARRIVAL_OPCODE,
     DAMAGED_OPCODE,
     INDEX_HEAD,
@@ -53,22 +52,22 @@ from hybridlog_storage.segments.segment_reader import SegmentReader, open_chunk
 if TYPE_CHECKING:
     from hybridlog_storage.messages import Buffer, Channel
 
+MENDED: Final = "it was damaged when the recording was recovered"
+"""Reason of a place that readers skip."""
+_PROVABLE: Final = frozenset({Opcode.CHUNK, Opcode.METADATA})
+_INDEX: Final = bytes([Opcode.MESSAGE_INDEX])
 _WINDOW: Final = 4096  # bytes read at once around the heads of records
 _SEARCHED: Final = 1 << 20  # bytes searched at once for the next record
 _MAX_RECORD: Final = 1 << 28  # bytes of what is read into memory as a whole
 
 
 class WalkedChunk(NamedTuple):
-    """A chunk whose head, arrival numbers and channels are whole.
-
-    `offset` is of the chunk record; `trailer` is the bytes of message indexes and arrival numbers
-    behind it; `indexes` is the bytes of each message index by channel id, none if they are damaged.
-    """
+    """A whole chunk: where it starts, its record before the content, bytes of message indexes."""
 
     offset: int
     head: ChunkHead
-    trailer: int
     indexes: dict[int, int]
+    """By channel id."""
 
 
 class _TornError(SegmentError):
@@ -165,8 +164,7 @@ class Walk:
                 found = self.reader.attachment_at(at, end - at)
                 self.attachments.append(found.index(at, end - at))
             else:
-                why = "it was damaged when the recording was recovered"
-                self._damaged.append(Damage(at, end - at, why))
+                self._damaged.append(Damage(at, end - at, MENDED))
             return end
         why = "it belongs to no chunk"
         if opcode not in {Opcode.MESSAGE_INDEX, ARRIVAL_OPCODE}:
@@ -187,46 +185,50 @@ class Walk:
     # Chunks
 
     def _take_chunk(self, at: int, end: int) -> int:
-        head = self._chunk_head(at, end)
-        trailer = self._trailer(at, end, head.size)
-        if crc32(self._bytes.at(at, head.start, move=True)) != trailer.head_crc:
-            raise SegmentError("the head of a chunk changed: its checksum differs")
-        try:
-            parts, seq = trailer.arrivals()
-        except SegmentError as error:  # its length may be wrong: what follows is looked for
-            raise SegmentError(f"a chunk is damaged: {error}") from error
-        behind = end + trailer.length
-        try:
-            if not len(seq):
-                self._define(at, end)
-                return behind
-            place, span = (at, head.length, trailer.length), (head.first, head.last)
-            check_parts(place, span, parts, len(seq))
-            if self._reads:
-                self._content(at, end)
-        except SegmentError as error:
-            self._damaged.append(Damage(at, behind - at, f"a chunk is damaged: {error}"))
-            return behind
+        """Take a chunk, if it is whole with all that belongs to it."""
+        head, trailer = self._proven_chunk(at, end)
+        parts, seq = trailer.arrivals()
+        if not len(seq):
+            self._define(at, end)
+            return end + trailer.length
+        place, span = (at, head.length, trailer.length), (head.first, head.last)
+        check_parts(place, span, parts, len(seq))
+        if self._reads:
+            self._content(at, end)
         lost = {*parts["channel"].tolist()} - self.channels.keys()
         if lost:
             raise SegmentError(f"the definition of its channel {min(lost)} is lost")
-        found = trailer.indexes or ()
-        indexes = {channel: INDEX_HEAD.size + rows.nbytes for channel, rows in found}
-        if self._reads and not indexes:
-            size = trailer.length - ARRIVAL_HEAD - len(trailer.packed)
-            self._damaged.append(Damage(end, size, "message indexes are damaged"))
-        self.chunks.append(WalkedChunk(at, head, trailer.length, indexes))
+        sizes = {channel: INDEX_HEAD.size + rows.nbytes for channel, rows in trailer.indexes}
+        self.chunks.append(WalkedChunk(at, head, sizes))
         self.table.chunk(place, span, parts)
-        return behind
+        return end + trailer.length
 
-    def _chunk_head(self, at: int, end: int) -> ChunkHead:
-        """A chunk record before its content; `SegmentError` if the file ends in the chunk."""
-        head = chunk_head_of(self._bytes.at(at, MAX_CHUNK_HEAD, move=True))
-        if head is not None and at + head.end == end <= self.reader.size:
-            return head
-        if end > self.reader.size and (head is None or at + head.end == end):
+    def _proven_chunk(self, at: int, end: int) -> tuple[ChunkHead, Trailer]:
+        """A chunk record before its content, and what is behind it; they prove each other."""
+        head, size = chunk_head_of(self._bytes.at(at, MAX_CHUNK_HEAD, move=True)), self.reader.size
+        is_right = head is not None and at + head.end == end
+        if end > size and (head is None or is_right):
             raise _TornError("the file ends in the middle of a chunk")
-        raise SegmentError("the lengths of a chunk contradict each other")
+        if head is None or not is_right:
+            raise SegmentError("the lengths of a chunk contradict each other")
+        behind = end
+        while (raw := self._bytes.at(behind, INDEX_HEAD.size, move=True))[:1] == _INDEX:
+            if len(raw) == INDEX_HEAD.size:
+                _, length, _, entries = INDEX_HEAD.unpack(raw)
+                if entries + 6 != length:
+                    raise SegmentError("the lengths of a message index contradict each other")
+            behind = self._head(behind)[1]
+        if not len(raw) or self._is_room(behind):
+            raise _TornError("the file ends behind a chunk")
+        behind = self._head(behind)[1]
+        if behind > size:
+            raise _TornError("the file ends behind a chunk")
+        if behind - end > _MAX_RECORD:
+            raise SegmentError("its message indexes are too large")
+        trailer = trailer_of(self.reader.read(end, behind - end), at)
+        if crc32(self._bytes.at(at, head.start, move=True)) != trailer.head_crc:
+            raise SegmentError("the head of a chunk changed: its checksum differs")
+        return head, trailer
 
     def _define(self, at: int, end: int) -> None:
         """Take a chunk of definitions."""
@@ -242,25 +244,6 @@ class Walk:
         if end - at > _MAX_RECORD:
             raise SegmentError("a chunk is too large")
         return open_chunk(self.reader.read(at, end - at))[0]
-
-    def _trailer(self, at: int, end: int, content: int) -> Trailer:
-        """The records behind a chunk, also if its message indexes are damaged."""
-        behind, opcode = end, int(Opcode.MESSAGE_INDEX)
-        size = self.reader.size
-        while opcode in {Opcode.MESSAGE_INDEX, DAMAGED_OPCODE} and behind + HEAD <= size:
-            opcode, behind = self._head(behind)
-        is_whole = opcode == ARRIVAL_OPCODE and behind <= size
-        if not is_whole:
-            # Message indexes have at most as many bytes as the messages.
-            behind = min(size, end + content + _WINDOW)
-        try:
-            if behind - end > _MAX_RECORD:
-                raise SegmentError("its message indexes are too large")
-            return trailer_of(self.reader.read(end, behind - end), at)
-        except SegmentError as error:
-            if behind == size and not is_whole:
-                raise _TornError(str(error)) from error
-            raise
 
     # Behind damage
 
@@ -279,14 +262,10 @@ class Walk:
             if opcode == Opcode.METADATA:
                 metadata_of(self.reader.read(at, end - at), at)
                 return True
-            head = self._chunk_head(at, end)
-            trailer = self._trailer(at, end, head.size)
-            return crc32(self._bytes.at(at, head.start, move=True)) == trailer.head_crc
+            self._proven_chunk(at, end)
         except SegmentError:
             return False
-
-
-_PROVABLE: Final = frozenset({Opcode.CHUNK, Opcode.METADATA})
+        return True
 
 
 _WRITING_S: Final = 0.02  # the time that a writer may take for the rest of a record
