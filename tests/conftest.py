@@ -30,7 +30,6 @@ for name in (
     "HYBRIDLOG_STORE",
     "HYBRIDLOG_MONGO_URI",
     "HYBRIDLOG_MONGO_PASSWORD",
-    "HYBRIDLOG_MONGO_PASSWORD_FILE",
 ):
     os.environ.pop(name, None)
 # What the tests agree to is nothing that whoever runs them has agreed to.

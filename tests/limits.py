@@ -67,7 +67,6 @@ PLACES = {
     "mongod_start_s": "hybridlog_storage.mongo.mongod.START_LIMIT_S",
     "segment_chunks": "hybridlog_storage.segments.segment_writer._MAX_CHUNKS",
     "segment_parts": "hybridlog_storage.segments.segment_writer._MAX_PARTS",
-    "sync_stride_bytes": "hybridlog_storage.segments.segment_writer._SYNC_STRIDE",
     "bucket_whole_bytes": "hybridlog_storage.remote.bucket.PART_BYTES",
     "bucket_part_bytes": "hybridlog_storage.remote.bucket._PART",
     "bucket_retry_s": "hybridlog_storage.remote.bucket._RETRY_S",

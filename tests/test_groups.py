@@ -203,20 +203,3 @@ def test_a_name_that_is_taken(place: Path) -> None:
 
 
 # --- what others can and cannot read ---
-
-
-@needs_root
-def test_a_password_file_of_somebody_else(place: Path) -> None:
-    secret = place / "secret"
-    secret.write_text("hunter2")
-    secret.chmod(0o600)
-    script = (
-        "from hybridlog_storage.settings import with_password\n"
-        "try: print(with_password('mongodb://me@h/x'))\n"
-        "except Exception as error: print(error)"
-    )
-    done = User(place).python("-c", script, HYBRIDLOG_MONGO_PASSWORD_FILE=str(secret))
-    assert "Permission denied" in done.out
-    os.chown(secret, 65534, 65534)
-    done = User(place).python("-c", script, HYBRIDLOG_MONGO_PASSWORD_FILE=str(secret))
-    assert done.out == "mongodb://me:hunter2@h/x\n"

@@ -134,7 +134,6 @@ class StoreFiles(Struct):
     def _sweep(self) -> None:
         """Remove what killed processes have left outside of recordings."""
         directory, catalog = self.directory, self.catalog
-        directory.manifests.clear()
         known = {*directory.ids(), *directory.manifests.without()}
         gone = self._gone - known
         tables.clear(directory, gone, known)

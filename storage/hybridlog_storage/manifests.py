@@ -71,9 +71,6 @@ class Manifests(ABC):
         """Ids of recordings that have lost their manifest, sorted; of none by default."""
         return []
 
-    def clear(self) -> None:  # noqa: B027 - a bucket has nothing of that
-        """Remove what is left of beginnings and removals of processes that were killed."""
-
     def read(self, recording: str) -> Manifest:
         """The newest manifest of a recording; `RecordingGoneError` if there is none."""
         return _present(self._seen(recording)[0])
@@ -229,24 +226,19 @@ class DiskManifests(Manifests):
     def without(self) -> list[str]:
         """Names of folders in `recordings` without a manifest, sorted: lost, or copied by hand.
 
-        Those with nothing but locks are left out: a recording begins, or was removed. So are
-        those of copies that have not ended, which have no `manifest.lock` yet.
+        Those with nothing but locks are left out: a recording begins, or was removed, or its
+        beginning was killed. So are those of copies that have not ended, which have no
+        `manifest.lock` yet.
         """
-        return [
-            name
-            for name, found in self._others()
-            if name[0] != "."
-            and not found <= _LOCKS
-            and (MANIFEST_LOCK in found or not is_id(name))
-        ]
-
-    def _others(self) -> Iterator[tuple[str, set[str]]]:
-        """Names of folders in `recordings` that have no manifest, sorted, and what they hold."""
-        found = self._names(self._recordings)  # before the manifests, which come later
-        manifests = {*self._names(self._folder)}
-        for name in sorted(name for name in found if f"{name}{_SUFFIX}" not in manifests):
+        there = self._names(self._recordings)  # before the manifests, which come later
+        manifests, found = {*self._names(self._folder)}, []
+        for name in sorted(one for one in there if f"{one}{_SUFFIX}" not in manifests):
             with suppress(OSError):  # it goes at this moment, or is none
-                yield name, {*files.names(self._recordings / name)}
+                held = {*files.names(self._recordings / name)}
+                is_begun = MANIFEST_LOCK in held or not is_id(name)
+                if name[0] != "." and not held <= _LOCKS and is_begun:
+                    found.append(name)
+        return found
 
     def _names(self, folder: Path) -> list[str]:
         try:
@@ -261,40 +253,15 @@ class DiskManifests(Manifests):
         """The path of the manifest of a recording."""
         return self._folder / f"{recording}{_SUFFIX}"
 
-    def clear(self) -> None:
-        """Remove what is left of beginnings and removals of processes that were killed.
-
-        While a recording begins, nothing is removed.
-        """
-        if not self._bare():
-            return
-        explained = files.explained(self._folder, "clearing")
-        with suppress(HeldError), explained, self._all_locked(wait_s=0):
-            for folder in self._bare():
-                with ExitStack() as held, suppress(FileNotFoundError, HeldError):
-                    if WRITER_LOCK in files.names(folder):  # a copy may begin there
-                        held.enter_context(_locked(folder / WRITER_LOCK, 0))
-                    files.remove_tree(self._folder / f".{folder.name}{_NEW}")
-                    files.remove_tree(folder)
-
-    def _bare(self) -> list[Path]:
-        """Folders without a manifest that hold only locks."""
-        return [self._recordings / n for n, held in self._others() if is_id(n) and held <= _LOCKS]
-
     @contextmanager
     def creating(self) -> Iterator[Callable[[Manifest], None]]:
         """Create manifests; nobody else can create one meanwhile."""
-        with self._all_locked():
-            yield self._create
-
-    @contextmanager
-    def _all_locked(self, wait_s: float | None = None) -> Iterator[None]:
         with files.explained(self._folder, "making"):
             files.make_folders(self._folder)
             files.sync_folder(self._folder.parent)
         _make_file(self._folder / _ALL)
-        with _locked(self._folder / _ALL, wait_s):
-            yield
+        with _locked(self._folder / _ALL):
+            yield self._create
 
     def _create(self, manifest: Manifest) -> None:
         data, path = encode(manifest), self.path(manifest.id)
@@ -419,9 +386,9 @@ def _present(manifest: Manifest) -> Manifest:
 
 
 @contextmanager
-def _locked(path: Path, wait_s: float | None = None) -> Iterator[None]:
+def _locked(path: Path) -> Iterator[None]:
     """Hold a file's lock. If the file was deleted meanwhile, the one of its name is locked."""
-    end = time.monotonic() + (WAIT_S if wait_s is None else wait_s)
+    end = time.monotonic() + WAIT_S
     while True:
         fd = _opened(path, os.O_RDWR)
         try:

@@ -10,7 +10,6 @@ import errno
 import json
 import os
 import re
-import stat
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Final, TypeGuard
@@ -37,13 +36,11 @@ MAX_CACHE_MB: Final = 10_000 << 10
 
 MAX_SETTINGS: Final = 1 << 20
 """Bytes of the file."""
-_PASSWORD_LIMIT = 4096  # bytes of a file with a password
 _HOST = r"(?:\[[^\s@/\[\]]+\]|[^\s@:/?\[\]]+)(?::\d{1,5})?"
 _HOSTS = re.compile(rf"{_HOST}(?:,{_HOST})*")
 LOGIN_CURE: Final = (
-    "Give the password in HYBRIDLOG_MONGO_PASSWORD, or in a file that "
-    "HYBRIDLOG_MONGO_PASSWORD_FILE names: a server that --mongo or HYBRIDLOG_MONGO_URI names "
-    "gets it."
+    "Give the password in HYBRIDLOG_MONGO_PASSWORD: a server that --mongo or HYBRIDLOG_MONGO_URI "
+    "names gets it."
 )
 """The cure for a password that is missing or readable by others."""
 
@@ -179,17 +176,17 @@ def without_password(uri: str) -> str:
 
 
 def with_password(uri: str) -> str:
-    """A connection string with the password from the environment.
+    """A connection string with the password of HYBRIDLOG_MONGO_PASSWORD.
 
-    HYBRIDLOG_MONGO_PASSWORD holds it, or the file named by HYBRIDLOG_MONGO_PASSWORD_FILE. A
-    URI without a user, or with a password of its own, is unchanged.
+    A URI without a user, or with a password of its own, is unchanged.
     """
     try:
         parts = _split(uri)
     except UsageError:
         return uri  # connecting reports the error
     user, _, hosts = parts.netloc.rpartition("@")
-    if not user or ":" in user or (password := _password()) is None:
+    password = os.environ.get("HYBRIDLOG_MONGO_PASSWORD")
+    if not user or ":" in user or not password:
         return uri
     return parts._replace(netloc=f"{user}:{quote(password, safe='')}@{hosts}").geturl()
 
@@ -234,43 +231,6 @@ def _stored_uri(file: str, mongo: str | None) -> str | None:
             f"{clean}. {LOGIN_CURE}"
         )
     return mongo
-
-
-def _password() -> str | None:
-    """The password from the environment."""
-    given = os.environ.get("HYBRIDLOG_MONGO_PASSWORD")
-    if given:
-        return given
-    named = os.environ.get("HYBRIDLOG_MONGO_PASSWORD_FILE")
-    if not named:
-        return None
-    try:
-        # The user chose this path: symlinks are followed.
-        with os.fdopen(
-            os.open(Path(named).expanduser(), os.O_RDONLY | os.O_NONBLOCK), "rb"
-        ) as file:
-            about = os.fstat(file.fileno())
-            content = file.read(_PASSWORD_LIMIT + 1) if stat.S_ISREG(about.st_mode) else b""
-    except (OSError, RuntimeError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else str(error)
-        raise UsageError(
-            f"HYBRIDLOG_MONGO_PASSWORD_FILE names {named}, which cannot be read: {reason}."
-        ) from error
-    if about.st_mode & 0o077:
-        raise UsageError(
-            f"{named}, which HYBRIDLOG_MONGO_PASSWORD_FILE names, can be read or written by "
-            f"others: `chmod 600 {named}`."
-        )
-    try:
-        password = content.decode().removesuffix("\n").removesuffix("\r")
-    except UnicodeDecodeError:
-        password = ""
-    if not password or len(content) > _PASSWORD_LIMIT:
-        raise UsageError(
-            f"{named}, which HYBRIDLOG_MONGO_PASSWORD_FILE names, must be a file that holds one "
-            "line with the password."
-        )
-    return password
 
 
 def _as_toml(value: object) -> str:

@@ -235,21 +235,6 @@ def test_after_a_killed_change_no_second_name_stays(store: Path) -> None:
     assert not [name for name in names(store) if Path(name).name.startswith(".manifest")]
 
 
-def test_what_killed_processes_left_is_removed_unless_a_recording_begins(store: Path) -> None:
-    manifests = DiskManifests(store)
-    bare = store / "recordings" / OTHER.id
-    left = [store / "manifests" / f".{OTHER.id}.new", bare / "manifest.lock", bare / "writer.lock"]
-    bare.mkdir()
-    for path in left:
-        path.write_bytes(b"x")
-    with manifests.creating():
-        manifests.clear()
-    assert all(path.exists() for path in left)
-    manifests.clear()
-    assert not any(path.exists() for path in (*left, bare))
-    assert (store / "recordings" / ONE.id / "000000.mcap").exists()
-
-
 def test_folders_without_a_manifest_are_told_unless_they_hold_nothing(store: Path) -> None:
     manifests = DiskManifests(store)
     lost, copied, bare = (new_id(name) for name in ("lost", "copied", "bare"))

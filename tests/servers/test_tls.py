@@ -108,10 +108,7 @@ def test_everything_works_and_the_password_stays_where_it_is(
     server: Guarded, log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store, uri = tmp_path / "store", server.uri()
-    password = tmp_path / "password"
-    password.touch(0o600)
-    password.write_text(PASSWORD + "\n")
-    env = {"HYBRIDLOG_MONGO_PASSWORD_FILE": str(password), "HYBRIDLOG_MONGO_URI": uri}
+    env = {"HYBRIDLOG_MONGO_PASSWORD": PASSWORD, "HYBRIDLOG_MONGO_URI": uri}
     said = [run("record", log, store=store, **env)]
     where = ("fetch", "-t", "/number", "--where", "n >= 100")
     counted = run(*where, "--count", "--quiet", store=store, **env)
@@ -122,7 +119,7 @@ def test_everything_works_and_the_password_stays_where_it_is(
     verified = run("verify", store=store, **env)
     again = run("index", "rebuild", store=store, **env)
     said += [counted, rows, indexed, verified, again, run("verify", store=store, **env)]
-    monkeypatch.setenv("HYBRIDLOG_MONGO_PASSWORD_FILE", str(password))
+    monkeypatch.setenv("HYBRIDLOG_MONGO_PASSWORD", PASSWORD)
     channel = Channel("/live", "ros1", Schema("a/N", "ros1msg", b"uint32 n\n"), {}, False)
     with hl.open(store, mongo=uri, require_database=True) as opened:
         recording = opened.start("live")

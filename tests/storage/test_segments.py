@@ -371,19 +371,6 @@ def test_a_recovered_segment_is_on_the_disk_before_it_gets_its_name(tmp_path: Pa
         recovered.path.unlink()
 
 
-def test_long_segments_are_synced_as_they_grow(tmp_path: Path, limit: Limit) -> None:
-    """Where writes go through the page cache; so sealing takes no time."""
-    limit(sync_stride_bytes=1000, direct_flag=0)
-    steps = Steps()
-    with through(steps):
-        writer = recorder(tmp_path, setup=SegmentSettings(sync="seal"))
-        for n in range(5):
-            writer.append(batch_of([(0, os.urandom(2000), n, n, n)]), CHANNELS)
-            writer.flush()
-        writer.close()
-    assert steps.log.count(("sync", "000000.mcap.open")) >= 2
-
-
 def test_a_segment_whose_head_found_no_room_can_be_made_again(tmp_path: Path) -> None:
     steps = Steps(fail_from=0, only=frozenset({"write"}))
     with through(steps), pytest.raises(DiskFullError):

@@ -69,11 +69,6 @@ class AppendFile:
             raise OSError(errno.EINVAL, "it is not an ordinary file", str(path))
         return cls(fd, os.lseek(fd, 0, os.SEEK_END))
 
-    @property
-    def direct(self) -> bool:
-        """True if appended bytes are on the disk already, except for the file's length."""
-        return self._stage is not None
-
     def append(self, parts: Sequence[Buffer]) -> None:
         """Append all parts; they are in the file when this returns, and none after an `OSError`."""
         before = self.position
@@ -131,15 +126,11 @@ class AppendFile:
         self._hasher = None
         self._write([memoryview(data)], position)
 
-    def trim(self) -> None:
-        """Set the file's exact length."""
-        if os.fstat(self._fd).st_size != self.position:
-            files.system.truncate(self._fd, self.position)
-
     def finish(self, *, sync: bool) -> None:
         """Set the file's exact length and close it."""
         try:
-            self.trim()
+            if os.fstat(self._fd).st_size != self.position:
+                files.system.truncate(self._fd, self.position)
             if sync:
                 self.sync()
         finally:

@@ -217,11 +217,6 @@ class SegmentFile:
         """Bytes in the file."""
         return self._file.position
 
-    @property
-    def direct(self) -> bool:
-        """True if written bytes are on the disk already, except for the file's length."""
-        return self._file.direct
-
     def define(self, channels: Iterable[tuple[int, int, Channel]]) -> None:
         """Write channels (id, id of the schema, channel) as a chunk, schemas on first use."""
         defined = [*channels]
@@ -365,12 +360,6 @@ class SegmentFile:
                 losses=self.losses,
             )
         return self._sealed
-
-    def trim(self) -> None:
-        """Give a complete file its length: of several, before the first is forced to the disk."""
-        with self._explained("sealing"):
-            if not self._finished:
-                self._file.trim()
 
     def abandon(self) -> None:
         """Close without sealing; the next opening of the store recovers the file."""

@@ -151,19 +151,11 @@ class SegmentGroup:
             for one in self.segments.values()
         )
 
-    def sync(self) -> None:
-        """Force the written bytes to the disk."""
-        for segment in [*self.segments.values()]:
-            segment.sync()
-
     def prepare(self, *, sync: bool) -> list[Sealed]:
         """Complete all segments, the first one last: until then it takes records."""
         segments = [*self.segments.values()]
         for segment in reversed(segments):
             segment.complete()
-        # A file system that forces one of them to the disk then does so for all.
-        for segment in segments:
-            segment.trim()
         return [segment.prepare(sync=sync) for segment in segments]
 
     def abandon(self) -> None:
@@ -179,7 +171,6 @@ _SHARED = -1
 _LATCHED = -2
 _MAX_SPAN = 3600 * 10**9  # ns
 _SMALL_SPANS = 256  # times the usual span, for a chunk that is still small
-_SYNC_STRIDE = 32 << 20  # bytes
 
 
 class SegmentSettings(Struct, frozen=True):
@@ -310,8 +301,6 @@ class RecordingWriter:
         self._group: SegmentGroup | None = None
         self._number = 0
         self._closed: list[Path] = []
-        self._synced = 0
-        self._syncing: Future[None] | None = None
 
     @property
     def is_idle(self) -> bool:
@@ -400,7 +389,6 @@ class RecordingWriter:
         `DiskFullError` if no message is in the files, or there is no room: the next opening of the
         store seals the segment.
         """
-        self._syncing = None
         self._shut_down()
         if not self.written.total():
             raise DiskFullError("No space left for any message. Free some, and record again.")
@@ -557,10 +545,7 @@ class RecordingWriter:
         self._publish(chunk)
         if self.settings.sync == "chunk":
             segment.sync()
-        group = self._open_group()
-        if self.settings.sync == "seal" and not group.first.direct:
-            self._sync_behind(group)
-        if group.is_full(self.settings.segment_size, self.settings.segment_span_s):
+        if self._open_group().is_full(self.settings.segment_size, self.settings.segment_span_s):
             self._seal()
 
     def _append(self, chunk: PackedChunk, key: Key) -> SegmentFile:
@@ -589,20 +574,6 @@ class RecordingWriter:
         if self._on_written is not None:
             self._on_written()
 
-    def _sync_behind(self, group: SegmentGroup) -> None:
-        """Force long groups to the disk as they grow, so that sealing them is fast."""
-        position = group.position
-        if position - self._synced >= _SYNC_STRIDE and self._syncing is None:
-            self._synced = position
-            self._syncing = self._pool.submit(group.sync)
-        elif self._syncing is not None and self._syncing.done():
-            self._finish_sync()
-
-    def _finish_sync(self) -> None:
-        syncing, self._syncing = self._syncing, None
-        if syncing is not None:
-            syncing.result()
-
     def _open_group(self) -> SegmentGroup:
         if self._group is None:
             self._group = SegmentGroup(self._create)
@@ -621,8 +592,6 @@ class RecordingWriter:
 
     def _seal(self) -> None:
         group = self._open_group()
-        self._finish_sync()
-        self._synced = 0
         is_synced = self.settings.sync != "never"
         self._on_sealing(self._with_room(lambda: group.prepare(sync=is_synced)))
         segments = [*group.segments.values()]
