@@ -238,6 +238,13 @@ class TopicTable:
         fields = [schema.field(top).with_type(one.type) for top, one in columns.items()]
         return ours, pa.StructArray.from_arrays([*columns.values()], fields=fields)
 
+    def is_cut(self, array: tuple[str, ...]) -> bool:
+        """True if an array at a path, or one inside it, is only a summary in some row."""
+        inside = {
+            one for file in self.files for one in file.summaries if one[: len(array)] == array
+        }
+        return any(map(self._is_summarised, inside))
+
     def _is_full(self, array: tuple[str, ...]) -> bool:
         """True if an array is there in full in all rows, and its summary, too."""
         return self.has_arrays and all(

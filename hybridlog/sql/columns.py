@@ -36,7 +36,7 @@ from hybridlog.schema.arrow_types import (
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    pass
 
 OWN: Final = pa.schema(
     [
@@ -120,40 +120,6 @@ def field_of(columns: Any, name: str, *, is_summary: bool = False) -> Any:
         if original_name(field) == name and has_summaries(field) == is_summary:
             return pc.struct_field(columns, [place])
     return None
-
-
-def absent(columns: Any, path: Path) -> NDArray[np.bool_]:
-    """bool[n], true for rows of which columns have only the summary of an array at a path."""
-    for name in path[:-1]:
-        columns = field_of(columns, name)
-        if columns is None:
-            return np.zeros(1, np.bool_)
-    array = field_of(columns, path[-1])
-    found = _absent_in(array) if array is not None else np.zeros(1, np.bool_)
-    made = field_of(columns, path[-1], is_summary=True)
-    return found if made is None else found | _replaces(made, array)
-
-
-def _absent_in(columns: Any) -> NDArray[np.bool_]:
-    """The same for all arrays in some values."""
-    found = np.zeros(len(columns), np.bool_)
-    if is_list(columns.type):
-        inner = columns.flatten()
-        if _types.is_struct(inner.type) or is_list(inner.type):
-            rows = pc.list_parent_indices(columns).to_numpy(zero_copy_only=False)
-            found[rows[_absent_in(inner)]] = True
-    elif _types.is_struct(columns.type):
-        for field, column in zip(columns.type, columns.flatten(), strict=True):
-            if has_summaries(field):
-                found |= _replaces(column, field_of(columns, original_name(field)))
-            else:
-                found |= _absent_in(column)
-    return found
-
-
-def _replaces(summaries: Any, array: Any) -> NDArray[np.bool_]:
-    found = pc.and_(summaries.is_valid(), True if array is None else array.is_null())
-    return found.to_numpy(zero_copy_only=False)  # type: ignore[no-any-return]
 
 
 def view_columns(kind: Any) -> list[ViewColumn]:

@@ -12,7 +12,6 @@ from msgspec.structs import replace
 
 from hybridlog.columns.layout import POINTS
 from hybridlog.columns.recordings_file import (
-    RECORDINGS,
     TAGS,
     TIME,
     TIMES,
@@ -222,11 +221,6 @@ def store_table(name: str, content: StoreContent) -> pa.Table:
         return recordings_table(content.summaries)
     rows, schema = _TABLES[name]
     return pa.Table.from_pylist(list(rows(content)), schema=schema)
-
-
-def store_schema(name: str) -> pa.Schema:
-    """The columns of such a table."""
-    return RECORDINGS if name == "recordings" else _TABLES[name][1]
 
 
 def _topics(content: StoreContent) -> Iterator[Mapping[str, Any]]:

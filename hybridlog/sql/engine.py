@@ -7,7 +7,7 @@ import threading
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
-from functools import lru_cache, partial
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import pyarrow as pa
@@ -16,7 +16,7 @@ from msgspec.structs import replace
 from hybridlog.query.answers.completeness import completeness_of
 from hybridlog.query.question import Question
 from hybridlog.schema.states import without_fields
-from hybridlog.sql.content import StoreContent, store_schema, store_table
+from hybridlog.sql.content import StoreContent, store_table
 from hybridlog.sql.duck import MEMORY, Worker, explained, open_duckdb, shortage_of
 from hybridlog.sql.names import EVERYTHING, TABLES, Usage, usage_of
 from hybridlog.sql.rows import Reading
@@ -38,12 +38,6 @@ _TREE: Final = (
     "select json_serialize_sql(?::varchar, skip_null := true, skip_empty := true, "
     "skip_default := true)"
 )
-_MAX_TREES: Final = 64  # syntax trees that are kept
-_SHOW_TABLES: Final = re.compile(r"\s*show\s+tables\s*;?\s*", re.IGNORECASE)
-_NAMES: Final = (
-    "select unnest(?::varchar[]) as name union select table_name from duckdb_tables() "
-    "union select view_name from duckdb_views() where not internal order by name"
-)
 _NO_TABLE: Final = re.compile(r"Catalog Error: Table with name (.+?) does not exist")
 _MAX_TRIES: Final = 10  # tables that may be damaged in one query
 _T = TypeVar("_T")
@@ -56,7 +50,6 @@ class SqlEngine:
         self._source = source
         self._bases: dict[int, Any] = {}
         self._content: StoreContent | None = None
-        self.tree = lru_cache(_MAX_TREES)(self._tree)
         self._lock = threading.RLock()
 
     def connect(
@@ -97,13 +90,6 @@ class SqlEngine:
             if known is None or known.scope != scope or known.snapshot is not session.look():
                 known = self._content = StoreContent(session, scope)
             return known
-
-    def _tree(self, text: str) -> str:
-        """The syntax tree of a query as JSON; `tree` keeps those of the last queries."""
-        with self._lock:
-            base = next(iter(self._bases.values()))
-            ((found,),) = base.cursor().execute(_TREE, [text]).fetchall()
-        return str(found)
 
     def forget(self) -> None:
         """Look at the tables again for the next query: some have changed or were damaged."""
@@ -154,19 +140,6 @@ class SqlConnection:
         """Recordings and views as they are now."""
         return self.engine.content(self.scope)
 
-    def names(self) -> list[str]:
-        """Names of all views and tables of the store."""
-        return list(self.content.names)
-
-    def schema(self, view: str) -> pa.Schema:
-        """Columns of a view or table of the store; none without such a view."""
-        content = self.content
-        topic = content.names.topic(view)
-        if topic is not None:
-            return content.view(topic).schema
-        name = view.casefold()
-        return store_schema(name) if name in TABLES else pa.schema([])
-
     def query(self, text: str, params: Params = None, timeout: float | None = None) -> SqlAnswer:
         """Prepare a query; of several statements, all but the last are run.
 
@@ -186,11 +159,6 @@ class SqlConnection:
             statements = list(self.cursor.extract_statements(text))
         if not statements:
             raise UsageError("The query is empty.")
-        if len(statements) == 1 and _SHOW_TABLES.fullmatch(text) and not params:
-            # DuckDB would need every view, with its columns.
-            return self._prepared(
-                self.cursor.extract_statements(_NAMES)[0], [self.names()], timeout
-            )
         if self._only_reads and any(_kind(statement) != "SELECT" for statement in statements):
             raise UsageError("Only queries are possible here, such as select and show.")
         content = self.content
@@ -232,7 +200,8 @@ class SqlConnection:
         if self._has_own:
             return EVERYTHING
         text = statement.query.strip().rstrip(";")
-        return usage_of(self.engine.tree(text), {name.casefold() for name in self._names})
+        ((tree,),) = self.cursor.cursor().execute(_TREE, [text]).fetchall()
+        return usage_of(tree, {name.casefold() for name in self._names})
 
     def close(self) -> None:
         """Close the connection."""
@@ -416,12 +385,9 @@ class SqlAnswer:
                 self._relation = self._connection.cursor.sql(self._text, params=self._params)
         except UsageError as error:
             found = _NO_TABLE.match(str(error))
-            if 'Referenced table "points" not found' in str(error):
-                cure = "`hybridlog index arrays TOPIC` gives the view of a point cloud this column."
-                raise UsageError(f"{error}\n{cure}") from error
             if found is None:
                 raise
-            hint = meant(found[1], self._connection.names())
+            hint = meant(found[1], [*self._connection.content.names])
             raise TopicError(f"There is no view {found[1]!r}; {hint}") from error
 
     @contextmanager

@@ -1,4 +1,4 @@
-"""Names in SQL: of views, one a topic, and short ones that are unambiguous; completion; usage.
+"""Names in SQL: of views, one a topic, and short ones that are unambiguous; usage.
 
 DuckDB asks for whole columns, also where a query names one field of a struct. Its syntax tree
 tells the paths that are named. Wherever a struct may be used as a whole (`*`, a bare name, a
@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from operator import eq
 from typing import Any, Final
 
@@ -22,21 +22,12 @@ from hybridlog_storage.mongo.index_documents import collection_of
 TABLES: Final = ("recordings", "topics", "losses", "marks")
 """Tables about the store itself; their names are reserved."""
 _WORD: Final = re.compile(r'"((?:[^"]|"")*)"|([^\W\d][\w$]*)')
-PLAIN: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+_PLAIN: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _LISTING: Final = frozenset({
     "database", "duckdb_columns", "duckdb_tables", "duckdb_views", "information_schema",
     "pg_catalog", "pragma_show", "pragma_table_info", "show",
 })  # fmt: skip
 """Words of statements that list views."""
-DELIMITERS: Final = " \t\n,;()[]<>=!+-*/'"
-"""Characters between words."""
-_WORDS: Final = (
-    "as", "asof", "avg", "between", "by", "count", "describe", "distinct", "from", "group",
-    "having", "in", "is", "join", "like", "limit", "max", "min", "not", "null", "on", "or",
-    "order", "select", "show", "sum", "tables", "union", "using", "where", "with",
-)  # fmt: skip
-
-
 Path = tuple[str, ...]
 """Names on the way to a field, folded."""
 
@@ -93,64 +84,13 @@ class ViewNames:
         return [name for name in self if name.casefold() in words]
 
 
-def quoted(name: str) -> str:
-    """A name as SQL takes it, whatever it is."""
-    return '"' + name.replace('"', '""') + '"'
-
-
-def written(name: str) -> str:
-    """A name as people write it in SQL: in quotes only where it needs them."""
-    return name if PLAIN.fullmatch(name) else quoted(name)
-
-
 def _short_names(topic: str) -> Iterator[str]:
     """Whole parts at the end of a name: `scan` and `base__scan` of `/robot/base/scan`."""
     parts = topic.strip("/").split("/")
     for start in range(1, len(parts)):
         name = "__".join(parts[start:])
-        if PLAIN.fullmatch(name):
+        if _PLAIN.fullmatch(name):
             yield name
-
-
-def word_before(text: str) -> str:
-    """The word at the end of a text."""
-    return text[max(text.rfind(mark) for mark in DELIMITERS) + 1 :]
-
-
-def candidates(
-    names: Iterable[str], schema_of: Callable[[str], Any], line: str, text: str
-) -> list[str]:
-    """Views, columns, fields and words that begin with a text, such as `pose.po`, sorted.
-
-    Columns are those of the views in the line, the statement so far.
-    """
-    words = {word.casefold() for word in PLAIN.findall(line)}
-    views = [name for name in names if name.casefold() in words and name != text]
-    columns: dict[str, None] = {}
-    for view in views:
-        schema = schema_of(view)
-        above, _, _ = text.rpartition(".")
-        columns.update(dict.fromkeys(_below(schema, above)))
-        if above:
-            alias, _, rest = above.partition(".")
-            found = _below(schema, rest) if alias not in schema.names else []
-            columns.update(dict.fromkeys(f"{alias}.{path}" for path in found))
-    known = [*columns] if "." in text else [*map(written, names), *columns, *_WORDS]
-    return sorted({name for name in known if name.casefold().startswith(text.casefold())})
-
-
-def _below(schema: Any, path: str) -> list[str]:
-    """Paths of the fields below a path; of the columns below an empty one."""
-    fields = list(schema)
-    for name in path.split(".") if path else ():
-        found = [f for f in fields if f.name.casefold() == name.casefold()]
-        if not found or not hasattr(found[0].type, "get_field_index"):
-            return []
-        fields = list(found[0].type)
-    return [f"{path}.{field.name}" if path else field.name for field in fields]
-
-
-# Parts of columns.
 
 
 class Usage(Struct, frozen=True):

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from functools import reduce
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -27,7 +26,7 @@ from hybridlog.query.rows import offsets_by_chunk, places_of
 from hybridlog.schema.arrow_types import has_empty, is_array
 from hybridlog.schema.left import LeftFields
 from hybridlog.schema.states import GONE, State
-from hybridlog.sql.columns import OWN, ViewColumn, absent, points_column
+from hybridlog.sql.columns import OWN, ViewColumn, points_column
 from hybridlog.sql.names import EVERYTHING, Usage
 from hybridlog_storage.cache import lazy
 from hybridlog_storage.errors import ChangedError, StoreError
@@ -77,12 +76,10 @@ class Rows(NamedTuple):
     Attributes:
         own: Columns of the table itself, by name; with `state` unless all are whole.
         columns: Fields as tables have them, a struct each.
-        lacks: bool[n], true for messages of which an array that is asked for is not there.
     """
 
     own: Mapping[str, Any]
     columns: Any
-    lacks: Mask
 
     def take(self, chosen: Mask) -> Rows:
         """The chosen rows."""
@@ -90,7 +87,7 @@ class Rows(NamedTuple):
             return self
         places = pa.array(np.flatnonzero(chosen))
         own = {name: column.take(places) for name, column in self.own.items()}
-        return Rows(own, self.columns.take(places), self.lacks[chosen])
+        return Rows(own, self.columns.take(places))
 
 
 class Source(NamedTuple):
@@ -193,6 +190,13 @@ class TopicOfRecording:
                             return rows.columns.type.field(POINTS).type
         return None
 
+    def lacks(self, asked: Asked) -> bool:
+        """True if its table has only summaries of an array that is asked for, in some row."""
+        table = self.table
+        assert table is not None
+        lacks_points = asked.has_points and table.points is None
+        return lacks_points or any(table.is_cut(one.source) for one in asked.arrays)
+
     def in_table(self, part: TablePart, asked: Asked) -> Rows:
         """The rows of a row group."""
         table = self.table
@@ -213,7 +217,7 @@ class TopicOfRecording:
         if table.points is not None and points is not None:
             fields = [*columns.type, pa.field(POINTS, points.type)]
             columns = pa.StructArray.from_arrays([*columns.flatten(), points], fields=fields)
-        return Rows(own, columns, asked.lacking(columns, part.rows))
+        return Rows(own, columns)
 
     def _states(self, states: Any, segment: Any) -> Any:
         """States as they are now: payloads may have gone, or come, since the rows were made."""
@@ -258,8 +262,7 @@ class TopicOfRecording:
             piece = piece_of(
                 placed, decoded, channel.state, has_publish_time=has_times, columns=columns_of
             )
-            columns = piece.fields_as(pa.struct([]))
-            yield Rows(piece.own, columns, asked.lacking(columns, len(rows)))
+            yield Rows(piece.own, piece.fields_as(pa.struct([])))
 
 
 class Asked:
@@ -281,13 +284,6 @@ class Asked:
         self.keys = {one.key for one in known}
         self.has_points = any(one.is_points for one in known)
         self.arrays = [one for one in known if is_array(one.kind) and not one.is_summary]
-
-    def lacking(self, columns: Any, rows: int) -> Mask:
-        """bool[n], true for messages of which columns lack what tables may lack."""
-        found = [absent(columns, one.source) for one in self.arrays]
-        if self.has_points and POINTS not in columns.type.names:
-            found.append(np.ones(1, np.bool_))
-        return reduce(np.logical_or, found, np.zeros(rows, np.bool_))
 
 
 class Reading(Struct):
@@ -320,14 +316,13 @@ class Reading(Struct):
             if channel.codec.reason is not None:
                 self.undefined[recording.topic] = channel.codec.reason
 
-    def remark(self, topic: str, rows: Rows) -> None:
-        """Count rows without fields, or without arrays that are asked for."""
-        if "state" in rows.own:
-            states = rows.own["state"]
-            lacks = pc.or_(pa.array(rows.lacks), pc.equal(states, State.UNREADABLE.value))
-            for found in pc.value_counts(states.filter(lacks)).to_pylist():
-                if found["values"] != State.WHOLE:
-                    self.absent[topic, State(found["values"])] += found["counts"]
+    def remark(self, topic: str, rows: Rows, *, is_cut: bool) -> None:
+        """Count rows without fields, or, if any `is_cut`, without payload for their arrays."""
+        states = rows.own.get("state")
+        for found in () if states is None else pc.value_counts(states).to_pylist():
+            state = State(found["values"])
+            if state is State.UNREADABLE or (is_cut and state is not State.WHOLE):
+                self.absent[topic, state] += found["counts"]
 
 
 class Plan:
@@ -363,20 +358,22 @@ class Plan:
         self, recording: TopicOfRecording, source: Source, window: Span | None
     ) -> Iterator[pa.RecordBatch]:
         """The rows of a source in a range of log time, ns; None for all times."""
+        asked, reading = self._asked, self._reading
         if source.chunk is not None:
-            for rows in recording.in_chunk(source.chunk, self._asked):
-                self._reading.remark(recording.topic, rows)
+            is_cut = bool(asked.arrays) or asked.has_points
+            for rows in recording.in_chunk(source.chunk, asked):
+                reading.remark(recording.topic, rows, is_cut=is_cut)
                 yield from self._finished(recording, rows, self._holds(recording, rows, window))
         elif source.part is not None:
-            self._reading.groups.add((source.part.file.path, source.part.group))
-            rows = recording.in_table(source.part, self._asked)
-            self._reading.remark(recording.topic, rows)
+            reading.groups.add((source.part.file.path, source.part.group))
+            rows, is_cut = recording.in_table(source.part, asked), recording.lacks(asked)
+            reading.remark(recording.topic, rows, is_cut=is_cut)
             holds = self._holds(recording, rows, window)
-            # Of payloads, as few as possible are decoded.
-            left = rows.lacks
-            if "state" in rows.own:
+            # Payloads are decoded only of rows for which all else holds.
+            left = np.full(len(rows.columns), is_cut)
+            if is_cut and "state" in rows.own:
                 states = pc.equal(rows.own["state"], State.WHOLE.value)
-                left = left & states.to_numpy(zero_copy_only=False)
+                left = states.to_numpy(zero_copy_only=False)
             yield from self._finished(recording, rows, holds & ~left)
             left = left if self._tests_arrays else left & holds
             if left.any():
@@ -389,14 +386,14 @@ class Plan:
         for (_, *chunk), offsets in offsets_by_chunk(recording.entry.id, places).items():
             one = recording.chunks[chunk[0], chunk[1]]
             for rows in recording.in_chunk(one, self._asked, offsets):
-                holds = np.ones(len(rows.lacks), np.bool_)
+                holds = np.ones(len(rows.columns), np.bool_)
                 if self._tests_arrays:
                     holds = self._holds(recording, rows, window)
                 yield from self._finished(recording, rows, holds)
 
     def _holds(self, recording: TopicOfRecording, rows: Rows, window: Span | None) -> Mask:
         """Mask of the rows in a range of log time for which the filter holds."""
-        holds = np.ones(len(rows.lacks), np.bool_)
+        holds = np.ones(len(rows.columns), np.bool_)
         if window is not None:
             t = rows.own["t"].to_numpy()
             holds = (t >= window[0]) & ((t < window[1]) | (window[1] >= END))
@@ -415,7 +412,7 @@ class Plan:
         self, recording: TopicOfRecording, rows: Rows, names: Sequence[str]
     ) -> pa.RecordBatch:
         """Columns of some rows; those of fields that are not used are null."""
-        count, records = len(rows.lacks), records_of(rows.columns)
+        count, records = len(rows.columns), records_of(rows.columns)
         schema = pa.schema([self._schema.field(name) for name in names])
         arrays = []
         for name in names:

@@ -1,4 +1,4 @@
-"""`hybridlog sql`: outputs, standard input, the prompt with history and completion."""
+"""`hybridlog sql`: outputs, standard input, the prompt."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ from click.testing import CliRunner, Result
 
 import hybridlog as hl
 from hybridlog.cli.app import app
-from hybridlog.sql.names import candidates as found
 from hybridlog_storage.errors import (
     HybridlogError,
     IncompleteError,
@@ -195,30 +194,6 @@ def test_losses_are_told(root: Path, tmp_path: Path) -> None:
         assert (json.loads(done.stdout)["count_star()"], done.stderr) in {(LARGE, ""), (1000, "")}
 
 
-def test_completion(store: hl.Store) -> None:
-    connection = store.sql_engine.connect()
-
-    def candidates(line: str, text: str | None = None) -> list[str]:
-        word = line.rpartition(" ")[2] if text is None else text
-        return found(connection.names(), connection.schema, line, word)
-
-    assert candidates("select * from sca") == ["scan"]
-    assert candidates("select b") == ["base__scan", "between", "by"]
-    assert "recordings" in candidates("select * from rec")
-    assert candidates("from scan select ang") == ["angle"]
-    assert candidates("from scan select ranges_summary.m") == [
-        "ranges_summary.max",
-        "ranges_summary.mean",
-        "ranges_summary.min",
-    ]
-    assert candidates("from scan s select s.echo.far_summary.m")[0] == "s.echo.far_summary.max"
-    assert candidates("from scan s select s.ang") == ["s.angle"]
-    assert candidates("from recordings select first_") == ["first_t", "first_time"]
-    assert candidates("from scan select nothing.x") == []
-    assert "select" in candidates("SEL")
-    assert all(text.startswith('"') for text in candidates('from "a', '"a'))
-
-
 class Person:
     """Types into a command on a terminal, and reads what it shows."""
 
@@ -257,11 +232,8 @@ class Person:
                 self.process.kill()
 
 
-def test_the_prompt(root: Path, tmp_path: Path) -> None:
-    person = Person("sql", "--store", root, XDG_STATE_HOME=str(tmp_path))
-    person.reads("sql> ")
-    person.types("help\r")
-    person.reads("`quit` ends")
+def test_the_prompt(root: Path) -> None:
+    person = Person("sql", "--store", root)
     person.reads("sql> ")
     person.types("create table few as select * from scan limit 3;\r")
     person.reads("sql> ")
@@ -274,7 +246,7 @@ def test_the_prompt(root: Path, tmp_path: Path) -> None:
     person.reads("syntax error")
     person.reads("LINE 1: selec 1;")
     person.reads("sql> ")
-    person.types("select max(ranges_summary.max) as most from base__s\t;\r")
+    person.types("select max(ranges_summary.max) as most from base__scan;\r")
     person.reads("998")
     person.reads("sql> ")
     person.types(f"{ENDLESS};\r")
@@ -293,6 +265,3 @@ def test_the_prompt(root: Path, tmp_path: Path) -> None:
     person.reads("42")
     person.types("quit\r")
     assert person.leaves() == 0
-    history = (tmp_path / "hybridlog" / "sql_history").read_text()
-    assert "from few;" in history
-    assert "base__scan" in history

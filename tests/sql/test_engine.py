@@ -12,13 +12,12 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import duckdb
 import pyarrow as pa
 import pytest
 
 import hybridlog as hl
 from hybridlog.query.choice import Choice
-from hybridlog.sql import duck, engine
+from hybridlog.sql import duck
 from hybridlog.sql.engine import SqlConnection
 from hybridlog_storage.errors import (
     HybridlogError,
@@ -256,15 +255,6 @@ def test_a_damaged_chunk_is_an_error(own: hl.Store) -> None:
     assert own.sql("select max(angle) from scan").rows() == [((SCANS - 1) / 2,)]
     with pytest.raises(SegmentError, match="damaged"):
         own.sql("select max(ranges[1]) from scan").rows()
-
-
-def test_a_query_is_parsed_once(own: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    query = "select count(*) from scan where angle < 3"
-    found = own.sql(query).rows()
-    monkeypatch.setattr(engine, "_TREE", "select 1 / 'no number'")
-    assert own.sql(query).rows() == found
-    with pytest.raises(duckdb.Error):
-        own.sql(f"{query} and angle > 1")
 
 
 def test_fields_that_no_definition_fixes(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Matches of predicates over time, SQL, and completion."""
+"""Matches of predicates over time, SQL, and completion of predicates."""
 
 from __future__ import annotations
 
@@ -86,11 +86,9 @@ def _matches(context: Context, question: PageQuestion) -> Matches:
 
 
 def completion(context: Context, params: RequestParams) -> dict[str, Any]:
-    """Candidates for completing a predicate or SQL at a place."""
+    """Candidates for completing a predicate at a place."""
     text = params.text("text", "", longest=MAX_TEXT)
     place = min(params.integer("place", 0, MAX_TEXT), len(text))
-    if params.word("language", ("predicate", "sql"), "predicate") == "sql":
-        return sql_completion(context.store, text, place)
     recording = context.recording(params)
     own = params.text("topic")
     topics = {channel.topic for channel in recording.channels}
@@ -104,17 +102,6 @@ def completion(context: Context, params: RequestParams) -> dict[str, Any]:
 
     begin, candidates = complete(text[:place], topics - {own}, fields, most=_MAX_CANDIDATES)
     return {"begin": begin, "candidates": candidates}
-
-
-def sql_completion(store: Store, text: str, place: int) -> dict[str, Any]:
-    """Candidates for completing SQL: names of views, tables and columns."""
-    from hybridlog.sql.names import candidates, word_before
-
-    word = word_before(text[:place])
-    with closing(store.sql_engine.connect(SQL_MEMORY, only_reads=True)) as connection:
-        found = candidates(connection.names(), connection.schema, text, word)
-    offered = [[name, "word", ""] for name in found[:_MAX_CANDIDATES]]
-    return {"begin": place - len(word), "candidates": offered}
 
 
 def sql(context: Context, params: RequestParams) -> dict[str, Any]:

@@ -39,11 +39,9 @@ export function mountAsk(main, recording) {
     size: 10,
     maxlength: 64,
   });
-  const candidates = completed(text, () => ({
-    recording: recording.info.id,
-    topic: topic.value,
-    language: kind.value,
-  }));
+  const candidates = completed(text, () =>
+    kind.value === "sql" ? null : { recording: recording.info.id, topic: topic.value },
+  );
   const history = questionHistory();
   const list = matchList(recording);
   const files = exportForm(recording);

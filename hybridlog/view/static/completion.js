@@ -10,7 +10,7 @@ const MOST = 100;
  * Offers what may be written. Tab takes the first candidate, and again the next one.
  *
  * @param {HTMLInputElement} input
- * @param {function(): Object} context what the server has to know: recording, topic, language
+ * @param {function(): Object} context what the server has to know: recording, topic; null for no candidates
  * @returns {{list: HTMLElement, close: function(): boolean}} the list, to be put beside the input;
  *     `close` says whether it was open
  */
@@ -48,8 +48,8 @@ export function completed(input, context) {
     const place = input.selectionStart;
     let answer = null;
     try {
-      const asked = { ...context(), text: input.value, place };
-      answer = await asking.ask("complete", asked);
+      const about = context();
+      answer = about && (await asking.ask("complete", { ...about, text: input.value, place }));
     } catch (error) {
       if (isAborted(error)) return;
       if (!(error instanceof ApiError)) throw error; // what is wrong is said when it is asked
