@@ -187,39 +187,3 @@ def _open(session: Session, recording: str, number: int, index: AttachmentIndex)
 def _read(session: Session, recording: str, number: int, index: MetadataIndex) -> StoredMetadata:
     record = session.segment(recording, number).metadata(index)
     return StoredMetadata(record.name, dict(record.metadata))
-
-
-def file_names(attachments: list[StoredAttachment]) -> list[str]:
-    """A file name for each attachment, made from its name.
-
-    They are valid on all systems, hide no file, leave no directory, and differ also where case
-    does not count.
-    """
-    taken: set[str] = set()
-    next_number: dict[str, int] = {}
-    found: list[str] = []
-    for attachment in attachments:
-        name = plain = _file_name(attachment.name)
-        stem, suffix = Path(plain).stem, Path(plain).suffix
-        number = next_number.get(plain.casefold(), 2)
-        while name.casefold() in taken:
-            name = f"{stem}-{number}{suffix}"
-            number += 1
-        next_number[plain.casefold()] = number
-        taken.add(name.casefold())
-        found.append(name)
-    return found
-
-
-_LONGEST = 200  # bytes of a file name
-_FORBIDDEN = frozenset('/\\:*?"<>|')
-
-
-def _file_name(name: str) -> str:
-    plain = "".join("_" if c in _FORBIDDEN or not c.isprintable() else c for c in name)
-    plain = plain.strip(" ").lstrip(".").rstrip(".") or "attachment"
-    if len(plain.encode()) <= _LONGEST:
-        return plain
-    suffix = Path(plain).suffix[:20]
-    room = _LONGEST - len(suffix.encode())
-    return plain.encode()[:room].decode(errors="ignore") + suffix

@@ -467,7 +467,6 @@ class Store:
         topics: Sequence[str] = (),
         between: tuple[TimeLike | None, TimeLike | None] | None = None,
         tolerance: float = 0.0,
-        contract: Contract | None = None,
     ) -> list[Difference]:
         """Compare two recordings, or two choices of recordings, by topic.
 
@@ -480,7 +479,6 @@ class Store:
             topics: Only these; empty for all.
             between: Only messages of this range of each; None for the time that both have.
             tolerance: Numbers are equal that differ by at most this share of the greater one.
-            contract: Also compare which of its rules are broken; None for no contract.
 
         Raises:
             TopicError: No such recording.
@@ -489,14 +487,7 @@ class Store:
 
         now = self.snapshot()
         sides = (now.recordings(one).check() for one in (a, b))
-        return diff(
-            now.session,
-            *sides,
-            topics=topics,
-            between=between,
-            tolerance=tolerance,
-            contract=contract,
-        )
+        return diff(*sides, topics=topics, between=between, tolerance=tolerance)
 
     def align(
         self,

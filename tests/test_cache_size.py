@@ -10,8 +10,7 @@ import hybridlog as hl
 from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.errors import StoreError, UsageError
 from hybridlog_storage.settings import read_settings
-from tests.cli.running import run
-from tests.many_topics import mongod_of, write_log
+from tests.many_topics import mongod_of
 from tests.waiting import wait_for
 
 pytestmark = pytest.mark.mongo("embedded")
@@ -82,14 +81,3 @@ def test_a_wrong_size_in_the_environment_or_the_settings(
         settings.write_text(f"format = 4\nstore_id = 'x'\ncache_mb = {value}\n")
         with pytest.raises(StoreError, match=r"hybridlog.toml is malformed: .*cache_mb"):
             hl.open(tmp_path)
-
-
-def test_as_a_command(tmp_path: Path) -> None:
-    log, place = write_log(tmp_path / "log.mcap", 2), tmp_path / "store"
-    done = run("record", log, "--cache-size", 100, store=place, code=2)
-    assert "from 256" in done.err
-    assert not place.exists()
-    run("record", log, "--cache-size", 400, store=place, HYBRIDLOG_MONGOD_LINGER_S="0")
-    assert read_settings(place).cache_mb == 400
-    run("index", "rebuild", "--cache-size", 300, store=place, HYBRIDLOG_MONGOD_LINGER_S="0")
-    assert read_settings(place).cache_mb == 400

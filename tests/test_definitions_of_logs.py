@@ -154,7 +154,7 @@ def test_one_byte_too_many(tmp_path: Path) -> None:
     assert told.count("bytes left over") == 1
     assert f"{topic}: 5 messages with bytes left over behind" in told
     again = run("record", path, "--again", "--json", store=folder)
-    assert again.json[0]["messages_surplus"] == 5
+    assert again.json["messages_surplus"] == 5
     assert "bytes left over" not in run("record", path, "--again", "--quiet", store=folder).err
     assert "5 with bytes left over" in run("info", "rosserial_trailing", store=folder).out
     with hl.open(tmp_path / "store") as store:

@@ -478,7 +478,7 @@ def params_of(command: click.Command) -> list[click.Parameter]:
 
 ASKING = {
     *("-t", "--topic-type", "--between", "--where", "--strict", "-n", "-F", "-o", "-f"),
-    *("--json", "-q", "-v"),
+    *("--json", "-q"),
 }
 """Options that all commands have which ask about topics."""
 CHOICE = (

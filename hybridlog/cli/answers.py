@@ -5,9 +5,8 @@ from __future__ import annotations
 import json
 import os
 import sys
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import chain, groupby, islice
 from operator import itemgetter
@@ -21,9 +20,7 @@ from hybridlog.cli.binder import PATH, option
 from hybridlog.cli.options import AsJson, Forced, Topics
 from hybridlog.cli.output import Bar
 from hybridlog.cli.render import ROWS_AT_ONCE, Column, print_table
-from hybridlog.cli.signals import if_stopped
 from hybridlog.formats import OUTPUTS, formats_of, is_directory, suffixes_of
-from hybridlog_storage.disk.unfinished import is_published
 from hybridlog_storage.errors import PayloadError, UsageError
 from hybridlog_storage.stopping import anywhere
 
@@ -190,15 +187,11 @@ def _column(values: list[Any]) -> pa.Array:
 
 @contextmanager
 def answering(given: Topics) -> Iterator[Query]:
-    """The query of an open store; its cost and remarks are printed at the end.
-
-    Its counters say by then how many messages or rows the answer has.
-    """
-    started = time.monotonic()
+    """The query of an open store; remarks on its answer are printed at the end."""
     with given.opened(snapshot=True) as store:
         query = given.query(store)
         yield query
-        print_end(query.counters, started, verbose=given.verbose, count=True)
+        sys.stdout.flush()
         output.remarks(query.completeness().sentences)
 
 
@@ -246,23 +239,19 @@ def _write(
     size: int = 0,
 ) -> int:
     """Write an answer, all of it or nothing, with progress; gives the number of rows or lines."""
-    rows = done = 0
-    path = target if isinstance(target, Path) else None
+    rows = 0
 
     def told(pieces: Iterable[_T]) -> Iterator[_T]:
-        nonlocal rows, done
+        nonlocal rows
         for piece in pieces:
             yield piece
             rows += len(piece) if OUTPUTS[form].content in {"lines", "table"} else 0  # type: ignore[arg-type]
-            if counters is None:
-                done += getattr(piece, "nbytes", 0)
-                bar(done, output.counted(rows, "row"))
-            else:
+            if counters is not None:
                 bar(counters.payload_bytes, output.counted(counters.messages, "message"))
 
     for name in ("lines", "tables", "batches", "points", "messages"):
         setattr(answer, name, _checked(told(getattr(answer, name)), completeness))
-    with writing(path), Bar(form, size, quiet=path is None) as bar:
+    with Bar(form, size, quiet=not isinstance(target, Path)) as bar:
         OUTPUTS[form].write(answer, target, **settings or {})
     output.notes(answer.notes)
     return rows
@@ -427,7 +416,7 @@ def _print_rows(tables: Iterable[pa.Table], limit: int | None, noun: str) -> int
     for columns, alike in groupby(rows(), itemgetter(0)):
         print_table(
             [
-                Column(name, n, "whole", cut=MAX_CELL if is_cut else 0)
+                Column(name, n, cut=MAX_CELL if is_cut else 0)
                 for n, (name, is_cut) in enumerate(columns)
             ],
             map(itemgetter(1), alike),
@@ -439,25 +428,6 @@ def _print_rows(tables: Iterable[pa.Table], limit: int | None, noun: str) -> int
             f"The first {most} {noun}s. --limit shows more, --format jsonl or -o FILE gives all."
         )
     return min(read, most)
-
-
-def print_end(counters: Counters, started: float, *, verbose: bool, count: bool = False) -> None:
-    """Print what an answer cost, with `--verbose`; without, the messages in front."""
-    sys.stdout.flush()
-    front = latched(counters)
-    if not verbose:
-        if front and not count:
-            output.remarks([front.removeprefix(" and ")])
-        return
-    used = [
-        (not count, f"{output.counted(counters.messages - counters.reduced, 'message')}{front}"),
-        (counters.payload_bytes, f"{output.size(counters.payload_bytes)} of payload"),
-        (counters.bytes_read, f"{output.size(counters.bytes_read)} read from disk"),
-        (counters.chunks_read, output.counted(counters.chunks_read, "chunk")),
-        (counters.documents_read, output.counted(counters.documents_read, "index document")),
-        (True, f"{time.monotonic() - started:.3f} s"),
-    ]
-    output.remarks([", ".join(text for applies, text in used if applies)])
 
 
 def latched(counters: Counters) -> str:
@@ -475,7 +445,7 @@ def write_bytes(target: Target, content: bytes) -> None:
     """Write a file, all of it or nothing, or into a stream."""
     from hybridlog.formats.writing import Sink
 
-    with writing(target if isinstance(target, Path) else None), Sink(target) as sink:
+    with Sink(target) as sink:
         sink.write(content)
 
 
@@ -491,10 +461,3 @@ def check_room(path: Path, *, force: bool, is_directory: bool = False) -> None:
         raise UsageError(f"{path} is not empty: remove it, or name a new directory.")
     if not (is_directory or force):
         raise UsageError(f"{path} exists; --force overwrites it.")
-
-
-def writing(path: Path | None) -> AbstractContextManager[None]:
-    """A block that writes a file (None: a stream); stopped, it says if the file is not written."""
-    if path is None:
-        return nullcontext()
-    return if_stopped(lambda: "" if is_published(path) else f"{path} is not written.")

@@ -6,21 +6,18 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
-from itertools import chain, islice
 from pathlib import Path
-from shlex import quote
 from typing import TYPE_CHECKING, Any, Final
 
 import click
 
 from hybridlog import __version__
-from hybridlog.cli.output import Bar, counted, note, notes
+from hybridlog.cli.output import Bar, counted, notes
 from hybridlog.wording import listed
 from hybridlog_storage.errors import (
     NO_SPACE,
     DiskFullError,
     HybridlogError,
-    StoreError,
     WithoutMongoError,
 )
 
@@ -116,10 +113,7 @@ def app() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
-_MAX_LISTED = 3  # names of recordings or stores
-_MAX_FOLDERS = 1000
-_READING: Final = ("Look", "Ask", "Export")
-"""Groups of commands that take the only store that is near; others name it."""
+_MAX_LISTED = 3  # names of recordings
 
 
 @contextmanager
@@ -144,18 +138,8 @@ def opened_store(
     import_numpy_late()
     from hybridlog.store import open_store
 
-    near = [] if path or how.get("create") else _stores_near()
-    if len(near) == 1 and _reads():
-        path = near[0]
-        note(f"Store: {path}, the only one below this folder.")
-    try:
-        with Bar("indexing", quiet=quiet) as bar:
-            store = open_store(path, mongo=mongo, progress=bar.part, **how)
-    except StoreError as error:
-        if near and path is None:
-            named = " or ".join(f"--store {quote(str(one))}" for one in near[:_MAX_LISTED])
-            error.add_note(f"Below this folder: {named}.")
-        raise
+    with Bar("indexing", quiet=quiet) as bar:
+        store = open_store(path, mongo=mongo, progress=bar.part, **how)
     with store:
         doing = "so the files answer"
         if records:
@@ -167,25 +151,6 @@ def opened_store(
         finally:
             later = _repairs(store, "" if records else doing, verifies=verifies)
             notes(one for one in later if one not in told)
-
-
-def _stores_near() -> list[Path]:
-    """The stores up to two levels below this folder; none if one is named."""
-    from hybridlog.store import store_path
-    from hybridlog_storage.settings import NAME
-
-    if os.environ.get("HYBRIDLOG_STORE") or store_path().exists():
-        return []
-    folders = chain.from_iterable(
-        islice(Path().glob(depth), _MAX_FOLDERS) for depth in ("*", "*/*")
-    )
-    return sorted(folder for folder in folders if (folder / NAME).is_file())
-
-
-def _reads() -> bool:
-    """True in a command that only reads the store."""
-    context = click.get_current_context(silent=True)
-    return context is not None and any(context.info_name in GROUPS[one] for one in _READING)
 
 
 def _repairs(store: Store, doing: str, *, verifies: bool) -> list[str]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field, fields
 from functools import wraps
 from itertools import chain
@@ -77,7 +78,7 @@ _SECTIONS: Final[dict[str, tuple[str, ...]]] = {
         "recording", "tag", "has", "types", "during", "last", "older_than", "conditions",
     ),
     "Common options": (
-        "force", "strict", "as_json", "quiet", "verbose", "store", "mongo", "_click_default_help",
+        "force", "strict", "as_json", "quiet", "store", "mongo", "_click_default_help",
     ),
 }  # fmt: skip
 """Sections of help behind the options of a command alone, and what is in them everywhere."""
@@ -108,9 +109,30 @@ class Command(click.Command):
 
 
 def _completed(context: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
-    from hybridlog.cli.completion import complete
+    """Recordings or topics, as help names the value, that begin so; none where that fails."""
+    kind = str(param.metavar).strip("[].")
+    if kind not in {"RECORDING", "A", "B", "TOPIC"}:
+        return []
+    from hybridlog_storage.cache import import_numpy_late
 
-    return complete(context, param, incomplete)
+    import_numpy_late()
+    from hybridlog.opened import OpenStore
+    from hybridlog.store import store_path
+    from hybridlog_storage.remote import directory_of
+
+    try:
+        value: Path | None = context.params.get("store")
+        # The shell has not expanded the tilde of the line that is being completed.
+        path = store_path(None if value is None else Path(value).expanduser())
+        with closing(OpenStore(directory_of(path), "none", None)) as shared:
+            snapshot = shared.now().look()
+            names = [one.name for one in snapshot.summaries]
+            if kind == "TOPIC":
+                kinds = {one.topics: one for one in snapshot.summaries}.values()
+                names = sorted({topic for one in kinds for topic in snapshot.topics_of(one)})
+    except (HybridlogError, OSError):
+        return []
+    return [name for name in names if name.startswith(incomplete)]
 
 
 def option(
@@ -204,10 +226,6 @@ def check(kind: type, context: click.Context) -> None:
         name, _, value = name.partition("=")
         return context.params[name] == value if value else name in given
 
-    for name, pair in parameters.items():
-        for value in (context.params[name] or ()) if pair.nargs == 2 else ():
-            if value[:1] == "-" and not value[1:2].isdigit():
-                raise UsageError(f"{pair.opts[0]} takes two values: {pair.opts[0]} {pair.metavar}.")
     for one in (each for each in fields(kind) if each.name in given):
         name = spelled(one.name)
         needs = [n for n in one.metadata.get(_NEEDS, ()) if n.partition("=")[0] in parameters]

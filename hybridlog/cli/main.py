@@ -38,7 +38,7 @@ def main() -> NoReturn:
         code = _run()
     except signals.Stopped as stopped:
         signals.undo_unfinished()
-        code = _complain(f"interrupted. {stopped.consequence}".rstrip(), stopped.exit_code)
+        code = _complain(signals.INTERRUPTED, stopped.exit_code)
     _leave(_flushed(code))
 
 

@@ -12,15 +12,12 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import click
 
 from hybridlog.cli import output
-from hybridlog.cli.binder import Amount, argument, option
+from hybridlog.cli.binder import argument, option
 from hybridlog.cli.render import Column, print_table
-from hybridlog.formats import formats_of
 from hybridlog.query.choice import Choice
-from hybridlog.wording import parse_size
-from hybridlog_storage.errors import TopicError, UsageError
+from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
-    from hybridlog.formats.slices import Front
     from hybridlog.query.query import Query
     from hybridlog.query.times import TimeLike
     from hybridlog.recordings import Recordings
@@ -193,7 +190,6 @@ class Topics(Ranged):
     needs_topic: ClassVar[bool] = False
     where: ClassVar[tuple[str, ...]] = ()
     strict: ClassVar[bool] = False
-    verbose: ClassVar[bool] = False
     words: tuple[str, ...] = argument("Topics, as for --topic.", "[TOPIC]...")
     topic: tuple[str, ...] = topics()
     topic_type: tuple[str, ...] = option(
@@ -240,13 +236,6 @@ class Filtered(Strict, Topics):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Verbose:
-    """The option of commands that can tell the cost of an answer."""
-
-    verbose: bool = option("Say what the answer has cost.", short="-v")
-
-
-@dataclass(frozen=True, kw_only=True)
 class Served:
     """Options of commands that serve other programs on this computer."""
 
@@ -255,61 +244,26 @@ class Served:
         "for viewers that connect.",
         "N",
         type=click.IntRange(0, 65535),
-        needs=("viewer=websocket",),
     )
 
 
 @dataclass(frozen=True, kw_only=True)
-class Latched:
-    """Options about messages from before a slice."""
+class NoLatched:
+    """The option of commands that have messages from before a range of time in front."""
 
     no_latched: bool = option(
         "With --between: leave out the latched messages and frames of video from before it."
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Latched(NoLatched):
+    """Options about messages from before a slice."""
+
     original_times: bool = option(
         "Latched messages and frames from before the time range keep their log time.",
         excludes=("no_latched",),
     )
-
-    @property
-    def front(self) -> Front:
-        """The choice of these messages."""
-        from hybridlog.formats.slices import Front
-
-        return Front(latched=not self.no_latched, original_times=self.original_times)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Slices(Latched, Forced):
-    """Options of commands that write slices of logs, or tables."""
-
-    split: str | None = option(
-        "A file for each `recording`, each `mark`, or each interval in which a predicate "
-        "holds: 'odom: twist.twist.linear.x > 0.1'. Their names follow that of the output.",
-        "HOW",
-        name="--split-by",
-        needs=("output", "target"),
-        excludes=("at", "follow", "reverse"),
-    )
-    storage: str = option(
-        "For rosbag2: the storage of the bag.",
-        type=click.Choice(["mcap", "sqlite3"]),
-        default="mcap",
-        needs=("form=rosbag2",),
-    )
-    file_size: int = option(
-        "For rosbag2: begin a new file at so many bytes of payload, such as 500MB.",
-        "SIZE",
-        type=Amount(parse_size, "1B"),
-        default="2GiB",
-        needs=("form=rosbag2",),
-    )
-
-    def settings(self, form: str) -> dict[str, Any]:
-        """Arguments of the writer of a format; refuses options that do nothing in it."""
-        if self.original_times and form not in formats_of("log"):
-            raise UsageError(f"--original-times does nothing in {form}: leave it out.")
-        return {"storage": self.storage, "max_file": self.file_size} if form == "rosbag2" else {}
 
 
 def one_recording(
@@ -349,18 +303,6 @@ class InFrame:
         return query.in_frame(self.frame, tf_topics=self.tf_topic)
 
 
-def cache_size() -> Any:
-    """The option of commands that start the embedded MongoDB for long."""
-    return option(
-        "Size of the embedded MongoDB's cache, from 256; without, the one that the store was "
-        "made with, or 256.",
-        "MB",
-        name="--cache-size",
-        envvar="HYBRIDLOG_CACHE_SIZE",
-        show_envvar=True,
-    )
-
-
 def parse_tags(pairs: Iterable[str]) -> dict[str, str]:
     """Tags from KEY=VALUE pairs."""
     tags = {}
@@ -387,13 +329,7 @@ def query_of(store: Store, topics: Sequence[str] | None, choice: Choice) -> Quer
     asked = store if chosen is None else chosen
     if not topics:
         return asked.all_topics()
-    try:
-        return asked.topic(*topics)
-    except TopicError as error:
-        for name in topics:
-            if store.session.snapshot().called(name):
-                error.add_note(f"{name} is a recording: -r {name}.")
-        raise
+    return asked.topic(*topics)
 
 
 def parse_fields(text: str, option: str = "--fields") -> list[str]:

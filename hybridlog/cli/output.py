@@ -94,6 +94,7 @@ def tell(value: object, lines: Iterable[str], *, at_once: bool = False) -> None:
         print_json(value, at_once=at_once)
     elif not is_quiet():
         for line in lines:
+            clear()
             print(folded(line, sys.stdout))  # noqa: T201
 
 
@@ -112,9 +113,14 @@ def _plain(value: object) -> object:
 def note(text: str) -> None:
     """A line for the person, on standard error; who reads it may go, and the work goes on."""
     with suppress(BrokenPipeError), _drawing:
-        for one in _shown:
-            one.erase()
+        clear()
         print(folded(text), file=sys.stderr)  # noqa: T201
+
+
+def clear() -> None:
+    """Remove what is drawn at the end of the terminal, until it is drawn again."""
+    for one in _shown:
+        one.erase()
 
 
 def notes(lines: Iterable[str]) -> None:

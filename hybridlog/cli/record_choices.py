@@ -27,9 +27,7 @@ from hybridlog.cli.options import (
     InStore,
     Latched,
     Quiet,
-    cache_size,
 )
-from hybridlog.cli.render import Column, bytes_of, numbers
 from hybridlog.wording import parse_size
 from hybridlog_storage.errors import UsageError
 
@@ -85,12 +83,6 @@ class RecordChoices(Between, Latched, InStore, AsJson, Quiet):
         default="60s",
         needs=("watch",),
     )
-    chunk_size: int | None = option(
-        "Uncompressed size of a chunk, such as 512KiB; without, 2MiB, less where --budget is "
-        "small.",
-        "SIZE",
-        type=Amount(parse_size, "1KiB"),
-    )
     compression: str = option(
         "Compression of chunks.", type=click.Choice(["zstd", "lz4", "none"]), default="zstd"
     )
@@ -120,9 +112,6 @@ class RecordChoices(Between, Latched, InStore, AsJson, Quiet):
     duration: float | None = _live("Stop after this time, such as 10m.", "TIME", type=SOME_SECONDS)
     max_messages: int | None = _live(
         "Stop after this number of messages.", "N", type=click.IntRange(min=1)
-    )
-    max_size: int | None = _live(
-        "Stop after this size of payloads, such as 10GB.", "SIZE", type=Amount(parse_size, "1B")
     )
     split_size: int = _live(
         "Start a new segment file after this size.",
@@ -187,7 +176,6 @@ class RecordChoices(Between, Latched, InStore, AsJson, Quiet):
         excludes=("ring", "trigger", "contract"),
     )
     set_tag: tuple[str, ...] = option("Store KEY=VALUE with it.", "K=V")
-    cache_size: int | None = cache_size()
 
     @property
     def master(self) -> str | None:
@@ -223,14 +211,14 @@ class RecordChoices(Between, Latched, InStore, AsJson, Quiet):
         from hybridlog_storage.segments.segment_writer import SegmentSettings
 
         return SegmentSettings(
-            chunk_size=self.chunk_size or chunk_size,
+            chunk_size=chunk_size,
             compression=cast(Any, self.compression),
             level=self.level,
         )
 
     def opened_to_record(self) -> AbstractContextManager[Store]:
         """The store, which is made if there is none; see `opened_store`."""
-        return self.opened(create=True, cache_mb=self.cache_size, records=not self.is_live)
+        return self.opened(create=True, records=not self.is_live)
 
 
 def row_of(report: RecordReport, path: object) -> dict[str, Any]:
@@ -269,29 +257,25 @@ def row_of(report: RecordReport, path: object) -> dict[str, Any]:
 
 
 def fields_of(row: Mapping[str, Any]) -> list[tuple[str, object]]:
-    """The lines of one recorded log: name and value, without counts of zero."""
-    cells = [(one, one.cell(row)) for one in COLUMNS]
-    return [(one.name, cell) for one, cell in cells if not (one.varies and cell == "0")]
-
-
-def _share(row: Mapping[str, Any], above: str, below: str, form: str) -> str:
-    return format(row[above] / (row[below] or inf), form)
-
-
-COLUMNS: Final = [
-    Column("recording"),
-    Column("source", lambda row: f"{row['path']} ({row['kind']})", order=1),
-    *numbers("topics", "messages"),
-    Column("left out", "messages_skipped", "right", varies=True),
-    Column("from before", "messages_latched", "right", varies=True),
-    Column("attachments", side="right", varies=True),
-    bytes_of("bytes in", "bytes_in", order=3),
-    bytes_of("stored", "bytes_stored"),
-    Column("ratio", lambda row: _share(row, "bytes_in", "bytes_stored", ".2f"), "right"),
-    Column("indexed", "messages_indexed", "right"),
-    Column("time", lambda row: f"{row['seconds']:.2f} s", "right"),
-    Column("messages/s", lambda row: _share(row, "messages", "seconds", ",.0f"), "right", order=2),
-]
+    """The lines of one recorded log: name and value, without some counts of zero."""
+    some = {
+        "left out": row["messages_skipped"],
+        "from before": row["messages_latched"],
+        "attachments": row["attachments"],
+    }
+    return [
+        ("recording", row["recording"]),
+        ("source", f"{row['path']} ({row['kind']})"),
+        ("topics", row["topics"]),
+        ("messages", row["messages"]),
+        *(pair for pair in some.items() if pair[1]),
+        ("bytes in", output.size(row["bytes_in"])),
+        ("stored", output.size(row["bytes_stored"])),
+        ("ratio", f"{row['bytes_in'] / (row['bytes_stored'] or inf):.2f}"),
+        ("indexed", row["messages_indexed"]),
+        ("time", f"{row['seconds']:.2f} s"),
+        ("messages/s", f"{row['messages'] / (row['seconds'] or inf):,.0f}"),
+    ]
 
 
 def remarks_on(report: RecordReport) -> Iterator[str]:
@@ -302,7 +286,7 @@ def remarks_on(report: RecordReport) -> Iterator[str]:
             yield f"{channel.topic}: not indexed beyond time: {report.not_indexed[channel.id]}"
         if unreadable:
             unfit = output.unfit(unreadable)
-            yield f"{channel.topic}: {unfit}; stored, without fields in the index"
+            yield f"{channel.topic}: {unfit}, or the index; stored, without fields in it"
         if surplus:
             yield (
                 f"{channel.topic}: {output.counted(surplus, 'message')} with bytes left over "

@@ -175,8 +175,6 @@ def _finish(
     output.remarks(f"no topic fits {text}" for text in unfitting)
     for report in reports:
         output.remarks(remarks_on(report))
-    if choices.exclude and not (unfitting or silent or state.topics):
-        output.remarks(["no topic is left: --exclude takes away all that --topic names"])
     errors = [
         f"{one.topic or 'the recording'} breaks {one.rule} {one.wanted}: {one.found}"
         for one in broken
@@ -218,7 +216,6 @@ def recorder_options(choices: RecordChoices) -> RecorderOptions:
         priorities=[priority_rule(*one) for one in choices.priority],
         duration_s=choices.duration,
         max_messages=choices.max_messages,
-        max_bytes=choices.max_size,
         reserve_bytes=choices.reserve,
         budget_bytes=budget_bytes,
         flush_interval_s=choices.flush_interval,

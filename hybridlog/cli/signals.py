@@ -3,7 +3,8 @@
 A command that only reads, or whose work the next change of the store completes or takes back,
 ends at once, without unwinding: unfinished output files are removed, and the process leaves.
 Work in `stopping.at_safe_points` takes itself back: there `Stopped` is raised, at a safe
-point. It is no `KeyboardInterrupt`, because libraries catch that.
+point. It is no `KeyboardInterrupt`, because libraries catch that. A second signal always ends
+the process.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ SIGNALS: Final = tuple(
 )
 """Signals that stop a command, as far as this system has them."""
 
+INTERRUPTED: Final = "interrupted: undone, or finished by a later command."
 _SHOW_CURSOR: Final = "\r\x1b[K\x1b[?25h"
 """Clears the line of a progress bar."""
 
@@ -41,52 +43,29 @@ _AWAY: Final = (BucketError, DatabaseError, ResourceError, StoreError)
 _LONGER: Final = 5
 """Pause after such an error, as a multiple of the usual one."""
 
-_consequences: list[str | Callable[[], str]] = []
-
 
 class Stopped(BaseException):
     """A signal stopped the command."""
 
     def __init__(self, number: int) -> None:
         super().__init__(number)
-        self.number = number
-        self.consequence = _consequence()
-
-    @property
-    def exit_code(self) -> int:
-        """128 plus the signal, as in shells."""
-        return 128 + self.number
-
-
-@contextlib.contextmanager
-def if_stopped(consequence: str | Callable[[], str]) -> Iterator[None]:
-    """Say what it means when the block is stopped."""
-    _consequences.append(consequence)
-    try:
-        yield
-    finally:
-        _consequences.pop()
+        self.exit_code = 128 + number
+        """As in shells."""
 
 
 def install() -> None:
     """Let the signals stop the command. Call it in the main thread of the command's process.
 
-    Where work takes itself back, the second signal is answered with a note; the third ends the
-    process at once. SIGINT counts even if it was ignored, which shells without job control do
-    to background jobs; an ignored SIGHUP (`nohup`) or SIGTERM stays ignored.
+    SIGINT counts even if it was ignored, which shells without job control do to background jobs;
+    an ignored SIGHUP (`nohup`) or SIGTERM stays ignored.
     """
-    received = 0
+    is_stopping = False
 
     def stop(number: int, _frame: FrameType | None) -> None:
-        nonlocal received
-        received += 1
-        if received == 1:
-            if not stopping.postpone(partial(_stop, number)):
-                _leave(number, _consequence())
-        elif received == 2 and stopping.is_delayed():
-            write_note("\nhybridlog: cleaning up; press again to leave at once")
-        else:
-            _leave(number, "The next command that opens the store cleans up.")
+        nonlocal is_stopping
+        is_second, is_stopping = is_stopping, True
+        if is_second or not stopping.postpone(partial(_stop, number)):
+            _leave(number)
 
     for number in SIGNALS:
         if number == signal.SIGINT or signal.getsignal(number) is not signal.SIG_IGN:
@@ -140,28 +119,22 @@ def watch(
     if isinstance(sys.stdout, io.TextIOWrapper):  # a file and a pipe show each line at once
         sys.stdout.reconfigure(line_buffering=True)
     told: set[str] = set()  # problems that last
-    try:
-        with stopping.at_safe_points():
-            output.remarks([f"Watching {place}. Ctrl-C ends it."])
-            while True:
-                met, wait_s = set[str](), pause_s
-                try:
-                    for problem in look():
-                        met.add(str(problem))
-                        if str(problem) not in told:
-                            report(problem)
-                except _AWAY as error:
-                    # Ctrl-C may have ended a program that the other side needs.
-                    stopping.safe_point()
-                    wait_s = _LONGER * pause_s
-                    if str(error) not in told:
-                        report(error)
-                        output.note(f"The next try is in {wait_s:g} s.")
-                    met |= {*told, str(error)}
-                told = met
-                stopping.pause(wait_s)
-    except Stopped as stopped:
-        output.notes(filter(None, [stopped.consequence]))
+    with contextlib.suppress(Stopped), stopping.at_safe_points():
+        output.remarks([f"Watching {place}. Ctrl-C ends it."])
+        while True:
+            met, wait_s = list[HybridlogError](), pause_s
+            try:
+                met.extend(look())
+            except _AWAY as error:
+                # Ctrl-C may have ended a program that the other side needs.
+                stopping.safe_point()
+                met.append(error)
+                wait_s *= _LONGER
+            for problem in met:
+                if str(problem) not in told:
+                    report(problem)
+            told = {*map(str, met)}
+            stopping.pause(wait_s)
 
 
 def undo_unfinished() -> None:
@@ -182,17 +155,10 @@ def _stop(number: int) -> NoReturn:
     raise Stopped(number)
 
 
-def _consequence() -> str:
-    if not _consequences:
-        return ""
-    last = _consequences[-1]
-    return last if isinstance(last, str) else last()
-
-
-def _leave(number: int, consequence: str) -> NoReturn:
+def _leave(number: int) -> NoReturn:
     """End the process in the handler: no other code of the main thread runs any more."""
     undo_unfinished()
     with contextlib.suppress(OSError, ValueError):
         clear = _SHOW_CURSOR if os.isatty(sys.stderr.fileno()) else ""
-        write_note(clear + output.printable(f"hybridlog: interrupted. {consequence}".rstrip()))
+        write_note(f"{clear}hybridlog: {INTERRUPTED}")
     os._exit(128 + number)

@@ -9,18 +9,15 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from msgspec import Struct
 
-from hybridlog.contract.judge import broken, judge
 from hybridlog.query.times import format_duration
 from hybridlog.query.topics import resolve
 from hybridlog.record.marks import MARKS
 from hybridlog.wording import counted
 
 if TYPE_CHECKING:
-    from hybridlog.contract import Contract
     from hybridlog.query.answers.statistics import FieldStatistics, TopicCheck
     from hybridlog.query.times import TimeLike
     from hybridlog.recordings import Recordings
-    from hybridlog.session import Session
 
 Value = float | str | None
 Range = tuple["TimeLike | None", "TimeLike | None"]
@@ -36,7 +33,7 @@ class Difference(Struct, frozen=True):
     Attributes:
         topic: Full name of the topic; empty for the whole recording.
         what: `times`, `topic`, `type`, `messages`, `rate`, `longest_gap`, `jitter`, `late_start`,
-            `early_stop`, `lost`, the path of a field, or a rule of the contract.
+            `early_stop`, `lost`, or the path of a field.
         a: What the first choice has, in words; empty if it has no such thing.
         b: The same for the second one.
         share: How far numbers differ, as a share of the greater one; None for other things.
@@ -90,14 +87,12 @@ class _Side:
 
 
 def diff(
-    session: Session,
     a: Recordings,
     b: Recordings,
     *,
     topics: Sequence[str] = (),
     between: Range | None = None,
     tolerance: float = 0.0,
-    contract: Contract | None = None,
 ) -> list[Difference]:
     """Differences between two choices of recordings: what only one has first, then by topic.
 
@@ -133,13 +128,7 @@ def diff(
                 rest.append(Difference(topic, what, words[0], words[1], _finite(share)))
         counts = first["messages"], second["messages"]
         rest += _of_fields(topic, sides[0].fields[topic], sides[1].fields[topic], tolerance, counts)
-    found += rest
-    if contract is not None:
-        broke = [_broken(session, contract, side) for side in sides]
-        for topic, rule, limit in sorted(broke[0].keys() ^ broke[1].keys()):
-            words = [one.get((topic, rule, limit), "holds") for one in broke]
-            found.append(Difference(topic, f"{rule} {limit}", words[0], words[1]))
-    return found
+    return found + rest
 
 
 class _Shared(NamedTuple):
@@ -211,12 +200,6 @@ def _of_fields(
                 for side in (a, b)
             ]
             yield Difference(topic, field, words[0], words[1], _finite(max(shares)))
-
-
-def _broken(session: Session, contract: Contract, side: _Side) -> dict[tuple[str, str, str], str]:
-    """Values of the recordings where they break rules, by topic, rule and what it wants."""
-    results = [one for summary in side.summaries for one in judge(session, contract, summary)]
-    return {(one.topic, one.rule, one.wanted): one.found for one in broken(results)}
 
 
 def _greatest(values: Iterator[float | None]) -> float | None:

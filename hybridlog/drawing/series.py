@@ -63,26 +63,6 @@ class Series(Struct, frozen=True):
     greatest: Numbers
     exact: bool
 
-    def by_column(self, columns: int) -> NDArray[np.float64]:
-        """Means of the middle between least and greatest, in so many columns; NaN for none.
-
-        There are no more columns than entries, which are in order of time.
-        """
-        columns = max(1, min(columns, len(self.times)))
-        middle = (self.least / 2 + self.greatest / 2).astype(np.float64)
-        is_known = np.isfinite(middle)
-        if not is_known.any():
-            return np.full(columns, np.nan)
-        begin, end = int(self.times[0]), int(self.times[-1]) + 1
-        width = -(-(end - begin) // columns)
-        column = ((self.times - begin) // width)[is_known]
-        counts = np.bincount(column, minlength=columns)
-        with np.errstate(invalid="ignore"):
-            found: NDArray[np.float64] = (
-                np.bincount(column, middle[is_known], minlength=columns) / counts
-            )
-        return found
-
     def alone(self) -> NDArray[np.bool_]:
         """bool[n], True for entries between two gaps: no line goes through them."""
         is_known = np.isfinite(self.least) & np.isfinite(self.greatest)

@@ -83,8 +83,8 @@ class _Video(Whole):
         source = (message.recording, message.topic)
         if self._track is not None and source != self._source:
             raise UsageError(
-                "An MP4 is of one topic in one recording: choose one, or name a file for each "
-                "with --split-by recording."
+                "An MP4 is of one topic in one recording: choose one, or `hybridlog export` a file "
+                "for each with --split-by recording."
             )
         with failures(self._sink.name):
             if is_video_type(message.type):

@@ -79,10 +79,9 @@ _SLOW_WRITE_S = 2.0  # to pack and write a chunk, on a disk that is busy
 class RecorderOptions(LiveOptions, frozen=True):
     """Options of a recorder, and of its recording; the first rule that fits a topic applies.
 
-    It stops after `max_bytes` of payloads, or when less than `reserve_bytes` are free. After
-    `ring_s` messages go that no pin touches. What lies `before_s` (None: as long as the ring) and
-    `after_s` around a trigger or signal is marked and pinned. Unless it `derives`, tables and index
-    are left to a later command.
+    It stops when less than `reserve_bytes` are free. After `ring_s` messages go that no pin
+    touches. What lies `before_s` (None: as long as the ring) and `after_s` around a trigger or
+    signal is marked and pinned. Unless it `derives`, tables and index are left to a later command.
     """
 
     name: str = "live"
@@ -91,7 +90,6 @@ class RecorderOptions(LiveOptions, frozen=True):
     priorities: Sequence[Rule] = ()
     duration_s: float | None = None
     max_messages: int | None = None
-    max_bytes: int | None = None
     reserve_bytes: int = 1 << 30
     ring_s: float | None = None
     triggers: Sequence[Trigger] = ()
@@ -159,7 +157,7 @@ class Recorder:
         self.reason = ""  # for the end; empty while the recorder runs
         self.is_full = False  # another recording goes on
         self._goes_on = all(source.kind != "replay" for source in sources)
-        self._left, self._room = options.max_messages, options.max_bytes
+        self._left = options.max_messages
         self._closed = False
         self._refused: tuple[Cause, str] | None = None
         self._started = time.monotonic()
@@ -343,7 +341,7 @@ class Recorder:
         options, left = self._options, self._options.duration_s
         if left is not None:
             left = max(left - (time.monotonic() - self._started), 1e-3)
-        return replace(options, duration_s=left, max_messages=self._left, max_bytes=self._room)
+        return replace(options, duration_s=left, max_messages=self._left)
 
     @property
     def stopped_for_disk(self) -> bool:
@@ -507,7 +505,7 @@ class Recorder:
         size = len(payload)
         steady = self._steady(received)
         through = recorded.throttle is None or recorded.throttle.lets_through(steady)
-        if through and not self._claim(size):
+        if through and not self._claim():
             return  # messages after the end are not part of the recording
         recorded.tally.add(size, steady)
         if not through:
@@ -627,21 +625,18 @@ class Recorder:
             self._recorded[channel] = recorded
         return recorded
 
-    def _claim(self, size: int) -> bool:
+    def _claim(self) -> bool:
         """Tells whether a message is within the limits, and counts it."""
-        if self._refused is not None or (self._left is None and self._room is None):
+        if self._refused is not None or self._left is None:
             return not self._closed
         with self._lock:
             if self._closed:
                 return False
-            if self._left is not None:
-                self._left -= 1
-            if self._room is not None:
-                self._room -= size
-            self._closed = self._left == 0 or (self._room is not None and self._room <= 0)
+            self._left -= 1
+            self._closed = self._left == 0
             is_last = self._closed
         if is_last:
-            self._end(f"the limit of {'messages' if self._left == 0 else 'bytes'} is reached")
+            self._end("the limit of messages is reached")
         return True
 
     def _store_fields(

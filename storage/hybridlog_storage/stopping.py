@@ -83,11 +83,6 @@ def at_safe_points() -> Iterator[None]:
                 block.action()
 
 
-def is_delayed() -> bool:
-    """True within `at_safe_points`."""
-    return _block is not None
-
-
 class GivenUpError(BaseException):
     """Nobody waits for the answer. It is no `Exception`, so that nothing takes it for damage."""
 

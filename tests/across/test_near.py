@@ -234,12 +234,11 @@ def test_a_slice_of_another_topic(logs: Logs, tmp_path: Path) -> None:
     store = logs.store.directory.path
     path = tmp_path / "slice.mcap"
     asked = ("fetch", "-t", "base", "--where", "/left/pose: on == true and right/pose: x > -100")
-    done = run(*asked, "--within", "4ms", "-o", path, "-v", store=store)
+    run(*asked, "--within", "4ms", "-o", path, store=store)
     query = logs.store.topic("base").where(asked[-1], within="4ms")
     assert [m.payload for m in read_mcap(path)] == [m.raw for m in query]
     cost = sum(one.counters.bytes_read for one in (query, *query.conditions))
     assert 0 < cost < 200_000
-    assert f"{cost / 1000:.1f} kB read from disk" in done.err
     for code, arguments in (
         (0, ("--before", "2ms", "--count")),
         (2, ()),

@@ -35,18 +35,6 @@ def slice_of(scans: list[Seen], start: int) -> list[Seen]:
     return [m for m in scans if start + SECOND <= m.log_time < start + 2 * SECOND]
 
 
-def test_the_closing_line(store: Path, scans: list[Seen], start: int) -> None:
-    wanted = slice_of(scans, start)
-    done = run(*SCAN, "--between", "+1s", "+2s", "-F", "raw", "-v", store=store)
-    assert done.raw == b"".join(m.payload for m in wanted)
-    (line,) = done.err.splitlines()
-    size = sum(len(m.payload) for m in wanted) / 1000
-    assert line.startswith(f"{len(wanted)} messages, {size:.1f} kB of payload, ")
-    assert " read from disk, " in line
-    assert line.endswith(" s")
-    assert run(*SCAN, "--between", "+1s", "+2s", "-F", "raw", store=store).err == ""
-
-
 def test_a_wrong_predicate_is_pointed_at(store: Path) -> None:
     done = run(*SCAN, "--where", "ranges.min << 0.5", store=store, code=2)
     message, text, caret = done.err.splitlines()

@@ -73,12 +73,12 @@ def test_all_logs_below_a_directory_are_recorded_once(top: Path, store: Path) ->
     code, out, err = record(store, top)
     assert code == 0
     assert counts(store) == {"a": 1, "run": 5, "other": 4, "bag": 11}
-    assert {line.split()[0] for line in out.splitlines()[1:]} == {"a", "bag", "other", "run"}
+    assert {line.partition(":")[0] for line in out.splitlines()} == {"a", "bag", "other", "run"}
     assert err.endswith("4 logs recorded, 0 in the store already, 0 not recorded.\n")
     mcap(top / "new" / "late.mcap", 7)
     code, out, err = record(store, top, "--json")
     assert code == 0
-    assert [("known" in one, one.get("messages")) for one in json.loads(out)] == [
+    assert [("known" in one, one.get("messages")) for one in map(json.loads, out.splitlines())] == [
         (True, None), (True, None), (False, 7), (True, None), (True, None),
     ]  # fmt: skip
     assert err.endswith("1 log recorded, 4 in the store already, 0 not recorded.\n")
@@ -100,7 +100,6 @@ def test_one_error_does_not_stop_the_others(top: Path, store: Path) -> None:
     assert code == 3  # of the first error
     assert counts(store) == {"a": 1, "run": 5, "other": 4, "bag": 11, "torn": 3}
     assert err.count("aa.bag: not a log of a known kind") == 1
-    assert f"{inner} is a store and is not searched; `hybridlog copy --from {inner}`" in err
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""`hybridlog open websocket`, in a process of its own."""
+"""`hybridlog open`, in a process of its own."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .running import run, started
 
 def test_it_plays_until_ctrl_c(logs: Path, store: Path, tmp_path: Path) -> None:
     output = tmp_path / "output"
-    command = ("open", "websocket", "/imu/data", "/map", "-r", "robot", "--store", store)
+    command = ("open", "/imu/data", "/map", "-r", "robot", "--store", store)
     with started(*command, "--port", 0, "--speed", 100, output=output) as process:
         wait_for(lambda: "Ctrl-C ends it." in output.read_text())
         lines = output.read_text().splitlines()
@@ -37,10 +37,10 @@ def test_it_plays_until_ctrl_c(logs: Path, store: Path, tmp_path: Path) -> None:
 
 
 def test_wrong_ways(store: Path) -> None:
-    assert "0.01<=x<=100" in run("open", "websocket", "--speed", 0, store=store, code=2).err
-    assert "nothing" in run("open", "websocket", "nothing", store=store, code=2).err
+    assert "0.01<=x<=100" in run("open", "--speed", 0, store=store, code=2).err
+    assert "nothing" in run("open", "nothing", store=store, code=2).err
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        done = run("open", "websocket", "/map", "-r", "robot", "--port", port, store=store, code=2)
+        done = run("open", "/map", "-r", "robot", "--port", port, store=store, code=2)
     assert f"Port {port} is in use" in done.err
     assert done.out == ""

@@ -10,7 +10,7 @@ import pytest
 
 from hybridlog.cli import signals
 from hybridlog_storage.disk.unfinished import beside
-from hybridlog_storage.stopping import at_safe_points, safe_point
+from hybridlog_storage.stopping import at_safe_points
 
 
 def test_a_background_job_is_stopped_by_sigint_and_nohup_still_holds() -> None:
@@ -19,24 +19,6 @@ def test_a_background_job_is_stopped_by_sigint_and_nohup_still_holds() -> None:
     signals.install()
     ignored = [n for n in signals.SIGNALS if signal.getsignal(n) is signal.SIG_IGN]
     assert ignored == [signal.SIGTERM, signal.SIGHUP]
-
-
-def test_the_consequence_is_that_of_the_innermost_work_at_the_time() -> None:
-    signals.install()
-
-    def work() -> None:
-        with signals.if_stopped("outer"), at_safe_points():
-            done = 0
-            with signals.if_stopped("over"):
-                pass
-            with signals.if_stopped(lambda: f"{done} done"):
-                signal.raise_signal(signal.SIGTERM)
-                done = 1
-                safe_point()
-
-    with pytest.raises(signals.Stopped) as stopped:
-        work()
-    assert (stopped.value.consequence, stopped.value.exit_code) == ("1 done", 143)
 
 
 @pytest.mark.parametrize("is_terminal", [True, False])
@@ -54,41 +36,27 @@ def test_a_command_with_nothing_to_take_back_leaves_in_the_handler(
     signals.install()
     place = beside(tmp_path / "x")
     place.path.touch()
-    with pytest.raises(SystemExit) as left, signals.if_stopped("x\x07 is not written."):
+    with pytest.raises(SystemExit) as left:
         signal.raise_signal(signal.SIGINT)
     assert left.value.code == 130
     assert list(tmp_path.iterdir()) == []
     # The bar's line is cleared, and the cursor shown again.
     clear = "\r\x1b[K\x1b[?25h" if is_terminal else ""
-    assert capfd.readouterr().err == f"{clear}hybridlog: interrupted. x\\x07 is not written.\n"
+    assert capfd.readouterr().err == f"{clear}hybridlog: {signals.INTERRUPTED}\n"
 
 
-def test_the_third_signal_leaves_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_second_signal_leaves_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     def leave(code: int) -> NoReturn:
         raise SystemExit(code)
 
-    def press_three_times() -> None:
+    def press_twice() -> None:
         with at_safe_points():
-            for _ in range(3):
+            for _ in range(2):
                 signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr("os._exit", leave)
     signals.install()
     with pytest.raises(signals.Stopped) as stopped:
-        press_three_times()
+        press_twice()
     assert isinstance(stopped.value.__context__, SystemExit)
-
-
-def test_a_second_signal_only_says_that_it_waits(capfd: pytest.CaptureFixture[str]) -> None:
-    signals.install()
-
-    def work() -> None:
-        with at_safe_points():
-            signal.raise_signal(signal.SIGHUP)
-            assert capfd.readouterr().err == ""
-            signal.raise_signal(signal.SIGINT)
-            assert "press again to leave at once" in capfd.readouterr().err
-
-    with pytest.raises(signals.Stopped) as stopped:
-        work()
-    assert stopped.value.number == signal.SIGHUP
+    assert stopped.value.exit_code == 130

@@ -15,7 +15,6 @@ import pytest
 from hybridlog.cli.app import COMMANDS, GROUPS, app
 from hybridlog.cli.binder import PATH
 from hybridlog.cli.main import EXIT_CODES
-from hybridlog_storage.disk.directory import StoreDirectory
 from tests.json_schemas import misfit, schema_of, schemas
 
 from .running import COMMAND, complete, environment, run
@@ -71,9 +70,7 @@ def test_looking_imports_neither_numbers_nor_tables(store: Path) -> None:
     ]
     for line in (
         f"info --store {store} ro",
-        f"fetch --store {store} sc",
-        f"fetch --store {store} scan --fields ra",
-        f"align --store {store} --to odom scan --fields scan:ra",
+        f"fetch --store {store} /base/sc",
     ):
         words = {"COMP_WORDS": f"hybridlog {line}", "COMP_CWORD": str(len(line.split()))}
         asked.append(((), {"_HYBRIDLOG_COMPLETE": "bash_complete", **words}))
@@ -121,30 +118,10 @@ def test_wrong_usage_is_code_2(arguments: tuple[str, ...]) -> None:
 def test_completion(store: Path) -> None:
     assert complete(f"info --store {store} r") == ["robot"]
     assert complete(f"verify --store {store} o") == ["odd"]
-    assert complete(f"fetch --store {store} --topic /base/s") == ["/base/scan"]
-    assert complete(f"fetch --store {store} --topic sca") == ["scan"]
-    # Two cameras have one, so the short name stands for none.
-    assert complete(f"fetch --store {store} --topic image_") == []
-    assert complete(f"fetch --store {store} --recording odd --topic /base") == []
     assert complete(f"fetch --store {store} --recording t") == ["torn"]
+    assert complete(f"fetch --store {store} --topic /base/s") == ["/base/scan"]
     assert complete(f"info --losses --store {store} -t /base/s") == ["/base/scan"]
-    assert complete(f"record --store {store} --throttle /base/s") == ["/base/scan"]
-    assert complete(f"mark x --store {store} -r r") == []  # nothing is recorded now
     assert "--between" in complete("fetch --be")
-    assert complete(f"ls --store {store} --tag p") == ["place"]
-    assert complete(f"ls --store {store} --tag place=") == ["place=lab"]
-    assert complete(f"ls --store {store} --type Laser") == ["LaserScan"]
-    assert complete(f"info --store {store} --with /imu") == ["/imu/data: "]
-    assert complete(f"tf --store {store} -r robot base_l") == ["base_laser_link", "base_link"]
-    assert complete(f"fetch --store {store} -r robot scan --in-frame o") == ["odom"]
-    assert complete(f"align --store {store} --to odom scan --fields sc") == ["scan: "]
-    assert complete(f"align --store {store} --to odom scan --where scan:range_mi") == [
-        "scan:range_min"
-    ]
-    assert complete(f"align --store {store} scan --step 1s --fields range_mi") == ["range_min"]
-    assert "scan_time" in complete(f"fetch --store {store} scan --fields scan")
-    assert "ranges,scan_time" in complete(f"stats --store {store} scan --fields ranges,scan")
-    assert complete(f"fetch --store {store} -t scan --where range_m") == ["range_min", "range_max"]
     assert complete("info --store /nowhere r") == []
 
 
@@ -212,27 +189,6 @@ def test_a_reader_that_ends_early_is_no_error(store: Path) -> None:
         assert process.wait(60) == 0, text
         assert "Traceback" not in text
         assert "BrokenPipe" not in text
-
-
-@pytest.mark.parametrize(
-    ("words", "code", "said"),
-    [
-        ("ls", 0, "Store: demo/robot-logs, the only one below this folder."),
-        ("rm x -y", 5, "Below this folder: --store demo/robot-logs."),
-    ],
-)
-def test_the_only_store_below_the_folder(words: str, code: int, said: str, tmp_path: Path) -> None:
-    """Commands that read take it, others name it."""
-    StoreDirectory.create(tmp_path / "demo" / "robot-logs")
-    done = subprocess.run(
-        [*COMMAND, *words.split()],
-        cwd=tmp_path,
-        env=environment(),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert (done.returncode, said in done.stderr) == (code, True), done.stderr
 
 
 UNNEEDED = {

@@ -121,7 +121,7 @@ def test_tables_keep_within_the_screen(width: int, store: Path) -> None:
 
 
 def test_an_answer_is_a_table_when_it_fits(store: Path) -> None:
-    command = ("fetch", "-t", "scan", "-r", "robot", "--fields", "angle_min,scan_time", "-v")
+    command = ("fetch", "-t", "scan", "-r", "robot", "--fields", "angle_min,scan_time")
     code, shown = on_terminal(*command, "--store", store, width=80)
     assert code == 0
     lines = plain(shown).splitlines()
@@ -129,7 +129,6 @@ def test_an_answer_is_a_table_when_it_fits(store: Path) -> None:
     assert re.match(r"\d{4}-\d\d-\d\dT[\d:.]+Z  ", lines[1])
     assert len([line for line in lines if re.match(r"\d{4}-", line)]) == 20
     assert any("--limit shows more" in line for line in lines)
-    assert any(line.startswith("20 messages, ") for line in lines[-2:])
 
 
 def test_an_answer_is_a_block_a_message_when_it_does_not(store: Path) -> None:
@@ -170,7 +169,7 @@ def test_ctrl_c(logs: Path, fresh: Path) -> None:
         "record", logs / "robot.bag", "--level", "19", "--store", fresh, meanwhile=press
     )
     assert code == 130
-    assert "robot.bag is stored" in plain(shown).replace("\n", " ")
+    assert "interrupted: undone" in plain(shown).replace("\n", " ")
     # The cursor that the bar has hidden is back.
     assert shown.rindex("\x1b[?25h") > shown.rindex("\x1b[?25l")
     assert places.names(fresh) == ["small"]

@@ -167,7 +167,6 @@ def test_follows_a_store(robots: Path, tmp_path: Path) -> None:
         wait_for(lambda: told.read_text().splitlines()[1:] == ["copied noted", "copied driven"])
         process.send_signal(signal.SIGINT)
         assert process.wait(60) == 0
-    assert "What arrived stays there" in told.read_text()
     assert answers(lab, "driven") == answers(store, "driven")
 
 
@@ -187,7 +186,6 @@ def test_a_watch_goes_on_after_a_cut(
     words = ("copy", "driven", server.url(tmp_path / "lab"), "--ssh", server.ssh)
     told = answer(*words, "--watch", "--json", store=robots)
     assert pauses == [10, 2]
-    assert "The next try is in 10 s." in told.err
     assert [line for line in told.lines if '"copied": ["driven"]' in line] == told.lines[-1:]
     assert answers(tmp_path / "lab", "driven") == answers(robots, "driven")
 
@@ -199,5 +197,4 @@ def test_a_signal_ends_a_watch_amid_a_recording(robots: Path, tmp_path: Path) ->
         wait_for(lambda: any(file.stat().st_size for file in lab.rglob("*.part")))
         process.terminate()
         assert process.wait(60) == 0
-    assert "What arrived stays there" in told.read_text()
     assert run("copy", "driven", lab, "--store", robots).lines == ["copied driven"]

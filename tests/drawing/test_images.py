@@ -339,9 +339,8 @@ def index_of(directory: Path) -> list[dict[str, Any]]:
 
 def test_raw_images_become_png(drive: Drive, tmp_path: Path) -> None:
     out = tmp_path / "pictures"
-    done = fetch(drive, "-t", "front", "-F", "png", "-o", out, "-v")
+    done = fetch(drive, "-t", "front", "-F", "png", "-o", out)
     assert "1 message left out; the first: an image has rows of 18 bytes" in done.err
-    assert "4 messages, " in done.err
     assert sorted(p.name for p in out.iterdir()) == ["front", "index.jsonl"]
     names = [f"{BASE + n * MS}.png" for n in (0, 2, 3)]
     assert sorted(p.name for p in (out / "front").iterdir()) == names

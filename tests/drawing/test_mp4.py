@@ -179,8 +179,7 @@ def test_frames_in_another_order_are_encoded(store: hl.Store, form: str, tmp_pat
 @pytest.mark.parametrize("topic", ["/odd", "/compressed", "/mixed"])
 def test_images_are_encoded(store: hl.Store, topic: str, tmp_path: Path) -> None:
     out = tmp_path / "images.mp4"
-    done = answer("fetch", "-t", topic, "-o", out, "-v", store=store.directory.path)
-    assert "6 messages" in done.err
+    answer("fetch", "-t", topic, "-o", out, store=store.directory.path)
     codec, times, pictures = read(out)
     assert codec == "h264"
     assert times == rounded([BASE + time for time in ODD])
@@ -219,7 +218,6 @@ def test_frames_whose_payloads_have_expired(tmp_path: Path) -> None:
     one = ("fetch", "cam", "--at", "+0s", "-o", tmp_path / "a.png")
     told = run(*one, store=tmp_path / "store", code=PayloadError.exit_code).err
     assert "1 message has no payload, which was deleted to make room" in told
-    assert "known video" not in answer("info", "cam", store=tmp_path / "store").out
 
 
 def test_what_is_no_video(store: hl.Store, tmp_path: Path) -> None:

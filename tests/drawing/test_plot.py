@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hybridlog.cli.render import densities, sparkline
 from hybridlog.drawing.figure import MAX_LINES, Line, figure, lines
 from hybridlog.drawing.series import Series
 from hybridlog.query.answers.lost import lost_parts
@@ -54,11 +53,11 @@ def test_lines_are_by_topic_and_recording(drive: Drive) -> None:
 def test_files(drive: Drive, tmp_path: Path, form: str) -> None:
     path = tmp_path / f"speed.{form}"
     ask = ("-t", "drive", "--fields", "linear.z,y", "-o", path)
-    assert "of payload" not in plot(drive, *ask, "--size", "600x200").err
+    assert "of payload" not in plot(drive, *ask).err
     content = path.read_bytes()
     if form == "png":
         with Image.open(path) as picture:
-            assert picture.size == (600, 200)
+            assert picture.size == (1200, 400)
             colours = np.asarray(picture.convert("RGB")).reshape(-1, 3)
         for colour in ((31, 119, 180), (255, 127, 14)):  # blue and orange
             assert (np.abs(colours.astype(int) - colour).max(axis=1) < 20).sum() > 200
@@ -68,7 +67,7 @@ def test_files(drive: Drive, tmp_path: Path, form: str) -> None:
         assert "seconds since 2025-06-03T08:00:00Z, drive" in text
         assert len(content) < 200_000
         again = tmp_path / "again.svg"
-        plot(drive, *ask[:-1], again, "--size", "600x200")
+        plot(drive, *ask[:-1], again)
         assert again.read_bytes() == content
     else:
         assert content.startswith(b"%PDF")
@@ -84,33 +83,10 @@ def test_files(drive: Drive, tmp_path: Path, form: str) -> None:
     assert [p.name for p in tmp_path.iterdir() if p.name.startswith("speed")] == [path.name]
 
 
-def test_standard_output_and_text(drive: Drive) -> None:
-    done = plot(drive, "-t", "drive", "--fields", "linear.z", "-F", "svg", "-o", "-")
-    assert done.out.startswith("<?xml")
-    done = plot(drive, "-t", "drive", "--fields", "ticks,linear", "--between", "+0s", "+3s", "-q")
-    assert done.err == ""
-    head, *rows = done.lines
-    assert head.split() == ["field", "least", "greatest"]
-    assert [row.split()[0] for row in rows] == ["ticks", "linear.x", "linear.z"]
-    z = drive.z[:300]
-    assert rows[2].split()[1:3] == [f"{z.min():.6g}", f"{z.max():.6g}"]
-    drawn = rows[2][len(rows[2]) - 60 :]
-    columns = [z[n * 5 : n * 5 + 5].mean() for n in range(60)]
-    assert drawn == sparkline(np.array(columns))
-    done = plot(drive, "-t", "drive", "--fields", "y", "--where", "y > 1e9")
-    assert done.out == ""
-    assert "No message." in done.err
-    done = plot(drive, "-t", "drive", "-t", "loose", "--fields", "w,y")
-    assert done.lines[0].split() == ["topic", "field", "least", "greatest"]
-
-
 @pytest.mark.parametrize(
     ("arguments", "problem"),
     [
         (("-o", "x.gif"), "end it in .png, .svg, .pdf."),
-        (("-F", "svg"), "--format is for --output"),
-        (("-o", "x.png", "--size", "1x1"), "A size is 1200x400"),
-        (("-o", "x.png", "--size", "99999x100"), "A size is 1200x400"),
     ],
 )
 def test_what_is_refused(
@@ -148,16 +124,6 @@ def test_without_matplotlib(drive: Drive, tmp_path: Path, calls: Calls) -> None:
         figure([], size=(500, 300), form="png")
     plot(drive, *ask, "-o", tmp_path / "y.png", code=MissingDependencyError.exit_code)
     assert [*tmp_path.iterdir()] == []
-    assert plot(drive, *ask).lines
-
-
-def test_sparklines() -> None:
-    assert sparkline(np.array([0, 1, 2, 3, 4, 5, 6, 7.0])) == "▁▂▃▄▅▆▇█"
-    assert sparkline(np.array([NAN, -1.7e308, 1.7e308, np.inf])) == " ▁█ "
-    assert sparkline(np.array([3.0, 3.0])) == "▅▅"
-    assert sparkline(np.array([])) == ""
-    assert densities(np.array([0, 1, 50, 100])) == " ▁▄█"
-    assert densities(np.array([0, 0])) == "  "
 
 
 def test_parts_with_losses(drive: Drive) -> None:

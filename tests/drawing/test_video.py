@@ -185,18 +185,6 @@ def test_pictures_at_any_time(videos: hl.Store, form: str, encoding: str) -> Non
 
 
 @pytest.mark.parametrize("form", ENCODERS)
-def test_info_counts_key_frames(videos: hl.Store, form: str) -> None:
-    encoded(form)
-    found = answer("info", form, "--json", store=videos.directory.path).json[0]["channels"]
-    about = {channel["topic"]: channel["video"] for channel in found}
-    wanted = {"formats": [form], "frames": COUNT, "key_frames": len(KEYS), "unreadable": 0}
-    for encoding in ENCODINGS:
-        assert about[f"/{encoding}"] == wanted
-    text = answer("info", form, store=videos.directory.path).out
-    assert f"{form}, {len(KEYS)} key frames" in text
-
-
-@pytest.mark.parametrize("form", ENCODERS)
 def test_a_slice_begins_with_the_key_frame(videos: hl.Store, form: str, tmp_path: Path) -> None:
     frames, right, begin = encoded(form), decoded(form), BASE + 7 * STEP
     for number, encoding in enumerate(ENCODINGS):
@@ -271,8 +259,6 @@ def test_frames_without_those_that_they_refer_to(videos: hl.Store, tmp_path: Pat
     done = answer(*asked, store=videos.directory.path)
     assert "2 messages left out; the first: a frame of video cannot be decoded" in done.err
     assert len(list((out / "gap").iterdir())) == COUNT - 3
-    before = answer("info", "h264", store=videos.directory.path).out
-    assert "2 frames of no known video" in before or "h264, 0 key frames" in before
 
 
 @pytest.mark.parametrize("form", ENCODERS)
@@ -342,7 +328,5 @@ def test_without_pyav(videos: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(MissingDependencyError, match=r"pip install 'hybridlog\[video\]'"):
         at(videos, "h264", "/ros1", 1)
-    done = answer("info", "h264", store=videos.directory.path)
-    assert "3 key frames" in done.out
     with pytest.raises(MissingDependencyError, match="video"):
         videos.query(["/cdr"], ["h264"]).limit(1).to_numpy()

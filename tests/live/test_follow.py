@@ -256,7 +256,6 @@ def test_the_command_refuses_what_makes_no_sense(path: Path) -> None:
             ["--format", "parquet"],
             ["--format", "table"],
             ["--where", "/a: data == 'x'", "--within", "1s"],
-            ["--original-times"],
         ):
             done = run("fetch", "-t", "a", "--follow", *options, store=path, code=2)
             assert not done.out

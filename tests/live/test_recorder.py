@@ -277,14 +277,14 @@ def test_what_no_follower_derives_is_made_later(store: hl.Store) -> None:
         Running(store, alone)
 
 
-def test_bounds_of_time_and_size(store: hl.Store) -> None:
+def test_bounds_of_time_and_number(store: hl.Store) -> None:
     robot = Running(store, RecorderOptions(reserve_bytes=0, duration_s=0.05))
     robot.speaker.say(text_channel(), text("x"))
     wait_for(lambda: robot.recorder.look() and robot.recorder.wait(0))
     assert robot.recorder.stop()[0].entry.messages == 1
-    robot = Running(store, RecorderOptions(reserve_bytes=0, max_bytes=1000))
+    robot = Running(store, RecorderOptions(reserve_bytes=0, max_messages=4))
     for number in range(100):
-        robot.speaker.say(scan_channel(), scan(number, 288))  # 300 bytes
+        robot.speaker.say(scan_channel(), scan(number, 288))
     assert robot.recorder.wait(0)
     assert robot.recorder.stop()[0].entry.messages == 4
 

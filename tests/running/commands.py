@@ -394,7 +394,7 @@ EXEMPT: dict[str, str] = {
     "copy": "it copies recordings that have ended",
     "view": "it serves until it is stopped; see tests/view",
     "mcp": "it serves until it is stopped; see tests/view/test_tools.py",
-    "open": "it opens a program with a slice, which `fetch -o` makes",
+    "open": "it serves until it is stopped; see tests/cli/test_serve.py",
     "demo": "it makes a recording",
     "tf": "these recordings have no transforms; see tests/tf/test_tree.py",
 }

@@ -45,12 +45,12 @@ JOBS: dict[str, list[Asked]] = {
         ("align", "--to", "/pose", "-t", "/scan", "--in-frame", "map", "-F", "csv"),
     ],
     "split-by": [
-        ("fetch", "-t", "/pose", "--split-by", "mark", "-o", f"{OUT}.csv"),
+        ("export", OUT, "-t", "/pose", "-F", "csv", "--split-by", "mark"),
         ("export", f"{OUT}.mcap", "-t", "/pose", "--split-by", "/pose: pose.position.x > 0.5"),
     ],
     "rosbag2": [
         ("export", OUT, "-F", "rosbag2", "-t", "/pose", "-t", "/scan", "-t", "/tf"),
-        ("fetch", "-t", "/pose", "-F", "rosbag2", "--storage", "sqlite3", "-o", OUT),
+        ("export", OUT, "-t", "/pose", "-F", "rosbag2", "--storage", "sqlite3"),
     ],
     "video": [
         ("fetch", "-t", "/video", "--between", "+350ms", "+900ms", "-o", f"{OUT}.mp4"),

@@ -14,7 +14,6 @@ from hybridlog_storage.stopping import (
     Flag,
     anywhere,
     at_safe_points,
-    is_delayed,
     pause,
     postpone,
     safe_point,
@@ -65,7 +64,6 @@ def test_a_signal_waits_for_a_safe_point() -> None:
         safe_point()
         done.append("too much")
     assert done == ["more"]
-    assert not is_delayed()
     assert not postpone(stop)
 
 

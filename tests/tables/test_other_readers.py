@@ -268,8 +268,6 @@ def test_the_command_prints_statements_to_paste(many: hl.Store) -> None:
             rows += len(found)
         assert rows == many.topic(topic).count()
     lines = shown("small").splitlines()
-    files = [line for line in lines if line.endswith(".parquet")]
-    assert all(Path(file).is_file() for file in files)
     (statement,) = (line for line in lines if line.startswith("select"))
     assert len(duckdb.sql(statement)) == 160
     one = json.loads(shown("/large", "-r", "1", "--json"))["tables"]

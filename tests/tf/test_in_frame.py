@@ -106,7 +106,6 @@ def test_scans_of_a_real_log(demo: Path, store: hl.Store, tmp_path: Path) -> Non
         ("--strict", "--in-frame", "tilt_base", *aligned[1:-2], "-F", "csv"),
         (*fetched[1:], "-F", "ply"),
         (*fetched[1:], "-F", "parquet"),
-        (*fetched[1:], "-F", "csv", "--split-by", "recording"),
     ):
         command = aligned[0] if "--to" in asked else "fetch"
         out = tmp_path / "strict"

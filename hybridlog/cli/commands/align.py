@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import time
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 import click
 
-from hybridlog.cli.answers import Tabular, print_end
+from hybridlog.cli.answers import Tabular
 from hybridlog.cli.binder import command, option
-from hybridlog.cli.options import Filtered, InFrame, Verbose, parse_fields, query_of
+from hybridlog.cli.options import Filtered, InFrame, parse_fields, query_of
 from hybridlog.cli.output import remarks
 from hybridlog.query.choice import Choice
 from hybridlog_storage.errors import TopicError, UsageError
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Given(Verbose, Filtered, InFrame, Tabular):
+class _Given(Filtered, InFrame, Tabular):
     needs_topic: ClassVar[bool] = True
     base: str | None = option(
         "The topic whose messages are the rows.",
@@ -75,7 +75,6 @@ def align_command(given: _Given) -> None:
     """
     if given.base is None and given.step is None:
         raise UsageError("Name the rows: --to TOPIC for its messages, or --step for times.")
-    started = time.monotonic()
     with given.opened(snapshot=True) as store:
         if given.base is None:
             query = given.query(store)
@@ -87,7 +86,7 @@ def align_command(given: _Given) -> None:
         # That there is a transform shows only at the end.
         completeness = rows.completeness if given.strict else None
         given.answer(rows.to_tables(given.limit), rows.schema, completeness)
-        print_end(rows.counters, started, verbose=given.verbose)
+        sys.stdout.flush()
         remarks(rows.remarks())
 
 

@@ -16,7 +16,6 @@ from hybridlog.cli.binder import command, option
 from hybridlog.cli.options import (
     Strict,
     Topics,
-    Verbose,
 )
 from hybridlog.cli.render import Column, duration_of, rate_of
 from hybridlog_storage.errors import UsageError
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Given(Strict, Verbose, Topics, Listing):
+class _Given(Strict, Topics, Listing):
     contract: Path | None = option(
         "Judge recordings by the rules in this file; exit code 12 if one is broken.",
         "FILE",
@@ -62,14 +61,11 @@ def check_command(given: _Given) -> int:
         return _show_verdict(results, len(chosen), given)
     with answering(given) as query:
         found = query.check()
-        query.counters.messages = len(found)
         if make is not None:
             if len({one.recording for one in found}) != 1:
                 raise UsageError("A contract is made from one good recording: name it with -r.")
             write_bytes(make, contract_of(found).encode())
             return 0
-        # Losses are left out only where there are none; a late start may be why a topic is bad.
-        has_losses = any(one.lost != 0 for one in found)
         columns = [
             Column("recording", varies=True),
             Column("topic"),
@@ -78,14 +74,9 @@ def check_command(given: _Given) -> int:
             duration_of("jitter", "jitter_ns", order=2),
             duration_of("longest gap", "gap_ns"),
             Column("from", _gap_begin, "right", order=1),
-            duration_of("late", lambda row: _edge(row, "late_ns"), order=6),
-            duration_of("early", lambda row: _edge(row, "early_ns"), order=5),
-            Column(
-                "lost",
-                lambda row: "?" if row["lost"] is None else row["lost"],
-                "right",
-                order=0 if has_losses else 4,
-            ),
+            duration_of("late", lambda row: _edge(row, "late_ns"), order=5),
+            duration_of("early", lambda row: _edge(row, "early_ns"), order=4),
+            Column("lost", lambda row: "?" if row["lost"] is None else row["lost"], "right"),
         ]
         given.show(map(asdict, found), columns, "No topic.")
     return 0
@@ -108,14 +99,6 @@ def _show_verdict(results: Sequence[Result], recordings: int, given: _Given) -> 
     bad = broken(results)
     names = ("recording", "topic", "rule", "wanted", "found")
     given.show(map(asdict, results if given.as_json else bad), [*map(Column, names)])
-    output.remarks([verdict(results, f" in {output.counted(recordings, 'recording')}")])
+    rules, where = output.counted(len(results), "rule"), output.counted(recordings, "recording")
+    output.remarks([f"{rules} in {where}: {len(bad) or 'none'} broken."])
     return DIFFERENT if bad else 0
-
-
-def verdict(results: Sequence[Result], where: str = "") -> str:
-    """How many rules are broken, in a sentence."""
-    from hybridlog.contract.judge import broken
-
-    return (
-        f"{output.counted(len(results), 'rule')}{where}: {len(broken(results)) or 'none'} broken."
-    )

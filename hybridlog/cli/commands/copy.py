@@ -13,7 +13,7 @@ from hybridlog.cli import options, output
 from hybridlog.cli.binder import Amount, argument, command, option
 from hybridlog.cli.options import AsJson, Choosing, InStore, Quiet
 from hybridlog.cli.output import Bar
-from hybridlog.cli.signals import if_stopped, watch
+from hybridlog.cli.signals import watch
 from hybridlog.wording import parse_size
 from hybridlog_storage.errors import StoreError, TopicError, UsageError
 
@@ -69,10 +69,7 @@ def copy_command(given: _Copy) -> None:
     how = CopyOptions(
         given.only_fields, given.then_expire, given.limit_rate, given.ssh, given.check
     )
-    with (
-        given.opened() as store,
-        if_stopped("What arrived stays there: run the command again."),
-    ):
+    with given.opened() as store:
         if given.watch:
             look = partial(_look, store, given, how, set[str]())
             watch(store.directory.place, look)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from msgspec.structs import asdict
@@ -13,7 +12,6 @@ from hybridlog.cli import output
 from hybridlog.cli.answers import Listing
 from hybridlog.cli.app import DIFFERENT
 from hybridlog.cli.binder import argument, command, option
-from hybridlog.cli.commands.check import verdict
 from hybridlog.cli.options import Between, InStore, Quiet, one_recording, topics
 from hybridlog.cli.render import Column
 
@@ -27,7 +25,6 @@ class _Given(Between, InStore, Quiet, Listing):
         "Numbers are equal that differ by at most this, such as 5%.", "SHARE", default="0"
     )
     topic: tuple[str, ...] = topics()
-    contract: Path | None = option("Also compare which rules in this file are broken.", "FILE")
 
 
 @command(_Given)
@@ -37,9 +34,8 @@ def diff_command(given: _Given) -> int:
     First what only one has: times and topics. Then types, messages, rates, gaps, losses, and
     statistics of fields of the time that both have. Exit code 12 if anything differs.
     """
-    from hybridlog.contract import Contract, parse_share
+    from hybridlog.contract import parse_share
 
-    rules = None if given.contract is None else Contract.read(given.contract)
     share = parse_share(given.tolerance)
     with given.opened(snapshot=True) as store:
         found = store.diff(
@@ -48,19 +44,13 @@ def diff_command(given: _Given) -> int:
             topics=(*given.words, *given.topic),
             between=given.between,
             tolerance=share,
-            contract=rules,
         )
-        verdicts = [
-            f"{name}: {verdict(store.judge(rules, name))}"
-            for name in (given.a, given.b)
-            if rules is not None
-        ]
     columns = [Column("topic"), Column("what"), Column("a", _side("a")), Column("b", _side("b"))]
     given.show(map(asdict, found), columns)
     if not given.as_json:
         total = f"{output.counted(len(found), 'difference')}." if found else "No difference."
         is_cut = given.limit is not None and given.limit < len(found)
-        output.remarks([*verdicts, f"The first {given.limit} of {total}" if is_cut else total])
+        output.remarks([f"The first {given.limit} of {total}" if is_cut else total])
     return DIFFERENT if found else 0
 
 

@@ -1,4 +1,4 @@
-"""`hybridlog export`, and answers that are split over several files."""
+"""`hybridlog export`."""
 
 from __future__ import annotations
 
@@ -21,9 +21,8 @@ from hybridlog.cli.answers import (
     write_bytes,
 )
 from hybridlog.cli.binder import argument, command, option
-from hybridlog.cli.options import Slices, Topics
+from hybridlog.cli.options import Forced, Latched, Topics
 from hybridlog.cli.output import Bar
-from hybridlog.cli.signals import if_stopped
 from hybridlog.formats import OUTPUTS, formats_of, is_directory, suffixes_of
 from hybridlog_storage.disk.unfinished import undone
 from hybridlog_storage.errors import (
@@ -35,6 +34,7 @@ from hybridlog_storage.errors import (
 )
 
 if TYPE_CHECKING:
+    from hybridlog.formats.slices import Front
     from hybridlog.query.query import Query
     from hybridlog.store import Store
 
@@ -79,7 +79,7 @@ class _Training:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Given(Topics, Slices, _Training):
+class _Given(Topics, Latched, Forced, _Training):
     target: Path = argument(
         "File (mcap, bag) or directory (rosbag2, lerobot, mp4, tables).", "OUTPUT"
     )
@@ -92,6 +92,25 @@ class _Given(Topics, Slices, _Training):
         type=click.Choice([*_LOGS, _LEROBOT, *_FILES]),
     )
     no_attachments: bool = option("Leave out attachments; they are in MCAP files only.")
+    split: str | None = option(
+        "A file for each `recording`, each `mark`, or each interval in which a predicate "
+        "holds: 'odom: twist.twist.linear.x > 0.1'. Their names follow that of the output.",
+        "HOW",
+        name="--split-by",
+    )
+    storage: str = option(
+        "For rosbag2: the storage of the bag.",
+        type=click.Choice(["mcap", "sqlite3"]),
+        default="mcap",
+        needs=("form=rosbag2",),
+    )
+
+    @property
+    def front(self) -> Front:
+        """The messages from before the range."""
+        from hybridlog.formats.slices import Front
+
+        return Front(latched=not self.no_latched, original_times=self.original_times)
 
 
 @command(_Given)
@@ -104,7 +123,7 @@ def export_command(given: _Given) -> None:
     if str(target) == "-":
         raise UsageError("export writes files; for a pipe: `hybridlog fetch '**' -F mcap -o -`.")
     form = given.form or form_of(target, suffixes_of(_LOGS))
-    settings = given.settings(form)
+    settings = {"storage": given.storage} if form == "rosbag2" else {}
     is_log = form in _LOGS
     if is_log and split is None:
         check_room(target, force=force, is_directory=is_directory(form, target))
@@ -120,7 +139,7 @@ def export_command(given: _Given) -> None:
         parts: Iterable[tuple[Path, Query]] = [(target, query)]
         if split is not None:
             folder = is_directory(form, target) if is_log else None
-            parts = pieces(query, split, target, force=force, is_directory=folder)
+            parts = _pieces(query, split, target, force=force, is_directory=folder)
         for path, one in parts:
             if is_log:
                 _write_log(one, form, path, given, settings)
@@ -138,7 +157,7 @@ def _write_log(
     if given.no_attachments:
         extras = extras._replace(attachments=[], left_out=0)
     write_answer(query, form, path, front=given.front, extras=extras, settings=settings)
-    print_written(path, query)
+    _print_written(path, query)
     if form == "mcap" or settings.get("storage") == "mcap":
         if extras.left_out:
             left_out = output.counted(extras.left_out, "attachment")
@@ -176,7 +195,7 @@ def _write_tables(query: Query, form: str, directory: Path, given: _Given) -> No
                 output.note(f"{topic}: {error}")
                 left_out.append(error)
                 continue
-            print_written(path, one)
+            _print_written(path, one)
             query.counters.add(one.counters)
         if len(left_out) == len(paths):
             raise left_out[0]
@@ -198,7 +217,7 @@ def _image_topics(query: Query) -> list[str]:
     return [topic for topic in query.topics if topic in found]
 
 
-def print_written(path: Path, query: Query) -> None:
+def _print_written(path: Path, query: Query) -> None:
     """Print a line about a file."""
     files = path.iterdir() if path.is_dir() else [path]
     size = output.size(sum(one.stat().st_size for one in files))
@@ -206,7 +225,7 @@ def print_written(path: Path, query: Query) -> None:
     output.remarks([f"{path}: {many}{latched(query.counters)}, {size}"])
 
 
-def pieces(
+def _pieces(
     query: Query, how: str, target: Path, *, force: bool, is_directory: bool | None
 ) -> Iterator[tuple[Path, Query]]:
     """The parts of an answer that have messages, and where to write each; says which have none.
@@ -245,8 +264,7 @@ def _export_set(store: Store, query: Query, target: Path, given: _Given) -> None
     if given.force and target.is_dir() and (target / "meta" / "info.json").exists():
         shutil.rmtree(target)
     done, counted = 0, output.counted
-    again = "The same command goes on with the episodes that are not finished."
-    with if_stopped(again), Bar(target.name) as bar:
+    with Bar(target.name) as bar:
 
         def tell(name: str, frames: int) -> None:
             nonlocal done

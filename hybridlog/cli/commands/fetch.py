@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import time
+import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 import click
-from msgspec import structs
 
 from hybridlog.cli import output
 from hybridlog.cli.answers import (
@@ -17,21 +16,20 @@ from hybridlog.cli.answers import (
     SCREEN_ROWS,
     Tabular,
     format_option,
+    latched,
     output_option,
-    print_end,
     write_answer,
     write_following,
 )
 from hybridlog.cli.binder import command, option
-from hybridlog.cli.options import Filtered, InFrame, Slices, Verbose, parse_fields, query_of
-from hybridlog.formats import OUTPUTS, formats_of, is_directory
+from hybridlog.cli.options import Filtered, InFrame, NoLatched, parse_fields, query_of
+from hybridlog.formats import OUTPUTS, formats_of
 from hybridlog_storage.errors import TopicError, UsageError
 from hybridlog_storage.stopping import at_safe_points
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from hybridlog.formats.slices import Front
     from hybridlog.query.query import Query
     from hybridlog.store import Store
 
@@ -39,7 +37,7 @@ _FORMATS = formats_of()
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Choices(Verbose, Filtered, InFrame, Tabular, Slices):
+class _Choices(Filtered, InFrame, Tabular, NoLatched):
     needs_topic: ClassVar[bool] = True
     formats: ClassVar[Sequence[str]] = _FORMATS
 
@@ -82,7 +80,7 @@ class _Choices(Verbose, Filtered, InFrame, Tabular, Slices):
         "DURATION",
         needs=("where",),
     )
-    count: bool = option("Only print how many.", excludes=("output", "form", "split", "frame"))
+    count: bool = option("Only print how many.", excludes=("output", "form", "frame"))
     form: str | None = format_option(_FORMATS)
     output: Path | None = output_option(
         "Write to this file (raw: a directory; png and jpg: a directory, or one picture)"
@@ -97,8 +95,7 @@ class _Choices(Verbose, Filtered, InFrame, Tabular, Slices):
             raise UsageError(f"{form} has messages as they came: --in-frame is for tables and ply.")
         if self.follow and not (form in OUTPUTS and OUTPUTS[form].is_text and form != "json"):
             raise UsageError(f"--follow prints lines, such as jsonl or csv: {form} has an end.")
-        self.settings(form)
-        if not self.count and (self.split is None or form == SCREEN):
+        if not self.count:
             super().check()
 
 
@@ -109,7 +106,6 @@ def fetch_command(choices: _Choices) -> None:
     Without --format and -o: a table on a terminal, JSON lines elsewhere. What the answer may
     lack is printed on standard error.
     """
-    started = time.monotonic()
     with choices.opened(snapshot=not choices.follow) as store:
         query = _query(store, choices)
         if choices.follow:
@@ -136,29 +132,25 @@ def fetch_command(choices: _Choices) -> None:
             if completeness.has_losses:
                 lost = [completeness.describe(count, query.question.limit)]
         else:
-            front = choices.front
-            if choices.at is not None and choices.to_form != "mp4":  # the answer is one message
-                front = structs.replace(front, latched=False)
-            if choices.split is not None:
-                _write_pieces(query, choices, front)
-                return
-            query = _answer(query, choices, front)
-        cost = query.counters.copy()
-        for condition in query.conditions:
-            cost.add(condition.counters)
-        print_end(cost, started, verbose=choices.verbose, count=choices.count)
+            query = _answer(query, choices)
+            if front := latched(query.counters):
+                lost = [front.removeprefix(" and ")]
+        sys.stdout.flush()
         output.remarks((*query.completeness().sentences, *lost))
 
 
-def _answer(query: Query, choices: _Choices, front: Front) -> Query:
+def _answer(query: Query, choices: _Choices) -> Query:
     """Print the first messages of a query, or write all; gives the query that was answered.
 
     Strict: nothing is written if a pose has no transform, which shows only at the end.
     """
     form, strict = choices.to_form, choices.strict
     if form != SCREEN:
-        settings = choices.settings(form)
-        write_answer(query, form, choices.place, front=front, strict=strict, settings=settings)
+        from hybridlog.formats.slices import Front
+
+        is_one = choices.at is not None and form != "mp4"  # the answer is one message
+        front = Front(latched=not (choices.no_latched or is_one))
+        write_answer(query, form, choices.place, front=front, strict=strict)
         return query
     from hybridlog.query.query import tables_of
     from hybridlog.record.marks import MARKS
@@ -168,7 +160,7 @@ def _answer(query: Query, choices: _Choices, front: Front) -> Query:
     if answered.topics == (MARKS,):
         tables = map(_with_times, tables)
     completeness = answered.completeness if strict else None
-    answered.counters.messages = choices.answer(tables, completeness=completeness, noun="message")
+    choices.answer(tables, completeness=completeness, noun="message")
     return answered
 
 
@@ -182,30 +174,16 @@ def _with_times(marks: pa.Table) -> pa.Table:
     return marks.set_column(marks.column_names.index("end"), "end", end)
 
 
-def _write_pieces(query: Query, choices: _Choices, front: Front) -> None:
-    """Write a file for each part of the answer, and a line about each."""
-    from hybridlog.cli.commands.export import pieces, print_written
-
-    assert choices.output is not None
-    folder, how = is_directory(choices.to_form, choices.output), choices.split or ""
-    for path, one in pieces(query, how, choices.output, force=choices.force, is_directory=folder):
-        _answer(one, replace(choices, output=path), front)
-        print_written(path, one)
-        output.remarks(one.completeness().sentences)
-
-
 def _follow(query: Query, choices: _Choices) -> None:
     """Print messages as they come, then what they may lack."""
     from hybridlog.cli.commands.ls import status_text
     from hybridlog.query.query import Query
 
-    started = time.monotonic()
     following = query.follow(*(choices.topics or query.topics))
     try:
         with at_safe_points():
             write_following(following, choices.to_form)
     finally:
-        print_end(query.counters, started, verbose=choices.verbose)
         asked = Query(query.source.now(), following.question)
         asked.counters = query.counters
         ended = (

@@ -12,10 +12,10 @@ from msgspec.structs import asdict
 
 from hybridlog.cli import output
 from hybridlog.cli.binder import SOME_SECONDS, argument, command, option
-from hybridlog.cli.options import AsJson, Choosing, InStore, Quiet, cache_size
+from hybridlog.cli.options import AsJson, Choosing, InStore, Quiet
 from hybridlog.cli.output import Bar
 from hybridlog.cli.render import Column, bytes_of, numbers, print_table
-from hybridlog.cli.signals import if_stopped, watch
+from hybridlog.cli.signals import watch
 from hybridlog.wording import listed
 from hybridlog_storage.errors import StoreError, UsageError
 
@@ -108,7 +108,7 @@ def address(given: _Shared) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class _Rebuild(Choosing, _Shared):
-    cache_size: int | None = cache_size()
+    pass
 
 
 @command(_Rebuild, to=index_command)
@@ -118,15 +118,9 @@ def rebuild(given: _Rebuild) -> None:
     Without -r it is emptied first. After an interruption, the next command that needs the
     index makes the rest.
     """
-    with given.opened(require_database=True, cache_mb=given.cache_size) as store:
+    with given.opened(require_database=True) as store:
         chosen = given.recordings_in(store)
-        with (
-            if_stopped(
-                "Finished recordings stay indexed; the next command that needs the index makes "
-                "the rest."
-            ),
-            Bar("index rebuild") as bar,
-        ):
+        with Bar("index rebuild") as bar:
             done = store.index.rebuild(None if given.choice.is_everything else chosen, bar.part)
     rows = [
         {"recording": one.name, "messages": one.messages, "documents": one.documents}
@@ -154,11 +148,7 @@ def arrays(given: _Arrays) -> None:
     files; predicates have no points. New recordings follow, and tables of ended ones are made
     anew at once. Segments stay as they are, so this costs room. MongoDB is not needed.
     """
-    with (
-        given.opened() as store,
-        if_stopped("The setting is made; run it again for the tables that are left."),
-        Bar("index arrays") as bar,
-    ):
+    with given.opened() as store, Bar("index arrays") as bar:
         found = store.index.arrays(*given.topic, off=given.off, progress=bar.part)
     arrays = "without arrays" if given.off else "with arrays"
     tables = {None: "none yet", False: "no long arrays", True: arrays}

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Collection, Mapping
+from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 from operator import itemgetter
 from pathlib import Path
 from shlex import quote
@@ -15,19 +15,12 @@ import click
 from msgspec.structs import asdict
 
 from hybridlog.cli import options, output
-from hybridlog.cli.answers import check_room, writing
+from hybridlog.cli.answers import check_room
 from hybridlog.cli.binder import command, option
 from hybridlog.cli.commands.keep import pin_cells
-from hybridlog.cli.commands.ls import recording_dict, status_text, with_misfits
+from hybridlog.cli.commands.ls import recording_dict, status_text
 from hybridlog.cli.options import AsJson, Choosing, Forced, InStore, names_argument, query_of
-from hybridlog.cli.render import (
-    Column,
-    bytes_of,
-    densities,
-    duration_of,
-    print_fields,
-    print_table,
-)
+from hybridlog.cli.render import Column, bytes_of, duration_of, print_fields, print_table
 from hybridlog.query.topics import resolve
 from hybridlog.wording import listed
 from hybridlog_storage.errors import SegmentError, TopicError, UsageError
@@ -40,10 +33,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.catalog import RecordingEntry
 
 
-_MAX_DRAWN = 20  # recordings with sparklines; for more, reading their chunk tables takes long
-_DRAWN_TIMES = 1 << 18  # see `density`: little is read for a sparkline
-_LETTERS = 40  # of the coverage bar
-_DRAWN = 20  # letters of a sparkline
 _MAX_NAMES = 5  # recordings in a note
 _READABLE = {"ros1msg", "ros2msg", "ros2idl", "jsonschema"}
 
@@ -56,7 +45,8 @@ class _Given(Choosing, InStore, AsJson, Forced):
         "of this topic."
     )
     tables: bool = option(
-        "With --topic, instead: its Parquet files and SQL for DuckDB, and what is missing of them.",
+        "With --topic, instead: SQL for DuckDB about its Parquet files, and what is missing of "
+        "them.",
         needs=("topic",),
         excludes=("losses",),
     )
@@ -72,16 +62,12 @@ class _Given(Choosing, InStore, AsJson, Forced):
     )
     attachments: bool = option("Instead: the attachments of the logs.", excludes=("topic",))
     attachment: str | None = option(
-        "Instead: the content of this attachment, or with -o those that fit a glob such as "
-        "'*.yaml'.",
+        "Instead: the content of this attachment.",
         "NAME",
-        excludes=("topic",),
+        excludes=("topic", "attachments"),
     )
     output: Path | None = option(
-        "Write the attachment to this file; several attachments into this directory.",
-        "FILE|DIR",
-        short="-o",
-        needs=("attachments", "attachment"),
+        "Write the attachment to this file.", "FILE", short="-o", needs=("attachment",)
     )
 
 
@@ -106,8 +92,8 @@ def info_command(given: _Given) -> None:
 
 
 def _show_recordings(store: Store, given: _Given) -> None:
-    entries = [with_misfits(store, entry) for entry in given.recordings_in(store)]
-    found = [_as_dict(store, one, with_videos=n < _MAX_DRAWN) for n, one in enumerate(entries)]
+    entries = [*given.recordings_in(store)]
+    found = [_as_dict(store, one) for one in entries]
     if given.as_json:
         output.print_json(found)
         return
@@ -116,22 +102,13 @@ def _show_recordings(store: Store, given: _Given) -> None:
     for number, (entry, about) in enumerate(zip(entries, found, strict=True)):
         if number:
             output.say()
-        drawn = sys.stdout.isatty() and len(entries) <= _MAX_DRAWN
-        _show_recording(store, entry, about, _sparklines(store, entry) if drawn else {})
+        print_fields(_fields(store, entry, about))
+        if about["channels"]:
+            output.say()
+            print_table(_CHANNELS, sorted(about["channels"], key=itemgetter("topic")))
 
 
-def _show_recording(
-    store: Store, entry: RecordingEntry, about: dict[str, Any], drawn: Mapping[str, str]
-) -> None:
-    print_fields(_fields(store, entry, about))
-    if about["channels"]:
-        output.say()
-        over_time = Column("over time", lambda c: drawn.get(c["topic"]), "whole", order=1)
-        columns = [*_CHANNELS, *([over_time] if drawn else []), Column("note", _channel_note)]
-        print_table(columns, sorted(about["channels"], key=itemgetter("topic")))
-
-
-def _as_dict(store: Store, entry: RecordingEntry, *, with_videos: bool) -> dict[str, Any]:
+def _as_dict(store: Store, entry: RecordingEntry) -> dict[str, Any]:
     from hybridlog.entries import summary_of
     from hybridlog.query.answers.lost import coverage
     from hybridlog.query.periods import mean_rate
@@ -145,8 +122,7 @@ def _as_dict(store: Store, entry: RecordingEntry, *, with_videos: bool) -> dict[
         attachments, metadata = store.attachments(entry), store.metadata(entry)
     except SegmentError as error:
         output.note(f"{entry.name}: {error}")
-    losses, videos = losses_of(entry), _videos(store, entry) if with_videos else {}
-    reasons = unindexed(store.session.definitions(entry))
+    losses, reasons = losses_of(entry), unindexed(store.session.definitions(entry))
     return {
         **recording_dict(summary_of(entry)),
         "chunks": entry.chunks,
@@ -174,26 +150,10 @@ def _as_dict(store: Store, entry: RecordingEntry, *, with_videos: bool) -> dict[
                 "surplus": c.stats.surplus if entry.is_decoded else None,
                 "not_indexed": reasons.get(c.id),
                 "metadata": c.metadata,
-                "video": videos.get(c.topic),
             }
             for c in shown_channels(entry.channels)
         ],
     }
-
-
-def _videos(store: Store, entry: RecordingEntry) -> dict[str, dict[str, Any]]:
-    """Codec and key frames of video topics, by topic; none of those that cannot be read."""
-    from hybridlog.arrays import is_video_type
-
-    found: dict[str, dict[str, Any]] = {}
-    for topic in dict.fromkeys(one.topic for one in entry.channels if is_video_type(one.type)):
-        from hybridlog.query.answers.video import summary_of
-
-        try:
-            found[topic] = summary_of(store.session, entry.id, topic)
-        except SegmentError as error:
-            output.note(f"{entry.name}: {error}")
-    return found
 
 
 def _fields(store: Store, entry: RecordingEntry, about: dict[str, Any]) -> list[tuple[str, object]]:
@@ -213,7 +173,6 @@ def _fields(store: Store, entry: RecordingEntry, about: dict[str, Any]) -> list[
     segments, chunks = (
         output.counted(getattr(entry, f"{what}s"), what) for what in ("segment", "chunk")
     )
-    bar = _coverage_bar(entry)
     return [
         ("recording", entry.name),
         ("id", entry.id),
@@ -224,14 +183,13 @@ def _fields(store: Store, entry: RecordingEntry, about: dict[str, Any]) -> list[
         ("duration", "-" if first is None else format_duration(last - first)),
         ("messages", entry.messages),
         ("stored", f"{output.size(entry.stored_bytes)} in {segments}, {chunks}"),
-        *([("coverage", bar)] if bar else ()),
-        ("" if bar else "coverage", about["coverage"]),
+        ("coverage", about["coverage"]),
         *(("", line_of(loss)) for loss in about["losses"]),
         *(("tag", f"{key}={value}") for key, value in sorted(entry.tags.items())),
         *(("note", note["text"]) for note in entry.notes),
         *(("pin", f"{pin['id']}: {', '.join(filter(None, pin_cells(pin)))}") for pin in entry.pins),
         *(
-            ("attachment", f"{one['name']} ({', '.join(filter(None, _about(one)))})")
+            ("attachment", f"{one['name']} ({_about(one['media_type'], one['bytes'])})")
             for one in about["attachments"]
         ),
         *(
@@ -242,38 +200,8 @@ def _fields(store: Store, entry: RecordingEntry, about: dict[str, Any]) -> list[
     ]
 
 
-def _about(attachment: Mapping[str, Any]) -> tuple[str, str]:
-    return attachment["media_type"], output.size(attachment["bytes"])
-
-
-def _coverage_bar(entry: RecordingEntry) -> str:
-    """A bar of letters that shows where messages are lost; empty without a terminal."""
-    if entry.span is None or not sys.stdout.isatty():
-        return ""
-    from hybridlog.query.answers.lost import lost_parts
-    from hybridlog.record.losses import extent_of
-
-    lost = lost_parts(entry, extent_of(entry), _LETTERS).tolist()
-    return "".join("░" if one else "█" for one in lost)
-
-
-def _sparklines(store: Store, entry: RecordingEntry) -> dict[str, str]:
-    """Messages of each topic over time; none without any, or if they cannot be read."""
-    from hybridlog.drawing.times import evenly, lane_of
-    from hybridlog.record.losses import extent_of
-
-    begin, end = extent_of(entry)
-    if begin == end:
-        return {}
-    edges = evenly((begin, end), _DRAWN)
-    try:
-        return {
-            topic: densities(lane_of(store.session, entry, topic, _DRAWN_TIMES).counts(edges))
-            for topic in sorted({channel.topic for channel in entry.channels})
-        }
-    except SegmentError as error:
-        output.note(f"{entry.name}: {error}")
-        return {}
+def _about(media_type: str, size: int) -> str:
+    return ", ".join(filter(None, (media_type, output.size(size))))
 
 
 def _kind(channel: Mapping[str, Any]) -> str:
@@ -297,7 +225,7 @@ def _channel_note(channel: Mapping[str, Any]) -> str:
     from hybridlog_storage.messages import SUPPLIED, Channel
 
     encoding, metadata = channel["message_encoding"], channel["metadata"]
-    state, video = state_of(encoding), channel["video"]
+    state = state_of(encoding)
     why = {State.EXPIRED: ", expired", State.NOT_COPIED: ", not copied yet"}.get(state, "")
     unset = channel["skew_ns"] is not None and channel["unset_stamps"]
     notes = {
@@ -307,30 +235,19 @@ def _channel_note(channel: Mapping[str, Any]) -> str:
         f"{channel['surplus']} with bytes left over": channel["surplus"],
         f"fields only{why}": state is not State.WHOLE,
         "latched": depth_of(Channel(channel["topic"], encoding, None, metadata)),
-        _video_text(video, channel["messages"]): video and video["frames"],
         f"{output.counted(unset or 0, 'stamp')} not set": unset,
     }
     return "; ".join(text for text, applies in notes.items() if applies)
 
 
-def _video_text(video: Mapping[str, Any] | None, messages: int) -> str:
-    if video is None:
-        return ""
-    frames = "" if video["frames"] >= messages else f" in the first {video['frames']}"
-    keys = output.counted(video["key_frames"], "key frame")
-    parts = [f"{', '.join(video['formats'])}, {keys}{frames}"] if video["formats"] else []
-    if video["unreadable"]:
-        parts.append(f"{output.counted(video['unreadable'], 'frame')} of no known video{frames}")
-    return "; ".join(parts)
-
-
 _CHANNELS = [
     Column("topic"),
-    Column("type", _kind, short=lambda channel: _kind(channel).rpartition("/")[2]),
+    Column("type", _kind, cut=12),
     Column("messages", side="right"),
     Column("Hz", lambda c: "-" if c["rate_hz"] is None else f"{c['rate_hz']:.2f}", "right"),
-    bytes_of("payload", "payload_bytes", order=2),
-    Column("log - header", _skew_text, "right", order=3),
+    bytes_of("payload", "payload_bytes", order=1),
+    Column("log - header", _skew_text, "right", order=2),
+    Column("note", _channel_note, cut=12),
 ]
 
 
@@ -365,7 +282,7 @@ def _show_topics(store: Store, query: Query, given: _Given) -> None:
             output.say()
             if item["observed"]:
                 output.say("No definition fixes the fields. The first messages have these:")
-            asked = Column("asked as", "path" if item["observed"] else _asked_as)
+            asked = Column("asked as", "path" if item["observed"] else _asked_as, cut=20)
             print_table([Column("field", "path"), Column("type"), asked], item["fields"])
 
 
@@ -404,62 +321,49 @@ def _asked_as(field: dict[str, Any]) -> str:
 
 
 def _show_tables(store: Store, query: Query, _: _Given) -> None:
-    """Print the Parquet files with the rows of a topic, and SQL for DuckDB."""
+    """Print SQL for DuckDB about the Parquet files of a topic, and which recordings they lack."""
+    from glob import escape
+
+    from hybridlog.columns.folders import files_of
+    from hybridlog.columns.layout import type_prefix
     from hybridlog.maintenance.tables import missing
     from hybridlog.query.query import channels_of
-    from hybridlog.record.marks import MARKS
     from hybridlog.snapshot import UNFINISHED
 
     topic, *others = query.topics
     if others:
         raise UsageError(f"--tables is about one topic: name one of {listed(query.topics)}.")
     channels = channels_of(query)
-    recordings = {one.recording.id: one.recording for one in channels}.values()
-    ended = [one for one in recordings if one.status not in UNFINISHED]
-    going = [one.name for one in recordings if one.status in UNFINISHED]
-    found = _tables_of(store, query, [one for one in channels if one.recording in ended])
-    tables = store.session.tables
-    lacking = [one.name for one in ended if topic in missing(store.directory, one, tables)]
-    shown = ((*one["files"], "", f"{one['statement']};", "") for one in found)
-    output.tell({"tables": found, "missing": lacking}, [line for each in shown for line in each])
-    marks = sum(len(one.marks) for one in recordings) if topic == MARKS else 0
-    without = {
-        f"{listed(lacking, _MAX_NAMES)}, whose rows are missing: `hybridlog verify --repair` "
-        "makes them again": lacking,
-        f"{listed(going)}: rows are added when a recording ends": going,
-        f"{output.counted(marks, 'mark')} that somebody set: no table has them, `hybridlog sql` "
-        "has": marks,
-    }
-    output.notes(f"Without {what}." for what, applies in without.items() if applies)
-
-
-def _tables_of(
-    store: Store, query: Query, channels: Collection[RecordedChannel]
-) -> list[dict[str, Any]]:
-    """Folders with rows of a topic in some recordings: files, rows, statement."""
-    from glob import escape
-
-    from hybridlog.columns.folders import files_of
-    from hybridlog.columns.layout import type_prefix
-
-    (topic,), recordings = query.topics, {one.recording.id for one in channels}
-    schemas = [one.channel.schema for one in channels]
-    prefixes = {type_prefix("" if schema is None else schema.name) for schema in schemas}
+    recordings = {one.recording.id: one.recording for one in channels}
+    ended = {id_: one for id_, one in recordings.items() if one.status not in UNFINISHED}
     where = f"topic = {_quoted(topic)}"
     if query.question.recordings is not None:
-        where += f" and recording in ({', '.join(map(_quoted, sorted(recordings)))})"
-    folders: dict[Path, dict[str, Any]] = {}
-    for file in files_of(store.directory.path, prefixes) if prefixes else ():
-        own = (one for one in file.about.sections if one.topic == topic and one.id in recordings)
-        if rows := sum(one.rows for one in own):
-            folder = file.path.parent
-            found = folders.setdefault(folder, {"folder": str(folder), "rows": 0, "files": []})
-            found["rows"] += rows
-            found["files"].append(str(file.path))
-            files = _quoted(f"{escape(str(folder))}/*.parquet")
+        where += f" and recording in ({', '.join(map(_quoted, sorted(ended)))})"
+    schemas = [one.channel.schema for one in channels if one.recording.id in ended]
+    types = {"" if schema is None else schema.name for schema in schemas}
+    folders: Counter[Path] = Counter()
+    for file in files_of(store.directory.path, {*map(type_prefix, types)}) if types else ():
+        own = (one for one in file.about.sections if one.topic == topic and one.id in ended)
+        folders[file.path.parent] += sum(one.rows for one in own)
+    found = [
+        {
+            "folder": str(folder),
+            "rows": rows,
             # The only texts in it are quoted, and nothing is run here.
-            found["statement"] = f"select * from {files} where {where}"  # noqa: S608
-    return list(folders.values())
+            "statement": f"select * from {_quoted(f'{escape(str(folder))}/*.parquet')} where {where}",  # noqa: S608, E501
+        }
+        for folder, rows in folders.items()
+        if rows
+    ]
+    tables = store.session.tables
+    lacking = [one.name for one in ended.values() if topic in missing(store.directory, one, tables)]
+    output.tell({"tables": found, "missing": lacking}, (f"{one['statement']};" for one in found))
+    going = [one.name for id_, one in recordings.items() if id_ not in ended]
+    if lacking:
+        named = listed(lacking, _MAX_NAMES)
+        output.note(f"Without {named}: `hybridlog verify --repair` makes their rows again.")
+    if going:
+        output.note(f"Without {listed(going)}: rows are added when a recording ends.")
 
 
 def _quoted(text: str) -> str:
@@ -498,7 +402,7 @@ _LOSSES = [
     Column("topic", lambda loss: loss.get("topic") or "any"),
     Column("cause"),
     Column("messages", lambda loss: "unknown" if loss["count"] is None else loss["count"], "right"),
-    Column("from", lambda loss: output.short_time(loss.get("from")), "whole"),
+    Column("from", lambda loss: output.short_time(loss.get("from"))),
     duration_of("for", _span),
     Column("detail", lambda loss: ": ".join(filter(None, (loss.get("file"), loss.get("reason"))))),
 ]
@@ -518,8 +422,8 @@ def _show_sizes(store: Store, by: str, given: _Given) -> None:
         return
     names = [Column("recording"), Column("topic", lambda row: row.get("topic", "(no topic)"))]
     names = [one for one in names if by in {one.name, "both"}]
-    last = total | {one.name: "" for one in names[1:]} | {names[0].name: "total"}
-    columns = [column for column in _SIZES if column.name != "fields" or total["column_bytes"]]
+    last = total | {"recording": "", "topic": "", names[0].name: "total"}
+    columns = [one for one in _SIZES if one.name != "fields" or total["column_bytes"]]
     given.show([*rows, last] if rows else [], [*names, *columns], store.session.when_empty)
 
 
@@ -535,51 +439,26 @@ _SIZES = [
 
 
 def _show_attachments(store: Store, given: _Given) -> None:
-    """List attachments, print the one that is named or fits a glob, or write some into files."""
+    """List attachments, or give the content of one."""
     there = [one for entry in given.recordings_in(store) for one in store.attachments(entry)]
-    found, name = there, given.attachment
-    if name is not None:
-        found = [one for one in there if one.name == name]
-        found = found or [one for one in there if fnmatchcase(one.name, name)]
-        if not found:
-            names = listed(output.quoted(one.name) for one in there)
-            raise TopicError(f"There is no attachment {output.quoted(name)}. There are: {names}.")
+    name = given.attachment
+    if name is None:
+        given.show([*map(_attachment_dict, there)], _ATTACHMENTS, "There are no attachments.")
+        return
+    found = [one for one in there if one.name == name]
+    if len(found) != 1:
+        many = f"{len(found)} attachments have" if found else "There is no attachment with"
+        names = listed(output.quoted(one.name) for one in there)
+        raise TopicError(f"{many} the name {output.quoted(name)}. There are: {names}.")
     if given.output is not None:
-        is_one = name is not None and len(found) == 1
-        _write_attachments(found, given.output, is_one=is_one, force=given.force)
-    elif name is None or given.as_json:
-        given.show([*map(_attachment_dict, found)], _ATTACHMENTS, "There are no attachments.")
-    elif len(found) > 1:
-        raise UsageError(
-            f"{len(found)} attachments have this name: -o DIR writes each of them into a file."
-        )
+        check_room(given.output, force=given.force)
+        found[0].save(given.output)
+        output.note(f"{given.output}: {output.size(found[0].size)}")
     elif sys.stdout.isatty() and not found[0].media_type.startswith("text/"):
         raise UsageError(f"{found[0].name} may be no text: name a file with -o.")
     else:
         for piece in found[0].pieces():
             sys.stdout.buffer.write(piece)
-
-
-def _write_attachments(
-    found: list[StoredAttachment], target: Path, *, is_one: bool, force: bool
-) -> None:
-    """Write one attachment to a file, or each into a directory under a name made from its own."""
-    from hybridlog.attachments import file_names
-
-    paths = [target]
-    if target.is_dir() or not is_one:
-        paths = [target / name for name in file_names(found)]
-    for path in paths:
-        check_room(path, force=force)
-    if paths != [target]:
-        try:
-            target.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise UsageError(f"{target} cannot be made: {error.strerror}.") from error
-    for attachment, path in zip(found, paths, strict=True):
-        with writing(path):
-            attachment.save(path)
-        output.note(f"{path}: {output.size(attachment.size)}")
 
 
 def _attachment_dict(attachment: StoredAttachment) -> dict[str, Any]:

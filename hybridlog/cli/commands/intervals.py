@@ -11,8 +11,8 @@ import click
 from hybridlog.cli import output
 from hybridlog.cli.answers import Listing, answering
 from hybridlog.cli.binder import command, option
-from hybridlog.cli.options import Filtered, Verbose, parse_fields
-from hybridlog.cli.render import Column, times
+from hybridlog.cli.options import Filtered, parse_fields
+from hybridlog.cli.render import Column, time_of
 
 if TYPE_CHECKING:
     from hybridlog.query.intervals import Intervals
@@ -23,7 +23,7 @@ _OF_A_PREDICATE = ("max_gap", "state")
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Given(Verbose, Filtered, Listing):
+class _Given(Filtered, Listing):
     needs_topic: ClassVar[bool] = True
     changes: str | None = option(
         "Instead: when these fields changed.", "A,B.C", excludes=("gaps", *_OF_A_PREDICATE)
@@ -38,11 +38,8 @@ class _Given(Verbose, Filtered, Listing):
     )
     gaps: bool = option("Instead: when no message came for long.", excludes=_OF_A_PREDICATE)
     longer_than: str | None = option(
-        "With --gaps: only longer ones: 500ms.", "DURATION", needs=("gaps",)
-    )
-    periods: float | None = option(
-        "With --gaps: only those longer than so many usual periods of the topic; without both, 5.",
-        "K",
+        "With --gaps: only longer ones: 500ms; without, than five usual periods of the topic.",
+        "DURATION",
         needs=("gaps",),
     )
     at_least: str | None = option("Only those of at least this length, such as 60s.", "DURATION")
@@ -70,7 +67,6 @@ def intervals_command(given: _Given) -> None:
         found = _intervals(given, query)
         if given.strict:
             query.completeness().check()
-        query.counters.messages = len(found)
         if given.count:
             output.say(str(len(found)))
         else:
@@ -95,7 +91,7 @@ def _intervals(given: _Given, query: Query) -> Intervals:
         names = parse_fields(given.changes, "--changes")
         found = query.changes(*names, pause=given.pause or "1s", tolerance=given.tolerance or 0.0)
     elif given.gaps:
-        found = query.gaps(given.longer_than, given.periods)
+        found = query.gaps(given.longer_than)
     else:
         state = given.state and given.state.replace("-", " ")
         found = query.intervals(given.max_gap, state)
@@ -110,7 +106,8 @@ def _duration(row: Mapping[str, int]) -> str:
 
 _COLUMNS = [
     Column("recording"),
-    *times(),
+    time_of("begin", "begin_ns"),
+    time_of("end", "end_ns", order=1),
     Column("duration", _duration, "right"),
     Column("messages", side="right"),
 ]

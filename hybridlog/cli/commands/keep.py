@@ -12,8 +12,7 @@ from hybridlog.cli import output
 from hybridlog.cli.binder import command, option
 from hybridlog.cli.options import AsJson, Choosing, InStore, Quiet, query_of
 from hybridlog.cli.output import Bar
-from hybridlog.cli.render import Column
-from hybridlog.cli.signals import if_stopped
+from hybridlog.cli.render import Column, time_of
 from hybridlog.wording import listed
 from hybridlog_storage.errors import UsageError
 
@@ -159,17 +158,9 @@ def _spans(store: Store, given: _Given) -> Iterator[tuple[str, int | None, int |
         yield from ((one.recording, one.begin_ns, one.end_ns + 1) for one in found)
 
 
-def _time(key: str) -> Column:
-    return Column(
-        key,
-        lambda pin: output.time_text(pin[key]),
-        short=lambda pin: output.short_time(pin[key]),
-    )
-
-
 _PIN = [
-    _time("from"),
-    _time("to"),
+    time_of("from", "from"),
+    time_of("to", "to"),
     Column("topics", lambda pin: "all" if pin["topics"] is None else listed(pin["topics"])),
     Column("reason"),
 ]
@@ -194,10 +185,7 @@ def _keep(store: Store, rules: dict[str, Any], given: _Given) -> int:
         store.directory.check_changes()
         store.directory.change_settings(retention=rules)
     dry_run = given.dry_run
-    with (
-        if_stopped("What was not deleted is as it was; run it again."),
-        Bar("keep") as bar,
-    ):
+    with Bar("keep") as bar:
         found = store.keep(wanted, dry_run=dry_run, progress=bar.part)
     plan = found.plan
     if not given.as_json:

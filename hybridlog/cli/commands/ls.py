@@ -5,16 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from msgspec.structs import replace
-
 from hybridlog.cli import output
 from hybridlog.cli.binder import command
 from hybridlog.cli.options import AsJson, Choosing, InStore
 from hybridlog.cli.render import Column
 
 if TYPE_CHECKING:
-    from hybridlog.store import Store
-    from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.summary import RecordingSummary
 
 
@@ -49,7 +45,7 @@ def _duration(entry: RecordingSummary) -> str:
 
 RECORDINGS = [
     Column("recording", lambda one: one.name),
-    Column("start", lambda one: output.short_time(one.span and one.span[0]), "whole"),
+    Column("start", lambda one: output.short_time(one.span and one.span[0])),
     Column("duration", _duration, "right"),
     Column("topics", lambda one: one.topic_count, "right", order=1),
     Column("messages", lambda one: one.messages, "right"),
@@ -93,20 +89,3 @@ def recording_dict(recording: RecordingSummary) -> dict[str, Any]:
         "source": recording.source,
         "created_ns": recording.created,
     }
-
-
-def with_misfits(store: Store, recording: RecordingEntry) -> RecordingEntry:
-    """The same recording, where `unreadable` counts what does not fit its definition alone.
-
-    The catalog also counts messages with more fields than the index takes; tables have these.
-    """
-    channels = []
-    for channel in recording.channels:
-        unreadable, table = channel.stats.unreadable, None
-        if unreadable:
-            table = store.session.tables.of(recording, channel.topic)
-        if table is not None:
-            unfit = sum(int(rows.is_unreadable().sum()) for rows in table.scan(own={"state"}))
-            unreadable = min(unreadable, unfit)
-        channels.append(replace(channel, stats=replace(channel.stats, unreadable=unreadable)))
-    return replace(recording, channels=channels)

@@ -5,17 +5,15 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.cli import output
 from hybridlog.cli.binder import command
-from hybridlog.cli.commands.ls import with_misfits
 from hybridlog.cli.options import parse_tags
 from hybridlog.cli.record_choices import (
-    COLUMNS,
     RecordChoices,
     fields_of,
     not_indexed,
@@ -23,8 +21,8 @@ from hybridlog.cli.record_choices import (
     row_of,
     stored,
 )
-from hybridlog.cli.render import print_fields, print_table
-from hybridlog.cli.signals import if_stopped, watch
+from hybridlog.cli.render import print_fields
+from hybridlog.cli.signals import watch
 from hybridlog.wording import listed
 from hybridlog_storage.errors import (
     AlreadyRecordedError,
@@ -38,7 +36,7 @@ from hybridlog_storage.errors import (
 from hybridlog_storage.stopping import anywhere, at_safe_points, safe_point
 
 if TYPE_CHECKING:
-    from hybridlog.formats.find import Found, Watch
+    from hybridlog.formats.find import Watch
     from hybridlog.formats.log_set import LogSet
     from hybridlog.formats.reading import Source
     from hybridlog.query.topics import TopicMatcher
@@ -69,26 +67,29 @@ def record_command(choices: RecordChoices) -> int:
 
 def _record_logs(choices: RecordChoices) -> int:
     """Record each path, and each log below a directory; an error does not stop the others."""
-    logs, walked = _find(choices)
-    if choices.name is not None and len(logs) > 1:
+    logs, problems, is_search = _find(choices)
+    is_one = len(logs) == 1
+    if choices.name is not None and not is_one:
         raise UsageError(f"--name names one recording; there are {len(logs)} logs.")
     # Wrong options are found before a store is made.
-    recorder = LogRecorder(choices, logs, is_search=walked is not None)
-    total, before, is_one = sum(log.size for log in logs), 0, len(logs) == 1
+    recorder = LogRecorder(choices, is_search=is_search, is_one=is_one)
+    total, before = sum(log.size for log in logs), 0
 
     def show(name: str, read: int, messages: int) -> None:
         # A single one needs no name beside the bar.
         many = output.counted(messages, "message")
         bar(before + read, many if is_one else f"{name}: {many}")
 
+    recorder.check_new_store(logs)
     label = logs[0].path.name if is_one else f"{len(logs)} logs"
-    with recorder.opened() as store, at_safe_points(), output.Bar(label, total) as bar:
-        for problem in walked.problems if walked is not None else ():
+    with choices.opened_to_record() as store, at_safe_points(), output.Bar(label, total) as bar:
+        for problem in problems:
             recorder.fail(None, problem)
         for log in logs:
             safe_point()
             recorder.record(store, log, partial(show, log.path.name))
             before += log.size
+    recorder.sum_up()
     return recorder.exit_code
 
 
@@ -96,22 +97,25 @@ def _record_watched(choices: RecordChoices) -> int:
     """Record what lies in directories, and what comes into them, until a signal ends it."""
     from hybridlog.formats.find import Watch
 
-    recorder = LogRecorder(choices, (), is_search=True)
+    recorder = LogRecorder(choices, is_search=True)
+    recorder.check_new_store(())
     watches = [Watch(path, choices.settle) for path in choices.paths]
-    with recorder.opened() as store:
-        look = partial(_look, recorder, store, watches, set[Path]())
+    with choices.opened_to_record() as store:
         places = ", ".join(map(str, choices.paths))
-        watch(places, look, report=partial(recorder.fail, None))
+        watch(
+            places,
+            partial(_look, recorder, store, watches),
+            report=partial(recorder.fail, None),
+        )
         left = [path for one in watches for path in one.unfinished()]
         if left:
             paths = listed(map(str, left))
             output.note(f"Not complete: {paths}. `hybridlog record PATH` records what is there.")
+    recorder.sum_up()
     return recorder.exit_code
 
 
-def _look(
-    recorder: LogRecorder, store: Store, watches: Sequence[Watch], met: set[Path]
-) -> Iterator[SourceError]:
+def _look(recorder: LogRecorder, store: Store, watches: Sequence[Watch]) -> Iterator[SourceError]:
     """Record logs that have become complete; yields what cannot be read."""
     for one in watches:
         try:
@@ -119,8 +123,6 @@ def _look(
         except SourceError as error:  # the directory may come back
             yield error
             continue
-        _tell_stores(path for path in found.stores if path not in met)
-        met.update(found.stores)
         yield from found.problems
         for place, log in enumerate(found.logs):
             safe_point()
@@ -132,112 +134,84 @@ def _look(
                 raise
 
 
-def _find(choices: RecordChoices) -> tuple[list[LogSet], Found | None]:
-    """The logs to record, and what was met in directories; None if each path is one log."""
+def _find(choices: RecordChoices) -> tuple[list[LogSet], list[SourceError], bool]:
+    """The logs to record, what is unreadable in directories, and whether any was searched."""
     from hybridlog.formats.find import Found, find_logs
     from hybridlog.formats.log_set import LogSet
 
     logs: list[LogSet] = []
-    walked: Found | None = None
+    problems: list[SourceError] = []
+    is_search = False
     for path in choices.paths:
         found = find_logs(path) if path.is_dir() else Found()
-        _tell_stores(found.stores)
         is_one = len(found.logs) == 1 and path in {found.logs[0].path, found.logs[0].path.parent}
         if is_one or not found.logs:
             logs.append(LogSet.at(path))
             continue
-        walked = walked or Found()
+        is_search = True
         logs += found.logs
-        walked.problems += found.problems
-    return logs, walked
-
-
-def _tell_stores(stores: Iterable[Path]) -> None:
-    """Print which stores were met and not searched."""
-    output.notes(
-        f"{store} is a store and is not searched; `hybridlog copy --from {store}` takes its "
-        "recordings."
-        for store in stores
-    )
-
-
-def _check_new_store(choices: RecordChoices, logs: Sequence[LogSet]) -> None:
-    """Fail before a store is made, when no log can be read or the server does not answer."""
-    from hybridlog.store import store_path
-    from hybridlog_storage.settings import NAME, is_uri, with_password
-
-    settings = store_path(choices.store) / NAME
-    if os.path.lexists(settings):
-        return
-    problems: list[SourceError] = []
-    for log in logs:
-        try:
-            log.open().close()
-            break
-        except SourceError as error:
-            problems.append(error)
-    else:
-        if problems:
-            raise problems[0]
-    if is_uri(choices.mongo):
-        # The new store stores the URI, so it has to be right.
-        from hybridlog_storage.mongo.database import Database
-        from hybridlog_storage.mongo.index_documents import IndexState, other_store
-
-        with Database.connect(with_password(choices.mongo)) as database:
-            owner = IndexState(database).owner()
-            if owner is not None and not os.path.lexists(settings):  # nobody made it meanwhile
-                raise other_store(database)
+        problems += found.problems
+    return logs, problems, is_search
 
 
 class LogRecorder:
-    """Records logs with the options of the command; what came of them is told at the end."""
+    """Records logs with the options of the command, and tells at once what came of each."""
 
-    def __init__(self, choices: RecordChoices, logs: Sequence[LogSet], *, is_search: bool) -> None:
+    def __init__(self, choices: RecordChoices, *, is_search: bool, is_one: bool = False) -> None:
         self._choices = choices
         self._settings = choices.segment_settings()
         self._tags = parse_tags(choices.set_tag)
         choices.matchers()
-        self._logs, self._is_search = logs, is_search
-        self._left = [log.path for log in logs]
+        self._is_search, self._is_one = is_search, is_one
         self._counts: Counter[str] = Counter()  # of what came of logs
         self.exit_code = 0
-        self._rows: list[dict[str, Any]] = []  # those that are shown at the end
 
-    @contextmanager
-    def opened(self) -> Iterator[Store]:
-        """The store; at the end the results are shown."""
-        try:
-            _check_new_store(self._choices, self._logs)
-            with if_stopped(self._on_stop), self._choices.opened_to_record() as store:
-                yield store
-        except SourceError as error:
-            if len(self._logs) == 1 and not self._rows:
-                self._tell(_refused(self._logs[0].path, error), "error")
-            raise
-        finally:
-            self._show()
+    def check_new_store(self, logs: Sequence[LogSet]) -> None:
+        """Fail before a store is made: no log can be read, or its server does not answer."""
+        from hybridlog.store import store_path
+        from hybridlog_storage.settings import NAME, is_uri, with_password
+
+        choices, problems = self._choices, list[SourceError]()
+        settings = store_path(choices.store) / NAME
+        if os.path.lexists(settings):
+            return
+        for log in logs:
+            try:
+                log.open().close()
+                break
+            except SourceError as error:
+                problems.append(error)
+        if logs and len(problems) == len(logs):
+            if self._is_one:
+                self.fail(logs[0].path, problems[0])
+            raise problems[0]
+        if is_uri(choices.mongo):
+            # The new store stores the URI, so it has to be right.
+            from hybridlog_storage.mongo.database import Database
+            from hybridlog_storage.mongo.index_documents import IndexState, other_store
+
+            with Database.connect(with_password(choices.mongo)) as database:
+                owner = IndexState(database).owner()
+                if owner is not None and not os.path.lexists(settings):  # nobody made it meanwhile
+                    raise other_store(database)
 
     def record(self, store: Store, log: LogSet, progress: Callable[[int, int], None]) -> None:
         """Record a log, or the parts that the store lacks; raises if the only log cannot be."""
-        if not self._logs:
-            self._left = [log.path]
         for piece in self._pieces(store, log):
             try:
                 report = self._record_one(store, piece, progress)
             except (AlreadyRecordedError, SourceError, UsageError) as error:
                 if self._is_search and isinstance(error, AlreadyRecordedError):
-                    self._tell({"path": str(piece.path), "known": str(error)}, "known")
+                    self._tell("known", {"path": str(piece.path), "known": str(error)})
                 else:
                     self.fail(piece.path, error)
-            else:
-                report.entry = entry = with_misfits(store, report.entry)
-                code = _told(piece.path, report)
-                self.exit_code = self.exit_code or code
-                many = output.counted(entry.messages, "message")
-                about = f"{many}, {output.size(entry.stored_bytes)}, from {piece.path}"
-                self._tell(row_of(report, piece.path), "recorded", [f"{entry.name}: {about}"])
-        self._left.remove(log.path)
+                continue
+            self.exit_code = self.exit_code or _told(piece.path, report)
+            row = row_of(report, piece.path)
+            about = (
+                f"{output.counted(row['messages'], 'message')}, {output.size(row['bytes_stored'])}"
+            )
+            self._tell("recorded", row, [f"{row['recording']}: {about}, from {piece.path}"])
 
     def _pieces(self, store: Store, log: LogSet) -> Iterator[LogSet]:
         """The log; in a search, the missing parts of it if others were recorded on their own."""
@@ -288,52 +262,30 @@ class LogRecorder:
         return report
 
     def fail(self, path: Path | None, error: HybridlogError) -> None:
-        """Add an error; that of the only log is raised."""
-        self._tell(_refused(path, error), "error")
-        if len(self._logs) == 1 and not self._is_search:
+        """Tell an error; that of the only log is raised."""
+        about = {} if path is None else {"path": str(path)}
+        self._tell("error", {**about, "error": str(error), "exit_code": error.exit_code})
+        if self._is_one and not self._is_search:
             raise error
         output.note(f"hybridlog: {error}")
         self.exit_code = self.exit_code or error.exit_code
 
-    def _tell(self, row: dict[str, Any], what: str, lines: Sequence[str] = ()) -> None:
-        """Show what came of a log: at the end; at once while directories are watched."""
+    def _tell(self, what: str, row: dict[str, Any], lines: Sequence[str] = ()) -> None:
+        """Print what came of a log: a line, or all about the only one."""
         self._counts[what] += 1
-        if self._logs:
-            self._rows.append(row)
+        if self._is_one and lines and not (self._choices.as_json or output.is_quiet()):
+            output.clear()
+            print_fields(fields_of(row))
         else:
             output.tell(row, lines, at_once=True)
 
-    def _on_stop(self) -> str:
-        """The effect of stopping now on the recordings."""
-        left, stored, parts = self._left, self._counts["recorded"], []
-        if left:
-            what = left[0] if len(left) == 1 else output.counted(len(left), "log")
-            parts.append(f"Nothing of {what} is stored.")
-        if stored:
-            before = " before" if left else ""
-            parts.append(f"{output.counted(stored, 'recording')} stored{before}.")
-        return " ".join(parts)
-
-    def _show(self) -> None:
-        """Print the finished recordings, and what became of the others."""
+    def sum_up(self) -> None:
+        """Say of a search what became of its logs."""
         counts = self._counts
-        if self._choices.as_json and self._rows:
-            output.print_json(self._rows)
-        elif not self._choices.as_json and not output.is_quiet():
-            recorded = [row for row in self._rows if "messages" in row]
-            if len(recorded) == 1:
-                print_fields(fields_of(recorded[0]))
-            else:
-                print_table(COLUMNS, recorded)
         if self._is_search:
             many = output.counted(counts["recorded"], "log")
             left = f"{counts['known']} in the store already, {counts['error']} not recorded"
             output.remarks([f"{many} recorded, {left}."])
-
-
-def _refused(path: Path | None, error: HybridlogError) -> dict[str, Any]:
-    about = {} if path is None else {"path": str(path)}
-    return {**about, "error": str(error), "exit_code": error.exit_code}
 
 
 def _between(source: Source, log: LogSet, choices: RecordChoices) -> tuple[int, int] | None:

@@ -14,7 +14,6 @@ from hybridlog.cli.binder import command, option
 from hybridlog.cli.commands.ls import RECORDINGS
 from hybridlog.cli.options import Choosing, InStore, Quiet, names_argument, recordings_of
 from hybridlog.cli.render import print_table
-from hybridlog.cli.signals import if_stopped
 from hybridlog.wording import listed
 from hybridlog_storage.errors import UsageError
 
@@ -45,11 +44,7 @@ def rm_command(given: _Given) -> None:
             pins = [pin["reason"] for one in chosen for pin in store.entry(one.id).pins]
             _confirm(chosen, pins)
         for one in chosen:
-            with if_stopped(
-                "A recording whose removal began is gone; the next command that opens the "
-                "store removes the rest of it."
-            ):
-                store.remove(one.id)
+            store.remove(one.id)
             output.tell(None, [f"deleted {one.name}"])
 
 

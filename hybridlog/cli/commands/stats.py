@@ -9,14 +9,14 @@ from msgspec.structs import asdict
 
 from hybridlog.cli.answers import Listing, answering
 from hybridlog.cli.binder import command, option
-from hybridlog.cli.options import Filtered, Verbose, parse_fields
+from hybridlog.cli.options import Filtered, parse_fields
 from hybridlog.cli.render import Column
 
 _NAMES = ("count", "nan", "infinite", "min", "max", "mean", "std")
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Given(Verbose, Filtered, Listing):
+class _Given(Filtered, Listing):
     needs_topic: ClassVar[bool] = True
     fields: str | None = option(
         "Only these fields, also summaries and arrays; without, all that are numbers.",
@@ -35,9 +35,6 @@ def stats_command(given: _Given) -> None:
         found = [asdict(row) for row in stats]
         if given.strict:
             query.completeness().check()
-        # How many are no numbers is left out only where there are none.
-        order = {name: 1 for name in ("nan", "infinite") if not any(row[name] for row in found)}
-        order["std"] = 2
-        shown = [Column(name, side="right", order=order.get(name, 0)) for name in _NAMES]
+        shown = [Column(name, side="right", order=name == "std") for name in _NAMES]
         columns = [Column("topic", varies=True), Column("field"), *shown]
         given.show(found, columns, "No field is a number.")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from hybridlog.cli.answers import SCREEN, Tabular
 from hybridlog.cli.binder import argument, command, option
-from hybridlog.cli.options import Strict, Topics, Verbose, tf_topic, topics
+from hybridlog.cli.options import Strict, Topics, tf_topic, topics
 from hybridlog.cli.output import remarks
 from hybridlog.cli.render import Column, duration_of, print_table, rate_of
 from hybridlog.wording import counted, listed
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Given(Strict, Verbose, Topics, Tabular):
+class _Given(Strict, Topics, Tabular):
     words: ClassVar[tuple[str, ...]] = ()  # type: ignore[misc]
     target: str | None = argument("The frame of the results.", "[TARGET]")
     source: str | None = argument(
@@ -159,8 +159,8 @@ def _with_name(topic: str, tree: FrameTree) -> pa.Table:
 
 
 _FRAMES = [
-    Column("tree", 0, "whole"),
-    Column("frame", 1, "whole"),
+    Column("tree", 0),
+    Column("frame", 1),
     Column(
         "transforms",
         lambda row: row[2] and ("static" if row[2].is_static else len(row[2].stamps)),

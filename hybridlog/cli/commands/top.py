@@ -71,31 +71,24 @@ def draw(state: RecorderState, table: output.Drawn) -> None:
 
 def _lines_of(state: RecorderState, width: int, height: int | None = None) -> list[str]:
     """A state as the lines of a table of topics, with others below it."""
-    # Broken between its parts only.
-    whole = summary(state).replace(" ", "\N{NO-BREAK SPACE}").replace("·\N{NO-BREAK SPACE}", "· ")
-    ends = [line.replace("\N{NO-BREAK SPACE}", " ") for line in textwrap.wrap(whole, width)]
+    ends = textwrap.wrap(summary(state), width)
     for topic in state.silent:
         ends += textwrap.wrap(output.printable(f"{topic} is silent"), width)
     topics = state.topics
     rows = len(topics) if height is None else max(height - 1 - len(ends), 4)
-    if len(topics) > rows:
+    if left := max(len(topics) - rows, 0):
         # Those with losses first, then those with most bytes; a line tells of the others.
-        first = sorted(topics, key=lambda t: (-t.lost, -t.bytes_per_s, t.topic))[: rows - 1]
-        shown = {topic.topic for topic in first}
-        topics = [topic for topic in topics if topic.topic in shown]
-    name = Column("topic", lambda topic: _cut(output.printable(topic.topic), width // 2), "whole")
-    lines = table_lines(
-        [name, *(one for one in _COLUMNS if any(map(one.cell, topics)))], topics, width
-    )
-    if left := len(state.topics) - len(topics):
-        lines.append(f"… and {output.counted(left, 'more topic')}")
-    return [*lines, *ends]
+        topics = sorted(topics, key=lambda t: (-t.lost, -t.bytes_per_s, t.topic))[: rows - 1]
+        ends.insert(0, f"… and {output.counted(left + 1, 'more topic')}")
+    shown = [one for one in _COLUMNS if any(map(one.cell, topics))]
+    return [*table_lines([_TOPIC, *shown], topics, width), *ends]
 
 
 def _optional(value: float | None) -> str:
     return "" if value is None else f"{value:.1f}"
 
 
+_TOPIC: Final = Column("topic", lambda topic: topic.topic, cut=16)
 _COLUMNS: Final = [
     Column("Hz", lambda topic: f"{topic.hz:.1f}", "right"),
     Column("usual", lambda topic: _optional(topic.expected_hz), "right", order=2),
@@ -105,14 +98,6 @@ _COLUMNS: Final = [
     Column("thinned", lambda topic: topic.thinned or "", "right", order=4),
     Column("lost", lambda topic: topic.lost or "", "right"),
 ]
-
-
-def _cut(name: str, room: int) -> str:
-    """A name without its middle if it is too long: both ends tell topics apart."""
-    if len(name) <= room:
-        return name
-    end = room // 2
-    return f"{name[: max(room - end - 1, 0)]}…{name[-end:]}"
 
 
 def summary(state: RecorderState) -> str:

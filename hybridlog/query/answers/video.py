@@ -30,32 +30,7 @@ if TYPE_CHECKING:
 
 _MAX_OPEN = 4
 _MAX_BYTES = 256 << 20  # between two key frames
-_MAX_LOOKED = 600
 _SIZE = 16 << 20  # of the pictures of some topics, about
-
-
-def summary_of(session: Session, recording: str, topic: str) -> dict[str, Any]:
-    """Formats of the first 600 frames of a topic, their number, key frames and unreadable ones.
-
-    Raises:
-        SegmentError: A chunk is damaged.
-    """
-    question = Question((topic,), (recording,), limit=_MAX_LOOKED)
-    formats: set[str] = set()
-    found = {"frames": 0, "key_frames": 0, "unreadable": 0}
-    for run in Planner(session, question).runs():
-        for message in messages_in(run):
-            if message.is_reduced:
-                continue
-            found["frames"] += 1
-            try:
-                form, data = frame_of(message.decode())
-            except (PayloadError, DefinitionError):
-                found["unreadable"] += 1
-                continue
-            formats.add(form)
-            found["key_frames"] += is_key_frame(form, data)
-    return {"formats": sorted(formats), **found}
 
 
 def frames_in_front(session: Session, question: Question) -> list[Message]:

@@ -18,7 +18,6 @@ from pathlib import Path
 
 _noted: dict[Path, int] = {}
 """Unfinished paths and the process that makes them: a child process removes none."""
-_published: set[Path] = set()
 _undo: list[tuple[int, Callable[[], object]]] = []
 
 
@@ -38,7 +37,6 @@ class Unfinished:
         from hybridlog_storage.disk.files import publish
 
         publish(self.path, final)
-        _published.add(final)
         self.remove()
 
     def remove(self) -> None:
@@ -79,11 +77,6 @@ def undone(undo: Callable[[], object]) -> Iterator[None]:
         raise
     finally:
         _undo.remove(registered)
-
-
-def is_published(final: Path) -> bool:
-    """True if this process has completed a file or directory of that name."""
-    return final in _published
 
 
 def undo_unfinished() -> None:
