@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
 from rosbags.rosbag1 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
@@ -166,45 +165,3 @@ def test_one_byte_too_many(tmp_path: Path) -> None:
         compare_every_output(query, [{"data": value} for value in values], raw, tmp_path)
         assert [message.decode().data for message in query] == values
         assert query.where("data >= 2").count() == sum(value >= 2 for value in values)
-
-
-@pytest.mark.parametrize("form", ["export.mcap", "slice.mcap", "export.bag", "slice.bag"])
-@pytest.mark.parametrize("encoding", ["cdr", "ros1"])
-def test_exports_have_the_nested_definitions(tmp_path: Path, encoding: str, form: str) -> None:
-    """A definition without those of its standard types is supplied to other readers, too."""
-    if encoding == "cdr" and form.endswith("bag"):
-        pytest.skip("a bag holds ROS 1 messages")
-    name = "geometry_msgs/msg/PoseStamped"
-    store, write = (ROS2, "serialize_cdr") if encoding == "cdr" else (ROS1, "serialize_ros1")
-    sent = messages(store, name, write)
-    rule = "=" * 80
-    nested = f"\n{rule}\nMSG: geometry_msgs/Point\nfloat64 x\nfloat64 y\nfloat64 z\n"
-    text = f"# incomplete\nHeader header\ngeometry_msgs/Pose pose\n{nested}"
-    if encoding == "cdr":
-        text = text.replace("Header header", "std_msgs/Header header")
-    kind = "ros2msg" if encoding == "cdr" else "ros1msg"
-    spelled = name if encoding == "cdr" else name.replace("/msg/", "/")
-    channel = Channel("/pose", encoding, Schema(spelled, kind, text.encode()))
-    said = [(channel, START + at, payload) for at, (_, payload) in enumerate(sent)]
-    write_mcap(tmp_path / "some.mcap", said)
-    out = tmp_path / form
-    run("record", tmp_path / "some.mcap", "-q", store=tmp_path / "store")
-    if form.startswith("export"):
-        run("export", out, "-q", store=tmp_path / "store")
-    else:
-        run("fetch", "-t", "/pose", "-o", out, "-q", store=tmp_path / "store")
-    if form.endswith("mcap"):
-        with out.open("rb") as stream:
-            ((definition, *_), *_) = make_reader(stream).iter_messages()
-        assert definition is not None
-        data = definition.data.decode()
-    else:
-        with Reader(out) as bag:
-            data = bag.connections[0].msgdef.data
-    assert data.startswith(text)
-    types = get_typestore(Stores.EMPTY)
-    types.register(get_types_from_msg(data, name))
-    for message, payload in sent:
-        read = "deserialize_cdr" if encoding == "cdr" else "deserialize_ros1"
-        found = plain_of(types, name, getattr(types, read)(payload, name))
-        assert repr(found) == repr(plain_of(store, name, message))

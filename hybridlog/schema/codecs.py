@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, cast
 from msgspec.structs import replace
 
 from hybridlog.schema.codec import Codec, ObjectCodec, OpaqueCodec
-from hybridlog.schema.completion import has_hidden_fields
 from hybridlog.schema.states import State, encoding_of, state_of
 from hybridlog_storage.errors import DefinitionError, PayloadError
 from hybridlog_storage.messages import MARKS_CHANNEL
@@ -24,19 +23,13 @@ _ROS = {("ros1", "ros1msg"), ("cdr", "ros2msg"), ("cdr", "ros2idl"), ("cdr", "om
 
 def codec_for(channel: Channel) -> Codec:
     """The codec of a channel. Never raises: an unreadable channel gets an `OpaqueCodec`."""
-    schema = channel.schema
     state = state_of(channel.message_encoding)
     if state is not State.WHOLE:
         from hybridlog.schema.left import LeftCodec
 
         encoding = encoding_of(channel.message_encoding, channel.metadata)
         return LeftCodec(codec_for(replace(channel, message_encoding=encoding)), state)
-    if schema is not None and has_hidden_fields(channel):
-        return OpaqueCodec(
-            f"{schema.name}: the definition in the source is empty, but its md5sum says that it "
-            "has fields"
-        )
-    return _codec(channel.message_encoding, schema)
+    return _codec(channel.message_encoding, channel.schema)
 
 
 @lru_cache(maxsize=1024)

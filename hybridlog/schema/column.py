@@ -95,16 +95,16 @@ def take(column: Any, rows: NDArray[np.intp] | NDArray[np.int64]) -> Any:
     counts = np.diff(column.offset)[rows]
     start, offset = column.offset[:-1][rows], offsets(counts)
     if isinstance(column, Strings):
-        return Strings(_pick(column.data, start, counts), offset)
+        return Strings(pick(column.data, start, counts), offset)
     values = column.values
     if isinstance(values, Scalars):
-        picked = Scalars(_pick(values.values, start, counts), values.kind)
+        picked = Scalars(pick(values.values, start, counts), values.kind)
         return Arrays(picked, offset, column.width)
     return Arrays(take(values, ranges(start, counts)), offset, column.width)
 
 
-def _pick(data: NDArray[_T], start: NDArray[np.int64], count: NDArray[np.int64]) -> NDArray[_T]:
-    """Concatenate `data[start[i]:start[i] + count[i]]` for all i."""
+def pick(data: NDArray[_T], start: NDArray[np.int64], count: NDArray[np.int64]) -> NDArray[_T]:
+    """Concatenate `data[start[i]:start[i] + count[i]]` for all i: a copy."""
     if int(count.sum()) <= LONG * len(count):
         return data[ranges(start, count)]
     # An index of eight bytes per element would be larger than the elements.

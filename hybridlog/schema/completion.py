@@ -1,9 +1,7 @@
 """Supplies definitions of standard ROS types that a source does not have.
 
-Three cases differ. A source may have no definition of a type; a definition that is empty; or
-messages that are empty, whose definition rightly has no fields. A text that cannot be parsed,
-such as the name of the type or prose, is no definition. Neither is one that leaves bytes over
-where the standard type of that name fits exactly.
+A source may have no definition of a type, an empty one, or a text that cannot be parsed, such as
+the name of the type or prose; messages that are empty rightly have a definition without fields.
 
 A standard definition is supplied if it is proved: by the MD5 sum of ROS 1, by the type hash of
 ROS 2, or because it fits the messages. Releases of ROS 2 differ in some types; the one that fits
@@ -13,7 +11,7 @@ best is chosen, the newest of equal ones.
 from __future__ import annotations
 
 from contextlib import suppress
-from functools import cache, lru_cache
+from functools import cache
 from itertools import accumulate
 from operator import itemgetter
 from typing import TYPE_CHECKING
@@ -21,17 +19,10 @@ from typing import TYPE_CHECKING
 from msgspec import Struct
 from msgspec.structs import replace
 
-from hybridlog.schema.definition import (
-    MessageType,
-    parse_definition,
-    parsed_with_supplied,
-    releases,
-    standard_text,
-    typestore,
-)
-from hybridlog.schema.definition_text import canonical, has_parts
+from hybridlog.schema.definition import MessageType, parse_definition, releases, typestore
+from hybridlog.schema.definition_text import canonical
 from hybridlog.schema.wire import WireReader
-from hybridlog.schema.wire_scan import MAX_PADDING, MisfitError
+from hybridlog.schema.wire_walk import MAX_PADDING, MisfitError
 from hybridlog_storage.errors import DefinitionError
 from hybridlog_storage.messages import REPLACED, SUPPLIED, Schema
 
@@ -44,10 +35,8 @@ if TYPE_CHECKING:
 TRIED_MESSAGES = 64
 """Most messages of a channel that definitions are tried on."""
 _TRIED_BYTES = 1 << 22  # of these, but one message at least
-
-_EMPTY_MD5 = "d41d8cd98f00b204e9800998ecf8427e"
-_DEFAULTS = {"ros1msg": 1, "ros2msg": 2}
 _ENCODINGS = {"", "ros1msg", "ros2msg", "ros2idl", "omgidl"}
+_WIRES: Mapping[str, Wire] = {"ros1": "ros1", "cdr": "cdr"}
 
 
 class _Candidate(Struct, frozen=True):
@@ -74,57 +63,27 @@ def completed(channel: Channel, payloads: Sequence[Buffer]) -> Channel:
     wire = _WIRES.get(channel.message_encoding)
     if wire is None or schema is None or not schema.name or schema.encoding not in _ENCODINGS:
         return channel
-    payloads = _some(payloads)
-    own = (0, 0)
     with suppress(DefinitionError):
-        found = parse_definition(schema)
-        own = _fit(found, wire, payloads) if found.fields else own
-        if found.fields and own == (len(payloads), len(payloads)):
+        if parse_definition(schema).fields:
             return channel
     proof = _proof(channel.metadata, wire)
     candidates = [each for each in _standard(schema.name, wire) if proof in {"", each.proof}]
-    if proof and candidates and not own[1]:
-        return _with(channel, candidates[0], "md5sum" if wire == "ros1" else "type hash")
-    chosen = _fitting(candidates, wire, payloads, better_than=own)
-    return channel if chosen is None else _with(channel, chosen, "fits the messages")
-
-
-_WIRES: Mapping[str, Wire] = {"ros1": "ros1", "cdr": "cdr"}
-
-
-@lru_cache(maxsize=1024)
-def with_nested(schema: Schema) -> Schema:
-    """A definition with those of the standard types that reading supplies, for other readers."""
-    if schema.encoding not in _DEFAULTS or has_parts(schema.data.decode(errors="replace")):
-        return schema
-    ros = _DEFAULTS[schema.encoding]
-    with suppress(DefinitionError):
-        names = sorted(parsed_with_supplied(schema)[1])
-        rule = "=" * 80
-        texts = (f"\n{rule}\nMSG: {name}\n{standard_text(name, ros)}" for name in names)
-        schema = replace(schema, data=schema.data + "".join(texts).encode())
-    return schema
-
-
-def has_hidden_fields(channel: Channel) -> bool:
-    """True if the MD5 sum of a ROS 1 type proves that its empty definition is not its own."""
-    schema = channel.schema
-    if channel.message_encoding != "ros1" or schema is None or not schema.encoding:
-        return False
-    if schema.data.strip():
-        return False
-    return _proof(channel.metadata, "ros1") not in {"", _EMPTY_MD5}
-
-
-def _with(channel: Channel, chosen: _Candidate, how: str) -> Channel:
-    assert channel.schema is not None
+    how = "fits the messages"
+    if proof:
+        how = "md5sum" if wire == "ros1" else "type hash"
+    else:
+        payloads = _some(payloads)
+        scored = [(_fit(one.type, wire, payloads), one) for one in candidates]
+        most = max(scored, key=itemgetter(0), default=None)
+        candidates = [] if most is None or most[0] == (0, 0) else [most[1]]
+    if not candidates:
+        return channel
+    chosen, given = candidates[0], schema.data
     release = chosen.release.partition("_")[2].lower()
     metadata = {**channel.metadata, SUPPLIED: f"{release}, {how}"}
-    given = channel.schema.data
-    if given.strip() and not chosen.schema.data.startswith(given):
+    if given.strip():
         metadata[REPLACED] = given.decode(errors="replace")
-    schema = replace(chosen.schema, name=channel.schema.name)
-    return replace(channel, schema=schema, metadata=metadata)
+    return replace(channel, schema=replace(chosen.schema, name=schema.name), metadata=metadata)
 
 
 def _proof(metadata: Mapping[str, str], wire: Wire) -> str:
@@ -179,16 +138,3 @@ def _fit(message_type: MessageType, wire: Wire, payloads: Sequence[Buffer]) -> t
         fits += 1
         exact += rest <= MAX_PADDING[wire]
     return exact, fits
-
-
-def _fitting(
-    candidates: Sequence[_Candidate],
-    wire: Wire,
-    payloads: Sequence[Buffer],
-    *,
-    better_than: tuple[int, int],
-) -> _Candidate | None:
-    """The candidate that fits most messages exactly, then most at all; None if none is better."""
-    scored = [(_fit(one.type, wire, payloads), one) for one in candidates]
-    most, best = max(scored, key=itemgetter(0), default=(better_than, None))
-    return best if most > better_than else None

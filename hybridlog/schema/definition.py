@@ -128,18 +128,13 @@ _ROS1_TIMES = {"time": Instant("time", False, False), "duration": Instant("durat
 _WORDS = frozenset({*DTYPES, "string", *_NOT_PORTABLE})
 
 
+@lru_cache(maxsize=1024)
 def parse_definition(schema: Schema) -> MessageType:
     """Parse a definition of encoding `ros1msg`, `ros2msg`, `ros2idl` or `omgidl`.
 
     Missing standard types (`std_msgs/Header`, `geometry_msgs/Point`, ...) are those of Noetic or
     Kilted; definitions in the text take precedence.
     """
-    return parsed_with_supplied(schema)[0]
-
-
-@lru_cache(maxsize=1024)
-def parsed_with_supplied(schema: Schema) -> tuple[MessageType, frozenset[str]]:
-    """Parse a definition; returns also the names of the standard types that it lacked."""
     if schema.encoding not in {"ros1msg", "ros2msg", "ros2idl", "omgidl"}:
         raise DefinitionError(f"{schema.name}: {schema.encoding!r} is not a ROS definition")
     if len(schema.data) > MAX_DEFINITION:
@@ -152,9 +147,8 @@ def parsed_with_supplied(schema: Schema) -> tuple[MessageType, frozenset[str]]:
     top = canonical(schema.name)
     if top not in types:
         top = first
-    resolver = _Resolver(schema.name, types, ros)
-    fields = resolver.message(top)[0].fields
-    return MessageType(schema.name, fields), frozenset(resolver.supplied)
+    fields = _Resolver(schema.name, types, ros).message(top)[0].fields
+    return MessageType(schema.name, fields)
 
 
 _RELEASES = {1: "ROS1_NOETIC", 2: "ROS2_KILTED"}
@@ -234,7 +228,6 @@ class _Resolver:
     """Resolves type names to types, each type once."""
 
     def __init__(self, owner: str, types: dict[str, list[RawField]], ros: int) -> None:
-        self.supplied: set[str] = set()
         self._owner = owner
         self._types = types
         self._ros = ros
@@ -257,7 +250,6 @@ class _Resolver:
         raw_fields = self._types.get(name)
         if raw_fields is None:
             text = standard_text(name, self._ros)
-            self.supplied.add(name)
             if text is None:
                 raise self._fail(f"the definition does not say what {name} is")
             raw_fields = parse_msg(name, text, defaults=self._ros == 2)

@@ -22,7 +22,7 @@ from hybridlog.schema.definition import (
     paths,
 )
 from hybridlog.schema.wire import WireReader
-from hybridlog.schema.wire_scan import MisfitError
+from hybridlog.schema.wire_walk import MisfitError
 from hybridlog_storage.errors import DefinitionError, PayloadError
 
 if TYPE_CHECKING:

@@ -16,8 +16,7 @@ from hybridlog.schema.codec import Decoded, Unreadable, no_rows
 from hybridlog.schema.column import Records, concatenate, take
 from hybridlog.schema.wire_gather import Source
 from hybridlog.schema.wire_program import Wire, compile_type
-from hybridlog.schema.wire_scan import MisfitError, Scanner
-from hybridlog.schema.wire_walk import Walker
+from hybridlog.schema.wire_walk import MisfitError, Scanner, Walker
 from hybridlog_storage.messages import distinct
 
 if TYPE_CHECKING:
@@ -28,19 +27,10 @@ if TYPE_CHECKING:
     from hybridlog.schema.definition import MessageType
     from hybridlog_storage.messages import Buffer
 
-_HEADER = 4
+_HEADER = 4  # bytes in front of a message in CDR
 _LITTLE = 0x0001
-_BIG = 0x0000
-_OTHER_ENCAPSULATIONS = {
-    0x0002: "PL_CDR",
-    0x0003: "PL_CDR",
-    0x0006: "XCDR2",
-    0x0007: "XCDR2",
-    0x0008: "XCDR2 (delimited)",
-    0x0009: "XCDR2 (delimited)",
-    0x000A: "XCDR2 (parameter list)",
-    0x000B: "XCDR2 (parameter list)",
-}
+_ORDERS: dict[int, Literal["<", ">"]] = {_LITTLE: "<", 0x0000: ">"}
+"""Byte orders of plain CDR, by the first two bytes."""
 
 
 class _Odd(Struct):
@@ -76,10 +66,14 @@ class WireReader:
         rows = np.flatnonzero(~outside)
         if len(rows) < len(offset):
             odd.bad["lies outside of the chunk"] = [np.flatnonzero(outside)]
-        if self._wire == "ros1":
-            good, records = self._read(Source(buffer, "<"), rows, offset, end, odd)
-        else:
-            good, records = self._read_cdr(buffer, rows, offset, end, odd)
+        sources, start = [(Source(buffer, "<"), rows)], offset
+        if self._wire == "cdr":
+            sources, start = self._by_order(buffer, rows, offset, end, odd), offset + _HEADER
+        (good, records), *others = (self._read(*one, start, end, odd) for one in sources)
+        for other, more in others:
+            both = np.concatenate([good, other])
+            order = np.argsort(both)
+            good, records = both[order], take(concatenate([records, more]), order)
         unreadable = [Unreadable(np.sort(np.concatenate(r)), why) for why, r in odd.bad.items()]
         surplus = np.sort(np.concatenate(odd.surplus)) if odd.surplus else no_rows()
         return Decoded(good, records, unreadable, surplus)
@@ -92,40 +86,32 @@ class WireReader:
         scanner = Scanner(Source(payload, order), self._wire)
         return view[: scanner.walk(self._program, start, len(view), start)]
 
-    def _read_cdr(
+    def _by_order(
         self,
         buffer: Buffer,
         rows: NDArray[np.intp],
         offset: NDArray[np.int64],
         end: NDArray[np.int64],
         odd: _Odd,
-    ) -> tuple[NDArray[np.intp], Records]:
-        """Split the rows by byte order, read both, and merge them."""
+    ) -> list[tuple[Source, NDArray[np.intp]]]:
+        """The rows of each byte order of CDR, at least of one, and the buffer for these."""
         short = end[rows] - offset[rows] < _HEADER
         if bool(short.any()):
             odd.bad["is shorter than a CDR header"] = [rows[short]]
             rows = rows[~short]
-        start = offset + _HEADER
-        little = Source(buffer, "<")
-        if len(rows) == 0:
-            return self._read(little, rows, start, end, odd)
-        begin = offset[rows]
+        little, begin = Source(buffer, "<"), offset[rows]
         kind = little.u1(begin, 0).astype(np.int64) << 8
         kind |= little.u1(begin, 1)
         if bool((kind == _LITTLE).all()):
-            return self._read(little, rows, start, end, odd)
+            return [(little, rows)]
+        found = []
         for code in distinct(kind).tolist():
-            if code not in {_LITTLE, _BIG}:
-                name = _OTHER_ENCAPSULATIONS.get(code, "unknown")
-                odd.bad[f"encapsulation 0x{code:04x} ({name}) is not read"] = [rows[kind == code]]
-        orders: tuple[tuple[Literal["<", ">"], int], ...] = (("<", _LITTLE), (">", _BIG))
-        (first_rows, first), (second_rows, second) = (
-            self._read(Source(buffer, order), rows[kind == code], start, end, odd)
-            for order, code in orders
-        )
-        both = np.concatenate([first_rows, second_rows])
-        order = np.argsort(both)
-        return both[order], take(concatenate([first, second]), order)
+            own = rows[kind == code]
+            if code in _ORDERS:
+                found.append((Source(buffer, _ORDERS[code]), own))
+            else:
+                odd.bad[f"encapsulation 0x{code:04x} is not read"] = [own]
+        return found or [(little, rows[:0])]
 
     def _read(
         self,

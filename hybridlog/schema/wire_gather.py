@@ -1,4 +1,4 @@
-"""Gathers columns from a buffer, and reorders rows of columns."""
+"""Gathers columns from a buffer."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Literal, cast
 
 import numpy as np
 
-from hybridlog.schema.column import Arrays, Column, Scalars
+from hybridlog.schema.column import Arrays, Column, Scalars, pick
 from hybridlog.schema.definition import Instant, Primitive
 
 if TYPE_CHECKING:
@@ -15,15 +15,9 @@ if TYPE_CHECKING:
     from hybridlog.schema.wire_program import Fixed
     from hybridlog_storage.messages import Buffer
 
-# Bytes from which a single row is a view into the buffer: for fewer, a copy costs less
-# than keeping the whole buffer alive.
-_VIEW_BYTES = 4096
-# Bytes from which rows are copied one by one into a reused buffer: numpy's gathering
-# takes new memory from the system, which costs more than the copy.
-_LONG_BLOCK = 1 << 12
-# Rows of equal length are copied together if that is worth finding them.
-_MAX_GROUPS = 32
-_ROWS_A_GROUP = 16
+# Bytes of a row from which a single one is a view into the buffer, and several are copied
+# one by one: for fewer, a copy costs less than keeping the whole buffer alive.
+_LONG = 4096
 # Rows from which a check for equal distances pays.
 _EVEN_ROWS = 16
 
@@ -40,31 +34,24 @@ class Source:
         """Read numbers of one byte order (`<` little endian, `>` big endian)."""
         self.buffer = memoryview(buffer).cast("B")
         self.order = order
-        self._length = len(self.buffer)
+        self._bytes: NDArray[np.uint8] = np.asarray(self.buffer)
         self._base: NDArray[np.int64] | None = None
         self._stride = 0
 
     def _gather(
         self, dtype: str | np.dtype[np.generic], size: int, base: NDArray[np.int64], delta: int
     ) -> NDArray[np.generic]:
+        if not len(base):
+            return np.empty(0, dtype)
         if base is not self._base:
             # Many gathers use one base: its stride is computed once.
             self._base, self._stride = base, _even_stride(base)
-        view: NDArray[np.generic]
         if self._stride:
-            start = int(base[0]) + delta
-            view = np.ndarray(
-                base.shape, dtype, buffer=self.buffer, offset=start, strides=(self._stride,)
-            )
-            return view.copy()
-        view = np.ndarray(
-            (self._length - delta - size + 1,),
-            dtype,
-            buffer=self.buffer,
-            offset=delta,
-            strides=(1,),
-        )
-        return view[base]
+            start, shape, stride = int(base[0]) + delta, base.shape, self._stride
+        else:
+            start, shape, stride = delta, (len(self.buffer) - delta - size + 1,), 1
+        view: NDArray[np.generic] = np.ndarray(shape, dtype, self.buffer, start, (stride,))
+        return view.copy() if self._stride else view[base]
 
     def u1(self, base: NDArray[np.int64], delta: int) -> NDArray[np.uint8]:
         """The byte at each `base + delta`."""
@@ -78,63 +65,16 @@ class Source:
         """Gather `size` bytes from each `base + delta`, row by row: uint8[n * size]."""
         if size == 0:
             return np.empty(0, np.uint8)
-        if len(base) == 1 and size >= _VIEW_BYTES:
-            return np.frombuffer(self.buffer, np.uint8, size, int(base[0]) + delta)
-        if size >= _LONG_BLOCK:
-            return self._join_equal(base + delta, size)
+        if size >= _LONG and len(base) == 1:
+            start = int(base[0]) + delta
+            return self._bytes[start : start + size]
+        if size >= _LONG:
+            return self.ragged(base + delta, np.full(len(base), size))
         return cast("NDArray[np.uint8]", self._gather(f"V{size}", size, base, delta).view("u1"))
 
     def ragged(self, start: NDArray[np.int64], size: NDArray[np.int64]) -> NDArray[np.uint8]:
         """Gather `size[i]` bytes from `start[i]`, row by row."""
-        if len(start) >= 2 * _ROWS_A_GROUP and int(size.max()) < _LONG_BLOCK:
-            sizes, group = np.unique(size, return_inverse=True)
-            if len(sizes) <= _MAX_GROUPS and len(sizes) * _ROWS_A_GROUP <= len(start):
-                return self._by_size(start, size, sizes, group)
-        if len(size) and size[0] >= _LONG_BLOCK and bool((size == size[0]).all()):
-            return self._join_equal(start, int(size[0]))
-        return self._join(start.tolist(), size.tolist())
-
-    def _join_equal(self, start: NDArray[np.int64], size: int) -> NDArray[np.uint8]:
-        """Gather `size` bytes from each start, in one step if the starts are equally spaced."""
-        rows = len(start)
-        stride = _even_stride(start, least=2)
-        if not stride:
-            return self._join(start.tolist(), [size] * rows)
-        joined = np.empty(rows * size, np.uint8)
-        view: NDArray[np.uint8] = np.ndarray(
-            (rows, size), np.uint8, buffer=self.buffer, offset=int(start[0]), strides=(stride, 1)
-        )
-        joined.reshape(rows, size)[:] = view
-        return joined
-
-    def _join(self, start: list[int], size: list[int]) -> NDArray[np.uint8]:
-        total = sum(size)
-        joined = np.empty(total, np.uint8)
-        content = np.frombuffer(self.buffer, np.uint8)
-        to = 0
-        for at, count in zip(start, size, strict=True):
-            joined[to : to + count] = content[at : at + count]
-            to += count
-        return joined
-
-    def _by_size(
-        self,
-        start: NDArray[np.int64],
-        size: NDArray[np.int64],
-        sizes: NDArray[np.int64],
-        group: NDArray[np.intp],
-    ) -> NDArray[np.uint8]:
-        offset = np.cumsum(size) - size
-        target = np.empty(int(size.sum()), np.uint8)
-        for number, count in enumerate(sizes.tolist()):
-            if count == 0:
-                continue
-            rows = np.flatnonzero(group == number)
-            view: NDArray[np.void] = np.ndarray(
-                (len(target) - count + 1,), f"V{count}", buffer=target, strides=(1,)
-            )
-            view[offset[rows]] = self._gather(f"V{count}", count, start[rows], 0)
-        return target
+        return pick(self._bytes, start, size)
 
     def numbers(self, data: NDArray[np.uint8], kind: Primitive) -> NDArray[np.generic]:
         """Gathered bytes as aligned numbers of native byte order."""
@@ -143,7 +83,20 @@ class Source:
         values = data.view(kind.dtype.newbyteorder(self.order))
         return values.astype(kind.dtype, copy=not values.flags.aligned)
 
-    def instants(self, data: NDArray[np.uint8], kind: Instant) -> NDArray[np.int64]:
+    def fixed(self, item: Fixed, base: NDArray[np.int64], delta: int) -> Column:
+        """The column of a field of fixed size at each `base + delta`."""
+        kind = item.kind
+        assert kind is not None
+        if isinstance(kind, Instant):
+            times = self._instants(self.block(base, delta, item.size), kind)
+            column = Scalars(times, kind.kind)
+        else:
+            column = Scalars(self._primitive(item, kind, base, delta))
+        if item.width is None:
+            return column
+        return Arrays(column, even_offsets(len(base), item.width), item.width)
+
+    def _instants(self, data: NDArray[np.uint8], kind: Instant) -> NDArray[np.int64]:
         """Gathered bytes as nanoseconds."""
         signed = data.view(f"{self.order}i4").reshape(-1, 2)
         unsigned = data.view(f"{self.order}u4").reshape(-1, 2)
@@ -151,19 +104,6 @@ class Source:
         seconds *= 1_000_000_000
         seconds += (signed if kind.signed_nanoseconds else unsigned)[:, 1]
         return seconds
-
-    def fixed(self, item: Fixed, base: NDArray[np.int64], delta: int) -> Column:
-        """The column of a field of fixed size at each `base + delta`."""
-        kind = item.kind
-        if isinstance(kind, Instant):
-            times = self.instants(self.block(base, delta, item.size), kind)
-            column = Scalars(times, kind.kind)
-        else:
-            assert kind is not None
-            column = Scalars(self._primitive(item, kind, base, delta))
-        if item.width is None:
-            return column
-        return Arrays(column, even_offsets(len(base), item.width), item.width)
 
     def _primitive(
         self, item: Fixed, kind: Primitive, base: NDArray[np.int64], delta: int
@@ -176,26 +116,14 @@ class Source:
         return values.astype(kind.dtype, copy=False)
 
 
-def empty_fixed(item: Fixed) -> Column:
-    """The column of a field of fixed size for no rows."""
-    if isinstance(item.kind, Instant):
-        column = Scalars(np.empty(0, np.int64), item.kind.kind)
-    else:
-        assert item.kind is not None
-        column = Scalars(np.empty(0, item.kind.dtype))
-    if item.width is None:
-        return column
-    return Arrays(column, np.zeros(1, np.int64), item.width)
-
-
 def even_offsets(rows: int, width: int) -> NDArray[np.int64]:
     """Offsets of rows of `width` elements each: int64[rows + 1]."""
     return np.arange(rows + 1, dtype=np.int64) * width
 
 
-def _even_stride(base: NDArray[np.int64], least: int = _EVEN_ROWS) -> int:
+def _even_stride(base: NDArray[np.int64]) -> int:
     """The distance of equally spaced offsets, 0 for others and for few."""
-    if len(base) < least:
+    if len(base) < _EVEN_ROWS:
         return 0
     stride = int(base[1] - base[0])
     return stride if stride > 0 and bool((base[1:] - base[:-1] == stride).all()) else 0

@@ -1,47 +1,137 @@
-"""Walks over many payloads at once and gathers their columns.
+"""Walks over many payloads at once and gathers their columns, or over one, value by value.
 
 All rows take the same steps. Their positions are a vector (`base`) plus a number
 (`delta`). The vector changes only behind fields of varying length, so most fields cost only
 their gather. Bounds take one comparison for each run: `room` is the smallest distance from
 `base` to the end of the payload over all rows.
 
-A row that does not fit stops the walk. The reader then finds these rows and restarts
-without them.
+A row that does not fit stops the walk. The reader then finds these rows with the walk over
+one, and restarts without them.
 """
 
 from __future__ import annotations
 
+from struct import Struct
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hybridlog.schema.column import Arrays, Column, Scalars, Strings, offsets, ranges
-from hybridlog.schema.wire_gather import (
-    Source,
-    empty_fixed,
-    even_offsets,
-)
+from hybridlog.schema.wire_gather import Source, even_offsets
 from hybridlog.schema.wire_program import (
     ArrayStep,
     NumbersStep,
     Program,
     Run,
+    Step,
     TextStep,
     Wire,
     assemble,
-)
-from hybridlog.schema.wire_scan import (
-    MAX_EMPTY_ELEMENTS,
-    MAX_PADDING,
-    MisfitError,
-    Scanner,
 )
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-# Rows below which walking over elements is faster one row at a time.
-_MIN_VECTOR_ROWS = 12
+MAX_EMPTY_ELEMENTS = 1_000_000
+"""Most elements of an array whose elements take no bytes."""
+MAX_PADDING = {"ros1": 0, "cdr": 3}
+"""Most bytes that fill up a payload; in CDR to a multiple of four."""
+_MIN_VECTOR_ROWS = 12  # rows below which walking over elements is faster one row at a time
+_FAR = 1 << 62  # room of no rows
+_U4 = {"<": Struct("<I"), ">": Struct(">I")}
+
+
+class MisfitError(Exception):
+    """A payload does not fit its definition; the message names the place."""
+
+
+class Scanner:
+    """Walks over one payload of a buffer at a time, to check or measure it.
+
+    The slow counterpart of `Walker`. It allocates nothing, and accepts a claimed length only if
+    that many bytes are left.
+    """
+
+    def __init__(self, source: Source, wire: Wire) -> None:
+        self._buffer = source.buffer
+        self._u4 = _U4[source.order].unpack_from
+        self._cdr = wire == "cdr"
+        self._mask = 7 if self._cdr else 0
+        self._padding = MAX_PADDING[wire]
+
+    def check(self, program: Program, start: int, end: int) -> None:
+        """Walk over a whole message. Bytes may be left over, except of a type without fields.
+
+        In CDR, `start` is behind the encapsulation header. A payload that does not fit raises
+        MisfitError.
+        """
+        rest = end - self.walk(program, start, end, start)
+        if program.empty and rest > self._padding:
+            raise MisfitError(f"{rest} bytes left over: the definition has no fields")
+
+    def walk(self, program: Program, at: int, end: int, origin: int) -> int:
+        """The position behind a message or element at `at`; `origin` is that of the alignment."""
+        for step in program.steps:
+            if isinstance(step, Run):
+                size = step.size((at - origin) & self._mask)
+                if size > end - at:
+                    path = step.cut((at - origin) & self._mask, end - at)
+                    raise MisfitError(f"ends in the middle of field {path}")
+                at += size
+            elif isinstance(step, TextStep):
+                at = self._text(step, at, end, origin)
+            elif isinstance(step, NumbersStep):
+                at = self._numbers(step, at, end, origin)
+            else:
+                at = self._array(step, at, end, origin)
+        return at
+
+    def _count(self, step: Step, at: int, end: int, origin: int) -> tuple[int, int]:
+        """A length in 32 bits, and the position behind it."""
+        assert not isinstance(step, Run)
+        at += (origin - at) & self._mask & 3
+        if end - at < 4:
+            raise MisfitError(f"ends in the middle of field {step.path}")
+        return self._u4(self._buffer, at)[0], at + 4
+
+    def _text(self, step: TextStep, at: int, end: int, origin: int) -> int:
+        size, at = self._count(step, at, end, origin)
+        if size > end - at:
+            raise MisfitError(f"{step.path} claims {size} bytes, {end - at} bytes remain")
+        at += size
+        if self._cdr and size and self._buffer[at - 1]:
+            raise MisfitError(f"{step.path} does not end with NUL")
+        return at
+
+    def _numbers(self, step: NumbersStep, at: int, end: int, origin: int) -> int:
+        count, at = self._count(step, at, end, origin)
+        if count == 0:
+            return at
+        room = end - at
+        at += (origin - at) & (step.align - 1)
+        size = count * step.kind.size
+        if size > end - at:
+            raise MisfitError(f"{step.path} claims {count} elements, {room} bytes remain")
+        return at + size
+
+    def _array(self, step: ArrayStep, at: int, end: int, origin: int) -> int:
+        count, element = step.width, step.element
+        if count is None:
+            count, at = self._count(step, at, end, origin)
+        if element.least == 0:
+            if count > MAX_EMPTY_ELEMENTS:
+                raise MisfitError(f"{step.path} claims {count} elements that take no bytes")
+            return at
+        size = count * element.least
+        if element.fixed and size <= end - at:
+            size = element.span((at - origin) & self._mask, count)
+        if size > end - at:
+            raise MisfitError(f"{step.path} claims {count} elements, {end - at} bytes remain")
+        if element.fixed:
+            return at + size
+        for _ in range(count):
+            at = self.walk(element, at, end, origin)
+        return at
 
 
 class _Cursor:
@@ -77,7 +167,7 @@ class _Cursor:
         self.delta = 0
         self.phase = phase
         self.modulus = modulus
-        self.room = int((self.end - base).min())
+        self.room = int((self.end - base).min(initial=_FAR))
         if self.room < 0:
             raise MisfitError
 
@@ -87,9 +177,8 @@ class _Cursor:
         Otherwise the phase is 0 modulo `modulus`.
         """
         step = positions - self.base
-        first = int(step[0])
-        if len(step) == 1 or bool((step == first).all()):
-            self.delta = first
+        if len(step) and bool((step == step[0]).all()):
+            self.delta = int(step[0])
             self.need(0)
         else:
             self.move(positions, 0, modulus)
@@ -118,7 +207,7 @@ class Walker:
         self._cdr = wire == "cdr"
         # ROS 1: every phase counts as 0 and known.
         self._mask = 7 if self._cdr else 0
-        self._count_align = 4 if self._cdr else 1
+        self._least_known = 1 if self._cdr else 8  # modulus behind a field of varying length
         self._padding = MAX_PADDING[wire]
 
     def read(
@@ -130,34 +219,42 @@ class Walker:
         requested; bool[n] is True where bytes are left over behind the message, None if there are
         none. MisfitError names no payload.
         """
-        slots: list[Column | None] = [None] * program.slots
-        if len(start) == 0:
-            return self._empty(program), None
         cursor = _Cursor(start, end, start)
-        self._walk(program, cursor, slots)
-        surplus = None
+        column = self._gather(program, cursor)
         rest = end - cursor.base - cursor.delta
-        most = int(rest.max())
+        most = int(rest.max(initial=0))
         if program.empty and most > self._padding:
             raise MisfitError
-        if most > 0:
-            surplus = rest > self._padding
-            if self._cdr:
-                surplus |= (rest > 0) & ((end - start) & 3 > 0)
-        column = None if program.root is None else assemble(program.root, slots, len(start))
+        if most == 0:
+            return column, None
+        surplus = rest > self._padding
+        if self._cdr:
+            surplus |= (rest > 0) & ((end - start) & 3 > 0)
         return column, surplus
+
+    def _gather(self, program: Program, cursor: _Cursor) -> Column | None:
+        """Gather the columns of the requested fields of a program; None without any."""
+        rows = len(cursor.base)
+        slots: list[Column | None] = [None] * program.slots
+        self._walk(program, cursor, slots)
+        return None if program.root is None else assemble(program.root, slots, rows)
 
     def _walk(self, program: Program, cursor: _Cursor, slots: list[Column | None] | None) -> None:
         """Take all steps of a program; gather columns if it has slots."""
         for step in program.steps:
             if isinstance(step, Run):
                 self._run(step, cursor, slots)
-            elif isinstance(step, TextStep):
-                self._text(step, cursor, slots)
+                continue
+            slot = None if slots is None else step.slot
+            column: Column | None
+            if isinstance(step, TextStep):
+                column = self._text(cursor, gather=slot is not None)
             elif isinstance(step, NumbersStep):
-                self._numbers(step, cursor, slots)
+                column = self._numbers(step, cursor, gather=slot is not None)
             else:
-                self._array(step, cursor, slots)
+                column = self._array(step, cursor, gather=slot is not None)
+            if slots is not None and slot is not None:
+                slots[slot] = column
 
     def _run(self, run: Run, cursor: _Cursor, slots: list[Column | None] | None) -> None:
         first = 0
@@ -169,9 +266,8 @@ class Walker:
             if slots is not None:
                 for distance, item in layout.wanted:
                     assert item.slot is not None
-                    slots[item.slot] = self._source.fixed(
-                        item, cursor.base, cursor.delta + distance
-                    )
+                    at = cursor.delta + distance
+                    slots[item.slot] = self._source.fixed(item, cursor.base, at)
             cursor.delta += layout.size
             first = layout.stop
             if first == len(run.fields):
@@ -180,61 +276,46 @@ class Walker:
 
     def _claims(self, cursor: _Cursor) -> int | NDArray[np.int64]:
         """Lengths in 32 bits: one number if they are equal, else int64[n]."""
-        if self._count_align > 1:
-            cursor.align(self._count_align)
+        if self._cdr:
+            cursor.align(4)
         cursor.need(4)
         claims = self._source.u4(cursor.base, cursor.delta)
         cursor.delta += 4
-        first = int(claims[0])
-        if len(claims) == 1 or bool((claims == first).all()):
-            return first
-        return claims
+        first = int(claims[0]) if len(claims) else 0
+        return first if bool((claims == first).all()) else claims
 
-    def _text(self, step: TextStep, cursor: _Cursor, slots: list[Column | None] | None) -> None:
-        claims = self._claims(cursor)
-        source = self._source
-        gather = slots is not None and step.slot is not None
+    def _text(self, cursor: _Cursor, *, gather: bool) -> Strings | None:
+        claims, source = self._claims(cursor), self._source
         nul = 1 if self._cdr else 0
-        column: Column | None = None
         if isinstance(claims, int):
             cursor.need(claims)
             base, delta = cursor.base, cursor.delta
             if nul and claims and bool(source.u1(base, delta + claims - 1).any()):
                 raise MisfitError
-            if gather:
-                size = max(claims - nul, 0)
-                column = Strings(source.block(base, delta, size), even_offsets(len(base), size))
             cursor.delta += claims
-        else:
-            start = cursor.base + cursor.delta
-            ends = start + claims
-            cursor.move(ends, 0, 1 if self._cdr else 8)
-            if nul:
-                filled = ends if bool(claims.all()) else ends[claims > 0]
-                if bool(source.u1(filled - 1, 0).any()):
-                    raise MisfitError
-            if gather:
-                sizes = np.maximum(claims - nul, 0)
-                column = Strings(source.ragged(start, sizes), offsets(sizes))
-        if slots is not None and step.slot is not None:
-            slots[step.slot] = column
+            size = max(claims - nul, 0)
+            even = even_offsets(len(base), size)
+            return Strings(source.block(base, delta, size), even) if gather else None
+        start = cursor.base + cursor.delta
+        ends = start + claims
+        cursor.move(ends, 0, self._least_known)
+        if nul and bool(source.u1(ends[claims > 0] - 1, 0).any()):
+            raise MisfitError
+        sizes = np.maximum(claims - nul, 0)
+        return Strings(source.ragged(start, sizes), offsets(sizes)) if gather else None
 
-    def _numbers(
-        self, step: NumbersStep, cursor: _Cursor, slots: list[Column | None] | None
-    ) -> None:
-        claims = self._claims(cursor)
-        source = self._source
-        gather = slots is not None and step.slot is not None
-        item_size = step.kind.size
-        data: NDArray[np.uint8] | None = None
+    def _numbers(self, step: NumbersStep, cursor: _Cursor, *, gather: bool) -> Arrays | None:
+        claims, source, item_size = self._claims(cursor), self._source, step.kind.size
         if isinstance(claims, int):
             if claims:
                 cursor.align(step.align)
-            cursor.need(claims * item_size)
-            if gather:
-                data = source.block(cursor.base, cursor.delta, claims * item_size)
-                offset = even_offsets(len(cursor.base), claims)
-            cursor.delta += claims * item_size
+            size = claims * item_size
+            cursor.need(size)
+            base, delta = cursor.base, cursor.delta
+            cursor.delta += size
+            if not gather:
+                return None
+            data, offset = source.block(base, delta, size), even_offsets(len(base), claims)
         else:
             start = cursor.base + cursor.delta
             if step.align > 4:
@@ -243,172 +324,85 @@ class Walker:
             sizes = claims * item_size
             # Rows without elements are aligned to 4 only: the count came last.
             cursor.move(start + sizes, 0, min(item_size, 4) if self._cdr else 8)
-            if gather:
-                data = source.ragged(start, sizes)
-                offset = offsets(claims)
-        if data is not None and slots is not None and step.slot is not None:
-            slots[step.slot] = Arrays(Scalars(source.numbers(data, step.kind)), offset)
+            if not gather:
+                return None
+            data, offset = source.ragged(start, sizes), offsets(claims)
+        return Arrays(Scalars(source.numbers(data, step.kind)), offset)
 
-    def _array(self, step: ArrayStep, cursor: _Cursor, slots: list[Column | None] | None) -> None:
-        counts = self._claims(cursor) if step.width is None else step.width
-        if slots is None or step.slot is None:
-            self._elements(step.element, cursor, counts)
-            return
-        rows = len(cursor.base)
-        end, origin = cursor.end, cursor.origin
-        found = self._elements(step.element, cursor, counts)
-        offset = even_offsets(rows, counts) if isinstance(counts, int) else offsets(counts)
-        total = int(offset[-1])
-        if found is None or total == 0:
-            values = self._valueless(step.element, total)
-        else:
-            starts, phase, modulus = found
-            each_end, each_origin = np.repeat(end, counts), np.repeat(origin, counts)
-            inner = _Cursor(starts, each_end, each_origin, phase, modulus)
-            values = self._gather(step.element, inner)
-        slots[step.slot] = Arrays(values, offset, step.width)
-
-    def _gather(self, program: Program, cursor: _Cursor) -> Column:
-        """Gather the columns of a program with requested fields."""
-        assert program.root is not None
-        slots: list[Column | None] = [None] * program.slots
-        rows = len(cursor.base)
-        self._walk(program, cursor, slots)
-        return assemble(program.root, slots, rows)
-
-    def _valueless(self, element: Program, total: int) -> Column:
-        """Columns of no elements, or of elements without bytes."""
-        if total == 0:
-            column = self._empty(element)
-            assert column is not None
-            return column
-        assert element.root is not None
-        return assemble(element.root, [], total)
-
-    def _elements(
-        self, element: Program, cursor: _Cursor, counts: int | NDArray[np.int64]
-    ) -> tuple[NDArray[np.int64], int, int] | None:
-        """Advance over all elements; returns their starts, and phase and modulus as far as known.
-
-        Returns None if elements take no bytes.
-        """
-        most = counts if isinstance(counts, int) else int(counts.max())
-        if element.least == 0:
-            if most > MAX_EMPTY_ELEMENTS:
-                raise MisfitError
-            return None
+    def _array(self, step: ArrayStep, cursor: _Cursor, *, gather: bool) -> Arrays | None:
+        element, end, origin = step.element, cursor.end, cursor.origin
+        claims = self._claims(cursor) if step.width is None else step.width
+        counts = np.full(len(end), claims, np.int64)
+        room = end - cursor.base - cursor.delta
         # Before memory is allocated: the payload cannot hold that many.
-        if isinstance(counts, int):
-            cursor.need(counts * element.least)
-        elif bool((counts > (cursor.end - cursor.base - cursor.delta) // element.least).any()):
+        if bool((counts > (room // element.least if element.least else MAX_EMPTY_ELEMENTS)).any()):
             raise MisfitError
-        if element.fixed:
-            return self._fixed_elements(element, cursor, counts)
-        return self._varying_elements(element, cursor, counts), 0, 1 if self._cdr else 8
+        values: Column | None = None
+        if element.fixed and element.least:
+            starts, phase, modulus = self._fixed_elements(element, cursor, counts, gather=gather)
+        elif element.least:
+            starts, phase, modulus = self._varying_elements(element, cursor, counts)
+        elif element.root is not None:
+            values = assemble(element.root, [], int(counts.sum()))
+        if gather and element.least:
+            ends, origins = np.repeat(end, counts), np.repeat(origin, counts)
+            values = self._gather(element, _Cursor(starts, ends, origins, phase, modulus))
+        if not gather:
+            return None
+        assert values is not None
+        return Arrays(values, offsets(counts), step.width)
 
     def _fixed_elements(
-        self, element: Program, cursor: _Cursor, counts: int | NDArray[np.int64]
+        self, element: Program, cursor: _Cursor, counts: NDArray[np.int64], *, gather: bool
     ) -> tuple[NDArray[np.int64], int, int]:
+        """Advance over elements of fixed size; returns their starts, phase and modulus to `gather`.
+
+        From the second element of a row on, all start at one phase modulo the alignment; the
+        first one may differ, and then in size, too.
+        """
         align = element.align
-        # From the second element on, all start at this phase (modulo `align`).
         later = element.size(0) & (align - 1)
         stride = element.size(later)
         start = cursor.base + cursor.delta
         if cursor.modulus >= align:
             phase = (cursor.phase + cursor.delta) & (align - 1) & self._mask
-            first = element.size(phase)
-            if isinstance(counts, int):
-                span = element.span(phase, counts)
-                cursor.need(span)
-                cursor.delta += span
-                distance = np.arange(counts, dtype=np.int64) * stride
-                distance[1:] += first - stride
-                starts = (start[:, None] + distance).ravel()
-            else:
-                firsts = np.full(len(start), first, np.int64)
-                starts = self._spread(cursor, start, counts, firsts, stride)
-            if phase == later:
-                return starts, phase, align if self._cdr else 8
-            return starts, 0, 1
-        # Only CDR reaches this: in ROS 1 all phases are known.
-        sizes = np.array([element.size(phase) for phase in range(align)], np.int64)
-        firsts = sizes[(start - cursor.origin) & (align - 1)]
-        if isinstance(counts, int):
-            counts = np.full(len(start), counts, np.int64)
-        return self._spread(cursor, start, counts, firsts, stride), 0, 1
-
-    def _spread(
-        self,
-        cursor: _Cursor,
-        start: NDArray[np.int64],
-        counts: NDArray[np.int64],
-        firsts: NDArray[np.int64],
-        stride: int,
-    ) -> NDArray[np.int64]:
-        """Starts of elements of fixed size; the first of a row may differ in size."""
+            firsts = np.full(len(start), element.size(phase), np.int64)
+        else:  # Only CDR reaches this: in ROS 1 all phases are known.
+            phase = -1
+            sizes = np.array([element.size(one) for one in range(align)], np.int64)
+            firsts = sizes[(start - cursor.origin) & (align - 1)]
         extra = firsts - stride
         ends = start + np.where(counts > 0, counts * stride + extra, 0)
-        cursor.move_or_step(ends, self._least_known())
+        cursor.move_or_step(ends, self._least_known)
+        if not gather:
+            return start, 0, 1
         index = ranges(np.zeros_like(counts), counts)
-        starts = np.repeat(start, counts)
-        starts += index * stride
+        starts = np.repeat(start, counts) + index * stride
         starts += np.where(index > 0, np.repeat(extra, counts), 0)
-        return starts
+        return (starts, phase, align if self._cdr else 8) if phase == later else (starts, 0, 1)
 
     def _varying_elements(
-        self, element: Program, cursor: _Cursor, counts: int | NDArray[np.int64]
-    ) -> NDArray[np.int64]:
+        self, element: Program, cursor: _Cursor, counts: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], int, int]:
+        """Advance over other elements; returns as much."""
         at = cursor.base + cursor.delta
-        rows = len(at)
-        each = np.full(rows, counts, np.int64) if isinstance(counts, int) else counts
-        offset = offsets(each)
+        offset = offsets(counts)
         starts = np.empty(int(offset[-1]), np.int64)
-        active = np.flatnonzero(each)
+        active = np.flatnonzero(counts)
         index = 0
         while len(active) >= _MIN_VECTOR_ROWS:
             here = at[active]
             starts[offset[active] + index] = here
-            inner = _Cursor(here, cursor.end[active], cursor.origin[active], 0, self._least_known())
+            inner = _Cursor(here, cursor.end[active], cursor.origin[active], 0, self._least_known)
             self._walk(element, inner, None)
             at[active] = inner.base + inner.delta
             index += 1
-            active = active[each[active] > index]
+            active = active[counts[active] > index]
         for row in active.tolist():
-            found, after = self._scanner.elements(
-                element,
-                int(at[row]),
-                int(cursor.end[row]),
-                int(cursor.origin[row]),
-                int(each[row]) - index,
-            )
-            starts[int(offset[row]) + index : int(offset[row + 1])] = found
-            at[row] = after
-        cursor.move_or_step(at, self._least_known())
-        return starts
-
-    def _least_known(self) -> int:
-        """The known modulus of a phase behind a field of varying length."""
-        return 1 if self._cdr else 8
-
-    def _empty(self, program: Program) -> Column | None:
-        """Columns of a program for no rows."""
-        if program.root is None:
-            return None
-        slots: list[Column | None] = [None] * program.slots
-        none = np.zeros(1, np.int64)
-        for step in program.steps:
-            if isinstance(step, Run):
-                for item in step.fields:
-                    if item.slot is not None:
-                        slots[item.slot] = empty_fixed(item)
-            elif step.slot is None:
-                continue
-            elif isinstance(step, TextStep):
-                slots[step.slot] = Strings(np.empty(0, np.uint8), none)
-            elif isinstance(step, NumbersStep):
-                slots[step.slot] = Arrays(Scalars(np.empty(0, step.kind.dtype)), none)
-            else:
-                values = self._empty(step.element)
-                assert values is not None
-                slots[step.slot] = Arrays(values, none, step.width)
-        return assemble(program.root, slots, 0)
+            place, end, origin = int(at[row]), int(cursor.end[row]), int(cursor.origin[row])
+            for number in range(int(offset[row]) + index, int(offset[row + 1])):
+                starts[number] = place
+                place = self._scanner.walk(element, place, end, origin)
+            at[row] = place
+        cursor.move_or_step(at, self._least_known)
+        return starts, 0, self._least_known

@@ -358,9 +358,9 @@ def test_reasons_name_the_field_and_the_numbers():
     ("payload", "reason"),
     [
         (b"\x00\x01", "is shorter than a CDR header"),
-        (b"\x00\x03\x00\x00" + u4(1), "encapsulation 0x0003 (PL_CDR) is not read"),
-        (b"\x00\x07\x00\x00" + u4(1), "encapsulation 0x0007 (XCDR2) is not read"),
-        (b"\x77\x01\x00\x00" + u4(1), "encapsulation 0x7701 (unknown) is not read"),
+        (b"\x00\x03\x00\x00" + u4(1), "encapsulation 0x0003 is not read"),
+        (b"\x00\x07\x00\x00" + u4(1), "encapsulation 0x0007 is not read"),
+        (b"\x77\x01\x00\x00" + u4(1), "encapsulation 0x7701 is not read"),
     ],
 )
 def test_what_cdr_refuses(payload, reason):

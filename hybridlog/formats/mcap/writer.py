@@ -9,7 +9,6 @@ from mcap.writer import CompressionType, Writer
 
 from hybridlog.formats.answer import Answer, LogWriter
 from hybridlog.formats.writing import Sink, Target
-from hybridlog.schema.completion import with_nested
 from hybridlog_storage.segments.segment_format import OUR_NAMES
 
 if TYPE_CHECKING:
@@ -111,7 +110,7 @@ class McapWriter(LogWriter):
         if schema is None:
             return 0
         if schema not in self._schemas:
-            data = with_nested(schema).data
+            data = schema.data
             number = self._writer.register_schema(schema.name, schema.encoding, data)
             self._schemas[schema] = int(number)
         return self._schemas[schema]

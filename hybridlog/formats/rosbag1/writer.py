@@ -17,7 +17,6 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from hybridlog.formats.answer import Answer, LogWriter
 from hybridlog.formats.mcap.writer import source_metadata
 from hybridlog.formats.writing import Sink, Target, destination, failures
-from hybridlog.schema.completion import with_nested
 from hybridlog_storage.disk.unfinished import beside, scratch_directory
 from hybridlog_storage.errors import UsageError
 
@@ -115,7 +114,7 @@ class BagWriter(LogWriter):
                 "came: write --format mcap"
             )
         metadata = source_metadata(channel)
-        schema = with_nested(channel.schema)
+        schema = channel.schema
         md5sum = metadata.get("md5sum") or _md5sum(schema)
         callerid, latching = metadata.get("callerid"), metadata.get("latching")
         key = (channel.topic, schema.name, schema.data, md5sum, callerid, latching)

@@ -19,7 +19,6 @@ from hybridlog.formats.mcap.writer import McapWriter
 from hybridlog.formats.rosbag2.directory import NAME
 from hybridlog.formats.writing import Target, failures, new_directory, path_of
 from hybridlog.formats.yaml_values import YamlError, parse_yaml
-from hybridlog.schema.completion import with_nested
 from hybridlog_storage.errors import DiskFullError, HybridlogError, UsageError
 
 if TYPE_CHECKING:
@@ -242,7 +241,7 @@ class _SqliteFile(LogWriter):
                 self._db.execute("INSERT INTO topics VALUES (?, ?, ?, ?, ?, ?)", row)
                 schema = topic.channel.schema
                 assert schema is not None
-                text = with_nested(schema).data.decode(errors="replace")
+                text = schema.data.decode(errors="replace")
                 types.setdefault(kind, (kind, schema.encoding, text, topic.type_hash))
             self._db.executemany(
                 "INSERT INTO message_definitions(topic_type, encoding, "

@@ -14,7 +14,6 @@ from typing import Annotated, Any, Final, NamedTuple
 import msgspec
 
 from hybridlog.live.sources.foxglove.protocol import MESSAGE_DATA, TIME
-from hybridlog.schema.completion import with_nested
 from hybridlog.view.playback.played import PlayedChannel
 
 _BASE64 = frozenset({"protobuf", "flatbuffer"})
@@ -91,7 +90,7 @@ def advertise(channels: Iterable[PlayedChannel]) -> str:
 
 def _described(each: PlayedChannel) -> dict[str, Any]:
     channel = each.channel
-    schema = None if channel.schema is None else with_nested(channel.schema)
+    schema = None if channel.schema is None else channel.schema
     found = {"id": each.id, "topic": channel.topic, "encoding": channel.message_encoding}
     if schema is None or not schema.encoding:
         return {**found, "schemaName": schema.name if schema else "", "schema": ""}
