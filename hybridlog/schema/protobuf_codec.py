@@ -143,7 +143,8 @@ class _Messages(Objects):
 
     def _arrow(self, rows: slice) -> pa.StructArray:
         assert self.descriptor is not None
-        return messages_array(self.descriptor, self.values[rows], self.wanted())
+        found = _Builder().messages(self.descriptor, self.values[rows], self.wanted(), ())
+        return cast("pa.StructArray", found)
 
 
 def _message_class(schema: Schema) -> type[Message]:
@@ -184,28 +185,21 @@ def _fill(pool: DescriptorPool, data: bytes) -> Exception | None:
     """
     from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
 
-    files = {file.name: file for file in FileDescriptorSet.FromString(data).file}
-    if b"google.protobuf." in data:
-        for name in sorted(_STANDARD - files.keys()):
-            files[name] = _standard_file(name)
-    for name in {name for file in files.values() for name in file.dependency} - files.keys():
+    given = {file.name: file for file in FileDescriptorSet.FromString(data).file}
+    standard = sorted(_STANDARD - given.keys()) if b"google.protobuf." in data else []
+    files = {name: _standard_file(name) for name in standard} | given
+    for name in {name for file in given.values() for name in file.dependency} - files.keys():
         files[name] = FileDescriptorProto(name=name)
     graph = {name: set(file.dependency) for name, file in files.items()}
-    try:
-        waiting = list(TopologicalSorter(graph).static_order())
-    except CycleError as error:
-        raise ValueError(f"files import each other: {', '.join(error.args[1])[:200]}") from error
     problem: Exception | None = None
-    # Twice, since an import can have another name than the file, and thus no place in the order.
-    for _ in range(2):
-        problem, failed = None, []
-        for name in waiting:
+    try:
+        for name in TopologicalSorter(graph).static_order():
             try:
                 pool.AddSerializedFile(files[name].SerializeToString())
             except TypeError as error:
                 problem = problem or error
-                failed.append(name)
-        waiting = failed
+    except CycleError as error:
+        raise ValueError(f"files import each other: {', '.join(error.args[1])[:200]}") from error
     return problem
 
 
@@ -260,23 +254,6 @@ def is_repeated(field: FieldDescriptor) -> bool:
 def is_map(field: FieldDescriptor) -> bool:
     """True if the field is a map."""
     return field.type == _MESSAGE and bool(field.message_type.GetOptions().map_entry)
-
-
-def nanoseconds_of(message: Any) -> int:
-    """A `Timestamp` or `Duration` in nanoseconds."""
-    return int(message.seconds * 10**9 + message.nanos)
-
-
-def map_key(key: object) -> str:
-    """A map key as a field name."""
-    return str(key).lower() if isinstance(key, bool) else str(key)
-
-
-def messages_array(
-    descriptor: Descriptor, messages: Sequence[Message], wanted: Wanted
-) -> pa.StructArray:
-    """Messages of one type as a struct array of the wanted paths; None for all."""
-    return cast("pa.StructArray", _Builder().messages(descriptor, messages, wanted, ()))
 
 
 class _Builder:
@@ -339,7 +316,7 @@ class _Builder:
         inner = field.message_type.fields_by_name["value"]
         arrays: dict[str, pa.Array[Any]] = {}
         for key in sorted({key for row in rows if row is not None for key in row}):
-            name = map_key(key)
+            name = str(key).lower() if isinstance(key, bool) else str(key)
             if wanted is None or any(path[0] == name for path in wanted):
                 values = [row[key] if row is not None and key in row else None for row in rows]
                 arrays[name] = self._values(inner, values, below(wanted, name), above)
@@ -359,4 +336,5 @@ class _Builder:
         kind = TIMES.get(field.message_type.full_name)
         if kind is None:
             return self.messages(field.message_type, values, wanted, above)
-        return times_array([None if v is None else nanoseconds_of(v) for v in values], kind)
+        times = (None if one is None else one.seconds * 10**9 + one.nanos for one in values)
+        return times_array([*times], kind)
