@@ -190,7 +190,7 @@ class Messages:
 
     def fields(self, row: int) -> dict[str, object]:
         """The fields of one message, as in its index document."""
-        from hybridlog.schema.index_bodies import bodies_of, document_of
+        from hybridlog.schema.codecs import bodies_of, document_of
 
         if row not in self._bodies:
             index = int(self._batch.channel[row])
@@ -211,12 +211,13 @@ class Messages:
     def refuse(self, row: int) -> NoReturn:
         """Refuse a payload that is gone."""
         from hybridlog.columns.left_rows import digest_in, with_rows
-        from hybridlog.schema.left import missing_payload
+        from hybridlog.schema.codecs import missing_payload
 
         left = with_rows(self._batch.take(slice(row, row + 1))).left
         assert left is not None
         state = self.channels[int(self._batch.channel[row])].state
-        raise missing_payload(state, *digest_in(left, 0))
+        size, digest = digest_in(left, 0)
+        raise missing_payload(state, f" ({size} bytes, SHA-256 {digest.hex()})")
 
 
 def messages_in(run: MessageRun, picture_of: PictureOf | None = None) -> Iterator[Message]:

@@ -8,7 +8,8 @@ import numpy as np
 
 import hybridlog as hl
 from hybridlog.schema.codec import Codec
-from hybridlog.schema.index_bodies import BodyGroup, bodies_of, document_of
+from hybridlog.schema.codecs import bodies_of, document_of
+from hybridlog.schema.document import BodyGroup
 from hybridlog_storage.messages import Batch
 from hybridlog_storage.mongo.index_documents import collection_of
 

@@ -1019,7 +1019,7 @@ def check_state(second: FormatReader, database: Any, recordings: Mapping[str, Re
 
 
 def test_the_specification_names_what_there_is() -> None:
-    from hybridlog.schema.index_bodies import ARRAY_LIMIT
+    from hybridlog.schema.document import ARRAY_LIMIT
     from hybridlog_storage import manifest
     from hybridlog_storage.catalog import CATALOG
     from hybridlog_storage.disk import directory

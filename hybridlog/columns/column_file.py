@@ -24,11 +24,10 @@ import pyarrow.parquet as pq
 from hybridlog.columns.fields import (
     SUMMARY_FIELDS,
     has_summaries,
-    is_of_bytes,
     names_of,
     original_name,
 )
-from hybridlog.columns.layout import ABOUT, OWN, OWN_COLUMNS, About, Section
+from hybridlog.columns.layout import ABOUT, OWN_COLUMNS, About, Section
 from hybridlog.schema.arrow_types import is_bytes, is_list
 from hybridlog_storage.cache import Cache, lazy
 from hybridlog_storage.checksum import crc32
@@ -72,7 +71,7 @@ class Leaf(NamedTuple):
 def leaves(schema: pa.Schema) -> Iterator[Leaf]:
     """The columns of a file in Parquet's order."""
     for top in schema:
-        is_own = top.name in OWN_COLUMNS or OWN in (top.metadata or {})
+        is_own = top.name in OWN_COLUMNS
         pending: list[tuple[pa.Field, str, tuple[str, ...], tuple[str, ...] | None]]
         pending = [(top, top.name, (original_name(top),), None)]
         while pending:
@@ -248,12 +247,14 @@ class ColumnFile:
         """Stored bytes of some columns of a row group."""
         return sum(self._about(group, leaf).total_compressed_size for leaf in leaves)
 
-    def has_values(self, group: int, leaf: int) -> bool:
-        """False if a column of a row group is known to have nulls only."""
-        column = self._about(group, leaf)
+    def summarises(self, group: int, array: tuple[str, ...]) -> bool:
+        """False if no row of a row group is known to have a summary of an array."""
+        if array not in self.summaries:
+            return False
+        column = self._about(group, self.summaries[array])
         found = column.statistics
         is_known = found is not None and found.has_null_count
-        return not is_known or found.null_count < column.num_values
+        return not is_known or bool(found.null_count < column.num_values)
 
     def bounds(self, group: int, leaf: int) -> tuple[int, int] | None:
         """Least and greatest value in a column of a row group; None if unknown."""
@@ -329,8 +330,9 @@ class ColumnFile:
 
     @lazy
     def summaries(self) -> dict[tuple[str, ...], int]:
-        """Paths of arrays with summaries, and the number of a column of each."""
-        return {leaf.array: n for n, leaf in enumerate(self.leaves) if leaf.array is not None}
+        """Paths of arrays with summaries, and the number of the column of each one's `n`."""
+        leaves = reversed([*enumerate(self.leaves)])
+        return {leaf.array: number for number, leaf in leaves if leaf.array is not None}
 
     @lazy
     def paths(self) -> set[tuple[str, ...]]:
@@ -339,63 +341,38 @@ class ColumnFile:
         return {path[:end] for path in names for end in range(1, len(path) + 1)}
 
     @lazy
-    def own(self) -> set[str]:
-        """Columns of the table itself."""
-        return {leaf.top for leaf in self.leaves if leaf.is_own}
-
-    @lazy
-    def arrays(self) -> set[tuple[str, ...]]:
-        """Paths of arrays with summaries that tables with arrays have in full."""
-        of_bytes = {
-            leaf.names
-            for leaf in self.leaves
-            if leaf.array is None and not leaf.is_own and is_of_bytes(leaf.kind)
-        }
-        return self.summaries.keys() - of_bytes
-
-    @lazy
     def summary_paths(self) -> set[tuple[str, ...]]:
         """Paths of the numbers of summaries."""
         return {leaf.names for leaf in self.leaves if leaf.array is not None}
 
     def choose(
-        self, paths: Collection[str] | None, own: Collection[str], *, arrays: bool = False
+        self, paths: Collection[str] | None, own: Collection[str]
     ) -> dict[str, tuple[int, ...]]:
         """Numbers of the columns of some fields, None for all, by the table's column around them.
 
-        `own` are columns of the table itself. Of an array, and of its summary, there are both;
-        but `arrays` says that all rows have arrays in full, and their summaries.
+        `own` are columns of the table itself. Of an array, and of its summary, there are both.
         """
-        key = None if paths is None else frozenset(paths), frozenset(own), arrays
+        key = None if paths is None else frozenset(paths), frozenset(own)
         found = self._chosen.get(key)
         if found is None:
             wanted = None if paths is None else list(map(names_of, paths))
-            full = self.arrays if arrays else set()
             found = {}
             for number, leaf in enumerate(self.leaves):
-                if leaf.top in own if leaf.is_own else self._is_wanted(leaf, wanted, full):
+                if leaf.top in own if leaf.is_own else self._is_wanted(leaf, wanted):
                     found[leaf.top] = (*found.get(leaf.top, ()), number)
             if len(self._chosen) >= _MAX_FIELD_SETS:
                 self._chosen.clear()
             self._chosen[key] = found
         return found
 
-    def _is_wanted(
-        self,
-        leaf: Leaf,
-        wanted: Sequence[tuple[str, ...]] | None,
-        full: Collection[tuple[str, ...]],
-    ) -> bool:
-        if leaf.array in full:
-            return wanted is not None and leaf.names in wanted
+    def _is_wanted(self, leaf: Leaf, wanted: Sequence[tuple[str, ...]] | None) -> bool:
         if wanted is None or any(leaf.names[: len(path)] == path for path in wanted):
             return True
         if leaf.array is not None:  # it tells whether the array is there
             return any(path[: len(leaf.array)] == leaf.array for path in wanted)
         # A summary is worked out from the array where that is there.
         arrays = {path[:-1] for path in wanted if path[-1] in SUMMARY_FIELDS}
-        known = arrays & self.summaries.keys() - full
-        return any(leaf.names[: len(array)] == array for array in known)
+        return any(leaf.names[: len(one)] == one for one in arrays & self.summaries.keys())
 
     def sections(self) -> Iterator[tuple[int, Section]]:
         """The rows in it, each section with its first row."""

@@ -20,7 +20,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from hybridlog.columns.layout import EMPTY, ORIGINAL, RESERVED, SUMMARY, column_names
+from hybridlog.columns.layout import EMPTY, ORIGINAL, OWN_COLUMNS, SUMMARY, column_names
 from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.arrow_types import (
     Array,
@@ -45,14 +45,13 @@ SUMMARY_FIELDS: Final = ("n", "min", "max", "mean")
 class FieldShape:
     """Turns fields of messages into columns, with `arrays` in full at any length."""
 
-    def __init__(self, *, arrays: bool = False, reserved: Collection[str] = RESERVED) -> None:
+    def __init__(self, *, arrays: bool = False) -> None:
         self._has_arrays = arrays
-        self._reserved = reserved
         self._plain: set[Any] = set()  # types of messages that are columns as they are
 
     def columns(self, records: Array) -> Array:
         """Fields as columns: the fields of a struct array."""
-        return self._struct(records, self._reserved)
+        return self._struct(records, OWN_COLUMNS)
 
     def _column(self, array: Array) -> Array:
         kind = array.type
@@ -94,10 +93,10 @@ class FieldShape:
         return structs(found, len(array), missing_of(array), fields)
 
     def _split(self, array: Array) -> tuple[Array, Array]:
-        """Arrays within the limit, and summaries of the others; or both of all."""
-        if self._has_arrays and not is_of_bytes(array.type):
-            return self._column(array), summary(array)
-        is_long = _over(array, LIMIT)
+        """Arrays within the limit, and summaries of the others."""
+        is_long = np.zeros(len(array), np.bool_)
+        if not self._has_arrays or _is_of_bytes(array.type):
+            is_long = _over(array, LIMIT)
         if not is_long.any():
             return self._column(array), pa.nulls(len(array), summary(array.slice(0, 0)).type)
         rows = np.flatnonzero(is_long)
@@ -106,7 +105,7 @@ class FieldShape:
         return self._column(short), without(summary(long), rows, len(array))
 
 
-def is_of_bytes(kind: Any) -> bool:
+def _is_of_bytes(kind: Any) -> bool:
     """True for bytes, and arrays of them: tables have these in full up to the limit only."""
     while is_list(kind):
         kind = kind.value_type

@@ -39,35 +39,31 @@ PARTS: Final = "tables.part"
 SUFFIX: Final = ".parquet"
 SHARED: Final = "shared-"
 """Beginning of the names of files that recordings share."""
-OWN_COLUMNS: Final = (
-    "recording",
-    "topic",
-    "log_time",
-    "t",
-    "seq",
-    "pub",
-    "stamp",
-    "channel",
-    "state",
-    "error",
-    "ref",
+OWN_COLUMNS: Final = frozenset(
+    {
+        "recording",
+        "topic",
+        "log_time",
+        "t",
+        "seq",
+        "pub",
+        "stamp",
+        "channel",
+        "state",
+        "error",
+        "ref",
+    }
 )
-"""Columns that every table has in addition to the fields of the messages."""
+"""Columns that every table has besides the fields of the messages, which have other names."""
 ORIGINAL: Final = b"hybridlog.name"
 """Metadata of a column: the name of its field, if it differs."""
 SUMMARY: Final = b"hybridlog.summary"
 """Metadata of a column: the name of the array whose summaries it has."""
 EMPTY: Final = b"hybridlog.empty"
 """Metadata of a column of booleans, or of arrays of them: its messages have no fields."""
-OWN: Final = b"hybridlog.own"
-"""Metadata of a column that is none of a field, besides `OWN_COLUMNS`."""
 ABOUT: Final = b"hybridlog"
 """Metadata of a file: an `About` as JSON."""
 VERSION: Final = 4
-RESERVED: Final = frozenset(OWN_COLUMNS)
-"""Names that no column of a field has."""
-POINTS: Final = "points"
-"""Column of the points of clouds, a list for each of their fields."""
 _ODD: Final = re.compile(r"[^A-Za-z0-9_]")
 
 
@@ -102,7 +98,7 @@ def topics_of(entry: RecordingEntry) -> set[str]:
 
 
 def column_names(
-    names: Iterable[str], reserved: Collection[str] = RESERVED
+    names: Iterable[str], reserved: Collection[str] = OWN_COLUMNS
 ) -> Iterator[tuple[str, str]]:
     """Fields of a message, and the name of the column for each.
 
@@ -125,7 +121,7 @@ class Section(Struct, frozen=True):
     """Rows of one topic of one recording in a file; `begin` is of the recording, ns.
 
     `segments` has the digest of each segment with rows in it, by its number as text. So many rows
-    are `unreadable`, and have `arrays` in full.
+    are `unreadable`. With `arrays` these are in full, but for bytes, else up to a limit.
     """
 
     id: str
@@ -134,12 +130,7 @@ class Section(Struct, frozen=True):
     segments: Mapping[str, str]
     rows: int
     unreadable: int = 0
-    arrays: int = 0
-
-    @property
-    def has_arrays(self) -> bool:
-        """True if all rows have arrays in full."""
-        return self.arrays == self.rows
+    arrays: bool = False
 
 
 class About(Struct, frozen=True):

@@ -28,27 +28,133 @@ from hybridlog.columns.fields import (
     records_of,
 )
 from hybridlog.columns.layout import OWN_COLUMNS
-from hybridlog.schema.arrow_columns import structs
-from hybridlog.schema.arrow_types import Array, is_summary, plain_values
-from hybridlog.schema.codec import payload_alone
-from hybridlog.schema.index_bodies import MAX_BYTES
-from hybridlog.schema.objects import plain_cells
+from hybridlog.schema.arrow_columns import objects_array, structs
+from hybridlog.schema.arrow_types import (
+    Array,
+    converted,
+    is_summary,
+    part_of_summary,
+    plain_values,
+)
+from hybridlog.schema.codec import Decoded, no_messages, no_rows, payload_alone, unreadable
+from hybridlog.schema.column import Records
+from hybridlog.schema.document import MAX_BYTES
+from hybridlog.schema.objects import Objects, plain_cells
 from hybridlog_storage.messages import Batch, Left
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Sequence
+    from collections.abc import Collection, Iterable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
     from hybridlog.schema.codec import Codec
     from hybridlog_storage.messages import Buffer
 
-_OWN: Final = frozenset(OWN_COLUMNS)
+
+class LeftFields(Objects):
+    """Fields of messages whose payloads are gone.
+
+    Args:
+        columns: Columns of tables, one row for each message.
+        fields: Dotted paths of those wanted in `arrow`, each with all below it; None for all.
+        empty: No messages, as the codec of the payloads decodes them.
+    """
+
+    def __init__(
+        self, columns: pa.StructArray, fields: Collection[str] | None, empty: Decoded
+    ) -> None:
+        super().__init__([], fields)
+        self.columns = columns
+        """The messages as columns of tables."""
+        self._empty = empty
+
+    def __len__(self) -> int:
+        """Number of messages."""
+        return len(self.columns)
+
+    @property
+    def is_typed(self) -> bool:
+        """True if a definition fixes the types of the fields."""
+        return isinstance(self._empty.records, Records)
+
+    def take(self, rows: NDArray[np.bool_]) -> LeftFields:
+        """Select messages."""
+        return LeftFields(self.columns.filter(rows), self.fields, self._empty)
+
+    def plain(self) -> list[dict[str, object]]:
+        """The messages as plain values, long arrays and bytes as summaries."""
+        return _documents(self.columns, typed=self.is_typed)
+
+    def arrow(self) -> pa.StructArray:
+        """The messages as an Arrow array; arrays of which only a summary is left are null."""
+        if not self.is_typed:
+            found = _documents(self.columns, typed=False, summaries=False)
+            return objects_array(found, self.wanted())
+        return converted(records_of(self.columns), self._empty.arrow().type, drops=True)
+
+    def statistics(self, paths: Iterable[str]) -> dict[str, pa.Array[Any]]:
+        """`n`, `min`, `max` or `mean` of arrays by path (`ranges.min`), of those that have one."""
+        made = {}
+        for path in paths:
+            *array, what = names_of(path)
+            records = records_of(self.columns, (*array,).__eq__)
+            found = part_of_summary(records, array, what)
+            if found is not None:
+                made[path] = found
+        return made
+
+    def lacking(self, but: Collection[str] = ()) -> NDArray[np.bool_]:
+        """bool[n], True where a wanted array, none of `but`, has only its summary left."""
+        wanted = None if self.fields is None else [names_of(path) for path in self.fields]
+        found = np.zeros(len(self), np.bool_)
+        for path, summary in _summaries_in(self.columns):
+            if ".".join(path) not in but and (wanted is None or _asks(wanted, path)):
+                found |= summary.is_valid().to_numpy(zero_copy_only=False)
+        return found
 
 
-def fields_in(rows: pa.StructArray) -> pa.StructArray:
+def without_lacking(decoded: Decoded, but: Collection[str] = ()) -> tuple[Decoded, int]:
+    """Decoded messages but for those that lack a wanted value, and how many these are."""
+    records = decoded.records
+    if not isinstance(records, LeftFields):
+        return decoded, 0
+    there = ~records.lacking(but)
+    left = Decoded(decoded.rows[there], records.take(there), decoded.unreadable, decoded.surplus)
+    return left, int((~there).sum())
+
+
+def decoded_left(
+    batch: Batch, original: Codec, fields: Collection[str] | None, *, reduced: bool
+) -> Decoded:
+    """What is left of messages whose payloads a codec decodes; as of `Codec.columns_of`."""
+    if reduced and original.indexed:
+        batch = with_rows(batch)
+    empty = original.columns_of(no_messages(), fields)
+    parts: list[pa.StructArray] = []
+    rows, surplus = [no_rows()], [no_rows()]
+    bad: dict[str, list[int]] = {}
+    for part, own, taken in () if batch.left is None else batch.left.by_part():
+        found = part.take(taken)
+        error = found.field("error")
+        for row, reason in zip(own.tolist(), error.to_pylist(), strict=True):
+            if reason is not None:
+                bad.setdefault(reason, []).append(row)
+        there = error.is_null().to_numpy(zero_copy_only=False)
+        parts.append(_fields_in(found if there.all() else found.filter(there)))
+        rows.append(own[there])
+        has_surplus = found.field("ref").field("surplus").to_numpy(zero_copy_only=False)
+        surplus.append(own[has_surplus])
+    if not parts:
+        return empty
+    columns = joined(parts)
+    order = np.argsort(good := np.concatenate(rows))
+    records = LeftFields(columns.take(order) if len(parts) > 1 else columns, fields, empty)
+    return Decoded(good[order], records, unreadable(bad), np.sort(np.concatenate(surplus)))
+
+
+def _fields_in(rows: pa.StructArray) -> pa.StructArray:
     """The columns of fields among all columns of rows."""
-    fields = [field for field in rows.type if field.name not in _OWN]
+    fields = [field for field in rows.type if field.name not in OWN_COLUMNS]
     return structs({one.name: rows.field(one.name) for one in fields}, len(rows), None, fields)
 
 
@@ -56,18 +162,6 @@ def digest_in(left: Left, message: int) -> tuple[int, bytes]:
     """Bytes and SHA-256 of the payload that a message had."""
     row = left.parts[left.part[message]].field("ref")[int(left.row[message])].as_py()
     return row["size"], row["sha256"]
-
-
-def lacking(
-    columns: pa.StructArray, fields: Collection[str] | None, but: Collection[str]
-) -> NDArray[np.bool_]:
-    """bool[n], True where a wanted array is not there."""
-    wanted = None if fields is None else [names_of(path) for path in fields]
-    found = np.zeros(len(columns), np.bool_)
-    for path, summary in _summaries_in(columns):
-        if ".".join(path) not in but and (wanted is None or _asks(wanted, path)):
-            found |= summary.is_valid().to_numpy(zero_copy_only=False)
-    return found
 
 
 def _asks(wanted: Sequence[tuple[str, ...]], array: tuple[str, ...]) -> bool:
@@ -119,7 +213,7 @@ def _summaries_in(
             yield from _summaries_in(column, path)
 
 
-def documents(columns: Array, *, typed: bool, summaries: bool = True) -> list[dict[str, Any]]:
+def _documents(columns: Array, *, typed: bool, summaries: bool = True) -> list[dict[str, Any]]:
     """Columns as index documents: arrays, or summaries of long ones, and without what is null.
 
     They are the fields of a struct array. With `typed`, a definition fixes the width of integers.

@@ -21,7 +21,7 @@ from hybridlog.columns.left_rows import digest_in, with_rows
 from hybridlog.columns.rows import as_table, columns_from, piece_of
 from hybridlog.index.indexing import ChunkIndexer
 from hybridlog.schema.arrow_columns import structs
-from hybridlog.schema.left import LeftCodec
+from hybridlog.schema.codecs import LeftCodec
 from hybridlog.schema.states import State
 from hybridlog_storage.cache import Cache, lazy
 from hybridlog_storage.errors import StoreError

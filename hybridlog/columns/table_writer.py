@@ -25,8 +25,6 @@ from hybridlog.columns.column_file import ColumnFileWriter
 from hybridlog.columns.fields import FieldShape, copied, joined
 from hybridlog.columns.folders import Addition, TableFolders
 from hybridlog.columns.layout import (
-    POINTS,
-    RESERVED,
     SUFFIX,
     Section,
     parts_folder,
@@ -34,12 +32,11 @@ from hybridlog.columns.layout import (
     table_schema_of,
     type_prefix,
 )
-from hybridlog.columns.rows import Piece, PointColumns, as_table, columns_from, is_cloud, piece_of
+from hybridlog.columns.rows import Piece, as_table, columns_from, piece_of
 from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.codec import no_messages
 from hybridlog.schema.codecs import codec_for
-from hybridlog.schema.left import LeftFields
-from hybridlog.schema.states import State, encoding_of, state_of
+from hybridlog.schema.states import encoding_of, state_of
 from hybridlog_storage.disk import files
 from hybridlog_storage.messages import order_of
 from hybridlog_storage.settings import read_settings
@@ -78,11 +75,8 @@ class _Topic:
         self.type = channel.schema.name if channel.schema is not None else ""
         self.has_arrays = arrays
         encoding = encoding_of(channel.message_encoding, channel.metadata)
-        whole = replace(channel, message_encoding=encoding)
-        self.points = PointColumns() if arrays and is_cloud(whole) else None
-        reserved = RESERVED if self.points is None else RESERVED | {POINTS}
-        self.shape = FieldShape(arrays=arrays, reserved=reserved)
-        codec = codec_for(whole)
+        self.shape = FieldShape(arrays=arrays)
+        codec = codec_for(replace(channel, message_encoding=encoding))
         decoded = codec.columns_of(no_messages()) if codec.indexed else None
         self.none = structs({}, 0) if decoded is None else self.shape.columns(decoded.arrow())
         """No fields, with the columns that the definition fixes."""
@@ -135,7 +129,6 @@ class _Topic:
             own,
             fields,
             sum(piece.unreadable for piece in pieces),
-            sum(piece.arrays for piece in pieces),
         )
 
     def give_up(self) -> None:
@@ -149,10 +142,7 @@ class _Topic:
 
     def columns(self, decoded: Decoded) -> Any:
         """The fields of decoded messages as columns."""
-        columns = columns_from(decoded, self.shape)
-        if self.points is not None and not isinstance(decoded.records, LeftFields):
-            columns = self.points.with_points(columns, decoded.arrow())
-        return copied(columns)
+        return copied(columns_from(decoded, self.shape))
 
 
 class _File(ColumnFileWriter):
@@ -161,7 +151,7 @@ class _File(ColumnFileWriter):
     def __init__(self, path: Path, schema: pa.Schema) -> None:
         super().__init__(path, schema)
         self.segments: set[int] = set()
-        self.unreadable = self.arrays = 0
+        self.unreadable = 0
 
     def add(self, piece: Piece, table: pa.Table) -> None:
         """Write rows as row groups."""
@@ -171,7 +161,6 @@ class _File(ColumnFileWriter):
             self.write(table.slice(begin, step))
         self.segments |= piece.segments
         self.unreadable += piece.unreadable
-        self.arrays += piece.arrays
 
 
 class TableWriter:
@@ -256,15 +245,14 @@ class TableWriter:
             return
         with self._only(topic):
             state = state_of(channel.message_encoding)
-            piece = piece_of(
+            found = piece_of(
                 messages.placed,
                 messages.decoded,
                 state,
                 has_publish_time=channel.has_publish_time,
                 columns=topic.columns,
             )
-            piece.arrays = piece.rows if topic.has_arrays and state is State.WHOLE else 0
-            topic.add(piece)
+            topic.add(found)
 
     @contextmanager
     def _only(self, topic: _Topic) -> Iterator[None]:
@@ -332,7 +320,7 @@ class TableWriter:
     def _section(self, topic: _Topic, found: Piece | _File, begin: int = 0) -> Section:
         """The description of rows in their file."""
         digests = {str(number): self._cut[number] for number in sorted(found.segments)}
-        counts = found.rows, found.unreadable, found.arrays
+        counts = found.rows, found.unreadable, topic.has_arrays
         return Section(self._recording, topic.name, begin, digests, *counts)
 
     def _close(self, entry: RecordingEntry) -> None:

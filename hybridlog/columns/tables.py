@@ -210,11 +210,11 @@ class Tables:
         with self._lock:
             self._found[recording.id, topic] = None
 
-    def whole(self, file: ColumnFile, *, arrays: bool) -> TopicTable:
-        """All rows of a file, as if of one topic; with `arrays`, all count as rows with arrays."""
+    def whole(self, file: ColumnFile) -> TopicTable:
+        """All rows of a file, as if of one topic."""
         unreadable = sum(section.unreadable for section in file.about.sections)
         parts = [TablePart(file, group, 0, rows) for group, rows in enumerate(file.groups)]
-        return TopicTable(parts, unreadable=unreadable, has_arrays=arrays)
+        return TopicTable(parts, unreadable=unreadable)
 
     def check(self, recording: RecordingEntry, topic: str) -> TopicTable:
         """The table of a topic in a recording; FileNotFoundError if these segments have none."""
@@ -327,12 +327,11 @@ class Tables:
         """The table of a topic from some files; None without rows of it, or with stale ones."""
         if not found or not all(rows.is_of(recording) for rows in found):
             return None
-        # Arrays that have expired are in no answer.
         is_expired = any(one.id >= EXPIRED_IDS for one in self._channels_of(recording, topic))
         table = TopicTable(
             [part for one in found for part in one.file.parts(one.begin, one.section.rows)],
             unreadable=sum(one.section.unreadable for one in found),
-            has_arrays=not is_expired and all(one.section.has_arrays for one in found),
+            hides_arrays=is_expired and any(one.section.arrays for one in found),
             segments=(int(number) for one in found for number in one.section.segments),
         )
         if len(table.files) > 1:

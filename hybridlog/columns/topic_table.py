@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import chain
 from typing import TYPE_CHECKING, Any, Final
@@ -14,7 +14,7 @@ from msgspec import Struct
 
 from hybridlog.columns.column_file import FIRST
 from hybridlog.columns.fields import joined, names_of, records_of
-from hybridlog.columns.layout import POINTS
+from hybridlog.columns.layout import OWN_COLUMNS
 from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.arrow_types import converted
 from hybridlog.schema.column import ranges
@@ -79,7 +79,7 @@ class TableRows(Struct, frozen=True, eq=False):
 class TopicTable:
     """All messages of a topic in the `segments` of a recording that it covers, by number.
 
-    `has_arrays` if arrays are in full, but for bytes.
+    If it `hides_arrays`, only summaries of arrays are in answers: their payloads have expired.
     """
 
     def __init__(
@@ -87,13 +87,13 @@ class TopicTable:
         parts: Sequence[TablePart],
         *,
         unreadable: int = 0,
-        has_arrays: bool = False,
+        hides_arrays: bool = False,
         segments: Iterable[int] = (),
     ) -> None:
         self.segments = frozenset(segments)
         self.rows = sum(part.rows for part in parts)
         self.unreadable = unreadable
-        self.has_arrays = has_arrays
+        self.hides_arrays = hides_arrays
         self.files = list({part.file.number: part.file for part in parts}.values())
         self._parts = parts
         self._types: dict[frozenset[str] | None, Any] = {}
@@ -113,21 +113,13 @@ class TopicTable:
 
     def whole_types(self) -> list[Any]:
         """Types of the messages in each file, with whole arrays."""
-        own = {name for file in self.files for name in file.own}
-        schemas = ([f for f in file.schema if f.name not in own] for file in self.files)
+        schemas = ([f for f in file.schema if f.name not in OWN_COLUMNS] for file in self.files)
         return [records_of(pa.nulls(0, pa.struct(fields))).type for fields in schemas]
 
     @property
     def has_fields(self) -> bool:
         """True if the messages have any field."""
         return any(not leaf.is_own for file in self.files for leaf in file.leaves)
-
-    @property
-    def points(self) -> Any:
-        """Type of the column of points that all rows have; None without."""
-        if not self.has_arrays or any(POINTS not in file.own for file in self.files):
-            return None
-        return joined([pa.nulls(0, file.schema.field(POINTS).type) for file in self.files]).type
 
     def has(self, path: str, *, summaries: bool = True) -> bool:
         """True if every file has the field: an array is a summary in some, a list in others.
@@ -137,11 +129,7 @@ class TopicTable:
         names = names_of(path)
         return all(
             names in file.paths
-            or (
-                summaries
-                and names in file.summary_paths
-                and (self._is_full(names[:-1]) or self._is_summarised(names[:-1]))
-            )
+            or (summaries and names in file.summary_paths and self._is_summarised(names[:-1]))
             for file in self.files
         )
 
@@ -155,7 +143,7 @@ class TopicTable:
         return sum(
             part.file.size(part.group, numbers)
             for part in self._parts
-            for numbers in part.file.choose(paths, own, arrays=self.has_arrays).values()
+            for numbers in part.file.choose(paths, own).values()
         )
 
     def scan(
@@ -171,53 +159,49 @@ class TopicTable:
         and arrival number. `spans` are disjoint ranges of log time in order, ns; None for all
         times.
         """
-        kind = self.fields(paths)
-
+        read = partial(self._read, paths, own, self.fields(paths), spans)
         if all(part.first == FIRST for part in self._parts):  # in order, whatever they are
-            yield from (self._read(part, paths, own, kind) for part in self._parts)
+            yield from filter(None, map(read, self._parts))
             return
         held: TableRows | None = None
         for part in self.parts:
-            rows = self._within(part, spans, partial(self._read, part, paths, own, kind))
-            if rows is not None and held is not None:
+            rows = read(part)
+            if rows is None:
+                continue
+            if held is not None:
                 end = int(np.searchsorted(held.t, part.first))
                 if end:
                     yield held.slice(0, end)
                 if end < len(held):
                     rows = _in_order([held.slice(end, len(held)), rows])
-            held = held if rows is None else rows
+            held = rows
         if held is not None:
             yield held
 
-    def _within(
-        self, part: TablePart, spans: Sequence[Span] | None, read: Callable[[], TableRows]
-    ) -> TableRows | None:
-        """The rows of a part in some spans; None without any."""
-        if spans is None:
-            return read()
-        low, high = span_of(part.first, part.last)
-        near = [span for span in spans if span[0] < high and span[1] > low]
-        if not near:
-            return None
-        rows = read()
-        bounds = np.searchsorted(placed(rows.t), np.array(near, np.int64).reshape(-1, 2))
-        rows = rows.take(ranges(bounds[:, 0], bounds[:, 1] - bounds[:, 0]))
-        return rows if len(rows) else None
-
     def _read(
         self,
-        part: TablePart,
         paths: Collection[str] | None,
         own: Collection[str],
         kind: Any,
-    ) -> TableRows:
+        spans: Sequence[Span] | None,
+        part: TablePart,
+    ) -> TableRows | None:
+        """The rows of a part in some spans; None without any."""
+        low, high = span_of(part.first, part.last)
+        near = [span for span in spans or () if span[0] < high and span[1] > low]
+        if spans is not None and not near:
+            return None
         ours, columns = self.columns(part, paths, {"t", "seq", *own})
         t, seq = (ours.pop(name).to_numpy() for name in ("t", "seq"))
         try:
             records = converted(records_of(columns, self._is_summarised), kind)
         except pa.ArrowInvalid as error:  # an integer that no double is, beside fractions
             raise StoreError(f"The tables have no common exact type: {error}.") from error
-        return TableRows(t, seq, ours, records)
+        rows = TableRows(t, seq, ours, records)
+        if spans is not None:
+            bounds = np.searchsorted(placed(t), np.array(near, np.int64).reshape(-1, 2))
+            rows = rows.take(ranges(bounds[:, 0], bounds[:, 1] - bounds[:, 0]))
+        return rows if len(rows) else None
 
     @property
     def parts(self) -> list[TablePart]:
@@ -229,7 +213,7 @@ class TopicTable:
     ) -> tuple[dict[str, Any], Any]:
         """The table's own columns of a row group by name, and those of fields, a struct each."""
         check_wanted()
-        chosen = part.file.choose(paths, own, arrays=self.has_arrays)
+        chosen = part.file.choose(paths, own)
         columns = {top: _column(part, numbers) for top, numbers in chosen.items()}
         ours = {name: columns.pop(name) for name in own if name in columns}
         if not columns:
@@ -239,36 +223,24 @@ class TopicTable:
         return ours, pa.StructArray.from_arrays([*columns.values()], fields=fields)
 
     def is_cut(self, array: tuple[str, ...]) -> bool:
-        """True if an array at a path, or one inside it, is only a summary in some row."""
+        """True if an array at a path, or one inside it, may be only a summary in some row."""
         inside = {
             one for file in self.files for one in file.summaries if one[: len(array)] == array
         }
         return any(map(self._is_summarised, inside))
 
-    def _is_full(self, array: tuple[str, ...]) -> bool:
-        """True if an array is there in full in all rows, and its summary, too."""
-        return self.has_arrays and all(
-            array in file.arrays or array not in file.summaries for file in self.files
-        )
-
     def _is_summarised(self, array: tuple[str, ...]) -> bool:
-        """True if an array is a summary in some row."""
-        if self._is_full(array):
-            return False
+        """True if an array may be a summary in some row."""
         if array not in self._summarised:
-            self._summarised[array] = any(self._has_summary(part, array) for part in self._parts)
+            self._summarised[array] = self.hides_arrays or any(
+                part.file.summarises(part.group, array) for part in self._parts
+            )
         return self._summarised[array]
-
-    def _has_summary(self, part: TablePart, array: tuple[str, ...]) -> bool:
-        leaf = part.file.summaries.get(array)
-        if leaf is None or not part.file.has_values(part.group, leaf):
-            return False
-        return _has_values(_column(part, (leaf,)))
 
     def _find_type(self, paths: Collection[str] | None) -> Any:
         found = []
         for file in self.files:
-            chosen = file.choose(paths, (), arrays=self.has_arrays).values()
+            chosen = file.choose(paths, ()).values()
             table = file.read(None, [*chain.from_iterable(chosen)])
             columns = pa.nulls(0, pa.struct([*table.schema]))
             found.append(records_of(columns, self._is_summarised))
@@ -277,14 +249,6 @@ class TopicTable:
 
 def _column(part: TablePart, leaves: Sequence[int]) -> Any:
     return part.file.column(part.group, leaves).slice(part.begin, part.rows)
-
-
-def _has_values(column: Any) -> bool:
-    """True if a value inside a column of one leaf is not null."""
-    while column.type.num_fields:
-        inner = column.flatten()
-        column = inner[0] if isinstance(inner, list) else inner
-    return bool(column.null_count < len(column))
 
 
 def _in_order(parts: Sequence[TableRows]) -> TableRows:

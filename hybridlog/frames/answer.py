@@ -10,6 +10,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from hybridlog.columns.left_rows import LeftFields
 from hybridlog.frames.names import (
     FIELD,
     arranged,
@@ -36,7 +37,6 @@ from hybridlog.schema.arrow_types import (
 )
 from hybridlog.schema.codec import stamp_array
 from hybridlog.schema.column import STAMP
-from hybridlog.schema.left import LeftFields
 from hybridlog_storage.errors import DefinitionError
 from hybridlog_storage.messages import Batch, order_of
 

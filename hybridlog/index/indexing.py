@@ -13,9 +13,9 @@ import numpy as np
 from msgspec import Struct
 
 from hybridlog.schema.codec import stamps_of
-from hybridlog.schema.codecs import codec_for
+from hybridlog.schema.codecs import bodies_in, codec_for
 from hybridlog.schema.column import STAMP, Records, header_stamps
-from hybridlog.schema.index_bodies import MAX_BYTES, bodies_in
+from hybridlog.schema.document import MAX_BYTES
 from hybridlog.schema.states import encoding_of
 from hybridlog_storage.cache import lazy
 from hybridlog_storage.catalog import ChannelStats

@@ -160,13 +160,13 @@ def index_arrays(
     before = _bytes(directory.path, types)
     for entry in entries:
         own = topics_of(entry) & found.keys()
-        wanted = {topic for topic in own if _differs(known, entry, found[topic], off=off)}
+        wanted = {topic for topic in own if _differs(known, entry, topic, off=off)}
         if not wanted:
             continue
         make_tables(directory, catalog, entry, topics=wanted, progress=progress)
         known.look_again()
         for topic in wanted:
-            is_left = _differs(known, entry, found[topic], off=off)
+            is_left = _differs(known, entry, topic, off=off)
             (found[topic].left if is_left else found[topic].recordings).append(entry.name)
     after = _bytes(directory.path, types)
     for topic, one in found.items():
@@ -184,20 +184,15 @@ def _bytes(root: Path, types: Mapping[str, set[str]]) -> dict[str, int]:
     return {topic: sum(sizes[one] for one in own) for topic, own in types.items()}
 
 
-def _differs(known: Tables, entry: RecordingEntry, found: ArraysOfTopic, *, off: bool) -> bool:
-    """True if a table is not as the setting of its topic is; notes whether it can have arrays.
+def _differs(known: Tables, entry: RecordingEntry, topic: str, *, off: bool) -> bool:
+    """True if a table is not as the setting of its topic is.
 
     Arrays of a recording from which some have expired are in no answer, and so in no table.
     """
-    topic, differs = found.topic, None
-    for file, _, section in known.sections_of(entry):
-        if section.topic == topic:
-            can_have = bool(file.arrays)
-            found.has_arrays = found.has_arrays or can_have
-            is_other = can_have and bool(section.arrays) is off
-            differs = differs or is_other
+    found = [one.section for one in known.sections_of(entry)]
+    arrays = [section.arrays for section in found if section.topic == topic]
     is_expired = any(one.id >= EXPIRED_IDS for one in entry.channels if one.topic == topic)
-    return differs is not False and (off or not is_expired)
+    return (not arrays or off in arrays) and (off or not is_expired)
 
 
 _TRIES: Final = 10  # while others write the catalog, too

@@ -65,8 +65,6 @@ class ArraysOfTopic(Struct):
         bytes_after: Bytes of them now.
         left: Names of recordings whose tables are as before: they are being written, or
             cannot be read.
-        has_arrays: False if its messages can have no long arrays, except of bytes, and tables
-            stay as they are; None without tables.
     """
 
     topic: str
@@ -74,7 +72,6 @@ class ArraysOfTopic(Struct):
     bytes_before: int = 0
     bytes_after: int = 0
     left: list[str] = field(default_factory=list)
-    has_arrays: bool | None = None
 
 
 class Followed(NamedTuple):

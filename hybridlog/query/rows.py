@@ -279,7 +279,7 @@ class Rows:
             decoded, made = channel.codec.columns_of(own.batch, wanted), {}
             self.counters.unreadable += len(own.batch) - len(decoded.rows)
             if channel.is_reduced:
-                from hybridlog.schema.left import LeftFields, without_lacking
+                from hybridlog.columns.left_rows import LeftFields, without_lacking
 
                 whole, lacking = without_lacking(decoded, arrays.difference(fields or ()))
                 if partial:
@@ -338,15 +338,17 @@ class Rows:
 
     def _count_by_file(self, parts: Sequence[Part]) -> None:
         """Count whole parts that lie in one file: the predicate is evaluated once for all rows."""
-        by_file: dict[tuple[int, bool], list[Tabled]] = defaultdict(list)
+        by_file: dict[int, list[Tabled]] = defaultdict(list)
         for part in parts:
             if part.predicate is None or part in self._counts or not part.is_unbounded:
                 continue
             if any(map(is_meta, part.predicate.fields())):
                 continue  # known of the part, not of a row
             found = self.tabled(part)
-            if found is not None and found.rest is None and len(found.table.files) == 1:
-                by_file[found.table.files[0].number, found.table.has_arrays].append(found)
+            if found is None or found.rest is not None or found.table.hides_arrays:
+                continue
+            if len(found.table.files) == 1:
+                by_file[found.table.files[0].number].append(found)
         for group in by_file.values():
             if len(group) > 1:
                 with suppress(StoreError):  # then part by part
@@ -354,7 +356,7 @@ class Rows:
 
     def _count_in_file(self, group: Sequence[Tabled]) -> None:
         (first, table, _), types = group[0], group[0].part.field_types
-        whole = self.session.tables.whole(table.files[0], arrays=table.has_arrays)
+        whole = self.session.tables.whole(table.files[0])
         sums, before = [np.zeros((2, 1), np.int64)], [0]
         for rows, holds in self._scanned(first, whole):
             before.append(before[-1] + len(rows))

@@ -1,22 +1,28 @@
-"""Finds the codec of a channel; the codec of JSON, which has no definition."""
+"""The codec of a channel; those of JSON, and of what is left; index documents of messages."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import struct
+from collections.abc import Collection, Iterator, Mapping
 from functools import lru_cache
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, NoReturn, cast
 
+import numpy as np
 from msgspec.structs import replace
 
 from hybridlog.schema.codec import Codec, ObjectCodec, OpaqueCodec
-from hybridlog.schema.states import State, encoding_of, state_of
+from hybridlog.schema.column import Records
+from hybridlog.schema.document import BodyGroup, bodies, without_fields
+from hybridlog.schema.states import CAUSES, State, encoding_of, state_of
 from hybridlog_storage.errors import DefinitionError, PayloadError
 from hybridlog_storage.messages import MARKS_CHANNEL
 
 if TYPE_CHECKING:
+    from hybridlog.schema.codec import Decoded
+    from hybridlog.schema.definition import FieldPath
     from hybridlog.schema.objects import Plain
-    from hybridlog_storage.messages import Buffer, Channel, Schema
+    from hybridlog_storage.messages import Batch, Buffer, Channel, Schema
 
 _ROS = {("ros1", "ros1msg"), ("cdr", "ros2msg"), ("cdr", "ros2idl"), ("cdr", "omgidl")}
 
@@ -25,8 +31,6 @@ def codec_for(channel: Channel) -> Codec:
     """The codec of a channel. Never raises: an unreadable channel gets an `OpaqueCodec`."""
     state = state_of(channel.message_encoding)
     if state is not State.WHOLE:
-        from hybridlog.schema.left import LeftCodec
-
         encoding = encoding_of(channel.message_encoding, channel.metadata)
         return LeftCodec(codec_for(replace(channel, message_encoding=encoding)), state)
     return _codec(channel.message_encoding, channel.schema)
@@ -84,3 +88,60 @@ class JsonCodec(ObjectCodec):
             return cast("Plain", json.loads(str(memoryview(payload), "utf-8-sig")))
         except (ValueError, RecursionError) as error:
             raise PayloadError(f"the payload is not JSON: {error}") from error
+
+
+class LeftCodec(Codec):
+    """Codec of messages whose payloads are gone; `state` says why."""
+
+    def __init__(self, original: Codec, state: State) -> None:
+        self.state = state
+        self.indexed = original.indexed
+        self.reason = original.reason
+        self._original = original
+
+    def paths(self) -> list[FieldPath]:
+        """The fields of the messages."""
+        return self._original.paths()
+
+    def columns_of(self, batch: Batch, fields: Collection[str] | None = None) -> Decoded:
+        """The fields that are left; see `Codec.columns_of`."""
+        from hybridlog.columns.left_rows import decoded_left
+
+        return decoded_left(batch, self._original, fields, reduced=self.state is State.REDUCED)
+
+    def decode(self, payload: Buffer) -> NoReturn:
+        """Refuses with PayloadError."""
+        raise missing_payload(self.state)
+
+
+def missing_payload(state: State, about: str = "") -> PayloadError:
+    """Tells that a payload is gone, and what is known of it."""
+    return PayloadError(f"its payload was {CAUSES[state]}; only its fields are stored{about}")
+
+
+def bodies_of(codec: Codec, batch: Batch) -> Iterator[BodyGroup]:
+    """Make index bodies of messages of one channel, with or without payloads."""
+    return bodies_in(codec.columns_of(batch) if codec.indexed else None, len(batch))
+
+
+def bodies_in(decoded: Decoded | None, messages: int) -> Iterator[BodyGroup]:
+    """Make index bodies of so many decoded messages; None where these have no fields.
+
+    Each message is in exactly one group.
+    """
+    if decoded is None:
+        if messages:
+            yield without_fields(np.arange(messages), None)
+        return
+    records = decoded.records
+    for group in bodies(records) if isinstance(records, Records) else records.bodies():
+        yield group._replace(rows=decoded.rows[group.rows])
+    for bad in decoded.unreadable:
+        yield without_fields(bad.rows, bad.reason)
+
+
+def document_of(body: bytes) -> dict[str, object]:
+    """The document of a body."""
+    import bson
+
+    return bson.decode(struct.pack("<i", len(body) + 5) + body + b"\0")

@@ -13,7 +13,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -37,6 +37,9 @@ if TYPE_CHECKING:
 
 _DOUBLE, _STRING, _DOCUMENT, _ARRAY, _BOOL, _NULL, _INT32, _INT64 = 1, 2, 3, 4, 8, 10, 16, 18
 
+ARRAY_LIMIT: Final = 32
+"""Arrays of more elements are summarised."""
+MAX_BYTES: Final = 8 << 20
 _SLAB = 32 << 20
 """Bytes of bodies made at once."""
 
@@ -44,22 +47,29 @@ _UNROLL = 16
 """Rows per list element from which each element is written with separate operations."""
 
 
-class Bodies(NamedTuple):
-    """Bodies of equal width, or why there are none.
+class BodyGroup(NamedTuple):
+    """Bodies of index documents of equal width.
 
     Attributes:
         rows: intp[k], rows of the input.
         body: uint8[k, width], the BSON elements of the top level, without the
-            document's length in front and its final NUL; or a reason.
+            document's length in front and its final NUL.
+        error: Reason why there are none; the width is then 0.
     """
 
     rows: NDArray[np.intp]
-    body: NDArray[np.uint8] | str
+    body: NDArray[np.uint8]
+    error: str | None = None
+
+
+def without_fields(rows: NDArray[np.intp], error: str | None) -> BodyGroup:
+    """Bodies of messages that have no fields, or that cannot be documents."""
+    return BodyGroup(rows, np.empty((len(rows), 0), np.uint8), error)
 
 
 def bodies(
-    records: Records, *, array_limit: int = 32, max_bytes: int = 8 << 20
-) -> Iterator[Bodies]:
+    records: Records, *, array_limit: int = ARRAY_LIMIT, max_bytes: int = MAX_BYTES
+) -> Iterator[BodyGroup]:
     """Make the body of each row; every row is in exactly one of the results.
 
     The bytes equal `bson.encode` of the row's dictionary and depend on that row alone. Memory does
@@ -71,7 +81,8 @@ def bodies(
     width = _spread(top.width, len(records)) - 5
     large = width > max_bytes
     if large.any():
-        yield Bodies(np.flatnonzero(large), f"its fields take more than {max_bytes >> 20} MiB")
+        reason = f"its fields take more than {max_bytes >> 20} MiB"
+        yield without_fields(np.flatnonzero(large), reason)
     rows = np.flatnonzero(~large)
     slab = np.cumsum(width[rows]) // _SLAB
     for part in np.split(rows, np.flatnonzero(np.diff(slab)) + 1):
@@ -82,11 +93,11 @@ def bodies(
             yield from _made(sub, part, width[part])
 
 
-def _made(top: _Record, rows: NDArray[np.intp], width: NDArray[np.int64]) -> Iterator[Bodies]:
+def _made(top: _Record, rows: NDArray[np.intp], width: NDArray[np.int64]) -> Iterator[BodyGroup]:
     """Make the bodies of all rows of `top`, which are the input's `rows`, with these widths."""
     template = _Piece()
     if all(_append(template, name, node, slice(None), len(rows)) for name, node in top.fields):
-        yield Bodies(rows, template.tile(len(rows)))
+        yield BodyGroup(rows, template.tile(len(rows)))
         return
     # Sorted by width, so that bodies of equal width form one block of the output.
     order = np.argsort(width, kind="stable")
@@ -98,7 +109,7 @@ def _made(top: _Record, rows: NDArray[np.intp], width: NDArray[np.int64]) -> Ite
     begin = 0
     for part in np.split(order, edges):
         size = len(part) * int(width[part[0]])
-        yield Bodies(rows[part], out[begin : begin + size].reshape(len(part), -1))
+        yield BodyGroup(rows[part], out[begin : begin + size].reshape(len(part), -1))
         begin += size
 
 

@@ -7,6 +7,7 @@ bodies by the rules of `document.py` from it.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
@@ -16,7 +17,7 @@ from bson.errors import BSONError
 from bson.int64 import Int64
 
 from hybridlog.schema.column import RESERVED, top_level_names
-from hybridlog.schema.document import Bodies
+from hybridlog.schema.document import ARRAY_LIMIT, MAX_BYTES, BodyGroup
 from hybridlog.schema.summary import summary_of
 from hybridlog.schema.text import nearest, repaired_text
 from hybridlog_storage.errors import PayloadError
@@ -91,29 +92,27 @@ class Objects:
             return None
         return [path.replace("[]", "").split(".") for path in self.fields]
 
-    def bodies(self, array_limit: int, max_bytes: int) -> Iterator[Bodies]:
+    def bodies(self) -> Iterator[BodyGroup]:
         """As of `document.bodies`."""
-        found: dict[int | str, tuple[list[int], list[bytes]]] = {}
+        found = defaultdict[tuple[int, str | None], list[tuple[int, bytes]]](list)
         for row, value in enumerate(self.plain()):
-            body = _body_of(value, array_limit, max_bytes)
-            rows, parts = found.setdefault(body if isinstance(body, str) else len(body), ([], []))
-            rows.append(row)
-            parts += [body] if isinstance(body, bytes) else []
-        for key, (rows, parts) in found.items():
-            table = np.frombuffer(b"".join(parts), np.uint8)
-            made = key if isinstance(key, str) else table.reshape(len(rows), key)
-            yield Bodies(np.array(rows, np.intp), made)
+            body, error = _body_of(value)
+            found[len(body), error].append((row, body))
+        for (width, error), own in found.items():
+            table = np.frombuffer(b"".join(body for _, body in own), np.uint8)
+            rows = np.array([row for row, _ in own], np.intp)
+            yield BodyGroup(rows, table.reshape(len(own), width), error)
 
 
-def _body_of(value: dict[str, Any], array_limit: int, max_bytes: int) -> bytes | str:
+def _body_of(value: dict[str, Any]) -> tuple[bytes, str | None]:
     """The BSON elements of the index document of one message, or why there are none."""
     try:
-        document = bson.encode({_key(k): _indexed(v, array_limit, 2) for k, v in value.items()})
-        if len(document) - 5 > max_bytes:
-            raise PayloadError(f"its fields take more than {max_bytes >> 20} MiB")
+        document = bson.encode({_key(k): _indexed(v, 2) for k, v in value.items()})
+        if len(document) - 5 > MAX_BYTES:
+            raise PayloadError(f"its fields take more than {MAX_BYTES >> 20} MiB")
     except (PayloadError, BSONError, OverflowError, ValueError, RecursionError) as error:
-        return f"it cannot be a document: {error}"
-    return document[4:-1]
+        return b"", f"it cannot be a document: {error}"
+    return document[4:-1], None
 
 
 def top(value: Plain) -> dict[str, Plain]:
@@ -125,15 +124,15 @@ def top(value: Plain) -> dict[str, Plain]:
     return value
 
 
-def _indexed(value: Plain, limit: int, depth: int) -> object:
+def _indexed(value: Plain, depth: int) -> object:
     if isinstance(value, dict | list) and depth > MAX_DEPTH:
         raise PayloadError(f"it is nested deeper than {MAX_DEPTH}")
     if isinstance(value, dict):
-        return {_key(k): _indexed(v, limit, depth + 1) for k, v in value.items()}
-    if isinstance(value, bytes) or (isinstance(value, list) and len(value) > limit):
+        return {_key(k): _indexed(v, depth + 1) for k, v in value.items()}
+    if isinstance(value, bytes) or (isinstance(value, list) and len(value) > ARRAY_LIMIT):
         return _summary(value)
     if isinstance(value, list):
-        return [_indexed(v, limit, depth + 1) for v in value]
+        return [_indexed(v, depth + 1) for v in value]
     if isinstance(value, str):
         return repaired_text(value)
     if isinstance(value, int) and not _INT64_MIN <= value <= _INT64_MAX:

@@ -17,7 +17,7 @@ import pyarrow.compute as pc
 from msgspec import Struct
 
 from hybridlog.columns.fields import LIMIT, filled, has_summaries, original_name
-from hybridlog.columns.layout import OWN_COLUMNS, POINTS, column_names
+from hybridlog.columns.layout import OWN_COLUMNS, column_names
 from hybridlog.schema.arrow_columns import json_array, structs
 from hybridlog.schema.arrow_types import (
     COMPUTED_AS,
@@ -52,7 +52,7 @@ OWN: Final = pa.schema(
     ]
 )
 """Columns of every view in addition to the fields."""
-_RESERVED: Final = frozenset({*OWN_COLUMNS, *OWN.names})
+_RESERVED: Final = OWN_COLUMNS.union(OWN.names)
 _types = pa.types
 Path = tuple[str, ...]
 Key = tuple[Path, bool]
@@ -68,7 +68,6 @@ class ViewColumn(Struct, frozen=True):
         type: Its type in SQL.
         inner: Fields of a struct.
         is_summary: True for the twin of an array.
-        is_points: True for the points of clouds.
     """
 
     name: str
@@ -77,7 +76,6 @@ class ViewColumn(Struct, frozen=True):
     type: Any
     inner: tuple[ViewColumn, ...] = ()
     is_summary: bool = False
-    is_points: bool = False
 
     def leaves(self, above: Path = ()) -> Iterator[tuple[Path, ViewColumn]]:
         """Its fields that are no structs, each with the names on the way in SQL, folded."""
@@ -145,11 +143,6 @@ def _columns(message: Any, path: Path, reserved: frozenset[str]) -> Iterator[Vie
             yield ViewColumn(name, source, field.type, made, inner)
         else:
             yield ViewColumn(name, source, field.type, sql_type(field.type))
-
-
-def points_column(kind: Any) -> ViewColumn:
-    """The column of the points of clouds, of a type."""
-    return ViewColumn(POINTS, (POINTS,), kind, sql_type(kind), is_points=True)
 
 
 def _may_be_summary(kind: Any) -> bool:

@@ -143,18 +143,16 @@ def arrays(given: _Arrays) -> None:
     """Keep long arrays in the tables of topics.
 
     Tables have a summary of an array with more than 32 elements. Of these topics they get the
-    array, too: predicates on elements of arrays and SQL then read columns. Tables of point
-    clouds get a list for each field of the points, for SQL, DuckDB and other readers of the
-    files; predicates have no points. New recordings follow, and tables of ended ones are made
-    anew at once. Segments stay as they are, so this costs room. MongoDB is not needed.
+    array in its place: predicates on elements of arrays and SQL then read columns. New
+    recordings follow, and tables of ended ones are made anew at once. Segments stay as they
+    are, so this costs room. MongoDB is not needed.
     """
     with given.opened() as store, Bar("index arrays") as bar:
         found = store.index.arrays(*given.topic, off=given.off, progress=bar.part)
     arrays = "without arrays" if given.off else "with arrays"
-    tables = {None: "none yet", False: "no long arrays", True: arrays}
     columns = [
         Column("topic"),
-        Column("tables", lambda row: tables[row["has_arrays"]]),
+        Column("tables", lambda row: arrays if row["bytes_after"] else "none yet"),
         Column("made anew", lambda row: len(row["recordings"]), "right"),
         bytes_of("before", "bytes_before"),
         bytes_of("after", "bytes_after"),
