@@ -50,21 +50,13 @@ class Addition(Struct):
 class TableFolders:
     """Adds and removes tables of one recording, which this process has locked for writing.
 
-    Rows of other segments than those of `digests` go. Without `created` (ns), the recording is
-    looked for in all files.
+    Without `created` (ns), the recording is looked for in all files.
     """
 
-    def __init__(
-        self,
-        root: Path,
-        recording: str,
-        created: int | None,
-        digests: Mapping[str, str] | None = None,
-    ) -> None:
+    def __init__(self, root: Path, recording: str, created: int | None) -> None:
         self._root = root
         self._recording = recording
         self._created = created
-        self._digests = digests or {}
 
     def add(
         self,
@@ -149,8 +141,7 @@ class TableFolders:
         try:
             table = reader.table()
             for before, section in reader.sections():
-                is_fresh = section.segments.items() <= self._digests.items()
-                stays = is_fresh and section.topic not in new and not goes(section.topic)
+                stays = section.topic not in new and not goes(section.topic)
                 if section.id != self._recording or stays:
                     pieces.append((section, table.slice(before, section.rows)))
         except StoreError as error:

@@ -347,7 +347,7 @@ class TableWriter:
         if additions or replaced:
             self._check_room()
             types = {type_prefix(c.type) for c in entry.channels if c.topic in replaced}
-            folders = TableFolders(self._root, self._recording, entry.created, entry.digests)
+            folders = TableFolders(self._root, self._recording, entry.created)
             folders.add(additions, replaced, types)
 
     def _incomplete(self, entry: RecordingEntry) -> set[str]:

@@ -310,7 +310,6 @@ def _remove_arrays(directory: StoreDirectory, manifest: Manifest, going: Collect
     channels = (manifest.channels[number] for log in going for number in log.parts)
     gone = {one.topic: one.type for one in channels if one.topic in directory.settings.arrays}
     if gone:
-        digests = {str(number): log.digest for number, log in manifest.logs.items()}
-        folders = TableFolders(directory.path, manifest.id, manifest.created, digests)
+        folders = TableFolders(directory.path, manifest.id, manifest.created)
         with suppress(OSError):
             folders.add({}, {*gone}, {type_prefix(kind) for kind in gone.values()})

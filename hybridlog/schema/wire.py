@@ -14,9 +14,8 @@ from msgspec import Struct, field
 
 from hybridlog.schema.codec import Decoded, Unreadable, no_rows
 from hybridlog.schema.column import Records, concatenate, take
-from hybridlog.schema.wire_gather import Source
 from hybridlog.schema.wire_program import Wire, compile_type
-from hybridlog.schema.wire_walk import MisfitError, Scanner, Walker
+from hybridlog.schema.wire_walk import MisfitError, Scanner, Source, Walker
 from hybridlog_storage.messages import distinct
 
 if TYPE_CHECKING:

@@ -146,7 +146,7 @@ def test_rows_of_another_segment_are_not_kept(few: hl.Store) -> None:
     path = next((few.directory.path / TABLES).glob("*/*.parquet"))
     reader = ColumnFile(path)
     sections = reader.about.sections
-    folders = TableFolders(few.directory.path, entry.id, entry.created, entry.digests)
+    folders = TableFolders(few.directory.path, entry.id, entry.created)
     table, before, pieces = reader.table(), 0, []
     for section in sections:
         pieces.append((replace(section, segments=stale), table.slice(before, section.rows)))
