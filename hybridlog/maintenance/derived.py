@@ -1,4 +1,4 @@
-"""Brings what is derived of recordings up to date: the index, tables with arrays, buckets."""
+"""Brings what is derived of recordings up to date: the index, tables with arrays, in buckets."""
 
 from __future__ import annotations
 
@@ -8,14 +8,12 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from msgspec import Struct
 
 from hybridlog.columns.layout import SHARED, SUFFIX, TABLES, topics_of, type_prefix
-from hybridlog.entries import put_entry, schemas_in
 from hybridlog.follow.follower import bring, make_tables
-from hybridlog.maintenance.opening import open_catalog
 from hybridlog.maintenance.report import ArraysOfTopic
 from hybridlog.snapshot import UNFINISHED
 from hybridlog_storage.disk import files
@@ -42,7 +40,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.mongo.database import Database
-    from hybridlog_storage.remote.bucket import Object
     from hybridlog_storage.remote.store import RemoteDirectory
     from hybridlog_storage.summary import RecordingSummary
 
@@ -195,65 +192,35 @@ def _differs(known: Tables, entry: RecordingEntry, topic: str, *, off: bool) -> 
     return (not arrays or off in arrays) and (off or not is_expired)
 
 
-_TRIES: Final = 10  # while others write the catalog, too
-
-
-def bring_derived(source: Shared, target: RemoteDirectory, recordings: Collection[str]) -> None:
-    """Bring the tables and the rows of the catalog of recordings that were copied into a bucket.
-
-    Nothing depends on it: without it answers are the same, and take more requests.
-    """
-    known = {}
+def bring_tables(source: Shared, target: RemoteDirectory, recordings: Collection[str]) -> None:
+    """Bring the tables of recordings that were copied into a bucket; messages answer without."""
     for recording in recordings:
         entry = source.now().entry_if_there(recording)
         if entry is not None and entry.status not in UNFINISHED:
-            known[recording] = entry, _bring_tables(source, target, entry)
-    cells = target.source.cells
-    for _ in range(_TRIES if known else 0):
-        target.manifests.look(now=True)
-        catalog = open_catalog(target)
-        for recording, (entry, tables) in known.items():
-            with suppress(StoreError):  # who asks for it there is told what is wrong
-                _describe(source, entry, target, catalog)
-                cells.put_tables(recording, tables)
-        if cells.save():
-            return
-    cells.close()  # a manifest may have been made again
+            _bring_tables(source, target, entry)
 
 
-def _describe(
-    source: Shared, entry: RecordingEntry, target: RemoteDirectory, catalog: Catalog
-) -> None:
-    """Make the row of the catalog from what is there, and from what decoding found out here."""
-    known = source.catalog
-    digests = {int(number): digest for number, digest in entry.digests.items()}
-    for number, decoded in known.decoded(entry.id, digests).items():
-        catalog.put_decoded(entry.id, number, digests[number], decoded)
-    catalog.put_damage(entry.id, known.damage(entry.id))
-    catalog.put_schemas(schemas_in(source.directory, entry).values())
-    put_entry(target, catalog, entry.id)
-
-
-def _bring_tables(source: Shared, target: RemoteDirectory, entry: RecordingEntry) -> list[Object]:
+def _bring_tables(source: Shared, target: RemoteDirectory, entry: RecordingEntry) -> None:
     """Write the tables of a recording; no file of them has another recording."""
     from hybridlog_storage.copy_places import read
 
-    found, numbers = [], dict[str, int]()
+    names, numbers = [], dict[str, int]()
     with tempfile.TemporaryDirectory(prefix="hybridlog-") as place:
         for path in _tables(source, entry, Path(place)):
             folder = path.parent.name
             number = numbers[folder] = numbers.get(folder, -1) + 1
             name = f"{TABLES}/{folder}/{entry.id}-{number}{SUFFIX}"
+            names.append(name)
             try:
                 fd = files.open_file(path, os.O_RDONLY)
             except OSError as error:
                 raise unreadable(error, path) from error
             try:
                 size = os.fstat(fd).st_size
-                found.append(target.bucket.put(name, size, read(fd, 0, size)))
+                target.bucket.put(name, size, read(fd, 0, size))
             finally:
                 os.close(fd)
-    return found
+    target.source.keep_tables(entry.id, names)
 
 
 def _tables(source: Shared, entry: RecordingEntry, root: Path) -> list[Path]:

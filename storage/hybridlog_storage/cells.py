@@ -72,21 +72,19 @@ class Cells:
     """Cells by kind, key and number; in memory without a path. Thread safe.
 
     The file of another `owner`, a store, is made again. Without `writes` it stays as it is, and a
-    copy in memory is used. `lock` is held while cells are read or changed; `changes` counts what
-    was written here.
+    copy in memory is used.
     """
 
     def __init__(self, path: Path | None, owner: str, *, writes: bool = True) -> None:
         self._path = path
         self._owner = crc32(f"{_VERSION} {owner}".encode()) >> 1
         self._writes = writes and path is not None
-        self.lock = RLock()
-        self.changes = 0
+        self._lock = RLock()
         self._db: sqlite3.Connection | None = None
 
     def close(self) -> None:
         """Close the file."""
-        with self.lock:
+        with self._lock:
             if self._db is not None:
                 self._db.close()
             self._db = None
@@ -96,7 +94,7 @@ class Cells:
     def _use(self) -> sqlite3.Connection:
         """The database to ask: the file, or memory in its place."""
         if self._db is None:
-            self._db = self._opened() if self._writes else self.loaded()
+            self._db = self._opened() if self._writes else self._loaded()
         return self._db
 
     def _opened(self) -> sqlite3.Connection:
@@ -131,9 +129,9 @@ class Cells:
         made.execute(_TABLE)
         made.execute(f"PRAGMA user_version = {self._owner}")
 
-    def loaded(self, content: bytes = b"") -> sqlite3.Connection:
-        """A database in memory with the cells of the file or content; empty if it is unreadable."""
-        made = _connected()
+    def _loaded(self) -> sqlite3.Connection:
+        """A database in memory with the cells of the file; empty if it is unreadable."""
+        made, content = _connected(), b""
         with suppress(*_ERRORS):
             if self._path is not None and not self._writes:
                 content = files.read_file(self._path, _MAX_COPIED)
@@ -148,7 +146,7 @@ class Cells:
 
     def _run(self, work: Callable[[sqlite3.Connection], _T]) -> _T:
         """Do something with the file, or else in memory."""
-        with self.lock:
+        with self._lock:
             for _ in range(2):
                 try:
                     return work(self._use())
@@ -196,11 +194,6 @@ class Cells:
                     opened.execute(*statement)
 
         self._run(work)
-        self.changes += 1
-
-    def to_bytes(self) -> bytes:
-        """All cells, as a database."""
-        return self._run(lambda opened: opened.serialize())
 
 
 @contextmanager

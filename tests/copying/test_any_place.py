@@ -10,6 +10,7 @@ from typing import Any, NoReturn
 
 import pytest
 
+from hybridlog_storage.cells import drop
 from hybridlog_storage.copy import Copied, How, copy
 from hybridlog_storage.copy_places import Directory, Place, RefusedError
 from hybridlog_storage.errors import HybridlogError
@@ -313,8 +314,8 @@ def test_payloads_that_are_only_there_are_not_replaced(make: Makes) -> None:
         copy(source.source, target.place, RECORDING)
         expire(source)
         target.delete(f"manifests/{RECORDING}.json")
-        if target.bucket is not None:  # one that has no catalog
-            target = Store(BucketStore(target.bucket), None, target.bucket)
+        if isinstance(target.place, BucketStore):  # one that has no catalog
+            target.place.cells.write(lambda: [drop("manifest", RECORDING)])
         if target.folder is not None:
             (target.folder / "recordings" / RECORDING / "manifest.old").unlink(missing_ok=True)
         before = target.names()

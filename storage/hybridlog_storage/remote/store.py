@@ -1,30 +1,31 @@
 """A store in a bucket, as a directory that others read.
 
 Its objects have the names of the files of a directory. A recording is its manifest, as this
-process has seen it last, and the files that it lists; nobody asks which others there are. What
-is derived may be missing:
+process has seen it last, and the files that it lists; nobody asks which others there are. Tables
+are derived and may be missing; no file of them has two recordings:
 
-    tables/<type>~<shape>/<id>-<number>.parquet   fields; no file has two recordings
-    manifests/catalog                             the catalog, manifests with their versions, and
-                                                  the names of tables: an opening reads it alone
+    tables/<type>~<shape>/<id>-<number>.parquet
+
+The catalog lies in the user's cache, and has manifests with their versions: an opening reads those
+that have changed since the last one.
 """
 
 from __future__ import annotations
 
 import errno
+import hashlib
 import os
 import secrets
 import stat
 import tempfile
 import threading
 import time
-import zlib
 from collections.abc import Callable, Collection, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Final, cast
+from typing import Any, ClassVar, Final, cast
 
-from msgspec import Meta, MsgspecError, json
 from msgspec.structs import replace
 
 from hybridlog_storage.cells import Cells, drop, put
@@ -42,7 +43,6 @@ from hybridlog_storage.disk.directory import (
     gone,
 )
 from hybridlog_storage.errors import (
-    BucketError,
     DiskFullError,
     ManifestError,
     ObjectChangedError,
@@ -66,99 +66,13 @@ from hybridlog_storage.settings import NAME as SETTINGS
 
 LOOK_EVERY_S: Final = 5.0
 """Seconds between two looks for changes of others, for each thousand recordings."""
-CATALOG: Final = "manifests/catalog"
-"""Name of the object with the catalog; where manifests lie, so that one listing tells of it."""
 TABLES: Final = "tables"
 _MANIFEST: Final = "manifest"
-_TABLES: Final = "tables"
-"""Kinds of cells, by recording: its manifest with its version, and the objects of its tables."""
-_FEW: Final = 4  # manifests that are read one by one, even if there is a newer catalog
+"""Kind of the cells, by recording, of its manifest with its version."""
+_PARALLEL: Final = 16
 _FETCHED: Final = 8 << 20  # bytes that a copy asks for at once
-_MAX_CATALOG: Final = 1 << 30  # bytes, packed and unpacked
-_PART: Final = r"(?!\.\.?(?:/|$))[^/\x00]{1,255}"
-_Row = tuple[
-    Annotated[str, Meta(pattern=f"^{TABLES}/{_PART}/{_PART}$")],
-    Annotated[int, Meta(ge=0, lt=1 << 50)],
-    str,
-]
 _FOLDER: Final = stat.S_IFDIR | 0o555
 _FILE: Final = stat.S_IFREG | 0o444
-
-
-class CatalogCells(Cells):
-    """The cells of the catalog, which lie in an object; changes stay in memory until `save`.
-
-    Attributes:
-        about: The object; None before there is one.
-        has_changes: Whether this process has changed the store since it was saved.
-        is_behind: Whether another process has saved its own meanwhile.
-    """
-
-    def __init__(self, bucket: Bucket, cache: BlockCache) -> None:
-        self._bucket = bucket
-        self._blocks = cache
-        self.about: Object | None = None
-        self.has_changes = self.is_behind = False
-        self._tables: tuple[tuple[int, ...], dict[str, dict[str, Object]]] = (), {}
-        super().__init__(None, "")
-
-    def load(self, about: Object | None) -> None:
-        """Take the cells of an object; none of one that is damaged, or is another one by now."""
-        content = b""
-        with suppress(zlib.error, OSError):
-            if about is not None and about.size <= _MAX_CATALOG:
-                handle = self._blocks.open(self._bucket, about)
-                try:
-                    packed = files.pread(handle, about.size, 0)
-                finally:
-                    os.close(handle)
-                content = zlib.decompressobj().decompress(packed, _MAX_CATALOG)
-        with self.lock:
-            super().close()
-            self._db = self.loaded(content)
-            self.changes += 1
-            self.about, self.is_behind = about, False
-
-    def save(self) -> bool:
-        """Write the object; False if another process has written it since it was read."""
-        content = zlib.compress(self.to_bytes(), 1)
-        try:
-            if self.about is None:
-                version = self._bucket.create(CATALOG, content)
-            else:
-                version = self._bucket.replace(CATALOG, content, self.about.version)
-        except (ObjectExistsError, ObjectChangedError, FileNotFoundError):
-            self.is_behind = True
-            return False
-        self.about, self.has_changes = Object(CATALOG, len(content), version), False
-        return True
-
-    def tables(self) -> dict[str, dict[str, Object]]:
-        """The objects of tables by folder and name, without those that were lost."""
-        state = self.changes, len(self._bucket.lost)
-        if self._tables[0] != state:
-            found: dict[str, dict[str, Object]] = {}
-            for body in self.each(_TABLES).values():
-                for one in _objects(body):
-                    if one.name not in self._bucket.lost:
-                        _, folder, name = one.name.split("/")
-                        found.setdefault(folder, {})[name] = one
-            self._tables = state, found
-        return self._tables[1]
-
-    def put_tables(self, recording: str, objects: Collection[Object] = ()) -> None:
-        """List the tables of a recording; those that were listed before are deleted."""
-        before = _objects(self.read(_TABLES, recording) or b"")
-        body = json.encode([(one.name, one.size, one.version) for one in objects])
-        cell = put(_TABLES, recording, body) if objects else drop(_TABLES, recording)
-        self.write(lambda: [cell])
-        self._bucket.delete(sorted({one.name for one in before} - {one.name for one in objects}))
-
-    def close(self) -> None:
-        """Save what this process has changed. The cells stay: others here use them, too."""
-        if self.has_changes:
-            with suppress(BucketError):  # who opens the store reads a few manifests more
-                self.save()
 
 
 class BucketManifests(Manifests):
@@ -170,7 +84,7 @@ class BucketManifests(Manifests):
 
     cure = "If it is deleted, `hybridlog copy` from a store that has it brings it back."
 
-    def __init__(self, bucket: Bucket, cells: CatalogCells) -> None:
+    def __init__(self, bucket: Bucket, cells: Cells) -> None:
         self.objects: dict[str, Object] = {}
         self.number = 0
         self.place, self._bucket, self._cells = bucket.address, bucket, cells
@@ -191,15 +105,28 @@ class BucketManifests(Manifests):
                 for one in before.keys() | self.objects.keys()
                 if _version(before.get(one)) != _version(self.objects.get(one))
             }
-            catalog = found.get(CATALOG)
-            is_other = len(changed) > _FEW and _version(catalog) != _version(self._cells.about)
-            if not self.number or self._cells.is_behind or is_other:
-                self._cells.load(catalog)
             if changed or not self.number:
                 self.number += 1
                 lost = [*self._bucket.lost]  # which other threads add to
                 self._bucket.lost -= {name for name in lost if name.split("/")[1] in changed}
+                self._fetch(changed & self.objects.keys())
             self._look_at = time.monotonic() + LOOK_EVERY_S * (1 + len(found) // 1000)
+
+    def _fetch(self, changed: Collection[str]) -> None:
+        """Read manifests that the catalog does not have, several at once."""
+        known = self._cells.each(_MANIFEST, changed) if changed else {}
+        versions = {one: cell.partition(b"\n")[0].decode() for one, cell in known.items()}
+        new = [one for one in changed if versions.get(one) != self.objects[one].version]
+
+        def read(recording: str) -> tuple[Object, bytes] | None:
+            with suppress(FileNotFoundError):  # it was removed just now
+                return self._bucket.read_whole(_name_of(recording), MAX_BYTES)
+            return None
+
+        with ThreadPoolExecutor(_PARALLEL) as pool:
+            for recording, found in zip(new, pool.map(read, new), strict=True):
+                if found is not None:
+                    self._note(recording, found[1], found[0].version)
 
     def ids(self) -> list[str]:
         """Ids of all recordings, sorted; also of those being removed."""
@@ -208,8 +135,13 @@ class BucketManifests(Manifests):
 
     def without(self) -> list[str]:
         """Ids of recordings that the catalog has, and that have files and no manifest."""
-        known = sorted(self._cells.each(_MANIFEST).keys() - self.objects.keys())
-        return [one for one in known if any(self._bucket.objects(f"{RECORDINGS}/{one}/"))]
+        found = []
+        for one in sorted(self._cells.each(_MANIFEST).keys() - self.objects.keys()):
+            if any(self._bucket.objects(f"{RECORDINGS}/{one}/")):
+                found.append(one)
+            else:
+                self._cells.write(lambda one=one: [drop(_MANIFEST, one)])  # type: ignore[misc]
+        return found
 
     def remove(
         self, recording: str, check: Callable[[Manifest], object] = lambda _: None
@@ -255,15 +187,14 @@ class BucketManifests(Manifests):
             version = self._bucket.create(_name_of(manifest.id), data)
         except ObjectExistsError:
             raise RecordingExistsError(f"There is a recording {manifest.id} already.") from None
-        self._note(manifest.id, data, version, is_change=True)
+        self._note(manifest.id, data, version)
 
     def _replace(self, recording: str, data: bytes, version: str) -> None:
         version = self._bucket.replace(_name_of(recording), data, version)
-        self._note(recording, data, version, is_change=True)
+        self._note(recording, data, version)
 
-    def _note(self, recording: str, data: bytes, version: str, *, is_change: bool = False) -> None:
+    def _note(self, recording: str, data: bytes, version: str) -> None:
         with self._lock:
-            self._cells.has_changes |= is_change
             self.number += recording not in self.objects
             self.objects[recording] = Object(_name_of(recording), len(data), version)
             self._known.pop(recording, None)
@@ -276,7 +207,7 @@ class BucketManifests(Manifests):
     def _delete_files(self, recording: str) -> None:
         names = [one.name for one in self._bucket.objects(f"{RECORDINGS}/{recording}/")]
         self._bucket.delete(names)
-        self._cells.put_tables(recording)
+        self._bucket.delete([one.name for one in tables_of(self._bucket, recording)])
 
     def _forget(self, recording: str, *, says_so: bool) -> None:
         # Servers have no condition for deletions: between these two it could be created anew.
@@ -285,7 +216,6 @@ class BucketManifests(Manifests):
                 return
             self._drop(recording)
         with self._lock:
-            self._cells.has_changes = True
             self._known.pop(recording, None)
             self.objects.pop(recording, None)
             self.number += 1
@@ -303,9 +233,13 @@ class BucketStore(Source):
     def __init__(self, bucket: Bucket) -> None:
         self.bucket, self.address = bucket, bucket.address
         self.cache = BlockCache()
-        self.cells = CatalogCells(bucket, self.cache)
+        with suppress(OSError):  # then memory takes its place
+            self.cache.path.mkdir(mode=0o700, parents=True, exist_ok=True)
+        name = hashlib.sha256(self.address.encode()).hexdigest()[:40]
+        self.cells = Cells(self.cache.path / f"{name}.sqlite", self.address)
         self.manifests = BucketManifests(bucket, self.cells)
         self._found: dict[str, Object] = {}
+        self._tables: tuple[int, dict[str, dict[str, Object]]] = -1, {}
 
     def open(self, inner: tuple[str, ...]) -> int:
         """A handle for reading a file that a manifest or the catalog lists."""
@@ -315,7 +249,7 @@ class BucketStore(Source):
                 listed = objects_of(self.manifests.read(inner[1]))
                 about = next((one for one in listed if one.name == "/".join(inner)), None)
         elif len(inner) == 3 and inner[0] == TABLES:
-            about = self.cells.tables().get(inner[1], {}).get(inner[2])
+            about = self.tables().get(inner[1], {}).get(inner[2])
         if about is None or about.name in self.bucket.lost:
             problem = "there is no such object" if about is None else LOST
             raise FileNotFoundError(errno.ENOENT, problem, "/".join([self.address, *inner]))
@@ -323,7 +257,7 @@ class BucketStore(Source):
 
     def names(self, inner: tuple[str, ...]) -> tuple[int, dict[str, os.stat_result]]:
         """The entries of a folder of tables, and a number that changes with them."""
-        found = self.cells.tables()
+        found = self.tables()
         if inner == (TABLES,):
             return self.number, dict.fromkeys(found, _stat(_FOLDER, 0, 0))
         if len(inner) != 2 or inner[0] != TABLES or inner[1] not in found:
@@ -335,6 +269,24 @@ class BucketStore(Source):
     def number(self) -> int:
         """Changes with what was seen of the store."""
         return self.manifests.number + len(self.bucket.lost)
+
+    def tables(self) -> dict[str, dict[str, Object]]:
+        """The objects of tables by folder and name, without those that were lost."""
+        number = self.number
+        if self._tables[0] != number:
+            found: dict[str, dict[str, Object]] = {}
+            for one in tables_of(self.bucket):
+                if one.name not in self.bucket.lost:
+                    _, folder, name = one.name.split("/")
+                    found.setdefault(folder, {})[name] = one
+            self._tables = number, found
+        return self._tables[1]
+
+    def keep_tables(self, recording: str, names: Collection[str]) -> None:
+        """Delete the tables of a recording but some."""
+        there = (one.name for one in tables_of(self.bucket, recording))
+        self.bucket.delete(sorted({*there}.difference(names)))
+        self._tables = -1, {}
 
     def sizes(self, recording: str) -> dict[str, int]:
         """As of `Place`; 1,000 a request."""
@@ -504,7 +456,7 @@ class RemoteDirectory(StoreDirectory):
 
     def listed_bytes(self) -> int:
         """Bytes of all files that manifests list, and of tables."""
-        tables = sum(o.size for own in self.source.cells.tables().values() for o in own.values())
+        tables = sum(o.size for own in self.source.tables().values() for o in own.values())
         manifests = self.manifests.each(self.ids())
         return tables + sum(one.bytes for now in manifests for one in now.present.values())
 
@@ -550,11 +502,12 @@ class RemoteDirectory(StoreDirectory):
         self.bucket.delete([f"{RECORDINGS}/{recording}/{name}" for name in names])
 
 
-def _objects(body: bytes) -> list[Object]:
-    """Objects of tables; none of a list that does not fit."""
-    with suppress(MsgspecError):
-        return [Object(*row) for row in json.decode(body, type=list[_Row])]
-    return []
+def tables_of(bucket: Bucket, recording: str = "") -> Iterator[Object]:
+    """The objects of tables, of a recording or of all."""
+    for one in bucket.objects(f"{TABLES}/"):
+        name = one.name.rpartition("/")[2]
+        if one.name.count("/") == 2 and (not recording or name.startswith(f"{recording}-")):
+            yield one
 
 
 def _version(about: Object | None) -> str:
