@@ -77,7 +77,7 @@ class SimulatedTime(Sink):
         return self._latest[1]
 
     def clock(self, now: int, *, received: int) -> None:
-        """See `Sink.clock`."""
+        """Take a time of the clock, ns."""
         if not 0 <= now < _MAX_NS:
             self._recorder.say(f"{CLOCK}: {now} ns is no time that can be stored; it is ignored")
             return

@@ -1,4 +1,4 @@
-"""Policies for dropping messages or payloads: throttles and priorities.
+"""Policies of a recorder: throttles, priorities, the memory budget, the garbage collector.
 
 A throttle limits a topic's rate at all times. Priorities decide which topics drop payloads
 first when the memory budget fills, because messages come faster than the disk writes.
@@ -11,8 +11,7 @@ import math
 import os
 import re
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
-from functools import cache
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
@@ -109,57 +108,25 @@ def frozen_objects() -> Iterator[None]:
         gc.unfreeze()
 
 
-MIN_BUDGET = 64 << 20
-MAX_BUDGET = 2 << 30
-MIN_USER_BUDGET = 1 << 20
+MIN_USER_BUDGET: Final = 1 << 20
 """Smallest budget that a user may choose, bytes."""
-_MACHINE_SHARE = 16
-_CGROUPS = Path("/sys/fs/cgroup")
-_OWN_CGROUPS = Path("/proc/self/cgroup")
-_OWN_MEMORY = Path("/proc/self/statm")
+_MIN_BUDGET, _MAX_BUDGET = 64 << 20, 2 << 30
+_MACHINE_SHARE: Final = 16
 
 
-@cache
 def default_budget() -> int:
-    """A sixteenth of the machine's memory in bytes, from `MIN_BUDGET` to `MAX_BUDGET`.
+    """A sixteenth of the machine's memory in bytes, from 64 MiB to 2 GiB.
 
-    It bridges some seconds of a slow disk, and leaves memory to other programs of the
-    robot. A memory limit of the container or service counts as the machine's memory.
+    It bridges some seconds of a slow disk, and leaves memory to other programs of the robot.
     """
-    return min(max(memory_bytes() // _MACHINE_SHARE, MIN_BUDGET), MAX_BUDGET)
-
-
-def memory_bytes(root: Path = _CGROUPS, own: Path = _OWN_CGROUPS) -> int:
-    """Bytes of memory that the machine has, or that this process's control group allows.
-
-    Args:
-        root: Mount point of control groups (version 2).
-        own: File that names the group of this process.
-    """
-    machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    return min([machine, *_limits(root, own)])
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return min(max(memory // _MACHINE_SHARE, _MIN_BUDGET), _MAX_BUDGET)
 
 
 def resident_bytes() -> int:
     """Bytes of memory that this process holds; 0 where that is unknown."""
     try:
-        pages = int(_OWN_MEMORY.read_text(encoding="ascii").split()[1])
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
     except (OSError, ValueError, IndexError):
         return 0
     return pages * os.sysconf("SC_PAGE_SIZE")
-
-
-def _limits(root: Path, own: Path) -> Iterator[int]:
-    """Memory limits of the group and its parents; nothing on a system without groups."""
-    try:
-        lines = own.read_text().splitlines()
-    except OSError:
-        return
-    name = next((line[3:] for line in lines if line.startswith("0::")), "/")
-    group = root / name.lstrip("/")
-    for directory in [group, *group.parents]:
-        if not directory.is_relative_to(root):
-            return
-        # `max` stands for no limit; the outermost group has no such file.
-        with suppress(OSError, ValueError):
-            yield int((directory / "memory.max").read_text())

@@ -546,9 +546,6 @@ class Recorder:
         self._count_lost(loss.topic, loss.cause, loss.count or 0)
         self._target.ledger.note(loss)
 
-    def clock(self, now: int, *, received: int) -> None:
-        """See `Sink.clock`; `SimulatedTime` uses it."""
-
     def drop(self, channel: Channel, size: int, cause: Cause, detail: str, at: int) -> None:
         """See `SimulatedTime`."""
         recorded = self._recorded.get(channel) or self._meet(channel, None)

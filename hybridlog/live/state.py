@@ -5,14 +5,12 @@ Other processes read the file. A recorder runs as long as its recording is locke
 
 from __future__ import annotations
 
-import math
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from operator import attrgetter
 from pathlib import Path
-from statistics import median
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
@@ -181,7 +179,6 @@ def _path(store: Path, recording: str) -> Path:
     return store / _FOLDER / f"{recording}{_SUFFIX}"
 
 
-_RATES = 60  # so many past rates give the expected rate
 _NS = 1e9
 
 
@@ -191,17 +188,9 @@ class Tally(Struct):
     messages: int = 0
     payload_bytes: int = 0
     last: int = 0
-    gaps: int = 0
-    squares: int = 0
-    counted: int = 0
 
     def add(self, size: int, received: int) -> None:
         """Count a message."""
-        if self.last:
-            gap = received - self.last
-            self.gaps += gap
-            self.squares += gap * gap
-            self.counted += 1
         self.last = received
         self.messages += 1
         self.payload_bytes += size
@@ -215,9 +204,7 @@ class TopicState(Struct, frozen=True):
     messages: int
     payload_bytes: int
     hz: float
-    expected_hz: float | None
     bytes_per_s: float
-    jitter_ms: float | None
     silent_s: float | None
     thinned: int
     lost: int
@@ -233,7 +220,6 @@ class TopicCounts(Struct):
     lost: Counter[str] = field(default_factory=Counter)
     _messages: int = 0
     _bytes: int = 0
-    _usual: deque[float] = field(default_factory=lambda: deque(maxlen=_RATES))
 
     @property
     def has_come(self) -> bool:
@@ -247,8 +233,6 @@ class TopicCounts(Struct):
         hz = (messages - self._messages) / elapsed_s
         rate = (size - self._bytes) / elapsed_s
         self._messages, self._bytes = messages, size
-        expected = median(self._usual) if len(self._usual) >= 3 else None
-        self._usual.append(hz)
         last = max((tally.last for tally in self.tallies), default=0)
         thinned = self.lost[Cause.THROTTLE]
         return TopicState(
@@ -257,22 +241,8 @@ class TopicCounts(Struct):
             messages,
             size,
             hz,
-            expected,
             rate,
-            self._jitter(),
             max(now - last, 0) / _NS if last else None,
             thinned,
             sum([*self.lost.values()]) - thinned,
         )
-
-    def _jitter(self) -> float | None:
-        """Largest standard deviation of the time between messages of a channel, ms."""
-        worst: float | None = None
-        for tally in self.tallies:
-            # A message that arrives between these lines counts at the next call.
-            count, total, squares = tally.counted, tally.gaps, tally.squares
-            tally.counted = tally.gaps = tally.squares = 0
-            if count >= 2:
-                deviation = math.sqrt(max(squares / count - (total / count) ** 2, 0.0)) / 1e6
-                worst = deviation if worst is None else max(worst, deviation)
-        return worst

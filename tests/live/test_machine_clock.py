@@ -99,7 +99,6 @@ def test_a_clock_that_is_set_mid_recording(plain: hl.Store) -> None:
         robot.play(chatter, "then")
         state = robot.recorder.look()
         assert [t.silent_s for t in state.topics if t.topic == "/chatter"] == [pytest.approx(0.1)]
-        assert all(t.jitter_ms is None or t.jitter_ms < 1000 for t in state.topics)
     assert state.clock_set_s == pytest.approx((eras[-1] - NOW) / 1e9 - 2.7)
     assert 4 * 15 <= state.lost["throttle"] <= 4 * 17
     jumps = [at - before - 9 * SECOND // 10 for before, at in pairwise(eras)]

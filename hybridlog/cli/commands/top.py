@@ -84,18 +84,12 @@ def _lines_of(state: RecorderState, width: int, height: int | None = None) -> li
     return [*table_lines([_TOPIC, *shown], topics, width), *ends]
 
 
-def _optional(value: float | None) -> str:
-    return "" if value is None else f"{value:.1f}"
-
-
 _TOPIC: Final = Column("topic", lambda topic: topic.topic, cut=16)
 _COLUMNS: Final = [
     Column("Hz", lambda topic: f"{topic.hz:.1f}", "right"),
-    Column("usual", lambda topic: _optional(topic.expected_hz), "right", order=2),
-    Column("MB/s", lambda topic: f"{topic.bytes_per_s / 1e6:.2f}", "right", order=3),
-    Column("jitter ms", lambda topic: _optional(topic.jitter_ms), "right", order=1),
+    Column("MB/s", lambda topic: f"{topic.bytes_per_s / 1e6:.2f}", "right", order=1),
     Column("messages", lambda topic: topic.messages, "right"),
-    Column("thinned", lambda topic: topic.thinned or "", "right", order=4),
+    Column("thinned", lambda topic: topic.thinned or "", "right", order=2),
     Column("lost", lambda topic: topic.lost or "", "right"),
 ]
 

@@ -62,9 +62,6 @@ class Sink(Protocol):
     def lost(self, loss: Loss) -> None:
         """Note messages that are lost."""
 
-    def clock(self, now: int, *, received: int) -> None:
-        """Note the time of a simulation, ns, as a source without a topic for it reports it."""
-
     def topic_came(self, topic: str, type_name: str) -> None:
         """Note that a wanted topic has publishers."""
 
@@ -103,7 +100,7 @@ class LiveSource(ABC):
         """Begin to listen.
 
         Temporary problems (a master that is not up yet, a publisher that dies) do not raise: the
-        source reports them, and retries with growing pauses. An invalid setting raises UsageError,
+        source reports them, and tries again. An invalid setting raises UsageError,
         a source that can never work SourceError.
         """
 

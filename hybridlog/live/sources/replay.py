@@ -2,18 +2,14 @@
 
 A message is due at its time since the first message, divided by the speed. Messages that are
 due go out without a pause: many small messages do not cost a pause each, and pauses do not
-accumulate errors.
-
-Messages go out in the order of log time, within a lookahead of some tens of megabytes.
-Messages that lie farther out of order, as in concatenated logs, are sent when they are read.
+accumulate errors. They go out in the order of the log, so one that lies behind a later one goes
+out with it.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from itertools import count
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 from hybridlog.formats.log_set import open_source
 from hybridlog.live.sources.base import Cause, Loss, Sink, ThreadedSource
@@ -23,23 +19,11 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from hybridlog.formats.reading import Damage, Source
-    from hybridlog_storage.messages import Channel
+    from hybridlog_storage.messages import Batch, Channel
 
 _MIN_PAUSE_S: Final = 0.001  # messages that are due within it go out together
 _MAX_PAUSE_S: Final = 3600.0
 _LATE_S: Final = 0.5
-_LONG_S: Final = 60.0
-_WINDOW: Final = 32 << 20  # payload bytes of the lookahead
-_WINDOW_ROWS: Final = 1 << 17
-
-
-class _Message(NamedTuple):
-    log_time: int
-    place: int  # in the log
-    channel: int
-    publish_time: int
-    sequence: int
-    payload: bytes
 
 
 class ReplaySource(ThreadedSource):
@@ -67,8 +51,8 @@ class ReplaySource(ThreadedSource):
         self._present: set[str] = set()
         self._channels: list[Channel | None] = []
         self._told = 0  # damaged places
-        self._failure = ""
-        self._waited_for = -1
+        self._began: float | None = None  # monotonic time of log time 0
+        self._newest = 0
 
     def check(self) -> None:
         """Check that the log can be opened."""
@@ -81,65 +65,60 @@ class ReplaySource(ThreadedSource):
 
     def _run(self) -> None:
         """Play the log to its end, or until it is stopped."""
+        failure = ""
         with self._source:
-            self._play()
-        if not self._stopping.is_set():
-            for topic in self._present:
-                self._sink.topic_gone(topic)
-            self._sink.ended(self._failure)
+            try:
+                for batch in self._source.batches():
+                    self._source.extras.clear()
+                    self._tell_news()
+                    if not self._play(batch):
+                        return
+            except SourceError as error:
+                failure = str(error)
+            self._tell_news()
+        for topic in self._present:
+            self._sink.topic_gone(topic)
+        self._sink.ended(failure)
 
-    def _play(self) -> None:
-        start, first, newest = time.monotonic(), None, 0
-        for message in self._messages():
-            if first is None:
-                start, first = time.monotonic(), message.log_time
-            due = start + (message.log_time - first) / (1e9 * self._speed)
-            while (pause := due - time.monotonic()) > 0:
-                if self._pause(pause, message.log_time):
-                    return
-            # A message in the wrong place of the log is not played late.
-            if message.log_time >= newest:
-                newest = message.log_time
-                self._check_lateness(-pause)
-            self._send(message)
-            if self._stopping.is_set():
-                return
-
-    def _messages(self) -> Iterator[_Message]:
-        """The messages in the order of log time, as far as one looks ahead."""
-        waiting: list[_Message] = []
-        places = count()
-        size = 0
-        try:
-            for batch in self._source.batches():
-                if self._stopping.is_set():
-                    return
-                self._source.extras.clear()
-                self._tell_news()
-                columns = (
-                    *(batch.log_time, batch.channel, batch.publish_time, batch.sequence),
-                    *(batch.offset, batch.offset + batch.length),
+    def _play(self, batch: Batch) -> bool:
+        """Play some messages; False if the source is stopped."""
+        buffer = memoryview(batch.buffer)
+        columns = (
+            *(batch.log_time, batch.channel, batch.publish_time, batch.sequence),
+            *(batch.offset, batch.offset + batch.length),
+        )
+        rows = zip(*(column.tolist() for column in columns), strict=True)
+        for log_time, number, sent, sequence, begin, end in rows:
+            if not self._wait_for(log_time):
+                return False
+            channel = self._channels[number]
+            if channel is not None:
+                self._sink.take(
+                    channel,
+                    bytes(buffer[begin:end]),
+                    received=time.time_ns(),
+                    sent=sent if channel.has_publish_time else None,
+                    sequence=sequence or None,
                 )
-                buffer = memoryview(batch.buffer)
-                rows = zip(*(column.tolist() for column in columns), strict=True)
-                waiting += [
-                    _Message(at, next(places), channel, sent, sequence, bytes(buffer[begin:end]))
-                    for at, channel, sent, sequence, begin, end in rows
-                ]
-                waiting.sort()
-                size += batch.payload_bytes
-                out = 0
-                while size > _WINDOW or len(waiting) - out > _WINDOW_ROWS:
-                    yield waiting[out]
-                    size -= len(waiting[out].payload)
-                    out += 1
-                del waiting[:out]
-        except SourceError as error:
-            self._failure = str(error)
-        self._tell_news()
-        yield from waiting
+        return True
 
-    # Channels and damage.
+    def _wait_for(self, log_time: int) -> bool:
+        """Wait until a message is due; False if the source is stopped."""
+        at = log_time / (1e9 * self._speed)
+        if self._began is None:
+            self._began = time.monotonic() - at
+        while (pause := self._began + at - time.monotonic()) > 0:
+            if self._stopping.wait(min(max(pause, _MIN_PAUSE_S), _MAX_PAUSE_S)):
+                return False
+        # A message in the wrong place of the log is not played late.
+        if -pause > _LATE_S and log_time >= self._newest and not self._is_late:
+            self._is_late = True
+            self._sink.say(
+                f"{self.address}: cannot be played at speed {self._speed:g}, messages are "
+                f"{-pause:.1f} s late; none is skipped, but a lower speed keeps their timing"
+            )
+        self._newest = max(self._newest, log_time)
+        return not self._stopping.is_set()
 
     def _tell_news(self) -> None:
         """Tell the channels and the damage that the last read has found."""
@@ -172,34 +151,3 @@ class ReplaySource(ThreadedSource):
             return
         now = time.time_ns()
         self._sink.lost(Loss(Cause.UNREADABLE, "", damage.messages_lost, now, now, detail))
-
-    # The messages.
-
-    def _pause(self, pause: float, moment: int) -> bool:
-        """Wait for the message of a log time; True if the source is stopped."""
-        if pause > _LONG_S and moment != self._waited_for:
-            self._waited_for = moment
-            self._sink.say(
-                f"{self.address}: the log has no message until {moment / 1e9:.3f} s since the "
-                f"epoch; that takes {pause:.0f} s, less at a higher speed"
-            )
-        return self._stopping.wait(min(max(pause, _MIN_PAUSE_S), _MAX_PAUSE_S))
-
-    def _check_lateness(self, behind: float) -> None:
-        if behind > _LATE_S and not self._is_late:
-            self._is_late = True
-            self._sink.say(
-                f"{self.address}: cannot be played at speed {self._speed:g}, messages are "
-                f"{behind:.1f} s late; none is skipped, but a lower speed keeps their timing"
-            )
-
-    def _send(self, message: _Message) -> None:
-        channel = self._channels[message.channel]
-        if channel is not None:
-            self._sink.take(
-                channel,
-                message.payload,
-                received=time.time_ns(),
-                sent=message.publish_time if channel.has_publish_time else None,
-                sequence=message.sequence or None,
-            )

@@ -13,12 +13,12 @@ from typing import Annotated, Any, Final, NamedTuple
 
 import msgspec
 
-from hybridlog.live.sources.foxglove.protocol import MESSAGE_DATA, TIME
+from hybridlog.live.sources.foxglove.protocol import MESSAGE_DATA
 from hybridlog.view.playback.played import PlayedChannel
 
 _BASE64 = frozenset({"protobuf", "flatbuffer"})
 _DATA = Struct("<BIQ")  # opcode, subscription, log time
-_TIME = Struct("<BQ")
+_TIME = Struct("<BQ")  # opcode 2, time
 _STATE = Struct("<BBQfBI")  # opcode, status, time, speed, did seek, length of the request's id
 _CONTROL = Struct("<BBfBQI")  # opcode, command, speed, seeks, time, length of the id
 _PLAYBACK_STATE: Final = 5
@@ -113,7 +113,7 @@ def message_data(subscription: int, log_time: int, payload: memoryview) -> bytes
 
 def time_now(position: int) -> bytes:
     """The time of the playback."""
-    return _TIME.pack(TIME, position)
+    return _TIME.pack(2, position)
 
 
 def playback_state(state: int, time: int, speed: float, *, did_seek: bool, request: bytes) -> bytes:

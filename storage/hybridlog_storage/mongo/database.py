@@ -123,8 +123,6 @@ class Database:
                 f"{name!r} cannot be the name of hybridlog's database: use up to 38 letters, "
                 f"digits, - and _, and none of {', '.join(sorted(_RESERVED_NAMES))}."
             )
-        if parsed["options"].get("w") == 0:
-            raise UsageError(f"{address}: w=0 would lose errors; leave it out.")
         try:
             with _mapped(address):
                 client: MongoClient[Document] = MongoClient(uri, **_options(parsed, timeout_s))  # type: ignore[arg-type]
@@ -394,8 +392,7 @@ def _options(parsed: Mapping[str, Any], timeout_s: float) -> dict[str, object]:
         # Members other than the primary may lack documents that the index is said to have.
         "readPreference": "primary",
         "readConcernLevel": "majority",
-        # A name is one of the server's.
-        "w": given["w"] if isinstance(given.get("w"), str) else "majority",
+        "w": "majority",
         **{name: value for name, value in defaults.items() if name.lower() not in given},
     }
 

@@ -93,7 +93,6 @@ class Heard:
         self.losses: list[Loss] = []
         self.topics: list[tuple[Any, ...]] = []
         self.said: list[str] = []
-        self.times: list[int] = []
         self.ends: list[str] = []
         self._changed = threading.Condition()
 
@@ -140,9 +139,6 @@ class Heard:
 
     def lost(self, loss: Loss) -> None:
         self._note(self.losses, loss)
-
-    def clock(self, now: int, *, received: int) -> None:
-        self._note(self.times, now)
 
     def topic_came(self, topic: str, type_name: str) -> None:
         self._note(self.topics, (topic, type_name))

@@ -187,7 +187,7 @@ def saying(payload: bytes, time: int = 0, number: int = 1) -> Script:
 @pytest.fixture(autouse=True)
 def _quick(limit: Limit) -> Iterator[None]:
     """Try again sooner; and nothing is left behind."""
-    limit(foxglove_pauses_s=(0.02, 0.05))
+    limit(foxglove_pause_s=0.02)
     yield
     assert [t.name for t in threading.enumerate() if t.name == "hybridlog-foxglove"] == []
 
@@ -340,33 +340,11 @@ def test_every_size_comes_byte_for_byte_however_it_is_cut() -> None:
     assert {taken.sequence for taken in heard.taken} == {None}
     assert len({id(taken.channel) for taken in heard.taken}) == 1
     assert (len(heard.expected), heard.unexpected) == (1, [])
-    assert heard.times == [5]
     times = [taken.received for taken in heard.taken]
     assert before <= times[0]
     assert times == sorted(times)
     assert heard.topics == [("/a", "T"), ("/a",)]
     assert (heard.said, heard.losses, heard.ends) == ([], [], [])
-
-
-def test_messages_in_pieces_are_put_together() -> None:
-    def script(peer: Peer) -> None:
-        offer = json.dumps({"op": "advertise", "channels": [channel()]}).encode()
-        peer.send(frame(Opcode.TEXT, offer[:5], is_last=False))
-        peer.send(frame(Opcode.CONT, offer[5:]))
-        whole = body(peer.subscribed()[1], 5, bytes(100_000))
-        peer.send(
-            frame(Opcode.BINARY, whole[:3], is_last=False),
-            frame(Opcode.PING, b"!"),
-            frame(Opcode.CONT, whole[3:70_000], is_last=False),
-            frame(Opcode.CONT, b"", is_last=False),
-            frame(Opcode.CONT, whole[70_000:]),
-            message(0, 6, b"next"),
-        )
-        peer.wait()
-
-    heard = hear(lambda h: len(h.taken) == 2, script)
-    assert heard.payloads() == [bytes(100_000), b"next"]
-    assert heard.said == []
 
 
 def test_only_what_is_wanted_is_subscribed_to() -> None:
@@ -420,9 +398,8 @@ REFUSALS = ["Unknown channel ID: {}", "Channel {} is not available; ignoring sub
 def test_a_channel_that_is_offered_too_soon_is_asked_for_again(words: str) -> None:
     def script(peer: Peer) -> None:
         number = peer.offer(channel(7))[7]
-        for _ in range(3):
-            peer.send(text({"op": "status", "level": 2, "message": words.format(7)}))
-            assert peer.subscribed() == {7: number}
+        peer.send(text({"op": "status", "level": 2, "message": words.format(7)}))
+        assert peer.subscribed() == {7: number}
         peer.send(message(number, 0, b"1"))
         peer.wait()
 
@@ -514,8 +491,8 @@ BREAKS = [
     (b"\x82\x85abcd12345", "violates the websocket protocol"),
     (b"\x83\x01x", "violates the websocket protocol"),
     (b"\xc2\x01x", "violates the websocket protocol"),
-    (frame(0, b"x"), "violates the websocket protocol"),
-    (frame(2, b"", is_last=False) + frame(2, b"x"), "violates the websocket protocol"),
+    (frame(0, b"x"), "messages in pieces"),
+    (frame(2, b"", is_last=False) + frame(2, b"x"), "messages in pieces"),
     (frame(8, b"\x03\xe9going"), "closed the connection (going)"),
     (frame(8, b"\x03\xe9\x1b[2J"), "closed the connection (?[2J)"),
     (frame(8, b""), "closed the connection;"),
@@ -579,7 +556,7 @@ def test_a_server_that_falls_silent_is_asked_and_then_left(
 
 
 def test_whatever_bytes_come_the_reader_ends_in_order(limit: Limit) -> None:
-    limit(foxglove_pauses_s=(0.0,))
+    limit(foxglove_pause_s=0.0)
     dice = random.Random(5)
     whole = [
         advertise(channel(), channel(2, "/b")),
@@ -629,15 +606,15 @@ def other_subprotocol(peer: Peer) -> None:
 @pytest.mark.parametrize(
     ("script", "words"),
     [
-        (answer(b"HTTP/1.1 404 Not Found\r\nContent-Length: 5\r\n\r\nhello"), "answers HTTP 404"),
+        (answer(b"HTTP/1.1 404 Not Found\r\nContent-Length: 5\r\n\r\nhello"), "(404 Not Found)"),
         (answer(b"HTTP/1.1 401 Who\r\n\r\n"), "USER:PASSWORD"),
-        (answer(b"HTTP/1.1 200 \x1b[31m\r\n\r\n"), "answers HTTP 200"),
+        (answer(b"HTTP/1.1 200 \x1b[31m\r\n\r\n"), "does not open a websocket (200"),
         (answer(b"SSH-2.0-OpenSSH\r\n\r\n"), "not a websocket server"),
         (answer(b"\x00" * 100_000), "not a websocket server"),
-        (answer(b"HTTP/1.1 101 Yes\r\n\r\n"), "handshake failed"),
-        (answer(b"HTTP/1.1 101 Yes\r\n" + b"a: b\r\n" * 5000 + b"\r\n"), "handshake failed"),
+        (answer(b"HTTP/1.1 101 Yes\r\n\r\n"), "does not open a websocket"),
+        (answer(b"HTTP/1.1 101 Yes\r\n" + b"a: b\r\n" * 5000 + b"\r\n"), "open a websocket"),
         (other_subprotocol, "does not speak Foxglove"),
-        (lambda peer: None, "the connection broke|not a websocket server"),
+        (lambda peer: None, "cannot be reached|not a websocket server"),
     ],
 )  # fmt: skip
 def test_somebody_elses_server_is_told_and_tried_again(script: Script, words: str) -> None:
@@ -882,9 +859,8 @@ def test_a_channel_that_is_offered_and_never_sent_is_told(limit: Limit) -> None:
     def script(peer: Peer) -> None:
         peer.offer(channel(7))
         status = text({"op": "status", "level": 2, "message": REFUSALS[0].format(7)})
-        for _ in range(20):
-            peer.send(status)
-            peer.subscribed()
+        peer.send(status)
+        peer.subscribed()
         peer.send(status, text({"op": "status", "message": REFUSALS[0].format(8)}))
         peer.wait()
 

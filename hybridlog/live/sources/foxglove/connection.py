@@ -12,10 +12,9 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import dataclass
 from operator import attrgetter
 from struct import Struct
-from typing import Final
+from typing import Final, NamedTuple
 
 from picows import (
     WSCloseCode,
@@ -33,7 +32,6 @@ from hybridlog.live.sources.foxglove.protocol import (
     MAX_TEXT,
     MESSAGE_DATA,
     SUBPROTOCOLS,
-    TIME,
     Address,
     Offer,
     parse_channel,
@@ -50,8 +48,7 @@ from hybridlog_storage.messages import Channel
 _OPEN_S: Final = 10.0
 _CLOSE_S: Final = 1.0
 _PING_S: Final = 10.0  # silence after which a ping is sent, and then until the end
-_PAUSES_S: Final = (0.5, 1.0, 2.0, 4.0, 8.0, 15.0)
-_STABLE_S: Final = 10.0  # after a connection of this length the pauses are short again
+_PAUSE_S: Final = 1.0
 _SILENT: Final = logging.Logger("picows", logging.CRITICAL + 1)  # the user is told by us
 
 
@@ -66,18 +63,13 @@ class Client:
 
     async def run(self) -> None:
         """Connect, read and reconnect until cancelled."""
-        failures = 0
         while True:
-            began = time.monotonic()
             try:
                 reason = await self._connect()
             except PeerError as error:
                 reason = str(error)
             self._sink.say(f"{self._address.shown}: {one_line(reason)}; trying again")
-            if time.monotonic() - began > _STABLE_S:
-                failures = 0
-            await asyncio.sleep(_PAUSES_S[min(failures, len(_PAUSES_S) - 1)])
-            failures += 1
+            await asyncio.sleep(_PAUSE_S)
 
     async def _connect(self) -> str:
         """Make one connection, and read it to its end; returns the reason, for the user."""
@@ -191,16 +183,11 @@ _NO_WEBSOCKET = "not a websocket server; check the port (foxglove_bridge uses 87
 def _refusal(error: WSHandshakeError) -> str:
     """Reason and remedy for an answer that refuses the websocket."""
     status = (error.raw_header or b"").split(b"\r\n", 1)[0].decode("ascii", "replace")
-    code = status[9:12]
     if not status.startswith("HTTP/"):
         return _NO_WEBSOCKET
-    if status.startswith("HTTP/1.1 101"):
-        return f"the websocket handshake failed ({error}); check whether it is a Foxglove server"
-    if code in {"401", "403"}:
-        return f"refuses access (HTTP {code}); give ws://USER:PASSWORD@HOST:PORT"
     return (
-        f"answers HTTP {code} instead of a websocket; check the port and the path, and "
-        "whether it is a Foxglove server"
+        f"does not open a websocket ({status[9:] or error}); check port and path, and whether it "
+        "asks for ws://USER:PASSWORD@HOST:PORT"
     )
 
 
@@ -208,8 +195,6 @@ def _reason_of(error: OSError) -> str:
     """The reason of a socket error, for the user."""
     if isinstance(error, ConnectionRefusedError):
         return "refuses connections; start foxglove_bridge or the program, or correct the port"
-    if isinstance(error, ConnectionResetError | BrokenPipeError):
-        return "the connection broke"
     return f"cannot be reached ({reason_of(error)})"
 
 
@@ -220,23 +205,19 @@ _NO_CHANNEL = re.compile(
     r"(?i)unknown channel\D{0,20}(\d{1,20})\b|channel\D{0,20}(\d{1,20}) is not available"
 )
 _LARGE: Final = 1 << 14  # bytes from which a second copy costs more than a view
-_MAX_REFUSALS: Final = 20
-_RETRY_S: Final = 0.02
+_RETRY_S: Final = 0.2
 _SEND_S: Final = 3.0
 _NUMBER: Final = Struct("<I").unpack_from
 _HEAD: Final = Struct("<xIQ")
-_TIME: Final = Struct("<xQ")
 _CONTENT: Final = attrgetter("topic", "message_encoding", "schema", "metadata")
 _BINARY: Final = WSMsgType.BINARY
 
 
-@dataclass(slots=True)
-class _Subscription:
-    """A subscription, and how often the server has refused it."""
+class _Subscription(NamedTuple):
+    """A subscription to a channel."""
 
     number: int
     offer: Offer
-    refusals: int = 0
 
 
 class Session(WSListener):
@@ -262,9 +243,8 @@ class Session(WSListener):
         self._routes: dict[int, tuple[Channel, SequenceGapDetector | None]] = {}
         self._subscriptions: dict[int, _Subscription] = {}
         self._topics: Counter[str] = Counter()
+        self._refused: set[int] = set()
         self._retired: deque[int] = deque()
-        self._gathered: bytearray | None = None
-        self._gathered_is_text = False
         self._loop = asyncio.get_running_loop()
         self._transport: WSTransport
         self._overdue: asyncio.TimerHandle
@@ -299,7 +279,9 @@ class Session(WSListener):
                 raise PeerError("violates the websocket protocol (reserved bits are set)")
             if size > self.max_bytes:
                 return  # picows, which ends the connection, may still read it
-            if kind is _BINARY and frame.fin and self._gathered is None:
+            if kind is WSMsgType.CONTINUATION or not frame.fin:
+                raise PeerError("sends messages in pieces, which no Foxglove server does")
+            if kind is _BINARY:
                 if size < _LARGE:
                     self._binary(frame.get_payload_as_bytes())
                 else:
@@ -311,8 +293,10 @@ class Session(WSListener):
                 transport.send_close(WSCloseCode.OK)
                 reason = frame.get_close_reason()
                 raise PeerError("closed the connection" + (f" ({reason})" if reason else ""))
-            elif kind not in {WSMsgType.PING, WSMsgType.PONG}:
-                self._gather(frame)
+            elif kind is WSMsgType.TEXT:
+                if size > MAX_TEXT:
+                    raise PeerError(f"sends a JSON message of more than {MAX_TEXT} bytes")
+                self._text(frame.get_payload_as_bytes())
         except Exception as error:
             self._fail(error)
 
@@ -340,22 +324,6 @@ class Session(WSListener):
 
     # Messages.
 
-    def _gather(self, frame: WSFrame) -> None:
-        """Take a text, or a message in pieces."""
-        if (frame.msg_type is WSMsgType.CONTINUATION) is (self._gathered is None):
-            raise PeerError("violates the websocket protocol (pieces of messages are mixed)")
-        if self._gathered is None:
-            self._gathered = bytearray()
-            self._gathered_is_text = frame.msg_type is WSMsgType.TEXT
-        limit = MAX_TEXT if self._gathered_is_text else self.max_bytes
-        if len(self._gathered) + frame.payload_size > limit:
-            kind = "JSON message" if self._gathered_is_text else "message in pieces"
-            raise PeerError(f"sends a {kind} of more than {limit} bytes")
-        self._gathered += frame.get_payload_as_memoryview()
-        if frame.fin:
-            whole, self._gathered = bytes(self._gathered), None
-            (self._text if self._gathered_is_text else self._binary)(whole)
-
     def _binary(self, data: bytes | memoryview) -> None:
         """Take a binary message."""
         if len(data) < _HEAD.size or data[0] != MESSAGE_DATA:
@@ -382,13 +350,11 @@ class Session(WSListener):
                 self._report(channel.topic, gaps.confirmed())
 
     def _other(self, data: bytes | memoryview) -> None:
-        """Take the server's time; answers to requests are not recorded."""
+        """Ignore what is no message, such as answers to requests."""
         if not data:
             self._ignored("an empty binary message")
-        elif data[0] == MESSAGE_DATA or (data[0] == TIME and len(data) < _TIME.size):
+        elif data[0] == MESSAGE_DATA:
             self._ignored(f"a message of {len(data)} bytes, shorter than its header")
-        elif data[0] == TIME:
-            self._sink.clock(_TIME.unpack_from(data)[0], received=time.time_ns())
 
     def _ignored(self, what: str, detail: str = "too short for a message") -> None:
         """Note a lost message of an unknown topic."""
@@ -483,7 +449,7 @@ class Session(WSListener):
             self._sink.topic_gone(topic)
 
     def _status(self, text: str) -> None:
-        """Handle a status message: retry a refused subscription, or show it to the user.
+        """Show a status message to the user, or ask for a refused channel again, once.
 
         A server may advertise a channel a moment before it accepts subscriptions.
         """
@@ -491,13 +457,11 @@ class Session(WSListener):
         refused = self._subscriptions.get(int(found[found.lastindex or 1])) if found else None
         if refused is None:
             self._say(f"says: {text}")
-            return
-        refused.refusals += 1
-        if refused.refusals > _MAX_REFUSALS:
-            topic = refused.offer.channel.topic
-            self._say(f"offers {topic!r}, but does not send it ({text})")
-            return
-        self._loop.call_later(_RETRY_S * (refused.refusals - 1), self._retry, refused)
+        elif refused.number in self._refused:
+            self._say(f"offers {refused.offer.channel.topic!r}, but does not send it ({text})")
+        else:
+            self._refused.add(refused.number)
+            self._loop.call_later(_RETRY_S, self._retry, refused)
 
     def _retry(self, refused: _Subscription) -> None:
         if self._subscriptions.get(refused.offer.id) is refused:

@@ -19,9 +19,6 @@ SUBPROTOCOLS: Final = ("foxglove.sdk.v1", "foxglove.websocket.v1")
 MESSAGE_DATA: Final = 1
 """First byte of a binary message with a payload."""
 
-TIME: Final = 2
-"""First byte of a binary message with the server's time."""
-
 MAX_TEXT: Final = 128 << 20
 """Largest JSON message, bytes; a thousand channels with their definitions take 20 MB."""
 

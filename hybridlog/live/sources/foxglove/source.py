@@ -27,7 +27,7 @@ from hybridlog_storage.errors import MissingDependencyError
 class FoxgloveSource(LoopSource):
     """A client of one Foxglove WebSocket server. TLS certificates are checked.
 
-    It reconnects with growing pauses. After that the server's channels may have other
+    It reconnects after a second. Then the server's channels may have other
     numbers. A message of more than 1 GiB ends a connection, and is noted in the loss ledger.
 
     Args:

@@ -114,8 +114,7 @@ class Ros1Source(LoopSource):
 
 
 _Kind = TypeVar("_Kind")
-_FIRST_PAUSE_S: Final = 0.25
-_MAX_PAUSE_S: Final = 2.0
+_PAUSE_S: Final = 1.0  # while the master does not answer
 _REST: Final = 4
 
 
@@ -136,7 +135,6 @@ class Graph:
     async def watch(self, context: Context) -> None:
         """Polls the master until cancelled."""
         loop = asyncio.get_running_loop()
-        pause = _FIRST_PAUSE_S
         while True:
             began = loop.time()
             try:
@@ -146,10 +144,8 @@ class Graph:
                     f"no ROS master at {one_line(self._uri)} ({error}); waiting for it. Start "
                     "roscore, or give its address with --ros1 or ROS_MASTER_URI"
                 )
-                pause = min(pause * 2, _MAX_PAUSE_S)
-                await asyncio.sleep(pause)
+                await asyncio.sleep(_PAUSE_S)
                 continue
-            pause = _FIRST_PAUSE_S
             # A large system that takes long to poll is polled less often.
             await asyncio.sleep(max(self._poll_s, _REST * (loop.time() - began)))
 

@@ -42,9 +42,7 @@ if TYPE_CHECKING:
 
 MAX_DOMAIN = 232
 
-_PAUSE_S = 0.5
-_MAX_PAUSE_S = 30.0
-_STABLE_S = 30.0
+_PAUSE_S = 1.0
 _HAND_OVER_S = 3.0
 
 
@@ -109,17 +107,12 @@ class Ros2Source(ThreadedSource):
 
     def _supervise(self, child: Process | None, sink: Sink) -> None:
         """Reads from one child after the other."""
-        pause = _PAUSE_S
         while child is not None:
-            began = time.monotonic()
             reason = self._listen(child, sink)
             if self._stopping.is_set():
                 break
-            if time.monotonic() - began > _STABLE_S:
-                pause = _PAUSE_S
             sink.say(f"ROS 2: the child ended ({reason}); restarting it")
-            child = self._start_again(sink, pause)
-            pause = min(2 * pause, _MAX_PAUSE_S)
+            child = self._start_again(sink)
         for topic, since in self._outages.items():
             report_outage(sink, topic, since)
         self._outages.clear()
@@ -127,19 +120,16 @@ class Ros2Source(ThreadedSource):
     def _listen(self, child: Process, sink: Sink) -> str:
         """Reads from a child until it ends; returns the reason of its end."""
         receiver = Receiver(child.peer, sink, self._outages)
-        reason = ""
-        exit_report = ""
+        reasons = []
         try:
-            try:
-                receiver.run()
-            except (WireError, MemoryError) as error:
-                reason = str(error) or "not enough memory for a message"
-                child.kill()
-            except OSError as error:
-                reason = error.strerror or str(error)
-                exit_report = child.exit_report()
-            else:
-                exit_report = child.exit_report()
+            receiver.run()
+        except (WireError, MemoryError) as error:
+            reasons.append(str(error) or "not enough memory for a message")
+            child.kill()
+        except OSError as error:
+            reasons += [error.strerror or str(error), child.exit_report()]
+        else:
+            reasons.append(child.exit_report())
         finally:
             child.end()
         if not (self._stopping.is_set() and receiver.said_bye):
@@ -148,12 +138,11 @@ class Ros2Source(ThreadedSource):
         if not self._stopping.is_set():
             for topic in sorted(receiver.present):
                 sink.topic_gone(topic)
-        return one_line("; ".join(filter(None, (reason, exit_report))))
+        return one_line("; ".join(reasons))
 
-    def _start_again(self, sink: Sink, pause: float) -> Process | None:
+    def _start_again(self, sink: Sink) -> Process | None:
         """A new child after a pause; None if the source is stopped meanwhile."""
-        while not self._stopping.wait(pause):
-            pause = min(2 * pause, _MAX_PAUSE_S)
+        while not self._stopping.wait(_PAUSE_S):
             try:
                 child, _ = launch(self._python, self._stopping)
             except (ChildError, MissingDependencyError) as error:
