@@ -19,13 +19,11 @@ class Import:
         module: Full name of what is imported (`from a import b` is both `a` and `a.b`).
         line: Where.
         typing: Whether only a type checker sees it.
-        lazy: Whether it happens in a function, so not when the module is loaded.
     """
 
     module: str
     line: int
     typing: bool
-    lazy: bool
 
 
 def modules() -> dict[str, Path]:
@@ -45,25 +43,21 @@ def imports_of(path: Path, name: str) -> list[Import]:
     found: list[Import] = []
     package = name if path.name == "__init__.py" else name.rpartition(".")[0]
 
-    def visit(node: ast.AST, *, typing: bool, lazy: bool) -> None:
+    def visit(node: ast.AST, *, typing: bool) -> None:
         if isinstance(node, ast.Import):
-            found.extend(Import(a.name, node.lineno, typing, lazy) for a in node.names)
+            found.extend(Import(a.name, node.lineno, typing) for a in node.names)
         elif isinstance(node, ast.ImportFrom):
             base = node.module or ""
             if node.level:
                 parents = package.split(".")[: len(package.split(".")) - node.level + 1]
                 base = ".".join([*parents, *([base] if base else [])])
-            found.append(Import(base, node.lineno, typing, lazy))
-            found.extend(Import(f"{base}.{a.name}", node.lineno, typing, lazy) for a in node.names)
-        elif isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
-            for statement in node.body:
-                visit(statement, typing=True, lazy=lazy)
-            for statement in node.orelse:
-                visit(statement, typing=typing, lazy=lazy)
+            found.append(Import(base, node.lineno, typing))
+            found.extend(Import(f"{base}.{a.name}", node.lineno, typing) for a in node.names)
         else:
-            inside = isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
+            is_checked = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
             for child in ast.iter_child_nodes(node):
-                visit(child, typing=typing, lazy=lazy or inside)
+                is_body = is_checked and child in node.body  # type: ignore[attr-defined]
+                visit(child, typing=typing or is_body)
 
-    visit(ast.parse(path.read_text(encoding="utf-8")), typing=False, lazy=False)
+    visit(ast.parse(path.read_text(encoding="utf-8")), typing=False)
     return found

@@ -10,7 +10,6 @@ import pytest
 
 PLACES = {
     "align_piece_bytes": "hybridlog.across.topic_reader._PIECE_BYTES",
-    "printed_rows_at_once": "hybridlog.cli.render.ROWS_AT_ONCE",
     "column_file_open_files": "hybridlog.columns.column_file._OPEN_FILES",
     "shared_file_recordings": "hybridlog.columns.folders.MAX_SHARED_RECORDINGS",
     "shared_file_rows": "hybridlog.columns.folders.MAX_SHARED_ROWS",
@@ -21,10 +20,8 @@ PLACES = {
     "table_pending_bytes": "hybridlog.columns.table_writer._PENDING",
     "table_reserve_bytes": "hybridlog.columns.table_writer._RESERVE",
     "group_rows": "hybridlog.follow.follower._GROUP_ROWS",
-    "json_text_piece_bytes": "hybridlog.formats.json_text.PIECE_BYTES",
     "bag_window_bytes": "hybridlog.formats.rosbag1.reader._WINDOW",
     "output_held_bytes": "hybridlog.formats.tables.HELD_BYTES",
-    "tables_piece_bytes": "hybridlog.formats.tables.PIECE_BYTES",
     "frame_block_rows": "hybridlog.frames.answer._BLOCK_ROWS",
     "clock_wait_s": "hybridlog.live.recorder._CLOCK_WAIT_S",
     "expected_topics": "hybridlog.live.recorder._MAX_EXPECTED",
@@ -42,8 +39,6 @@ PLACES = {
     "ros2_hello_s": "hybridlog.live.sources.ros2.source.HELLO_S",
     "ros2_hand_over_s": "hybridlog.live.sources.ros2.source._HAND_OVER_S",
     "ros2_pause_s": "hybridlog.live.sources.ros2.source._PAUSE_S",
-    "shown_bytes": "hybridlog.message._MAX_SHOWN",
-    "merged_bytes": "hybridlog.query.chunk_scan._MERGED_BYTES",
     "min_threaded_bytes": "hybridlog.query.chunk_scan._MIN_THREADED_BYTES",
     "latched_held": "hybridlog.query.latching.MAX_HELD",
     "sampled_periods": "hybridlog.query.periods._SAMPLED",
