@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ import hybridlog as hl
 from hybridlog_storage.messages import SUPPLIED, Channel, Schema
 from tests.cli.running import run
 from tests.every_output import compare_every_output
+from tests.formats.test_rosbag2 import MESSAGES, TOPICS, database
 from tests.independent import write_mcap
 from tests.ros_values import ROS1, ROS2, message_of, plain_of
 
@@ -45,21 +45,16 @@ def messages(store: Typestore, name: str, write: str = "serialize_cdr") -> list[
 
 
 def write_db3(path: Path) -> None:
-    with sqlite3.connect(path) as db:
-        db.execute(
-            "create table topics (id integer primary key, name text not null, type text not null, "
-            "serialization_format text not null, offered_qos_profiles text not null)"
-        )
-        db.execute(
-            "create table messages (id integer primary key, topic_id integer not null, "
-            "timestamp integer not null, data blob not null)"
-        )
-        for number, (topic, name, types) in enumerate(IN_DB3, 1):
-            db.execute("insert into topics values (?, ?, ?, 'cdr', '')", (number, topic, name))
-            for at, (_, payload) in enumerate(messages(types, name)):
-                row = (number, START + at, payload)
-                db.execute("insert into messages (topic_id, timestamp, data) values (?, ?, ?)", row)
-    db.close()
+    topics = [
+        f"INSERT INTO topics VALUES ({number}, '{topic}', '{name}', 'cdr')"
+        for number, (topic, name, _) in enumerate(IN_DB3, 1)
+    ]
+    rows = [
+        (None, number, START + at, payload)
+        for number, (_, name, types) in enumerate(IN_DB3, 1)
+        for at, (_, payload) in enumerate(messages(types, name))
+    ]
+    database(path, TOPICS, MESSAGES, *topics, rows=rows)
 
 
 def write_logs_mcap(path: Path) -> None:

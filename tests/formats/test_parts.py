@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import sqlite3
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -13,18 +12,14 @@ import zstandard
 from hybridlog.formats.log_set import LogSet, open_source
 from hybridlog_storage.errors import SourceError
 from hybridlog_storage.messages import Channel, Schema
+from tests.formats.test_rosbag2 import MESSAGES, TOPICS, database
 from tests.independent import write_mcap
 
 BEGIN = 1_700_000_000_000_000_000
 SECOND = 10**9
 
 TOPIC = "INSERT INTO topics VALUES (1, '/n', 'std_msgs/msg/UInt32', 'cdr')"
-TABLES = (
-    "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT)",
-    "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB)",
-    "CREATE INDEX timestamp_idx ON messages (timestamp ASC)",
-    TOPIC,
-)
+INDEX = "CREATE INDEX timestamp_idx ON messages (timestamp ASC)"
 
 
 def payload(number: int) -> bytes:
@@ -34,14 +29,8 @@ def payload(number: int) -> bytes:
 def put_db3(path: Path, numbers: Sequence[int], change: Callable[[bytes], bytes] = bytes) -> Path:
     """A database with a message a second, numbered by their seconds."""
     path.parent.mkdir(exist_ok=True, parents=True)
-    db = sqlite3.connect(path)
-    for line in TABLES:
-        db.execute(line)
     rows = [(n + 1, 1, BEGIN + n * SECOND, change(payload(n))) for n in numbers]
-    db.executemany("INSERT INTO messages VALUES (?, ?, ?, ?)", rows)
-    db.commit()
-    db.close()
-    return path
+    return database(path, TOPICS, MESSAGES, INDEX, TOPIC, rows=rows)
 
 
 def put_metadata(folder: Path, files: Sequence[str], messages: int, *more: str) -> None:

@@ -54,12 +54,8 @@ def put(database: Database, name: str, documents: list[bytes]) -> int:
     return database.insert_raw(name, documents)
 
 
-def raw_of(
-    database: Database,
-    name: str,
-    filter: dict[str, object] | None = None,  # noqa: A002
-) -> bytes:
-    return b"".join(database.each([(name, filter or {})], lambda _: {"$match": {}}))
+def raw_of(database: Database, name: str) -> bytes:
+    return b"".join(database.each([(name, {})], lambda _: {"$match": {}}))
 
 
 def test_bytes_arrive_and_come_back_as_they_are(

@@ -1,14 +1,12 @@
 """ROS 1 as Debian packs it: rosmaster, rospy, rosbag's recorder and player.
 
-Installed ones are used. Where they are not all there, the packages are fetched once into
-the cache and unpacked there, which needs apt but neither root nor an installation.
+The packages are fetched once into the cache and unpacked there, which needs apt but neither
+root nor an installation.
 """
 
 from __future__ import annotations
 
-import os
 import re
-import subprocess
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -23,7 +21,6 @@ PACKAGES = (
     "python3-sensor-msgs",
     "python3-rosbag",
 )
-_SYSTEM = Path("/")
 _OF_ROS = re.compile("^Source: ros-", re.MULTILINE)
 
 
@@ -37,37 +34,24 @@ class Ros1(NamedTuple):
 
 def ros1() -> Ros1 | str:
     """ROS 1, or why it cannot be had."""
-    installed = _in(_SYSTEM)
-    if not _failure(installed):
-        return installed
-    place = made_once("ros1-debian", _made)
-    if isinstance(place, str):
-        return place
-    fetched = _in(place / "tree")
-    return _failure(fetched) or fetched
-
-
-def _made(place: Path) -> str:
-    """Fetch everything; returns why it could not."""
-    return unpack(place, PACKAGES, _without_ros)
+    place = made_once("ros1-debian", lambda place: unpack(place, PACKAGES, _without_ros))
+    return place if isinstance(place, str) else _in(place / "tree")
 
 
 def _in(root: Path) -> Ros1:
     own_python = root / "usr/bin/python3"
-    environment = {"PYTHONPATH": ""}
-    if root != _SYSTEM:
-        environment = {
-            "PYTHONPATH": str(root / "usr/lib/python3/dist-packages"),
-            # Where the player looks for the package that reads bags, and for its plugin.
-            "ROS_PACKAGE_PATH": str(root / "usr/share"),
-            "CMAKE_PREFIX_PATH": str(_plugins(root)),
-            "LD_LIBRARY_PATH": libraries(root),
-        }
-        if own_python.exists():
-            # Debian's Python was missing, too.
-            environment["PYTHONHOME"] = str(root / "usr")
-        else:
-            own_python = _SYSTEM / "usr/bin/python3"
+    environment = {
+        "PYTHONPATH": str(root / "usr/lib/python3/dist-packages"),
+        # Where the player looks for the package that reads bags, and for its plugin.
+        "ROS_PACKAGE_PATH": str(root / "usr/share"),
+        "CMAKE_PREFIX_PATH": str(_plugins(root)),
+        "LD_LIBRARY_PATH": libraries(root),
+    }
+    if own_python.exists():
+        # Debian's Python was missing, too.
+        environment["PYTHONHOME"] = str(root / "usr")
+    else:
+        own_python = Path("/usr/bin/python3")
     return Ros1(str(own_python), root / "usr/lib/rosbag", environment)
 
 
@@ -79,26 +63,6 @@ def _plugins(root: Path) -> Path:
         with suppress(FileExistsError):  # also of a test that runs beside this one
             (prefix / "lib").symlink_to(plugins)
     return prefix
-
-
-def _failure(found: Ros1) -> str:
-    """Why some ROS 1 does not work, empty when it does."""
-    modules = "import rosbag, rosmaster, rospy, sensor_msgs.msg, std_msgs.msg"
-    for command in ([found.python, "-c", modules], [found.tools / "record", "--help"]):
-        try:
-            subprocess.run(
-                command,
-                env={**os.environ, **found.environment},
-                capture_output=True,
-                text=True,
-                check=True,
-                timeout=60,
-            )
-        except subprocess.CalledProcessError as error:
-            return str((error.stderr.strip().splitlines() or ["it fails"])[-1])
-        except (OSError, subprocess.TimeoutExpired) as error:
-            return str(error)
-    return ""
 
 
 def _without_ros(status: str) -> str:
