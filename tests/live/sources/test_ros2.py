@@ -90,20 +90,16 @@ def test_messages_and_events_reach_the_sink(
     assert heard.ends == []
 
 
-def test_a_child_that_does_not_listen_is_ended(tmp_path: Path, limit: Limit) -> None:
+@pytest.mark.parametrize(
+    "ceaseless", ["time.sleep(60)", 'event(event="candidate", topic="/a", type="b")']
+)
+def test_a_child_that_does_not_listen_is_ended(
+    tmp_path: Path, limit: Limit, ceaseless: str
+) -> None:
     limit(ros2_hand_over_s=0.1)
-    child = fake_child(
-        tmp_path,
-        """
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)
-        hello()
-        event(event="say", text="deaf")
-        while True:
-            time.sleep(60)
-        """,
-    )
+    deaf = 'signal.signal(signal.SIGTERM, signal.SIG_IGN)\nhello()\nevent(event="say", text="deaf")'
     heard = Heard()
-    source = Ros2Source(child)
+    source = Ros2Source(fake_child(tmp_path, f"{deaf}\nwhile True: {ceaseless}"))
     source.start(heard)
     heard.wait(lambda: heard.said, "it should say")
     source.stop()
@@ -278,20 +274,3 @@ def test_which_pythons_are_tried(tmp_path: Path) -> None:
     found = candidates({"ROS_DISTRO": "kilted", "PATH": str(tmp_path)})
     assert found[0] == str(python)
     assert found[-1] == sys.executable
-
-
-def test_a_child_that_floods_is_ended(tmp_path: Path, limit: Limit) -> None:
-    limit(ros2_hand_over_s=0.1)
-    child = fake_child(
-        tmp_path,
-        """
-        hello()
-        while True:
-            event(event="candidate", topic="/a", type="b")
-        """,
-    )
-    heard = Heard()
-    source = Ros2Source(child)
-    source.start(heard)
-    heard.wait(lambda: heard.asked, "it should ask")
-    source.stop()
