@@ -27,7 +27,7 @@ from hybridlog.columns.fields import (
     names_of,
     original_name,
 )
-from hybridlog.columns.layout import ABOUT, OWN_COLUMNS, About, Section
+from hybridlog.columns.layout import ABOUT, OWN, OWN_COLUMNS, About, Section
 from hybridlog.schema.arrow_types import is_bytes, is_list
 from hybridlog_storage.cache import Cache, lazy
 from hybridlog_storage.checksum import crc32
@@ -71,7 +71,7 @@ class Leaf(NamedTuple):
 def leaves(schema: pa.Schema) -> Iterator[Leaf]:
     """The columns of a file in Parquet's order."""
     for top in schema:
-        is_own = top.name in OWN_COLUMNS
+        is_own = top.name in OWN_COLUMNS or OWN in (top.metadata or {})
         pending: list[tuple[pa.Field, str, tuple[str, ...], tuple[str, ...] | None]]
         pending = [(top, top.name, (original_name(top),), None)]
         while pending:
@@ -339,6 +339,11 @@ class ColumnFile:
         """Paths of fields that the messages have."""
         names = [leaf.array or leaf.names for leaf in self.leaves if not leaf.is_own]
         return {path[:end] for path in names for end in range(1, len(path) + 1)}
+
+    @lazy
+    def own(self) -> set[str]:
+        """Columns of the table itself."""
+        return {leaf.top for leaf in self.leaves if leaf.is_own}
 
     @lazy
     def summary_paths(self) -> set[tuple[str, ...]]:

@@ -32,7 +32,8 @@ from hybridlog.columns.layout import (
     table_schema_of,
     type_prefix,
 )
-from hybridlog.columns.rows import Piece, as_table, columns_from, piece_of
+from hybridlog.columns.left_rows import LeftFields
+from hybridlog.columns.rows import Piece, PointColumns, as_table, columns_from, is_cloud, piece_of
 from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.codec import no_messages
 from hybridlog.schema.codecs import codec_for
@@ -75,8 +76,10 @@ class _Topic:
         self.type = channel.schema.name if channel.schema is not None else ""
         self.has_arrays = arrays
         encoding = encoding_of(channel.message_encoding, channel.metadata)
+        whole = replace(channel, message_encoding=encoding)
         self.shape = FieldShape(arrays=arrays)
-        codec = codec_for(replace(channel, message_encoding=encoding))
+        self.points = PointColumns() if arrays and is_cloud(whole) else None
+        codec = codec_for(whole)
         decoded = codec.columns_of(no_messages()) if codec.indexed else None
         self.none = structs({}, 0) if decoded is None else self.shape.columns(decoded.arrow())
         """No fields, with the columns that the definition fixes."""
@@ -142,7 +145,10 @@ class _Topic:
 
     def columns(self, decoded: Decoded) -> Any:
         """The fields of decoded messages as columns."""
-        return copied(columns_from(decoded, self.shape))
+        columns = columns_from(decoded, self.shape)
+        if self.points is not None and not isinstance(decoded.records, LeftFields):
+            columns = self.points.with_points(columns, decoded.arrow())
+        return copied(columns)
 
 
 class _File(ColumnFileWriter):

@@ -14,7 +14,7 @@ from msgspec import Struct
 
 from hybridlog.columns.column_file import FIRST
 from hybridlog.columns.fields import joined, names_of, records_of
-from hybridlog.columns.layout import OWN_COLUMNS
+from hybridlog.columns.layout import OWN_COLUMNS, POINTS
 from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.arrow_types import converted
 from hybridlog.schema.column import ranges
@@ -113,13 +113,21 @@ class TopicTable:
 
     def whole_types(self) -> list[Any]:
         """Types of the messages in each file, with whole arrays."""
-        schemas = ([f for f in file.schema if f.name not in OWN_COLUMNS] for file in self.files)
+        own = OWN_COLUMNS.union(*(file.own for file in self.files))
+        schemas = ([f for f in file.schema if f.name not in own] for file in self.files)
         return [records_of(pa.nulls(0, pa.struct(fields))).type for fields in schemas]
 
     @property
     def has_fields(self) -> bool:
         """True if the messages have any field."""
         return any(not leaf.is_own for file in self.files for leaf in file.leaves)
+
+    @property
+    def points(self) -> Any:
+        """Type of the column of points that all rows have; None without."""
+        if self.hides_arrays or any(POINTS not in file.own for file in self.files):
+            return None
+        return joined([pa.nulls(0, file.schema.field(POINTS).type) for file in self.files]).type
 
     def has(self, path: str, *, summaries: bool = True) -> bool:
         """True if every file has the field: an array is a summary in some, a list in others.

@@ -17,7 +17,7 @@ import pyarrow.compute as pc
 from msgspec import Struct
 
 from hybridlog.columns.fields import LIMIT, filled, has_summaries, original_name
-from hybridlog.columns.layout import OWN_COLUMNS, column_names
+from hybridlog.columns.layout import OWN_COLUMNS, POINTS, column_names
 from hybridlog.schema.arrow_columns import json_array, structs
 from hybridlog.schema.arrow_types import (
     COMPUTED_AS,
@@ -68,6 +68,7 @@ class ViewColumn(Struct, frozen=True):
         type: Its type in SQL.
         inner: Fields of a struct.
         is_summary: True for the twin of an array.
+        is_points: True for the points of clouds.
     """
 
     name: str
@@ -76,6 +77,7 @@ class ViewColumn(Struct, frozen=True):
     type: Any
     inner: tuple[ViewColumn, ...] = ()
     is_summary: bool = False
+    is_points: bool = False
 
     def leaves(self, above: Path = ()) -> Iterator[tuple[Path, ViewColumn]]:
         """Its fields that are no structs, each with the names on the way in SQL, folded."""
@@ -223,3 +225,8 @@ def _fitted(array: Any, kind: Any, target: Any) -> Any:
         return array.cast(pa.int64()).cast(target) if is_time(have) else array.cast(target)
     except pa.ArrowException as error:
         raise UsageError(f"{have} is not {target}: {error}") from error
+
+
+def points_column(kind: Any) -> ViewColumn:
+    """The column of the points of clouds, of a type."""
+    return ViewColumn(POINTS, (POINTS,), kind, sql_type(kind), is_points=True)

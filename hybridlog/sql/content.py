@@ -10,6 +10,7 @@ import numpy as np
 import pyarrow as pa
 from msgspec.structs import replace
 
+from hybridlog.columns.layout import POINTS
 from hybridlog.columns.recordings_file import (
     TAGS,
     TIME,
@@ -20,7 +21,7 @@ from hybridlog.columns.recordings_file import (
 from hybridlog.query.answers.marks import marks_in
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.snapshot import UNFINISHED
-from hybridlog.sql.columns import OWN, merged, view_columns
+from hybridlog.sql.columns import OWN, merged, points_column, view_columns
 from hybridlog.sql.names import ViewNames
 from hybridlog.sql.rows import Plan, TopicOfRecording
 from hybridlog_storage.catalog import ChannelStats
@@ -114,6 +115,9 @@ class TopicView:
         kinds = self._kinds(known)
         columns = view_columns(merged(kinds) if kinds else pa.struct([]))
         self._columns = {column.name: column for column in columns}
+        points = self._points()
+        if points is not None and POINTS not in self._columns:
+            self._columns[POINTS] = points_column(points)
         fields = [pa.field(column.name, column.type) for column in self._columns.values()]
         self.schema = pa.schema([*OWN, *fields])
         some = [self._of(one) for one in self._summaries[:_SAMPLED]]
@@ -130,6 +134,14 @@ class TopicView:
         if not all(one.is_fixed for one in some):
             some = [self._of(one) for one in known]
         return [kind for one in some for kind in one.kinds]
+
+    def _points(self) -> Any:
+        """Type of the points of clouds of a topic whose tables have them; None without."""
+        if self.topic not in self._content.session.directory.settings.arrays:
+            return None
+        clouds = (self._of(one).points() for one in self._summaries)
+        kinds = [kind for kind in clouds if kind is not None]
+        return merged(kinds) if kinds else None
 
     def rows(
         self, columns: Sequence[str], where: Filter, reading: Reading

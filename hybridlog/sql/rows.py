@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -18,13 +19,14 @@ from pyarrow import acero
 
 from hybridlog.columns.column_file import FIRST
 from hybridlog.columns.fields import records_of
+from hybridlog.columns.layout import POINTS
 from hybridlog.columns.left_rows import LeftFields
-from hybridlog.columns.rows import piece_of
+from hybridlog.columns.rows import NEEDED, PointColumns, is_cloud, piece_of
 from hybridlog.query.question import Counters, RecordedChannel
 from hybridlog.query.rows import offsets_by_chunk, places_of
 from hybridlog.schema.arrow_types import has_empty, is_array
 from hybridlog.schema.states import GONE, State
-from hybridlog.sql.columns import OWN, ViewColumn
+from hybridlog.sql.columns import OWN, ViewColumn, points_column
 from hybridlog.sql.names import EVERYTHING, Usage
 from hybridlog_storage.cache import lazy
 from hybridlog_storage.errors import ChangedError, StoreError
@@ -176,11 +178,24 @@ class TopicOfRecording:
                 found.setdefault(state, set()).add(one.segment)
         return found
 
+    def points(self) -> Any:
+        """Type of the points of its clouds, of the first that can be read; None without any."""
+        if self.table is not None and self.table.points is not None:
+            return self.table.points
+        if any(is_cloud(channel.channel) for channel in self.channels.values()):
+            for chunk in self.chunks.values():
+                with suppress(StoreError):
+                    for rows in self.in_chunk(chunk, Asked([points_column(pa.null())])):
+                        if POINTS in rows.columns.type.names:
+                            return rows.columns.type.field(POINTS).type
+        return None
+
     def lacks(self, asked: Asked) -> bool:
         """True if its table has only summaries of an array that is asked for, in some row."""
         table = self.table
         assert table is not None
-        return any(table.is_cut(one.source) for one in asked.arrays)
+        lacks_points = asked.has_points and table.points is None
+        return lacks_points or any(table.is_cut(one.source) for one in asked.arrays)
 
     def in_table(self, part: TablePart, asked: Asked) -> Rows:
         """The rows of a row group."""
@@ -189,15 +204,19 @@ class TopicOfRecording:
         is_reduced = any(channel.state is State.REDUCED for channel in self.channels.values())
         has_states = bool(table.unreadable or self._expired or is_reduced)
         wanted = {*asked.own, *({"state", "ref"} if has_states else ())}
-        wanted |= {"ref"} if asked.arrays else set()
+        wanted |= {"ref"} if asked.has_arrays else set()
         paths = paths_of(asked.leaves)
         try:
-            own, columns = table.columns(part, paths, wanted)
+            own, columns = table.columns(part, paths, wanted | {*[POINTS] * asked.has_points})
         except StoreError as error:
             self.session.tables.reject(self.entry, self.topic)
             raise ChangedError(f"{error} Ask again: messages answer then.") from error
         if has_states:
             own["state"] = self._states(own["state"], own["ref"].field("seg"))
+        points = own.pop(POINTS, None)
+        if table.points is not None and points is not None:
+            fields = [*columns.type, pa.field(POINTS, points.type)]
+            columns = pa.StructArray.from_arrays([*columns.flatten(), points], fields=fields)
         return Rows(own, columns)
 
     def _states(self, states: Any, segment: Any) -> Any:
@@ -221,12 +240,13 @@ class TopicOfRecording:
             chosen = np.isin(chunk.batch.places[0], offsets)
         paths = paths_of(asked.leaves)
         if paths is not None:
-            paths.append("header.stamp")
+            paths += ["header.stamp", *(NEEDED if asked.has_points else ())]
 
         def columns_of(decoded: Decoded) -> Any:
             if isinstance(decoded.records, LeftFields):
                 return decoded.records.columns
-            return decoded.arrow()
+            found = decoded.arrow()
+            return PointColumns().with_points(found, found) if asked.has_points else found
 
         for number in one.place.channels:
             channel = self.channels.get(number)
@@ -263,6 +283,8 @@ class Asked:
         known = leaves or ()
         self.keys = {one.key for one in known}
         self.arrays = [one for one in known if is_array(one.kind) and not one.is_summary]
+        self.has_points = any(one.is_points for one in known)
+        self.has_arrays = self.has_points or bool(self.arrays)
 
 
 class Reading(Struct):
@@ -329,7 +351,7 @@ class Plan:
         self._tests_arrays = any(
             all(one == name.casefold() for one, name in zip(path, tested, strict=False))
             for path, leaf in used
-            if leaf in self._asked.arrays
+            if leaf.is_points or leaf in self._asked.arrays
             for tested in where.paths
         )
 
@@ -339,9 +361,8 @@ class Plan:
         """The rows of a source in a range of log time, ns; None for all times."""
         asked, reading = self._asked, self._reading
         if source.chunk is not None:
-            is_cut = bool(asked.arrays)
             for rows in recording.in_chunk(source.chunk, asked):
-                reading.remark(recording.topic, rows, is_cut=is_cut)
+                reading.remark(recording.topic, rows, is_cut=asked.has_arrays)
                 yield from self._finished(recording, rows, self._holds(recording, rows, window))
         elif source.part is not None:
             reading.groups.add((source.part.file.path, source.part.group))
@@ -420,7 +441,7 @@ def paths_of(leaves: Iterable[ViewColumn] | None) -> list[str] | None:
     """Dotted paths of fields; None for all, for which a name with a dot of its own stands, too."""
     if leaves is None or any("." in n or "[" in n for leaf in leaves for n in leaf.source):
         return None
-    return [*dict.fromkeys(".".join(leaf.source) for leaf in leaves)]
+    return [*dict.fromkeys(".".join(leaf.source) for leaf in leaves if not leaf.is_points)]
 
 
 def _constant(name: str, entry: RecordingEntry, rows: int) -> Any:

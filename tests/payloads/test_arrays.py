@@ -10,23 +10,36 @@ from typing import Any
 
 import duckdb
 import numpy as np
+import polars as pl
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from msgspec.structs import replace
 from rosbags.typesys import Stores, get_typestore
 
 import hybridlog as hl
+from hybridlog.arrays.message_arrays import to_numpy
+from hybridlog.columns.fields import FieldShape
+from hybridlog.columns.rows import PointColumns
 from hybridlog.query.planner import Planner
+from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.errors import PayloadError, StoreError, TopicError, UsageError
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
 from tests.cli.within import answer
 from tests.damage import flip
+from tests.indexed import batch_of
 from tests.payloads.logs import (
     BASE,
+    CLOUD,
     COUNT,
     SCAN,
     STEP,
+    XYZ,
+    cloud,
+    points_of,
     ranges_of,
     scan,
     standard_channel,
@@ -144,15 +157,22 @@ def test_sql(stores: tuple[hl.Store, hl.Store], query: str, *, from_chunks: bool
 
 
 def test_other_readers(stores: tuple[hl.Store, hl.Store]) -> None:
-    """Each array as rosbags reads it from the payload."""
+    """Each array as rosbags reads it from the payload; points as numpy reads them."""
     store = stores[1]
-    (scans,) = files_of(store, "LaserScan")
+    (scans,), (clouds,) = files_of(store, "LaserScan"), files_of(store, "PointCloud2")
     rows = duckdb.execute(
         "select ranges, intensities from read_parquet(?) order by t", [str(scans)]
     ).fetchall()
     sent = [TYPES.deserialize_cdr(m.raw, SCAN) for m in store.topic("scan")]
     assert [np.float32(row[0]).tolist() for row in rows] == [s.ranges.tolist() for s in sent]
     assert [np.float32(row[1]).tolist() for row in rows] == [s.intensities.tolist() for s in sent]
+    frame = pl.scan_parquet(clouds).sort("t").select(pl.col("points").struct.unnest()).collect()
+    assert frame.columns == ["x", "y", "z", "ring"]
+    for n in range(COUNT):
+        points = points_of(n)
+        for place, axis in enumerate("xyz"):
+            assert frame[axis][n].to_numpy().tolist() == points["xyz"][:, place].tolist()
+        assert frame["ring"][n].to_list() == points["ring"].tolist()
 
 
 def columns_of(path: Path) -> dict[str, Any]:
@@ -283,6 +303,127 @@ def test_a_store_that_cannot_be_written_is_refused(
         monkeypatch.setattr(type(store.directory), "is_writable", False)
         with pytest.raises(StoreError):
             store.index.arrays("scan")
+
+
+# Points of clouds.
+
+_FIELD = st.tuples(
+    st.sampled_from(["x", "y", "Z", "z", "rgb", "", "a.b", "x"]),
+    st.integers(0, 20),  # offset
+    st.integers(0, 9),  # type; 0 and 9 are none
+    st.integers(0, 3),  # count
+)
+
+
+@given(
+    layout=st.lists(_FIELD, max_size=5),
+    step=st.integers(0, 40),
+    shape=st.tuples(st.integers(1, 3), st.integers(0, 4)),
+    pad=st.integers(0, 5),
+    big=st.booleans(),
+    lost=st.sampled_from([0, 0, 0, 1]),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_points_are_those_of_the_messages(
+    layout: list[tuple[str, int, int, int]],
+    step: int,
+    shape: tuple[int, int],
+    pad: int,
+    lost: int,
+    seed: int,
+    *,
+    big: bool,
+) -> None:
+    """As numpy reads each point; a cloud that contradicts itself is null."""
+    rows, width = shape
+    row_step = width * step + pad
+    data = np.random.default_rng(seed).bytes(max(rows * row_step - lost, 0))
+    kinds = TYPES.types
+    fields = [kinds["sensor_msgs/msg/PointField"](*one) for one in layout]
+    stamp = kinds["builtin_interfaces/msg/Time"](1, 2)
+    message = kinds[CLOUD](
+        kinds["std_msgs/msg/Header"](stamp, "lidar"), rows, width, fields, big, step, row_step,
+        np.frombuffer(data, np.uint8), True,
+    )  # fmt: skip
+    payload = bytes(TYPES.serialize_cdr(message, CLOUD))
+    good = cloud([("w", 0, 8, 1)], 8, np.arange(3.0).tobytes())
+    codec = codec_for(standard_channel(CLOUD))
+    records = codec.columns_of(batch_of(good, payload)).arrow()
+    maker = PointColumns()
+    columns = maker.with_points(FieldShape(arrays=True).columns(records), records)
+    found = columns.field("points")
+    assert found[0].as_py()["w"] == [0.0, 1.0, 2.0]
+    try:
+        points = _loop(layout, step, shape, row_step, data, big=big)
+    except ValueError:
+        assert not found[1].is_valid
+        return
+    array = to_numpy(CLOUD, message)
+    assert array.shape == (shape if rows > 1 else (width,))
+    assert not array.size or np.shares_memory(array, message.data)
+    values = [v for name, v in found[1].as_py().items() if name != "w"]
+    assert len(values) == len(points)
+    for have, want in zip(values, points, strict=True):
+        np.testing.assert_array_equal(np.array(have, want.dtype), want)
+
+
+def _loop(
+    layout: list[tuple[str, int, int, int]],
+    step: int,
+    shape: tuple[int, int],
+    row_step: int,
+    data: bytes,
+    *,
+    big: bool,
+) -> list[np.ndarray[Any, Any]]:
+    """Numbers of each field, a point at a time."""
+    rows, width = shape
+    if not layout or (rows * width and not step):
+        raise ValueError
+    row_step = row_step if rows > 1 and row_step else width * step
+    names = ["i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"]
+    found = []
+    for _, offset, kind, count in layout:
+        if not 1 <= kind <= 8:
+            raise ValueError
+        dtype = np.dtype((">" if big else "<") + names[kind - 1])
+        if offset + (count or 1) * dtype.itemsize > step:
+            raise ValueError
+        values = [np.empty(0, dtype)]
+        for row in range(rows):
+            for column in range(width):
+                at = row * row_step + column * step + offset
+                values.append(np.frombuffer(data, dtype, count or 1, at))
+        found.append(np.concatenate(values).astype(dtype.newbyteorder("=")))
+    if width and (rows - 1) * row_step + width * step > len(data):
+        raise ValueError
+    return found
+
+
+def test_points_in_sql(copy: Path) -> None:
+    """From tables where these have them, and from messages elsewhere."""
+    query = "select t, points.x[2] as x, len(points.ring) as n from cloud where seq % 3 = 1"
+    with hl.open(copy, mongo="none") as store:
+        store.index.arrays("cloud")
+        answer_ = store.sql(query + " order by t")
+        right = answer_.rows()
+        assert answer_.reading.counters.chunks_read == 0
+        points = [points_of(n) for n in range(COUNT)]
+        want = [(float(one["xyz"][1, 0]), len(one)) for one in points]
+        assert {row[1:] for row in right} <= {*want}
+        with store.start("now", flush_interval_s=0.05) as recording:
+            channel = replace(standard_channel(CLOUD), topic="/cloud")
+            late = BASE + 1000 * STEP
+            recording.write(channel, cloud(XYZ, 20, points[5].tobytes()), log_time=late)
+            recording.write(channel, cloud([("x", 9, 7, 1)], 8, bytes(8)), log_time=late + 1)
+            wait_for(lambda: (store.refresh(), store.topic("cloud").count())[1] == COUNT + 2)
+            found = store.sql("select points.x[2], points is null from cloud order by t").rows()
+            assert found[-2:] == [(want[5][0], False), (None, True)]
+        store.remove("now")
+    expire(copy, [0])
+    with hl.open(copy, mongo="none") as store:
+        gone = store.sql("select count(*) from cloud where points is null").rows()
+        assert gone[0][0] > 1
 
 
 # Scans as one array.

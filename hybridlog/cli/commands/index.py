@@ -143,9 +143,10 @@ def arrays(given: _Arrays) -> None:
     """Keep long arrays in the tables of topics.
 
     Tables have a summary of an array with more than 32 elements. Of these topics they get the
-    array in its place: predicates on elements of arrays and SQL then read columns. New
-    recordings follow, and tables of ended ones are made anew at once. Segments stay as they
-    are, so this costs room. MongoDB is not needed.
+    array in its place: predicates on elements of arrays and SQL then read columns. Tables of
+    point clouds get a list for each field of the points, for SQL, DuckDB and other readers of
+    the files. New recordings follow, and tables of ended ones are made anew at once. Segments
+    stay as they are, so this costs room. MongoDB is not needed.
     """
     with given.opened() as store, Bar("index arrays") as bar:
         found = store.index.arrays(*given.topic, off=given.off, progress=bar.part)
