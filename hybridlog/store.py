@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import (
     TYPE_CHECKING,
     Any,
-    Literal,
     Self,
     TypeAlias,
     cast,
@@ -60,7 +59,7 @@ if TYPE_CHECKING:
     from hybridlog.recordings import Recordings
     from hybridlog.sql.engine import SqlAnswer, SqlEngine
     from hybridlog.tf.tree import FrameTree
-    from hybridlog.training.lerobot import LerobotReport
+    from hybridlog.training.lerobot import LerobotOptions, LerobotReport
     from hybridlog_storage.mongo.database import Database
     from hybridlog_storage.summary import RecordingSummary
 
@@ -552,33 +551,22 @@ class Store:
         query: Query,
         features: str | Path | Mapping[str, Any],
         path: str | Path,
-        *,
-        fps: int,
-        episodes_by: str = "recording",
-        task: str = "",
-        task_topic: str | None = None,
-        codec: Literal["h264", "av1"] = "h264",
-        on_gap: Literal["refuse", "drop", "hold"] = "refuse",
+        options: LerobotOptions | None = None,
         progress: Callable[[str, int], None] | None = None,
+        **choices: Any,
     ) -> LerobotReport:
         """Write a training set for robot learning, in the format of LeRobot 3.0.
 
         Frames are at regular times; each has the last value of a topic that is not later.
-        The same question gives the same bytes. An interrupted export goes on.
+        The same question gives the same bytes.
 
         Args:
             query: The recordings and their range.
             features: Which fields and images: the path of a map in YAML, or its values.
             path: Directory of the set.
-            fps: Frames per second.
-            episodes_by: An episode for each `recording`, each `mark`, or each interval in which
-                a predicate holds, such as `"odom: twist.twist.linear.x > 0.1"`.
-            task: What the robot does, in words.
-            task_topic: A topic of texts that say it instead.
-            codec: Codec of the pictures.
-            on_gap: An episode with a gap in a topic is refused, is cut there, or keeps the last
-                value.
+            options: Options of the set.
             progress: Called with the name of each episode and the number of its frames.
+            choices: Fields of `LerobotOptions`, instead of `options`.
 
         Raises:
             UsageError: The directory has something else, there is a gap, or no episode.
@@ -587,12 +575,11 @@ class Store:
             MissingDependencyError: PyAV is not installed.
         """
         from hybridlog.training.feature_map import FeatureMap
-        from hybridlog.training.lerobot import write_lerobot
-        from hybridlog.training.lerobot_episodes import LerobotOptions
+        from hybridlog.training.lerobot import LerobotOptions, write_lerobot
 
-        options = LerobotOptions(fps, episodes_by, task, task_topic, codec, on_gap)
         given = FeatureMap.given(features)
-        return write_lerobot(of_now(query), given, path, options, progress=progress)
+        chosen = options or LerobotOptions(**choices)
+        return write_lerobot(of_now(query), given, path, chosen, progress=progress)
 
     def sync(
         self,

@@ -16,7 +16,7 @@ A map is YAML:
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NoReturn
@@ -25,7 +25,6 @@ from msgspec import Struct
 
 from hybridlog.arrays.message_arrays import IMAGES, plain_type
 from hybridlog.formats.yaml_values import YamlError, parse_yaml, read_yaml
-from hybridlog.query.query import narrowed
 from hybridlog.wording import listed
 from hybridlog_storage.errors import TopicError, UsageError
 
@@ -148,20 +147,7 @@ class FeatureMap(Struct, frozen=True):
         )
 
 
-def nearly_empty(query: Query) -> dict[str, int]:
-    """Topics of a question with less than a message a second, and their number of messages."""
-    found = {}
-    for one in (narrowed(query, topic) for topic in query.topics):
-        length = sum(
-            end - begin
-            for begin, end in (each.extent for each in one.source.now().summaries_of(one.question))
-        )
-        if (count := one.count()) < max(length / 1e9, 1):
-            found[one.topics[0]] = count
-    return found
-
-
-def proposed(query: Query, without: Collection[str] = ()) -> FeatureMap:
+def proposed(query: Query) -> FeatureMap:
     """A map for the topics of a question, by their types.
 
     Joint states and odometry become states, commands become actions, images of all encodings and
@@ -173,7 +159,7 @@ def proposed(query: Query, without: Collection[str] = ()) -> FeatureMap:
     entries = map(query.source.now().entry_of, query.source.now().summaries_of(query.question))
     types = {one.topic: plain_type(one.type) for entry in entries for one in entry.channels}
     for topic in query.topics:
-        kind = "" if topic in without else types.get(topic, "")
+        kind = types.get(topic, "")
         if kind in _STATES:
             states.append(Source(topic, _STATES[kind]))
         elif kind in _ACTIONS:
@@ -187,8 +173,7 @@ def proposed(query: Query, without: Collection[str] = ()) -> FeatureMap:
     found = FeatureMap({name: parts for name, parts in named.items() if parts}, images)
     if not found.topics:
         raise UsageError(
-            "There are no joint states, odometry, commands or images with a message a second: "
-            "write the map by hand."
+            "There are no joint states, odometry, commands or images: write the map by hand."
         )
     return found
 

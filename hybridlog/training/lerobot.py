@@ -1,52 +1,59 @@
 """Writes training sets in the format of LeRobot, version 3.0.
 
-Each episode is a directory until all are there, so an interrupted export goes on with the
-next one. Then they are put together: rows in Parquet files, pictures in MP4 files, and
-descriptions in `meta`. `meta/info.json` is written last.
+Episodes are written as they come: rows into Parquet files, pictures into MP4 files, several
+episodes a file. The set appears under its name when it is complete.
 """
 
 from __future__ import annotations
 
 import json
-import shutil
-from collections import Counter
-from dataclasses import dataclass, field
+from collections import Counter, defaultdict
+from contextlib import closing
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from msgspec import Struct
 
 from hybridlog import __version__
 from hybridlog.arrays.video import pyav
 from hybridlog.formats.slices import fingerprint
-from hybridlog.formats.writing import failures
+from hybridlog.formats.writing import failures, new_directory
 from hybridlog.query.pieces import pieces
-from hybridlog.query.query import narrowed
-from hybridlog.training.episodes import episodes
+from hybridlog.query.query import Query, narrowed
+from hybridlog.query.question import Question
+from hybridlog.training.episodes import episodes, pictures
 from hybridlog.training.feature_map import IMAGE_PREFIX
-from hybridlog.training.lerobot_episodes import WrittenEpisode, write_episode, write_text
-from hybridlog_storage.errors import PayloadError, UsageError
+from hybridlog_storage.errors import MissingDependencyError, PayloadError, UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from numpy.typing import ArrayLike, NDArray
 
-    from hybridlog.query.query import Query
+    from hybridlog.session import Session
+    from hybridlog.training.episodes import Episode, OnGap
     from hybridlog.training.feature_map import FeatureMap
-    from hybridlog.training.lerobot_episodes import LerobotOptions
 
+Codec = Literal["h264", "av1"]
+_CODECS: Final[Mapping[Codec, tuple[str, Mapping[str, str]]]] = {
+    "h264": ("libx264", {"preset": "veryfast", "crf": "23", "g": "2", "bf": "0"}),
+    "av1": ("libsvtav1", {"preset": "10", "crf": "30", "g": "2"}),
+}
+"""Encoders and their options: a key frame in every two, so that any frame is near one."""
+_THREADS: Final = 4  # of an encoder; the bytes depend on it
+_SAMPLED_FRAMES: Final = 100
+"""Pictures of an episode in its statistics, about."""
+_SAMPLED_ROWS: Final = 150
 _QUANTILES: Final = (0.01, 0.1, 0.5, 0.9, 0.99)
 _CHUNK_FILES: Final = 1000
 _DATA_MB: Final = 100
 _VIDEO_MB: Final = 200
-_UNFINISHED: Final = ".episodes"
-_PLAN: Final = "plan.json"
-_DATA: Final = "data/chunk-{chunk:03d}/file-{file:03d}.parquet"
-_VIDEO: Final = "videos/{key}/chunk-{chunk:03d}/file-{file:03d}.mp4"
+_PLACE: Final = "{folder}/chunk-{chunk:03d}/file-{file:03d}{suffix}"
 _TASKS: Final = {
     "index_columns": ["task"],
     "columns": [
@@ -54,8 +61,36 @@ _TASKS: Final = {
     ],
 }
 """Metadata for pandas: the text of a task is the index of its row, as LeRobot has it."""
-_EPISODES: Final = "meta/episodes/chunk-{chunk:03d}/file-{file:03d}.parquet"
 _INDEX: Final = {"dtype": "int64", "shape": [1], "names": None}
+
+
+class LerobotOptions(Struct, frozen=True):
+    """Options of a training set.
+
+    Attributes:
+        fps: Frames per second.
+        episodes_by: An episode for each `recording`, each `mark`, or each interval in which a
+            predicate holds, such as `"odom: twist.twist.linear.x > 0.1"`.
+        task: What the robot does, in words.
+        task_topic: A topic of texts that say it instead; the one at the begin of an episode
+            counts.
+        codec: Codec of the pictures.
+        on_gap: An episode with a gap in a topic is refused, is cut there, or keeps the last
+            value.
+    """
+
+    fps: int
+    episodes_by: str = "recording"
+    task: str = ""
+    task_topic: str | None = None
+    codec: Codec = "h264"
+    on_gap: OnGap = "refuse"
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.fps <= 1000:
+            raise UsageError("Frames per second are 1 to 1000.")
+        if bool(self.task.strip()) == (self.task_topic is not None):
+            raise UsageError("Say what the robot does: --task TEXT or --task-topic TOPIC.")
 
 
 @dataclass(slots=True)
@@ -66,7 +101,6 @@ class LerobotReport:
         path: Directory of the set.
         episodes: Number of episodes.
         frames: Number of frames.
-        resumed: Episodes that an interrupted export had finished.
         held: Frames whose value of some topic is older than usual.
         dropped: Frames in no episode, since a topic has a gap there.
         missing: Frames that show an earlier picture, since their own cannot be shown.
@@ -77,7 +111,6 @@ class LerobotReport:
     path: Path
     episodes: int = 0
     frames: int = 0
-    resumed: int = 0
     held: int = 0
     dropped: int = 0
     missing: int = 0
@@ -95,259 +128,323 @@ def write_lerobot(
 ) -> LerobotReport:
     """Write the episodes of a question as a training set, into a directory of its own.
 
-    The same export goes on where it was interrupted. `progress` is called with the name of an
-    episode and the number of its frames.
+    `progress` is called with the name of an episode and the number of its frames.
     """
     pyav()
-    features = features.resolved(query.source.now())
+    session, report = query.source.now(), LerobotReport(Path(path))
+    features, dropped = features.resolved(session), Counter[str]()
     selected = narrowed(query, *features.topics)
-    plan = _plan(selected, features, options)
-    root, report = Path(path), LerobotReport(Path(path))
-    unfinished = root / _UNFINISHED
-    if root.exists() and not unfinished.exists():
-        raise UsageError(f"{root} is there already: name another directory, or add --force.")
-    if not (unfinished / _PLAN).exists() or (unfinished / _PLAN).read_text() != plan:
-        shutil.rmtree(unfinished, ignore_errors=True)  # of another set, which nobody finished
-        unfinished.mkdir(parents=True)
-        write_text(unfinished / _PLAN, plan)
-    made: list[WrittenEpisode] = []
-    dropped: Counter[str] = Counter()
-    for piece in pieces(selected, options.episodes_by):
-        for episode in episodes(piece, features, options.fps, options.on_gap, dropped):
-            place = unfinished / f"{len(made):06d}"
-            written = WrittenEpisode.read(place)
-            report.resumed += written is not None
-            if written is None:
-                with failures(str(place)):
-                    written = write_episode(query.source.now(), episode, features, options, place)
-            made.append(written)
-            if progress is not None:
-                progress(episode.name, made[-1].length)
-    if not made:
-        shutil.rmtree(root)
-        raise UsageError("There is no episode in these recordings, so nothing is written.")
-    report.dropped = dropped.total()
-    with failures(str(root)):
-        _Assembly(root, made, features, options, json.loads(plan)).write(report)
-    shutil.rmtree(unfinished)
+    with failures(str(path)):
+        final, unfinished = new_directory(path, "a training set is a directory")
+        try:
+            with closing(_Set(session, unfinished.path, features, options, report)) as made:
+                for piece in pieces(selected, options.episodes_by):
+                    for one in episodes(piece, features, options.fps, options.on_gap, dropped):
+                        made.add(one)
+                        if progress is not None:
+                            progress(one.name, len(one.times))
+                report.dropped = dropped.total()
+                made.finish(selected)
+            unfinished.publish(final)
+        finally:
+            unfinished.remove()
     return report
 
 
-def _plan(query: Query, features: FeatureMap, options: LerobotOptions) -> str:
-    """Everything that determines the bytes of a set."""
-    return json.dumps(
-        {
+class _Set:
+    """Writes the files of a set below `root`, and counts in `report`."""
+
+    def __init__(
+        self,
+        session: Session,
+        root: Path,
+        features: FeatureMap,
+        options: LerobotOptions,
+        report: LerobotReport,
+    ) -> None:
+        self._session, self._root, self._features = session, root, features
+        self._options, self._report = options, report
+        self._rows: list[dict[str, Any]] = []  # of the table of episodes
+        self._about: list[dict[str, Any]] = []  # the episodes
+        self._tasks: dict[str, int] = {}
+        self._columns: defaultdict[str, list[NDArray[Any]]] = defaultdict(list)
+        self._videos = {name: _Video(root, name, options) for name in features.images}
+        self._file: pq.ParquetWriter | None = None
+        self._number, self._size = -1, 0
+
+    def add(self, episode: Episode) -> None:
+        """Write an episode."""
+        begin, length, report = self._report.frames, len(episode.times), self._report
+        about, missing = self._described(episode), Counter[str]()
+        names, first = about["names"], self._about[0] if self._about else about
+        if names != first["names"]:
+            raise UsageError(
+                f"{first['name']} and {episode.name} have other columns: choose recordings that "
+                "are alike."
+            )
+        frames = np.arange(length, dtype=np.int64)
+        task = self._tasks.setdefault(about["task"], len(self._tasks))
+        columns: dict[str, NDArray[Any]] = episode.vectors | {
+            "timestamp": (frames / self._options.fps).astype(np.float32),
+            "frame_index": frames,
+            "episode_index": np.full(length, len(self._rows), np.int64),
+            "index": frames + begin,
+            "task_index": np.full(length, task, np.int64),
+        }
+        for key, array in columns.items():
+            self._columns[key].append(array)
+        row: dict[str, Any] = {
+            "episode_index": len(self._rows),
+            "tasks": [about["task"]],
+            "length": length,
+            **_place_of("data", self._write(columns)),
+            **_place_of("meta/episodes", 0),
+            "dataset_from_index": begin,
+            "dataset_to_index": begin + length,
+            **_flat_stats({key: _stats(one) for key, one in columns.items()}),
+        }
+        for name, topic in self._features.images.items():
+            row |= self._videos[name].add(episode.name, self._shown(episode, topic, missing))
+        self._rows.append(row)
+        self._about.append(about | {"missing": missing})
+        report.episodes += 1
+        report.frames += length
+        report.held += sum(episode.held.values())
+        report.missing += missing.total()
+        report.lost += about["lost"]
+
+    def _described(self, episode: Episode) -> dict[str, Any]:
+        begin, end = int(episode.times[0]), int(episode.times[-1]) + 1
+        question = Question(self._features.topics, (episode.recording,))
+        lost = Query(self._session, question).between(begin, end).completeness()
+        return {
+            "name": episode.name,
+            "recording": episode.recording,
+            "begin_ns": begin,
+            "end_ns": end,
+            "task": self._task(episode),
+            "names": {name: [*columns] for name, columns in episode.names.items()},
+            "held": episode.held,
+            "lost": lost.messages,
+            "is_lost_exact": lost.is_exact,
+        }
+
+    def _task(self, episode: Episode) -> str:
+        topic = self._options.task_topic
+        if topic is None:
+            return self._options.task
+        query = Query(self._session, self._session.question([topic], [episode.recording]))
+        text = getattr(query.at(int(episode.times[0])).decode(), "data", None)
+        if not isinstance(text, str) or not text.strip():
+            raise UsageError(f"{topic} has no text in `data`: name another topic.")
+        return text
+
+    def _write(self, columns: Mapping[str, NDArray[Any]]) -> int:
+        """Write rows; returns the number of their file."""
+        table = pa.table({key: _column(array) for key, array in columns.items()})
+        self._size += table.nbytes
+        if self._file is None or self._size > _DATA_MB << 20:
+            self.close()
+            self._number, self._size = self._number + 1, table.nbytes
+            path = _path(self._root, "data", self._number, ".parquet")
+            self._file = pq.ParquetWriter(path, table.schema, compression="snappy")
+        self._file.write_table(table)
+        return self._number
+
+    def _shown(
+        self, episode: Episode, topic: str, missing: Counter[str]
+    ) -> Iterator[tuple[NDArray[np.uint8] | None, int]]:
+        for picture, frames in pictures(self._session, episode, topic):
+            if picture is None:
+                if self._options.on_gap == "refuse":
+                    raise UsageError(
+                        f"{episode.name}: a picture of {topic} cannot be shown, or has no "
+                        "payload. --on-gap hold shows the one before."
+                    )
+                missing[topic] += frames
+            yield picture, frames
+
+    def finish(self, query: Query) -> None:
+        """Write what describes the episodes of a question."""
+        if not self._rows:
+            raise UsageError("There is no episode in these recordings, so nothing is written.")
+        self.close()
+        stats = {key: _stats(np.concatenate(own)) for key, own in self._columns.items()}
+        for video in self._videos.values():
+            video.finish()
+            stats[video.key] = _colour_stats(video.counts)
+        path = _path(self._root, "meta/episodes", 0, ".parquet")
+        pq.write_table(pa.Table.from_pylist(self._rows), path, compression="snappy")
+        tasks = pa.table({"task_index": [*self._tasks.values()], "task": [*self._tasks]})
+        tasks = tasks.replace_schema_metadata({"pandas": json.dumps(_TASKS)})
+        pq.write_table(tasks, self._root / "meta/tasks.parquet", compression="snappy")
+        options = self._options
+        own = {
             "hybridlog": __version__,
             "question": repr(query),
             "fingerprint": fingerprint(query),
-            "map": features.to_yaml(),
+            "map": self._features.to_yaml(),
             "fps": options.fps,
             "episodes_by": options.episodes_by,
             "task": options.task or options.task_topic,
             "codec": options.codec,
             "on_gap": options.on_gap,
-        },
-        indent=1,
-    )
-
-
-# The set.
-
-
-@dataclass(slots=True)
-class _Assembly:
-    """Puts the episodes of a set together.
-
-    Attributes:
-        plan: Decides the bytes of the set.
-        rows: Of the table of episodes.
-        tasks: Numbers of the tasks.
-    """
-
-    root: Path
-    made: Sequence[WrittenEpisode]
-    features: FeatureMap
-    options: LerobotOptions
-    plan: Mapping[str, Any]
-    rows: list[dict[str, Any]] = field(init=False)
-    tasks: dict[str, int] = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.rows = [{} for _ in self.made]
-        names = dict.fromkeys(one.about["task"] for one in self.made)
-        self.tasks = {task: number for number, task in enumerate(names)}
-        self._check()
-
-    def _check(self) -> None:
-        """Refuse episodes of different columns and sizes."""
-        first = self.made[0]
-        for other in self.made[1:]:
-            for what, one, two in (
-                ("sizes of pictures", first.pixels, other.pixels),
-                ("columns", first.about["names"], other.about["names"]),
-            ):
-                if one != two:
-                    raise UsageError(
-                        f"{first.about['name']} and {other.about['name']} have other {what}: "
-                        "choose recordings that are alike."
-                    )
-
-    def write(self, report: LerobotReport) -> None:
-        """Write all files, `meta/info.json` last."""
-        for name in ("data", "videos", "meta"):
-            if (self.root / name).exists():
-                shutil.rmtree(self.root / name)
-        (self.root / "meta").mkdir()
-        stats = self._write_data()
-        for name in self.features.images:
-            self._write_videos(name)
-            counts = np.sum([one.counts[name] for one in self.made], axis=0)
-            stats[f"{IMAGE_PREFIX}{name}"] = _colour_stats(counts)
-        path = self._file(_EPISODES, 0)
-        pq.write_table(pa.Table.from_pylist(self.rows), path, compression="snappy")
-        tasks = pa.table({"task_index": [*self.tasks.values()], "task": [*self.tasks]})
-        tasks = tasks.replace_schema_metadata({"pandas": json.dumps(_TASKS)})
-        pq.write_table(tasks, self.root / "meta/tasks.parquet", compression="snappy")
-        own = {**self.plan, "episodes": [one.about for one in self.made]}
-        for file, value in (("stats", stats), ("hybridlog", own), ("info", self._info())):
-            write_text(self.root / f"meta/{file}.json", json.dumps(value, indent=1))
-        report.episodes = len(self.made)
-        report.frames = sum(one.length for one in self.made)
-        report.held = sum(sum(one.about["held"].values()) for one in self.made)
-        report.missing = sum(sum(one.about["missing"].values()) for one in self.made)
-        report.lost = sum(one.about["lost"] for one in self.made)
-        report.bytes = sum(
-            file.stat().st_size
-            for file in self.root.rglob("*")
-            if file.is_file() and _UNFINISHED not in file.parts
-        )
-
-    def _write_data(self) -> dict[str, Any]:
-        """Write the rows; returns statistics of all."""
-        begins = np.cumsum([0, *(one.length for one in self.made)]).tolist()
-        found = [
-            one.vectors() | self._own_columns(place, one, begins[place])
-            for place, one in enumerate(self.made)
-        ]
-        tables = [pa.table({key: _column(array) for key, array in own.items()}) for own in found]
-        for number, places in _by_file((table.nbytes for table in tables), _DATA_MB):
-            path = self._file(_DATA, number)
-            with pq.ParquetWriter(path, tables[0].schema, compression="snappy") as writer:
-                for place in places:
-                    writer.write_table(tables[place])
-                    self.rows[place] = {
-                        "episode_index": place,
-                        "tasks": [self.made[place].about["task"]],
-                        "length": self.made[place].length,
-                        **_place_of("data", number),
-                        **_place_of("meta/episodes", 0),
-                        "dataset_from_index": begins[place],
-                        "dataset_to_index": begins[place + 1],
-                        **_flat_stats({key: _stats(one) for key, one in found[place].items()}),
-                    }
-        return {key: _stats(np.concatenate([own[key] for own in found])) for key in found[0]}
-
-    def _file(self, form: str, number: int, key: str = "") -> Path:
-        """The path of a file by its number; its folder is made."""
-        chunk, file = divmod(number, _CHUNK_FILES)
-        path = self.root / form.format(key=key, chunk=chunk, file=file)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        return path
-
-    def _own_columns(self, place: int, one: WrittenEpisode, begin: int) -> dict[str, NDArray[Any]]:
-        frames = np.arange(one.length, dtype=np.int64)
-        return {
-            "timestamp": (frames / self.options.fps).astype(np.float32),
-            "frame_index": frames,
-            "episode_index": np.full(one.length, place, np.int64),
-            "index": frames + begin,
-            "task_index": np.full(one.length, self.tasks[one.about["task"]], np.int64),
+            "episodes": self._about,
         }
-
-    def _write_videos(self, name: str) -> None:
-        """Join the videos of the episodes; packets are copied."""
-        fps, key = self.options.fps, f"{IMAGE_PREFIX}{name}"
-        videos = [one.place / f"{name}.mp4" for one in self.made]
-        for number, places in _by_file((path.stat().st_size for path in videos), _VIDEO_MB):
-            with pyav().open(str(self._file(_VIDEO, number, key)), "w", format="mp4") as target:
-                frames, track = 0, None
-                for place in places:
-                    begin = frames
-                    with pyav().open(str(videos[place])) as file:
-                        track = track or target.add_stream_from_template(file.streams.video[0])
-                        for packet in file.demux(video=0):
-                            if packet.dts is None:
-                                continue
-                            packet.stream, packet.time_base = track, Fraction(1, fps)
-                            packet.pts = packet.dts = frames
-                            packet.duration = 1
-                            target.mux(packet)
-                            frames += 1
-                    one = self.made[place]
-                    if frames - begin != one.length:
-                        raise PayloadError(
-                            f"{name}.mp4 has {frames - begin} frames, not {one.length}"
-                        )
-                    self.rows[place] |= {
-                        **_place_of(f"videos/{key}", number),
-                        f"videos/{key}/from_timestamp": begin / fps,
-                        f"videos/{key}/to_timestamp": frames / fps,
-                        **_flat_stats({key: _colour_stats(one.counts[name])}),
-                    }
+        for file, value in (("stats", stats), ("hybridlog", own), ("info", self._info())):
+            (self._root / f"meta/{file}.json").write_text(json.dumps(value, indent=1))
+        files = (file for file in self._root.rglob("*") if file.is_file())
+        self._report.bytes = sum(file.stat().st_size for file in files)
 
     def _info(self) -> dict[str, Any]:
         """The description of the set for LeRobot."""
-        first, fps = self.made[0], self.options.fps
-        features: dict[str, Any] = {}
-        for name, array in first.vectors().items():
-            names = first.about["names"][name]
-            features[name] = {"dtype": "float32", "shape": [array.shape[1]], "names": names}
-        for name, size in first.pixels.items():
-            rows, columns = (number + number % 2 for number in size)
-            features[f"{IMAGE_PREFIX}{name}"] = {
-                "dtype": "video",
-                "shape": [rows, columns, 3],
-                "names": ["height", "width", "channels"],
-                "info": {
-                    "video.fps": fps,
-                    "video.height": rows,
-                    "video.width": columns,
-                    "video.channels": 3,
-                    "video.codec": self.options.codec,
-                    "video.pix_fmt": "yuv420p",
-                    "video.is_depth_map": False,
-                    "has_audio": False,
-                },
-            }
+        features: dict[str, Any] = {
+            name: {"dtype": "float32", "shape": [len(columns)], "names": columns}
+            for name, columns in self._about[0]["names"].items()
+        }
+        features |= {video.key: video.feature for video in self._videos.values()}
         features["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
         features |= dict.fromkeys(("frame_index", "episode_index", "index", "task_index"), _INDEX)
+        place = "chunk-{chunk_index:03d}/file-{file_index:03d}"
         return {
             "codebase_version": "v3.0",
-            "robot_type": self.features.robot_type or "unknown",
-            "total_episodes": len(self.made),
-            "total_frames": sum(one.length for one in self.made),
-            "total_tasks": len(self.tasks),
+            "robot_type": self._features.robot_type or "unknown",
+            "total_episodes": len(self._rows),
+            "total_frames": self._report.frames,
+            "total_tasks": len(self._tasks),
             "chunks_size": _CHUNK_FILES,
             "data_files_size_in_mb": _DATA_MB,
             "video_files_size_in_mb": _VIDEO_MB,
-            "fps": fps,
-            "splits": {"train": f"0:{len(self.made)}"},
-            "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
-            "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
+            "fps": self._options.fps,
+            "splits": {"train": f"0:{len(self._rows)}"},
+            "data_path": f"data/{place}.parquet",
+            "video_path": f"videos/{{video_key}}/{place}.mp4",
             "features": features,
         }
 
+    def close(self) -> None:
+        """Close the file of rows."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
 
-def _by_file(sizes: Iterable[int], limit_mb: int) -> Iterator[tuple[int, list[int]]]:
-    """Numbers of files, and the episodes of so many bytes that go into each."""
-    total, files = 0, list[list[int]]()
-    for place, size in enumerate(sizes):
-        if not files or total + size > limit_mb << 20:
-            total = 0
-            files.append([])
-        total += size
-        files[-1].append(place)
-    return enumerate(files)
+
+class _Video:
+    """Encodes the pictures of a camera, several episodes a file.
+
+    Attributes:
+        key: Name of the feature.
+        counts: int64[3, 256], how often each value occurs in a colour, of some pictures.
+    """
+
+    def __init__(self, root: Path, name: str, options: LerobotOptions) -> None:
+        self.key = f"{IMAGE_PREFIX}{name}"
+        self.counts = np.zeros((3, 256), np.int64)
+        self._root, self._options = root, options
+        self._size: tuple[int, ...] = ()  # rows and columns of a picture
+        self._file: Any = None
+        self._track: Any = None
+        self._path = root
+        self._number, self._frames = -1, 0
+
+    def add(
+        self, episode: str, shown: Iterable[tuple[NDArray[np.uint8] | None, int]]
+    ) -> dict[str, Any]:
+        """Append pictures, each for a number of frames; returns columns of their episode.
+
+        For None it is the one before, or the first one.
+        """
+        if self._file is not None and self._path.stat().st_size > _VIDEO_MB << 20:
+            self.finish()
+        begin, waiting, before, counts = self._frames, 0, None, np.zeros((3, 256), np.int64)
+        for picture, frames in shown:
+            waiting += frames
+            if picture is not None:
+                before = self._fitting(episode, picture)
+                done = self._frames - begin
+                if done % max(done // _SAMPLED_FRAMES, 1) == 0:
+                    counts += _counts_of(picture)
+            if before is not None:
+                self._encode(before, waiting)
+                waiting = 0
+        if before is None:
+            raise PayloadError(f"{episode}: {self.key} has no picture that can be shown")
+        self.counts += counts
+        folder, fps = f"videos/{self.key}", self._options.fps
+        return {
+            **_place_of(folder, self._number),
+            f"{folder}/from_timestamp": begin / fps,
+            f"{folder}/to_timestamp": self._frames / fps,
+            **_flat_stats({self.key: _colour_stats(counts)}),
+        }
+
+    @property
+    def feature(self) -> dict[str, Any]:
+        """Its description for LeRobot."""
+        rows, columns = (number + number % 2 for number in self._size)
+        return {
+            "dtype": "video",
+            "shape": [rows, columns, 3],
+            "names": ["height", "width", "channels"],
+            "info": {
+                "video.fps": self._options.fps,
+                "video.height": rows,
+                "video.width": columns,
+                "video.channels": 3,
+                "video.codec": self._options.codec,
+                "video.pix_fmt": "yuv420p",
+                "video.is_depth_map": False,
+                "has_audio": False,
+            },
+        }
+
+    def _fitting(self, episode: str, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """A picture with an even number of rows and columns; all have one size."""
+        rows, columns = self._size = self._size or picture.shape[:2]
+        if picture.shape[:2] != self._size:
+            raise UsageError(
+                f"{episode}: {self.key} has other sizes of pictures than before: choose "
+                "recordings that are alike."
+            )
+        even = [(0, rows % 2), (0, columns % 2), (0, 0)]
+        return np.ascontiguousarray(np.pad(picture, even, mode="edge"))
+
+    def _encode(self, picture: NDArray[np.uint8], frames: int) -> None:
+        if self._file is None:
+            self._begin(*picture.shape[:2])
+        frame = pyav().VideoFrame.from_ndarray(picture, format="rgb24").reformat(format="yuv420p")
+        for _ in range(frames):
+            frame.pts, frame.time_base = self._frames, Fraction(1, self._options.fps)
+            self._file.mux(self._track.encode(frame))
+            self._frames += 1
+
+    def _begin(self, rows: int, columns: int) -> None:
+        """Begin the next file."""
+        self._number += 1
+        self._path = _path(self._root, f"videos/{self.key}", self._number, ".mp4")
+        self._file = pyav().open(str(self._path), "w", format="mp4")
+        name, how = _CODECS[self._options.codec]
+        try:
+            track = self._file.add_stream(name, rate=self._options.fps, options=dict(how))
+        except (pyav().FFmpegError, ValueError) as error:
+            raise MissingDependencyError(f"this PyAV has no {name}") from error
+        track.width, track.height, track.pix_fmt = columns, rows, "yuv420p"
+        track.codec_context.thread_count = _THREADS
+        self._track = track
+
+    def finish(self) -> None:
+        """Complete the file."""
+        self._file.mux(self._track.encode(None))
+        self._file.close()
+        self._file, self._frames = None, 0
+
+
+def _path(root: Path, folder: str, number: int, suffix: str) -> Path:
+    """The path of a file by its number; its folder is made."""
+    chunk, file = divmod(number, _CHUNK_FILES)
+    path = root / _PLACE.format(folder=folder, chunk=chunk, file=file, suffix=suffix)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path
 
 
 def _place_of(what: str, number: int) -> dict[str, int]:
@@ -374,6 +471,13 @@ def _stats(array: NDArray[Any]) -> dict[str, list[Any]]:
     for share, row in zip(_QUANTILES, np.quantile(values, _QUANTILES, axis=0), strict=True):
         found[_quantile(share)] = row
     return {name: value.tolist() for name, value in found.items()}
+
+
+def _counts_of(picture: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """How often each value occurs in each colour of some rows and columns: int64[3, 256]."""
+    step = max(max(picture.shape[:2]) // _SAMPLED_ROWS, 1)
+    colours = (picture[::step, ::step, colour].ravel() for colour in range(3))
+    return np.array([np.bincount(one, minlength=256) for one in colours], np.int64)
 
 
 def _colour_stats(occurring: ArrayLike) -> dict[str, list[Any]]:

@@ -23,6 +23,7 @@ import hybridlog as hl
 from benchmarks.simulator.topics import RobotConfig
 from benchmarks.simulator.write import write_bag
 from hybridlog.drawing.images import shown_pixels
+from hybridlog.training import lerobot
 from hybridlog.training.feature_map import FeatureMap
 from hybridlog.training.lerobot import LerobotReport
 from hybridlog_storage.errors import PayloadError, TopicError, UsageError
@@ -188,7 +189,6 @@ def test_every_frame_is_that_of_the_log(plain: Path, tmp_path: Path) -> None:
     assert (info["codebase_version"], info["fps"], info["total_frames"]) == ("v3.0", FPS, 120)
     assert info["features"]["observation.state"]["names"] == ["arm.q[0]", "arm.q[1]", "arm.load"]
     assert info["features"]["observation.images.front"]["shape"] == [HEIGHT, WIDTH, 3]
-    assert not (path / ".episodes").exists()
     spans = [(one["dataset_from_index"], one["dataset_to_index"]) for one in episodes_of(path)]
     assert spans == [(0, 80), (80, 120)]
     key = "videos/observation.images.front"
@@ -237,28 +237,38 @@ def digests(path: Path) -> dict[str, str]:
     }
 
 
-def test_an_interrupted_export_goes_on(plain: Path, tmp_path: Path) -> None:
-    told: list[str] = []
-
-    def stop(name: str, _: int) -> None:
-        told.append(name)
+def test_an_interrupted_export_leaves_nothing(plain: Path, tmp_path: Path) -> None:
+    def stop(*_: object) -> None:
         raise KeyboardInterrupt
 
     with hl.open(plain, mongo="none") as store:
         export(store, tmp_path / "whole")
         with pytest.raises(KeyboardInterrupt):
             export(store, tmp_path / "set", progress=stop)
-        assert told == ["one"]
-        assert not (tmp_path / "set/meta").exists()
-        shutil.copytree(tmp_path / "set", tmp_path / "cut")
-        (tmp_path / "cut/.episodes/000000/episode.json").unlink()
-        shutil.copytree(tmp_path / "set", tmp_path / "other")
-        assert export(store, tmp_path / "other", task="another").resumed == 0
-        for name, resumed in (("set", 1), ("cut", 0)):
-            assert export(store, tmp_path / name).resumed == resumed
-            assert digests(tmp_path / name) == digests(tmp_path / "whole")
-        with pytest.raises(UsageError, match="is there already"):
+        assert [path.name for path in tmp_path.iterdir()] == ["whole"]
+        export(store, tmp_path / "set")
+        assert digests(tmp_path / "set") == digests(tmp_path / "whole")
+        with pytest.raises(UsageError, match="is not empty"):
             export(store, tmp_path / "whole")
+
+
+def test_long_sets_have_several_files(
+    plain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("_DATA_MB", "_VIDEO_MB"):
+        monkeypatch.setattr(lerobot, name, 0)
+    with hl.open(plain, mongo="none") as store:
+        export(store, tmp_path / "set")
+    for folder in ("data", "videos/observation.images.front"):
+        files = [path.stem for path in (tmp_path / "set" / folder).rglob("file-*")]
+        assert sorted(files) == ["file-000", "file-001"]
+    rows, pictures = rows_of(tmp_path / "set"), greys_of(tmp_path / "set")
+    assert len(rows) == len(pictures) == 120
+    key = "videos/observation.images.front"
+    assert [
+        (one[f"{key}/file_index"], one[f"{key}/from_timestamp"], one[f"{key}/to_timestamp"])
+        for one in episodes_of(tmp_path / "set")
+    ] == [(0, 0, 4), (1, 0, 2)]
 
 
 def test_episodes_are_marks_and_intervals(make: Make, tmp_path: Path) -> None:
@@ -510,21 +520,3 @@ def test_a_recording_whose_pictures_have_expired_is_refused(demo: Path, tmp_path
             store.to_lerobot(
                 store.topic("odom"), features, tmp_path / "expired", fps=RATE, task="x"
             )
-
-
-def test_nearly_empty_topics_are_not_proposed(tmp_path: Path) -> None:
-    joy = Schema("sensor_msgs/Joy", "ros1msg", b"float32[] axes\n")
-    payload = (1).to_bytes(4, "little") + np.float32(1).tobytes()
-    with hl.open(tmp_path / "store", create=True, mongo="none") as store:
-        with store.start("one") as recording:
-            for time in range(20):
-                for name in ("/often", *(["/seldom"] if time == 7 else [])):
-                    channel = Channel(name, "ros1", joy, {})
-                    recording.write(channel, payload, log_time=10**18 + time * 10**9 // 2)
-    text_of_map = proposed(tmp_path / "store", tmp_path / "map.yaml")
-    assert FeatureMap.read(tmp_path / "map.yaml").topics == ("/often",)
-    assert text_of_map.endswith("# left out: /seldom has 1 message\n")
-    words = ("export", str(tmp_path / "set"), "-F", "lerobot", "--map", str(tmp_path / "map.yaml"))
-    done = answer(*words, "--task", "x", store=tmp_path / "store")
-    assert " at 30 Hz, " in done.err
-    assert json.loads((tmp_path / "set/meta/info.json").read_text())["fps"] == 30

@@ -252,7 +252,7 @@ def _pieces(
 
 
 def _export_set(store: Store, query: Query, target: Path, given: _Given) -> None:
-    """Write a training set, or propose a map for one, with rare topics in comments."""
+    """Write a training set, or propose a map for one."""
     if given.propose_map:
         _propose_map(query, target, force=given.force)
         return
@@ -283,9 +283,8 @@ def _export_set(store: Store, query: Query, target: Path, given: _Given) -> None
             on_gap=given.on_gap,
             progress=tell,
         )
-    resumed = f", {report.resumed} of them from before" if report.resumed else ""
     about = (
-        f"{report.path}: {counted(report.episodes, 'episode')}{resumed}, "
+        f"{report.path}: {counted(report.episodes, 'episode')}, "
         f"{counted(report.frames, 'frame')} at {given.fps} Hz, {output.size(report.bytes)}"
     )
     output.remarks([about])
@@ -301,14 +300,8 @@ def _export_set(store: Store, query: Query, target: Path, given: _Given) -> None
 
 
 def _propose_map(query: Query, target: Path, *, force: bool) -> None:
-    from hybridlog.query.query import narrowed
-    from hybridlog.training.feature_map import nearly_empty, proposed
+    from hybridlog.training.feature_map import proposed
 
     check_room(target, force=force)
-    empty = nearly_empty(narrowed(query, *proposed(query).topics))
-    left_out = (
-        f"# left out: {topic} has {output.counted(count, 'message')}\n"
-        for topic, count in empty.items()
-    )
-    write_bytes(target, "".join([proposed(query, empty).to_yaml(), *left_out]).encode())
+    write_bytes(target, proposed(query).to_yaml().encode())
     output.remarks([f"{target}: look at it, then add --map {target}."])
