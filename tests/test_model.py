@@ -371,7 +371,7 @@ class Recording:
     @property
     def findings(self) -> Counter[tuple[str, str]]:
         """What `verify` must find: name and place."""
-        found = Counter((self.name, f"segment {number}") for number in self.lost)
+        found = Counter((self.name, f"{number:06d}.mcap") for number in self.lost)
         if self.status == "unproven":
             found[self.name, "manifest"] += 1
         return found

@@ -15,12 +15,11 @@ from hybridlog.entries import (
     NO_MANIFEST,
     Seen,
     ended,
-    inventory_of,
     listed,
     lost_in_crash,
     see,
+    segments_in,
     summary_by,
-    take_inventory,
     unlisted,
 )
 from hybridlog.maintenance import tables
@@ -146,7 +145,7 @@ def _lost(directory: StoreDirectory, name: str) -> str:
     """What to say of a folder without a manifest."""
     try:
         listing = directory.listing(name)
-        inventory_of(directory, name, listing, None)
+        segments_in(directory, name, listing.choosing(None))
     except StoreError as error:
         return str(error)
     if listing.sealed or listing.rows or listing.open:
@@ -164,16 +163,14 @@ def recover(directory: StoreDirectory, recording: str, report: RepairReport) -> 
         return
     listing = directory.listing(recording)
     directory.drop(recording, listing.left_over(manifest))
-    recovered = recover_segments(directory, recording, listing, manifest)
-    inventory = take_inventory(directory, recording)
-    is_empty = not (inventory.listing.sealed or manifest.logs or manifest.marks)
-    if is_empty and not manifest.is_ended:
+    if recovered := recover_segments(directory, recording, listing, manifest):
+        report.recovered[manifest.name] = recovered
+    manifest, listing = directory.manifests.read(recording), directory.listing(recording)
+    if not (listing.sealed or manifest.logs or manifest.marks or manifest.is_ended):
         directory.manifests.remove(recording)
-        report.recovered[inventory.name] = recovered
+        report.recovered[manifest.name] = recovered
         return
-    if recovered:
-        report.recovered[inventory.name] = recovered
-    adopt = unlisted(inventory)
+    adopt = unlisted(directory, recording, listing, manifest)
 
     def change(now: Manifest) -> Manifest:
         now = adopt(now)

@@ -19,14 +19,10 @@ pytestmark = pytest.mark.mongo
 
 def test_verify_lists_what_is_off(fresh: Path) -> None:
     flip(places.segment(fresh, "small", 1), 1 / 2)
-    with hl.open(fresh) as store:
-        assert store.database is not None
-        store.database.delete("imu__data", {"_meta.seq": {"$lt": 20}})
     done = run("verify", store=fresh, code=1)
     findings = done.lines[:-1]
     assert any("000001.mcap byte" in line for line in findings)
-    assert any("imu__data" in line for line in findings)
-    assert f"{len(findings)} problems" in done.lines[-1]
+    assert done.lines[-1].endswith(": 1 problem")
     found = run("verify", "--json", store=fresh, code=1).json["findings"]
     assert len(found) == len(findings)
     assert run("verify", "--quiet", store=fresh, code=1).lines == findings

@@ -213,10 +213,7 @@ def test_a_mongodb_of_ones_own_that_goes_away(server: Server, logs: Path, tmp_pa
     assert near.out.strip() == str(len(seen))  # the segments know
     assert "does not answer" in run("index", "rebuild", store=store, code=6).err
     # The segments are checked all the same.
-    done = run("verify", store=store, code=6)
-    assert "all is well in the files" in done.out
-    assert "The index was not compared: MongoDB" in done.err
-    assert "does not answer" in done.err
+    assert "all is well" in run("verify", store=store).out
 
     # Another server is as good: the index is made anew from the segments.
     run("index", "rebuild", "--mongo", "embedded", store=store)

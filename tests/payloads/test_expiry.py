@@ -102,7 +102,7 @@ def test_what_an_expiry_left_is_removed_by_the_next_writer(copy: Path) -> None:
     with hl.open(copy, mongo="none") as store:
         assert store.recordings()[0].status == "damaged"
         found = {one.place: one.problem for one in store.verify().findings}
-        assert found["000001.rows.parquet"] == "000001.rows.parquet is missing"
+        assert found["000001.rows.parquet"] == "it is missing"
     assert segment.exists()
 
 

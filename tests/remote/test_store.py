@@ -279,7 +279,7 @@ def test_lost_objects(here: Path, address: str, tmp_path: Path, how: str) -> Non
         assert question.count() == left + 20
         assert question.completeness().has_losses
         found = store.verify()
-        assert [(one.recording, one.place) for one in found.findings] == [("run", "segment 1")]
+        assert [(one.recording, one.place) for one in found.findings] == [("run", "000001.mcap")]
         assert "hybridlog copy" in found.findings[0].cure
         assert found.recordings == 2
     with hl.open(tmp_path / "back", mongo="none", create=True) as store:

@@ -15,7 +15,7 @@ from hybridlog.cli.binder import command, option
 from hybridlog.cli.options import AsJson, Choosing, InStore, Quiet, names_argument, recordings_of
 from hybridlog.cli.output import Bar
 from hybridlog.wording import listed
-from hybridlog_storage.errors import DatabaseError, TopicError, WithoutMongoError
+from hybridlog_storage.errors import TopicError
 
 if TYPE_CHECKING:
     from hybridlog.maintenance.report import Repaired
@@ -36,7 +36,7 @@ class _Given(Choosing, InStore, AsJson, Quiet):
 
 @command(_Given)
 def verify_command(given: _Given) -> int:
-    """Read everything, check checksums and references.
+    """Read everything, and check checksums.
 
     Exits with 1 when it finds a problem, and prints a cure for each. With --repair, it restores
     the names of segments, makes damaged summaries and lost manifests again, and brings catalog and
@@ -54,7 +54,6 @@ def verify_command(given: _Given) -> int:
         names = None if given.choice.is_everything else [*(one.id for one in chosen), *unreadable]
         with Bar("verify") as bar:
             result = store.verify(names, bar.part, repair=given.repair)
-        why = store.shared.index.unavailable
     elapsed = time.monotonic() - started
     if given.as_json:
         output.print_json({**asdict(result), "seconds": round(elapsed, 3)})
@@ -63,11 +62,6 @@ def verify_command(given: _Given) -> int:
         if running := [one.name for one in chosen if one.status == "open"]:
             said = f"Still being recorded, and checked as far as sealed: {listed(running)}."
             output.remarks([said])
-    is_wanted = not isinstance(why, WithoutMongoError)
-    if not result.index and is_wanted and (result.findings or why is None):
-        output.note(f"The index was not compared: {why}")
-    elif not result.index and is_wanted:
-        raise DatabaseError(f"The index was not compared: {why}")
     return 1 if result.findings else 0
 
 
@@ -91,12 +85,9 @@ def _print(result: Verification, elapsed: float) -> None:
         _say(done, f"mended: {done.done}")
     for finding in result.findings:
         _say(finding, f"{finding.problem.removesuffix('.')}; {finding.cure}")
-    verdict = "all is well" if result.index else "all is well in the files"
+    verdict = "all is well"
     if result.findings:
         verdict = output.counted(len(result.findings), "problem")
-    if result.without_documents:
-        without = output.counted(result.without_documents, "message")
-        verdict += f"; {without} without documents (--no-index)"
     told = (
         f"{output.counted(result.recordings, 'recording')}, "
         f"{output.counted(result.chunks, 'chunk')}, "
