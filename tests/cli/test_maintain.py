@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-import hybridlog as hl
 from tests import places
 from tests.damage import flip
 from tests.other_user import User, needs_root, open_place
