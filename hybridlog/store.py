@@ -784,7 +784,6 @@ class Store:
         rules: Mapping[str, Any] | None = None,
         *,
         dry_run: bool = False,
-        progress: Progress | None = None,
     ) -> KeepReport:
         """Delete what rules of retention do not let stay: payloads, then what is left of them.
 
@@ -792,7 +791,6 @@ class Store:
             rules: As the table `[retention]` in `hybridlog.toml` has them, such as
                 `{"quota": "200GB"}`; None for that table.
             dry_run: True to say what would go, and delete nothing.
-            progress: Called while payloads are replaced.
 
         Returns:
             What went, and why.
@@ -801,22 +799,11 @@ class Store:
             UsageError: A rule is malformed, or not for a bucket.
             StoreError: Another process deletes here, too; or the store is read-only.
         """
-        from hybridlog.maintenance.edit import remove_if
-        from hybridlog.maintenance.keep import Keeper, KeepReport
-        from hybridlog.maintenance.retention import Rules
+        from hybridlog.maintenance.keep import keep
 
-        self.shared.check_process()
-        wanted = Rules.of(self.directory.settings.retention if rules is None else rules)
-        wanted.check_place(is_remote=self.directory.is_remote)
-        keeper = Keeper(self.directory, partial(remove_if, self.shared))
-        if dry_run:
-            return KeepReport(keeper.plan(wanted))
-        self._to_change()
-        self.directory.check_changes()
-        try:
-            return keeper.keep(wanted, progress)
-        finally:
-            self.refresh()
+        shared = self.shared if dry_run else self._itself()
+        shared.check_process()
+        return keep(shared, rules, dry_run=dry_run)
 
     def pin(
         self,

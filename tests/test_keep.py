@@ -18,12 +18,10 @@ import pytest
 import hybridlog as hl
 from hybridlog.cli.commands.open import unplayed
 from hybridlog.entries import summary_of
-from hybridlog.maintenance import expiry
 from hybridlog.maintenance import keep as keeping
 from hybridlog.maintenance.edit import pin_of
-from hybridlog.maintenance.expiry import may_go
 from hybridlog.maintenance.keep import Keeper
-from hybridlog.maintenance.retention import Rules
+from hybridlog.maintenance.retention import Rules, may_go
 from hybridlog.maintenance.sizes import disk_bytes
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import StoreDirectory
@@ -131,7 +129,6 @@ def test_a_pass_makes_room_and_leaves_counts_fields_and_pins(store: Path) -> Non
     (first, *_) = done["plan"]["steps"]
     assert first == dry["plan"]["steps"][0]
     assert first["recording"] == "run"
-    assert first["topics"] == []
     assert f"more than 90% of {quota / 1000:.1f} kB" in first["reason"]
     gone = sorted(n for step in done["plan"]["steps"] for n in step["segments"])
     # The oldest went, but for those with what is pinned.
@@ -162,7 +159,7 @@ def test_a_pass_makes_room_and_leaves_counts_fields_and_pins(store: Path) -> Non
 
 def test_topics_go_and_the_rest_of_their_segments_stays(store: Path) -> None:
     out = keep("--topic", "/camera=0s", store=store).out
-    assert re.search(r"(?m)^run +1, 3, .*, 21 +/camera  ", out)
+    assert re.search(r"(?m)^run +1, 3, .*, 21 +[0-9.]+ kB  ", out)
     assert "/camera older than 0s" in out
     assert {*payloads(store).values()} == {None}
     with hl.open(store, mongo="none") as opened:
@@ -182,7 +179,7 @@ def test_a_recording_goes_with_its_fields(store: Path) -> None:
     assert keep("--fields-age", "0s", "--json", store=store).json["plan"]["steps"] == []
     (row,) = keep("--pins", "--json", store=store).json
     keep("--unpin", row["id"], store=store)
-    assert re.search(r"(?m)^run +all +all  ", keep("--fields-age", "0s", store=store).out)
+    assert re.search(r"(?m)^run +all  ", keep("--fields-age", "0s", store=store).out)
     with hl.open(store, mongo="none") as opened:
         assert opened.summaries() == []
 
@@ -198,7 +195,6 @@ def test_saved_rules_are_those_of_later_passes(store: Path) -> None:
     }
     found = keep("--json", store=store).json["plan"]
     assert found["steps"] == []
-    assert found["pinned_bytes"] > 0
     answer("tag", "run", "--remove", "keep", store=store)
     assert keep("--json", store=store).json["plan"]["steps"]
 
@@ -206,7 +202,6 @@ def test_saved_rules_are_those_of_later_passes(store: Path) -> None:
 def test_too_little_may_go(store: Path) -> None:
     keep("--pin", "-r", "run", store=store)
     found = run("keep", "--quota", "1kB", "--mongo", "none", store=store, code=1)
-    assert "What is pinned takes" in found.err
     assert "all that is left must stay" in found.err
     assert payloads(store)[0] == image(0)
 
@@ -362,7 +357,7 @@ def test_what_is_said_meanwhile_keeps_what_is_not_gone(
         "tag": {"tags": {"stay": "yes"}},
         "pin": {"pins": (pin_of("now", (None, None), None, ""),)},
     }
-    place: Any = {"expire": keeping, "write_rows": expiry, "remove": DiskManifests}[when]
+    place: Any = {"expire": keeping, "write_rows": keeping, "remove": DiskManifests}[when]
     work = getattr(place, when)
 
     def said_before(*words: Any, **options: Any) -> Any:
@@ -377,13 +372,10 @@ def test_what_is_said_meanwhile_keeps_what_is_not_gone(
     check_answers(store)
 
 
-def test_what_may_have_lost_pins_is_left_alone_and_named(store: Path) -> None:
+def test_what_may_have_lost_pins_is_left_alone(store: Path) -> None:
     places.manifest_of(places.folder(store, "run")).unlink()
     answer("verify", "--repair", "--mongo", "none", store=store, code=None)
-    found = keep("--max-age", "0s", "--fields-age", "0s", store=store)
-    assert (
-        "run: left alone, since a manifest that was lost and made again may lack pins" in found.err
-    )
+    keep("--max-age", "0s", "--fields-age", "0s", store=store)
     assert all(raw == image(n) for n, raw in payloads(store).items())
 
 
@@ -455,7 +447,7 @@ def test_a_full_disk_is_relieved_and_fields_stay(
             if (path / keeping.SPARE).exists():
                 raise DiskFullError
 
-        calls(expiry, "write_rows", full)
+        calls(keeping, "write_rows", full)
         if has_rules:
             calls.system(Full(path))
         (step,) = store.keep({"max-age": "0s"}).plan.steps
@@ -467,7 +459,7 @@ def test_a_full_disk_is_relieved_and_fields_stay(
 
 
 def test_a_log_that_goes_without_its_fields_is_counted(store: Path, calls: Calls) -> None:
-    calls.fail(expiry, "write_rows", DiskFullError)
+    calls.fail(keeping, "write_rows", DiskFullError)
     keep("--topic", "/camera=0s", store=store)
     with hl.open(store, mongo="none") as opened:
         (entry,) = opened.recordings()

@@ -17,7 +17,7 @@ from msgspec import Struct, field
 from hybridlog.columns.recording_logs import RecordingRows
 from hybridlog.entries import put_entry
 from hybridlog.index.indexing import ChunkIndexer, IndexTarget, Sender
-from hybridlog.maintenance.expiry import make_rows
+from hybridlog.maintenance.keep import make_rows
 from hybridlog.maintenance.report import Followed, reporter
 from hybridlog.maintenance.retention import Rules
 from hybridlog.maintenance.tables import missing

@@ -16,7 +16,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
-from hybridlog.maintenance.expiry import let_go
+from hybridlog.maintenance.keep import let_go
 from hybridlog.maintenance.retention import is_pinned
 from hybridlog.query.latching import depth_of, publisher_of
 from hybridlog.query.times import format_duration, format_time

@@ -214,7 +214,7 @@ class Copying:
     @contextmanager
     def _without_payloads(self, now: Manifest, logs: list[File]) -> Iterator[copy.Prepared]:
         """What is sent of a recording whose payloads are to come later, in a folder for a while."""
-        from hybridlog.maintenance.expiry import without_payloads
+        from hybridlog.maintenance.keep import without_payloads
 
         with tempfile.TemporaryDirectory(prefix="hybridlog-") as place:
             into = Path(place) / RECORDINGS / now.id
@@ -282,7 +282,7 @@ class Copying:
         rules = Rules.of(self._directory.settings.retention)
         keeper = Keeper(self._directory, partial(remove_if, self.shared))
         try:
-            expired = keeper.expire_all(one.id, proved, rules, place, self.progress)
+            expired = keeper.expire_all(one.id, proved, rules, place)
         except HeldError as error:
             report.problems.append(f"Payloads stay: {error}")
             report.held.append(one.id)

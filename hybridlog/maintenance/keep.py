@@ -3,11 +3,18 @@
 A pass reads manifests only; a step is a change of a manifest, then an unlink. A recorder makes
 passes for its own recording and for those that nobody records; what others record is left to
 them.
+
+What is left of the messages of a log are files of rows: the fields as in tables, times, sizes and
+hashes (`columns/rows_file.py`). They are written once and listed beside the log, as soon as it is
+sealed where a store has rules, else before it goes. Then one change of the manifest says that logs
+are gone; from then on their rows are the truth. A crash on either side of a change leaves files
+that the next change of the store removes.
 """
 
 from __future__ import annotations
 
 import os
+import secrets
 import shutil
 import threading
 import time
@@ -15,12 +22,12 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
 from functools import partial
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
-from msgspec import Struct, field
-from msgspec.structs import replace
+from msgspec import Struct, field, structs
 
-from hybridlog.maintenance.expiry import expire, let_go, may_go
+from hybridlog.maintenance.edit import remove_if
 from hybridlog.maintenance.retention import (
     Held,
     Plan,
@@ -28,10 +35,11 @@ from hybridlog.maintenance.retention import (
     Step,
     held_of,
     is_pinned,
+    may_go,
     plan,
 )
 from hybridlog.maintenance.sizes import disk_bytes
-from hybridlog.wording import listed
+from hybridlog.record.losses import Cause
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import LOCK_WAIT_S
 from hybridlog_storage.errors import (
@@ -39,17 +47,31 @@ from hybridlog_storage.errors import (
     DiskFullError,
     HeldError,
     HybridlogError,
+    SegmentError,
     StoreError,
     TopicError,
 )
+from hybridlog_storage.manifest import (
+    LetGo,
+    Loss,
+    Manifest,
+    digest_of,
+    replace,
+    with_rows,
+    with_totals,
+)
+from hybridlog_storage.segments.segment_reader import SegmentReader, front
 from hybridlog_storage.settings import read_settings
 
 if TYPE_CHECKING:
-    from hybridlog.maintenance.report import Progress
-    from hybridlog_storage.disk.directory import StoreDirectory
-    from hybridlog_storage.manifest import Manifest
+    from pathlib import Path
 
-    Remove = Callable[[str, Callable[[Manifest], None]], None]
+    from hybridlog.opened import OpenStore
+    from hybridlog_storage.disk.directory import StoreDirectory
+    from hybridlog_storage.manifest import File
+
+    Check = Callable[[Manifest], None]
+    Remove = Callable[[str, Check], None]
 
 _WHOLE: Final = -1
 _MAX_ROUNDS: Final = 20  # rows take room, too: then a little more has to go
@@ -58,6 +80,13 @@ SPARE: Final = "spare"
 _SPARE_BYTES: Final = 8 << 20
 _SPARE_SHARE: Final = 64  # of the quota, at most
 _LEAST_SPARE: Final = 1 << 16
+NO_ROOM: Final = "deleted without its fields: the disk was full"
+"""Reason in the loss ledger."""
+TOO_LATE: Final = "deleted without its fields: they were not written in time"
+"""Another one, of a recording in progress."""
+_WAIT_S: Final = 5.0  # for rows that a follower writes
+_POLL_S: Final = 0.1
+_PIECE: Final = 1 << 20
 
 
 class KeepReport(Struct):
@@ -96,15 +125,10 @@ class Keeper:
         judged: Callable[[], Collection[int] | None] = lambda: None,
         is_wanted: Callable[[], bool] = lambda: True,
     ) -> None:
-        self._directory = directory
-        self._remove = remove
-        self._own = own
-        self._window = window
-        self._judged = judged
-        self._is_wanted = is_wanted
+        self._directory, self._remove, self._own = directory, remove, own
+        self._window, self._judged, self._is_wanted = window, judged, is_wanted
         # Segments that this pass could not change, by recording; -1 for all of it.
         self._failed: defaultdict[str, set[int]] = defaultdict(set)
-        self._unproven: set[str] = set()  # names of recordings whose manifests were made again
 
     def plan(self, rules: Rules) -> Plan:
         """The deletions that are due now."""
@@ -112,15 +136,9 @@ class Keeper:
         used, free = self._directory.listed_bytes(), None
         if used is None:
             used, free = disk_bytes(path), shutil.disk_usage(path).free
-        found = plan(self._held(now), rules, used=used, free=free, now=now)
-        if self._unproven:
-            found.warnings.append(
-                f"{listed(sorted(self._unproven))}: left alone, since a manifest that was lost "
-                "and made again may lack pins."
-            )
-        return found
+        return plan(self._held(now), rules, used=used, free=free, now=now)
 
-    def keep(self, rules: Rules, progress: Progress | None = None) -> KeepReport:
+    def keep(self, rules: Rules) -> KeepReport:
         """Let go what has to go; HeldError while another process makes a pass."""
         with self._alone():
             if not self._directory.is_remote:
@@ -133,19 +151,14 @@ class Keeper:
                 for step in planned.steps:
                     if not self._is_wanted():
                         return found
-                    self._do(step, rules, found, {"progress": progress})
+                    self._do(step, rules, found)
                 planned = self.plan(rules)
                 found.plan.steps += planned.steps
             found.plan.warnings, found.plan.is_short = planned.warnings, planned.is_short
         return found
 
     def expire_all(
-        self,
-        recording: str,
-        logs: Collection[int],
-        rules: Rules,
-        copy: str,
-        progress: Progress | None = None,
+        self, recording: str, logs: Collection[int], rules: Rules, copy: str
     ) -> KeepReport:
         """Let payloads of a recording go, but for what pins and a `never_tag` of rules keep.
 
@@ -156,8 +169,7 @@ class Keeper:
             own = [now.logs[number] for number in sorted(logs) if number in now.logs]
             going = [log.number for log in own if may_go(log) and not is_pinned(log, now)]
             if going and not rules.is_never(now.tags):
-                step = Step(now.name, recording, tuple(going), (), 0, "")
-                self._do(step, rules, found, {"copy": copy, "progress": progress})
+                self._do(Step(now.name, recording, tuple(going), 0, ""), rules, found, copy)
         return found
 
     @contextmanager
@@ -171,28 +183,29 @@ class Keeper:
             yield
 
     def _held(self, now: int) -> Iterator[tuple[Manifest, list[Held]]]:
-        """Recordings and what they hold; nothing of those that are unproven, or held by others."""
-        self._unproven.clear()
+        """Recordings and what they hold; nothing of those that others hold.
+
+        Nor of those whose manifests were made again, which may lack pins.
+        """
         for manifest in self._directory.manifests.each(self._directory.ids()):
             failed, logs = self._failed[manifest.id], list[Held]()
-            if manifest.status == "unproven":
-                self._unproven.add(manifest.name)
-            elif manifest.id == self._own:
+            if manifest.id == self._own:
                 logs = held_of(manifest, now, self._window, self._judged(), failed)
-            elif _WHOLE not in failed and (
-                manifest.is_ended or not self._directory.is_recorded(manifest.id)
+            elif (
+                manifest.status != "unproven"
+                and _WHOLE not in failed
+                and (manifest.is_ended or not self._directory.is_recorded(manifest.id))
             ):
                 logs = held_of(manifest, now, stays=failed)
             yield manifest, logs
 
-    def _do(self, step: Step, rules: Rules, found: KeepReport, how: Mapping[str, Any]) -> None:
+    def _do(self, step: Step, rules: Rules, found: KeepReport, copy: str = "") -> None:
         """Do a step, with the room of the spare file if there is no other; reports in `found`."""
         if self._failed[step.id] and not step.segments:
             return  # planned before it was known: the next plan judges again
-        check = partial(_check, step, rules)
         while True:
             try:
-                freed, damaged = self._done(step, check, how)
+                freed, damaged = self._done(step, partial(_check, step, rules), copy)
                 break
             except DiskFullError:
                 if not use_spare(self._directory):
@@ -208,44 +221,53 @@ class Keeper:
             found.problems.append(f"{reason}. {cure}")
             self._failed[step.id].add(number)
 
-    def _done(
-        self, step: Step, check: Callable[[Manifest], None], how: Mapping[str, Any]
-    ) -> tuple[int, dict[int, str]]:
+    def _done(self, step: Step, check: Check, copy: str) -> tuple[int, dict[int, str]]:
         if not step.segments and not step.groups:
             self._remove(step.id, check)
             return step.bytes, {}
-        is_own = step.id == self._own
-        lock = self._directory.writing(step.id, step.recording, wait_s=LOCK_WAIT_S)
+        directory, is_own = self._directory, step.id == self._own
+        lock = directory.writing(step.id, step.recording, wait_s=LOCK_WAIT_S)
         with nullcontext() if is_own else lock:
             if step.groups:
-                let_go(
-                    self._directory,
-                    step.id,
-                    lambda now: [file for file in now.files if file.group in step.groups],
-                    check,
-                )
+
+                def choose(now: Manifest) -> list[File]:
+                    return [file for file in now.files if file.group in step.groups]
+
+                let_go(directory, step.id, choose, check)
                 return step.bytes, {}
             return expire(
-                self._directory,
-                step.id,
-                step.segments,
-                check=check,
-                make_room=partial(use_spare, self._directory),
-                is_followed=is_own,
-                **how,
+                directory, step.id, step.segments, copy=copy, check=check, is_followed=is_own
             )
+
+
+def keep(shared: OpenStore, rules: Mapping[str, Any] | None, *, dry_run: bool) -> KeepReport:
+    """Make a pass over an open store, or only plan it, as of `Store.keep`."""
+    directory = shared.directory
+    wanted = Rules.of(directory.settings.retention if rules is None else rules)
+    wanted.check_place(is_remote=directory.is_remote)
+    keeper = Keeper(directory, partial(remove_if, shared))
+    if dry_run:
+        return KeepReport(keeper.plan(wanted))
+    shared.change()
+    directory.check_changes()
+    try:
+        return keeper.keep(wanted)
+    finally:
+        shared.invalidate()
 
 
 def _check(step: Step, rules: Rules, manifest: Manifest) -> None:
     """Raise ChangedError if what goes in a step must stay by now."""
     if rules.is_never(manifest.tags):
         raise ChangedError(f"{step.recording}: a tag that keeps it was set meanwhile.")
-    if manifest.pins and not step.segments and not step.groups:
+    is_whole = not step.segments and not step.groups
+    going = [
+        log
+        for number, log in manifest.logs.items()
+        if number in step.segments or log.group in step.groups
+    ]
+    if (is_whole and manifest.pins) or any(is_pinned(log, manifest) for log in going):
         raise ChangedError(f"{step.recording}: a pin was set meanwhile.")
-    for number, log in manifest.logs.items():
-        goes = number in step.segments or log.group in step.groups
-        if goes and is_pinned(log, manifest):
-            raise ChangedError(f"{step.recording}: a pin was set meanwhile.")
 
 
 def _lay_spare(directory: StoreDirectory, rules: Rules) -> None:
@@ -270,6 +292,257 @@ def use_spare(directory: StoreDirectory) -> bool:
     except OSError:
         return False
     return True
+
+
+def expire(
+    directory: StoreDirectory,
+    recording: str,
+    segments: Collection[int],
+    *,
+    copy: str = "",
+    check: Check = lambda _: None,
+    is_followed: bool = False,
+) -> tuple[int, dict[int, str]]:
+    """Delete sealed logs of a recording that this process has locked; it may record it, too.
+
+    Returns the bytes of the disk that became free, what was written subtracted, and why logs could
+    not go, by number.
+
+    Logs that are gone already are left out, and those without messages. Those that have their rows
+    go first. Where there is no room for rows, a log goes without, and is lost. Damaged ones without
+    rows stay. `copy` is the address of a store with a proven copy of them. `check`, part of each
+    change of the manifest, raises if they must stay by now. After an error, logs that are listed
+    are as before. Where another process writes the rows (`is_followed`), they are waited for, and a
+    log that gets none goes without.
+    """
+    if is_followed:
+        _have_rows(directory, recording, segments, check)
+    manifest, damaged = directory.manifests.read(recording), dict[int, str]()
+    logs = [manifest.logs.get(number) for number in sorted(segments)]
+    going = [log for log in logs if log is not None and log.is_here and log.parts]
+    freed = sum(log.bytes for log in going)
+    if manifest.is_ended:
+        _remove_arrays(directory, manifest, going)
+    path, rows = directory.recording(recording), manifest.rows
+    ready = [log for log in going if _are_whole(path, rows.get(log.number, ()))]
+    _go(directory, recording, {log.number: () for log in ready}, check, copy)
+    for log in (one for one in going if one not in ready):
+        while True:
+            try:
+                made = _rows_of(directory, recording, log)
+                _go(directory, recording, {log.number: made}, check, copy)
+                freed -= sum(one.bytes for one in made)
+            except DiskFullError:
+                if use_spare(directory):
+                    continue
+                let_go(directory, recording, partial(_lines_of, log.number), check, NO_ROOM)
+            except SegmentError as error:
+                damaged[log.number] = str(error)
+                freed -= log.bytes
+            break
+    return freed, damaged
+
+
+def _have_rows(
+    directory: StoreDirectory, recording: str, segments: Collection[int], check: Check
+) -> None:
+    """Wait until a follower has written the rows of logs; delete those that have none in time."""
+
+    def lacking(now: Manifest) -> list[File]:
+        found = [now.logs[number] for number in segments if number in now.logs]
+        return [log for log in found if may_go(log) and log.number not in now.rows]
+
+    until = time.monotonic() + _WAIT_S
+    while lacking(directory.manifests.read(recording)):
+        if time.monotonic() >= until:
+            let_go(directory, recording, lacking, check, TOO_LATE)
+            return
+        use_spare(directory)
+        time.sleep(_POLL_S)
+
+
+def _are_whole(path: Path, rows: Collection[File]) -> bool:
+    """True if files of rows are as listed: they will be all that is left."""
+    try:
+        for line in rows:
+            with os.fdopen(files.open_file(path / line.name, os.O_RDONLY), "rb") as file:
+                digest = digest_of(iter(partial(file.read, _PIECE), b""))
+            if digest != line.digest:
+                return False
+    except OSError:
+        return False
+    return bool(rows)
+
+
+def _lines_of(number: int, manifest: Manifest) -> list[File]:
+    return [file for file in manifest.files if file.number == number]
+
+
+def make_rows(
+    directory: StoreDirectory, recording: str, is_wanted: Callable[[], bool] = lambda: True
+) -> None:
+    """Write the rows that logs which may go lack, as long as they are wanted.
+
+    This process has locked the recording, or records it.
+    """
+    manifest = directory.manifests.read(recording)
+    for log in manifest.logs.values():
+        if may_go(log) and log.number not in manifest.rows and is_wanted():
+            with suppress(SegmentError, ChangedError):  # it stays, or is gone
+                _list(directory, recording, {log.number: _rows_of(directory, recording, log)})
+
+
+def _rows_of(directory: StoreDirectory, recording: str, log: File) -> tuple[File, ...]:
+    """Write the rows of a log, in place of what a crash has left of such."""
+    path, left = directory.recording(recording), directory.listing(recording).rows
+    directory.drop(recording, [name for name in left if int(name[:6]) == log.number])
+    version = secrets.randbelow(9 * 10**8) + 1 if directory.is_remote else 0  # others do it, too
+    with directory.adding(recording) as into:
+        return write_rows(path, replace(log, gone="expired"), into, version=version)
+
+
+def _go(
+    directory: StoreDirectory,
+    recording: str,
+    made: Mapping[int, tuple[File, ...]],
+    check: Check,
+    copy: str,
+) -> None:
+    """Let the manifest say that logs are gone, then delete them."""
+    if made:
+        now = _list(directory, recording, made, check, {"gone": "expired", "copy": copy})
+        directory.drop(recording, [now.logs[number].name for number in made])
+
+
+def _list(
+    directory: StoreDirectory,
+    recording: str,
+    made: Mapping[int, tuple[File, ...]],
+    check: Check = lambda _: None,
+    values: Mapping[str, str] = MappingProxyType({}),
+) -> Manifest:
+    """List the rows of logs, where there are new ones, and change the lines of the logs."""
+    manifests = directory.manifests
+
+    def how(now: Manifest) -> Manifest:
+        check(now)
+        if not all(number in now.logs and now.logs[number].is_here for number in made):
+            raise ChangedError(f"{now.name}: a segment has gone meanwhile.")
+        for number, rows in made.items():
+            line = replace(now.logs[number], **values)
+            now = with_rows(now, line, rows or now.rows[number])
+        return now
+
+    try:
+        return manifests.change(recording, how)
+    finally:
+        with suppress(StoreError):  # or else the next change does it
+            listed = {file.name for file in manifests.read(recording).files}
+            new = [file.name for rows in made.values() for file in rows]
+            directory.drop(recording, [name for name in new if name not in listed])
+
+
+def let_go(
+    directory: StoreDirectory,
+    recording: str,
+    choose: Callable[[Manifest], Collection[File]],
+    check: Check = lambda _: None,
+    lost: str = "",
+) -> Manifest:
+    """Delete files of a recording with all that is left; returns the manifest without them.
+
+    This process has locked the recording, or records it. `choose` is called with each manifest that
+    is changed; `check` raises if they must stay. `lost` is the reason of a row of the loss ledger,
+    empty if they are counted as let go.
+    """
+    gone: list[File] = []
+
+    def how(now: Manifest) -> Manifest:
+        check(now)
+        gone[:] = choose(now)
+        if not gone:
+            return now
+        parts = [(n, part) for f in gone if f.kind == "log" for n, part in f.parts.items()]
+        before = now.let_go or LetGo(0, 0)
+        count = 0 if lost else sum(part.messages for _, part in parts)
+        rows = [
+            Loss(Cause.SEGMENT, now.channels[n].topic, part.messages, part.first, part.last, lost)
+            for n, part in (parts if lost else ())
+        ]
+        return with_totals(
+            replace(
+                now,
+                files=tuple(file for file in now.files if file not in gone),
+                losses=(*now.losses, *rows),
+                let_go=LetGo(
+                    before.messages + count, max(before.through, *(f.number for f in gone))
+                ),
+            )
+        )
+
+    changed = directory.manifests.change(recording, how)
+    directory.drop(recording, [file.name for file in gone])
+    return changed
+
+
+def write_rows(recording: Path, line: File, into: Path, *, version: int = 0) -> tuple[File, ...]:
+    """Write what is left of the messages of a log; returns the lines of the files in order.
+
+    The line of the log says that it is gone; the folder of its recording stays as it is. A damaged
+    log, or one with what rows cannot keep, raises SegmentError.
+    """
+    from hybridlog.columns.rows_file import RowsWriter
+
+    with SegmentReader(recording / line.name, line.number) as reader:
+        summary = reader.summary()
+        if summary.size != line.bytes:
+            raise SegmentError(f"{reader.path} is not the segment that the manifest lists")
+        if summary.attachments:
+            raise SegmentError(f"{reader.path} has attachments of its log")
+        begin = front(reader, summary, line)
+        writer = RowsWriter(into, line, summary.channels, begin, version)
+        reader.fetch(summary.chunks)
+        try:
+            for place in summary.chunks:
+                writer.add(reader.read_chunk(place))
+            return writer.close()
+        except BaseException as error:
+            writer.discard()
+            files.remove(into, writer.names)
+            if isinstance(error, OSError):
+                raise files.explain(error, into, "writing rows to") from error
+            raise
+
+
+def without_payloads(
+    path: Path, manifest: Manifest, logs: Collection[int], into: Path, copy: str
+) -> Manifest:
+    """Write the rows of logs of a recording, which are to be copied later, and its new manifest.
+
+    The recording's directory stays as it is; so do first logs of groups, and those without
+    messages. Names of the new files are drawn, so that no other file of the recording gets them.
+    `copy` is the address of the store that has the logs.
+    """
+    version = secrets.randbelow(8 * 10**8) + 10**8
+    for number in sorted(logs):
+        log = manifest.logs[number]
+        if may_go(log):
+            line = replace(log, gone="elsewhere", copy=copy)
+            manifest = with_rows(manifest, line, write_rows(path, line, into, version=version))
+    return manifest
+
+
+def _remove_arrays(directory: StoreDirectory, manifest: Manifest, going: Collection[File]) -> None:
+    """Remove tables with arrays that expire; they are made again without these."""
+    from hybridlog.columns.folders import TableFolders
+    from hybridlog.columns.layout import type_prefix
+
+    channels = (manifest.channels[number] for log in going for number in log.parts)
+    gone = {one.topic: one.type for one in channels if one.topic in directory.settings.arrays}
+    if gone:
+        folders = TableFolders(directory.path, manifest.id, manifest.created)
+        with suppress(OSError):
+            folders.add({}, {*gone}, {type_prefix(kind) for kind in gone.values()})
 
 
 LOOK_S: Final = 5.0
@@ -384,7 +657,7 @@ class RetentionThread:
             if self._over.is_set() or self._rules.is_empty:
                 return 0
             try:
-                done = self._keeper.keep(replace(self._rules, is_urgent=is_urgent))
+                done = self._keeper.keep(structs.replace(self._rules, is_urgent=is_urgent))
             except HeldError:
                 self._over.wait(_TICK_S)
                 return None

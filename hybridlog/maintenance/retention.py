@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any, Final
 from msgspec import Struct, field
 from msgspec.structs import replace
 
-from hybridlog.maintenance.expiry import may_go
 from hybridlog.query.choice import Choice
 from hybridlog.query.times import parse_duration
 from hybridlog.query.topics import matcher
@@ -31,7 +30,6 @@ _SEGMENTS_OF_QUOTA: Final = 50
 _TOPICS_FROM: Final = 0.8  # share of the quota above which payloads of topics go
 _SEGMENTS_FROM: Final = 0.9  # share above which whole segments go
 _TOPICS_BELOW: Final = 1.25  # times the free space below which segments go
-_WARN_FROM: Final = 0.8  # share of the quota that pins may take without a warning
 _CLOCK_WAS_SET: Final = 1_577_836_800 * 10**9  # 2020: earlier times are of a clock not set yet
 _LEAST_BARE: Final = 1 << 16  # bytes that a size without a unit has; less is meant as gigabytes
 _KEYS: Final = ("quota", "min-free", "max-age", "topic", "never-tag", "fields-age")
@@ -256,6 +254,11 @@ def _touches(pin: Pin, topic: str, part: Part) -> bool:
     )
 
 
+def may_go(log: File) -> bool:
+    """True if a log may go before its recording: the first one of a group stays."""
+    return log.is_here and log.number != log.group and bool(log.parts)
+
+
 class Step(Struct, frozen=True):
     """A deletion; without segments and groups, that of the whole recording, with its fields.
 
@@ -263,7 +266,6 @@ class Step(Struct, frozen=True):
         recording: Name of the recording.
         id: Its id.
         segments: Numbers of the segments whose payloads go.
-        topics: Their topics, if a rule for them lets the segments go; else empty.
         bytes: About the bytes that become free.
         reason: Why it goes.
         groups: Numbers of the groups of segments that go with their fields.
@@ -272,7 +274,6 @@ class Step(Struct, frozen=True):
     recording: str
     id: str
     segments: tuple[int, ...]
-    topics: tuple[str, ...]
     bytes: int
     reason: str
     groups: tuple[int, ...] = ()
@@ -285,8 +286,6 @@ class Plan(Struct):
         used_bytes: Bytes that the store takes.
         free_bytes: Free bytes of the disk; None in a bucket.
         steps: The deletions.
-        pinned_bytes: Bytes of segments that pins and tags keep.
-        pins: Number of pins.
         warnings: What the rules cannot reach, in sentences.
         is_short: Whether more should go than may go.
     """
@@ -294,8 +293,6 @@ class Plan(Struct):
     used_bytes: int
     free_bytes: int | None
     steps: list[Step] = field(default_factory=list)
-    pinned_bytes: int = 0
-    pins: int = 0
     warnings: list[str] = field(default_factory=list)
     is_short: bool = False
 
@@ -326,11 +323,7 @@ class _Planning:
 
     def made(self, held: Iterable[tuple[Manifest, Sequence[Held]]]) -> Plan:
         for manifest, logs in held:
-            is_never = self._rules.is_never(manifest.tags)
-            pinned = [one.size for one in logs if one.may_go and (is_never or one.is_pinned)]
-            self._plan.pinned_bytes += sum(pinned)
-            self._plan.pins += len(manifest.pins)
-            if not is_never and not self._goes_whole(manifest, logs):
+            if not self._rules.is_never(manifest.tags) and not self._goes_whole(manifest, logs):
                 self._left += logs
         self._left.sort(key=lambda one: one.order)
         self._by_age()
@@ -349,7 +342,7 @@ class _Planning:
         if not logs or not self._is_older(logs[-1].written, parse_duration(age)):
             return False
         size = sum(one.size + one.row_bytes for one in logs)
-        self._step(Step(manifest.name, manifest.id, (), (), size, f"fields older than {age}"))
+        self._step(Step(manifest.name, manifest.id, (), size, f"fields older than {age}"))
         return True
 
     def _by_age(self) -> None:
@@ -396,7 +389,7 @@ class _Planning:
             left = {group for one, group in groups if one == recording} - own.keys()
             is_whole = manifest.is_ended and not left and not manifest.pins
             numbers = () if is_whole else tuple(own)
-            self._step(Step(manifest.name, recording, (), (), sum(own.values()), reason, numbers))
+            self._step(Step(manifest.name, recording, (), sum(own.values()), reason, numbers))
 
     def _short(self, share: float, times: float) -> float:
         """Bytes that are to become free for a share of the quota, and for the free space."""
@@ -445,32 +438,24 @@ class _Planning:
                 need -= one.size
                 chosen.setdefault(one.recording.id, []).append(one)
         for recording, logs in chosen.items():
-            topics = set[str]().union(*(one.topics for one in logs if rule is not None))
             numbers = tuple(sorted(one.log.number for one in logs))
             size, name = sum(one.size for one in logs), logs[0].recording.name
-            self._step(Step(name, recording, numbers, tuple(sorted(topics)), size, reason))
+            self._step(Step(name, recording, numbers, size, reason))
 
     def _step(self, step: Step) -> None:
         self._freed += step.bytes
         self._plan.steps.append(step)
 
     def _warn(self) -> None:
-        plan_, quota = self._plan, self._rules.quota
-        pinned = plan_.pinned_bytes
-        if quota is not None and 0 < pinned >= _WARN_FROM * quota:
-            plan_.warnings.append(
-                f"What is pinned takes {size(pinned)} of the quota of {size(quota)}: "
-                "`hybridlog keep --pins` lists the pins, --unpin removes one."
-            )
         if self._shared:
-            plan_.warnings.append(
+            self._plan.warnings.append(
                 f"{listed(sorted(self._shared))}: older files have other topics, too, and go with "
                 "these. A rule for a topic holds for files that are opened after it."
             )
         left = self._short(_SEGMENTS_FROM, 1.0)
-        plan_.is_short = left > 0
+        self._plan.is_short = left > 0
         if left > 0:
-            plan_.warnings.append(
+            self._plan.warnings.append(
                 f"{size(left)} more should be deleted, but all that is left must stay: it is "
                 "pinned, being recorded, or tables and the index."
             )

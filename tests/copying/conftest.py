@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 import hybridlog as hl
-from hybridlog.maintenance import expiry
+from hybridlog.maintenance import keep
 from hybridlog.record.losses import losses_of
 from hybridlog_storage.errors import PayloadError
 from hybridlog_storage.segments.segment_writer import SegmentSettings
@@ -50,7 +50,7 @@ def expire(store: hl.Store, name: str, which: Sequence[int] = ()) -> None:
     with directory.writing(recording):
         logs = directory.manifests.read(recording).logs
         numbers = [number for number, log in logs.items() if log.number != log.group]
-        expiry.expire(directory, recording, [numbers[n] for n in which] or numbers)
+        keep.expire(directory, recording, [numbers[n] for n in which] or numbers)
     store.shared.catch_up()
 
 

@@ -19,7 +19,7 @@ from hybridlog.cli.answers import write_answer
 from hybridlog.formats import OUTPUTS
 from hybridlog.formats.answer import Answer
 from hybridlog.formats.mp4 import _Video
-from hybridlog.maintenance.expiry import expire
+from hybridlog.maintenance.keep import expire
 from hybridlog.message import Message
 from hybridlog.query.query import Query
 from hybridlog_storage.errors import DiskFullError, PayloadError, TimeError, UsageError

@@ -14,7 +14,7 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.entries import put_entry
-from hybridlog.maintenance import expiry
+from hybridlog.maintenance import keep
 from hybridlog_storage.errors import IncompleteError
 from hybridlog_storage.manifest import replace, with_rows
 from tests import places
@@ -39,7 +39,7 @@ def expire(store: Path, groups: Collection[int]) -> Counter[str]:
         firsts = sorted({log.group for log in logs})
         numbers = [log.number for log in logs if firsts.index(log.group) in groups]
         with opened.directory.writing(entry.id, entry.name):
-            expiry.expire(opened.directory, entry.id, numbers)
+            keep.expire(opened.directory, entry.id, numbers)
             put_entry(opened.directory, opened.catalog, entry.id)
     gone = Counter[str]()
     for log in logs:

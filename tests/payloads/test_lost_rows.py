@@ -11,7 +11,7 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.entries import topic_of
-from hybridlog.maintenance import expiry
+from hybridlog.maintenance import keep
 from hybridlog.maintenance.copying import CopyOptions
 from hybridlog.maintenance.verify import RESTORE
 from hybridlog_storage.errors import IncompleteError, StoreError
@@ -164,7 +164,7 @@ def test_rows_that_are_lost_before_their_log_goes_are_made_again(
     with hl.open(copy, mongo="none") as store:
         (entry,) = store.recordings()
         with store.directory.writing(entry.id, entry.name):
-            expiry.make_rows(store.directory, entry.id)
+            keep.make_rows(store.directory, entry.id)
     file, _ = rows_of(copy, 1)
     fault(recording_of(copy) / file.name)
     logs = {path: path.read_bytes() for path in recording_of(copy).glob("*.mcap")}

@@ -14,7 +14,7 @@ import pytest
 import hybridlog as hl
 from hybridlog.follow.follower import Follower
 from hybridlog.live import LiveOptions
-from hybridlog.maintenance.expiry import expire
+from hybridlog.maintenance.keep import expire
 from hybridlog.maintenance.opening import StoreFiles
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import UsageError

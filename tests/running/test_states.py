@@ -15,7 +15,7 @@ from mcap.records import Metadata
 
 import hybridlog as hl
 from hybridlog.attachments import extras_of
-from hybridlog.maintenance.expiry import expire
+from hybridlog.maintenance.keep import expire
 from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.segments.segment_format import Attachment, FilePart
 from tests import places

@@ -11,7 +11,6 @@ from msgspec.structs import asdict
 from hybridlog.cli import output
 from hybridlog.cli.binder import command, option
 from hybridlog.cli.options import AsJson, Choosing, InStore, Quiet, query_of
-from hybridlog.cli.output import Bar
 from hybridlog.cli.render import Column, time_of
 from hybridlog.wording import listed
 from hybridlog_storage.errors import UsageError
@@ -185,17 +184,15 @@ def _keep(store: Store, rules: dict[str, Any], given: _Given) -> int:
         store.directory.check_changes()
         store.directory.change_settings(retention=rules)
     dry_run = given.dry_run
-    with Bar("keep") as bar:
-        found = store.keep(wanted, dry_run=dry_run, progress=bar.part)
+    found = store.keep(wanted, dry_run=dry_run)
     plan = found.plan
     if not given.as_json:
         given.show(plan.steps, _STEPS)
     size = output.size
     freed = sum(step.bytes for step in plan.steps) if dry_run else found.freed_bytes
-    pinned = f", {size(plan.pinned_bytes)} pinned" if plan.pinned_bytes else ""
     free = "" if plan.free_bytes is None else f", {size(plan.free_bytes)} free"
     what = "would become free" if dry_run else "freed"
-    told = f"{size(plan.used_bytes)} used{pinned}{free}: {size(freed)} {what}"
+    told = f"{size(plan.used_bytes)} used{free}: {size(freed)} {what}"
     output.tell({**asdict(found), "dry_run": dry_run}, [told])
     topics = store.topics()
     useless = (
@@ -210,7 +207,6 @@ def _keep(store: Store, rules: dict[str, Any], given: _Given) -> int:
 _STEPS = [
     Column("recording", lambda step: step.recording),
     Column("segments", lambda step: listed(map(str, step.segments)) if step.segments else "all"),
-    Column("topics", lambda step: listed(step.topics) if step.topics else "all"),
     Column("about", lambda step: output.size(step.bytes), "right"),
     Column("reason", lambda step: step.reason),
 ]
