@@ -10,7 +10,7 @@ import numpy as np
 from hybridlog.query.times import format_time
 from hybridlog.schema.column import Records
 from hybridlog.schema.states import State
-from hybridlog_storage.errors import HybridlogError, PayloadError
+from hybridlog_storage.errors import PayloadError
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
 PictureOf: TypeAlias = "Callable[[Message], NDArray[Any]]"
 """Decodes a frame of video."""
-
-_MAX_SHOWN = 64 << 20  # bytes of a payload that a thumbnail is made of
 
 
 class Message:
@@ -76,33 +74,6 @@ class Message:
 
     def __repr__(self) -> str:
         return f"<Message {self.topic} {format_time(self.log_time_ns)} {len(self._view)} B>"
-
-    def _repr_html_(self) -> str:
-        """The message in a notebook: its fields, and a thumbnail of an image."""
-        from hybridlog.drawing.notebook import message_html
-
-        title = f"{self.topic} {self.type} {format_time(self.log_time_ns)}, {len(self._view)} B"
-        problem = ""
-        fields: dict[str, object] | None = None
-        try:
-            fields = self.fields
-        except HybridlogError as error:
-            problem = str(error)
-        return message_html(title, fields, problem, self._thumbnail())
-
-    def _thumbnail(self) -> bytes:
-        """A small PNG of an image; empty for other messages, and for what cannot be shown."""
-        from hybridlog.arrays.message_arrays import IMAGES
-        from hybridlog.drawing.pixels import thumbnail
-
-        is_image = self.type.replace("/msg/", "/") in IMAGES
-        if not is_image or len(self._view) > _MAX_SHOWN or self.is_reduced:
-            return b""
-        try:
-            message = self.decode()
-            return thumbnail(self.to_numpy(), getattr(message, "encoding", "rgb8"))
-        except HybridlogError:
-            return b""
 
     @property
     def raw(self) -> bytes:

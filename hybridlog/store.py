@@ -17,13 +17,12 @@ from typing import (
 
 from hybridlog.index.access import again_if_lost
 from hybridlog.index.of_store import Index
-from hybridlog.maintenance.report import Progress, RepairReport
 from hybridlog.opened import OpenStore
 from hybridlog.query.choice import Choice
 from hybridlog.query.query import Query, narrowed, of_now
 from hybridlog.query.question import Question
 from hybridlog.session import Asked, Session
-from hybridlog_storage.catalog import Catalog, RecordingEntry
+from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.errors import (
     StoreError,
@@ -31,12 +30,7 @@ from hybridlog_storage.errors import (
     UsageError,
 )
 from hybridlog_storage.remote import address_of, directory_of
-from hybridlog_storage.settings import (
-    EMBEDDED,
-    NONE,
-    cache_mb_from_environment,
-    checked_cache_mb,
-)
+from hybridlog_storage.settings import EMBEDDED, NONE
 
 if TYPE_CHECKING:
     from hybridlog.across.align import Aligned
@@ -49,6 +43,7 @@ if TYPE_CHECKING:
     from hybridlog.live import LiveOptions, LiveRecording
     from hybridlog.maintenance.copying import CopyOptions, CopyReport
     from hybridlog.maintenance.keep import KeepReport
+    from hybridlog.maintenance.report import Progress
     from hybridlog.maintenance.sizes import Sizes
     from hybridlog.maintenance.verify import Verification
     from hybridlog.query.answers.statistics import TopicCheck
@@ -60,7 +55,6 @@ if TYPE_CHECKING:
     from hybridlog.sql.engine import SqlAnswer, SqlEngine
     from hybridlog.tf.tree import FrameTree
     from hybridlog.training.lerobot import LerobotOptions, LerobotReport
-    from hybridlog_storage.mongo.database import Database
     from hybridlog_storage.summary import RecordingSummary
 
 DEFAULT_STORE = "hybridlog-store"
@@ -80,7 +74,6 @@ def open_store(
     create: bool = False,
     require_database: bool = False,
     progress: Progress | None = None,
-    cache_mb: int | None = None,
     read_only: bool = False,
 ) -> Store:
     """Open a store.
@@ -95,25 +88,18 @@ def open_store(
         create: Create the store if it does not exist.
         require_database: Connect to MongoDB now, and fail if it is unavailable.
         progress: Called while an index is brought up to date.
-        cache_mb: Size of the embedded MongoDB's cache in MiB, from 256; by default
-            `HYBRIDLOG_CACHE_SIZE`, the store's own setting, or 256. A new store keeps it. A
-            MongoDB that runs already is not changed.
         read_only: Never write a byte in it, as if this user could not, and use no MongoDB; so it
             is where `HYBRIDLOG_READ_ONLY` is set.
 
     Raises:
-        UsageError: MongoDB does not accept such a cache.
         StoreError: It is not a store, or has another format.
         DatabaseError: MongoDB does not answer and `require_database` is set.
     """
     where = store_path(path)
     read_only = read_only or "HYBRIDLOG_READ_ONLY" in os.environ
     wanted = NONE if read_only else mongo or os.environ.get("HYBRIDLOG_MONGO_URI")
-    cache = None
     if address_of(where) is not None:
         directory = directory_of(where, read_only=read_only)
-        if create:
-            directory.check_writable()
         if mongo not in {None, NONE}:
             raise UsageError("A store in a bucket is asked without MongoDB: leave out --mongo.")
         if require_database:
@@ -122,16 +108,13 @@ def open_store(
                 "in a store on a disk."
             )
         wanted = NONE
+    elif create:
+        directory = StoreDirectory.create(where, mongo=None if mongo == EMBEDDED else mongo)
     else:
-        if cache_mb is not None:
-            checked_cache_mb(cache_mb, "The size of the cache")
-        cache = cache_mb or cache_mb_from_environment()
-        directory = (
-            _created(where, mongo, cache_mb)
-            if create
-            else StoreDirectory(where, read_only=read_only)
-        )
-    shared = OpenStore(directory, wanted, progress, cache)
+        directory = StoreDirectory(where, read_only=read_only)
+    if create:
+        directory.check_writable()
+    shared = OpenStore(directory, wanted, progress)
     try:
         shared.now()
         if require_database:
@@ -140,14 +123,6 @@ def open_store(
         shared.close()
         raise
     return Store(shared)
-
-
-def _created(where: Path, mongo: str | None, cache_mb: int | None) -> StoreDirectory:
-    """The directory of a store, made if there is none."""
-    own = None if mongo in {None, EMBEDDED} else mongo
-    directory = StoreDirectory.create(where, mongo=own, cache_mb=cache_mb)
-    directory.check_writable()
-    return directory
 
 
 def _session_of(address: str | Path, mongo: str | None) -> Session:
@@ -162,7 +137,6 @@ class Store:
 
     Attributes:
         directory: The store's directory.
-        catalog: Recordings, channels, chunks and schemas, in a local file.
     """
 
     def __init__(self, shared: OpenStore) -> None:
@@ -202,45 +176,12 @@ class Store:
     def __repr__(self) -> str:
         return f"<Store {self.directory.place}>"
 
-    def _repr_html_(self) -> str:
-        """The store in a notebook: its latest recordings."""
-        from hybridlog.drawing.notebook import recordings_html
-
-        summaries = self.summaries()
-        title = f"Store {self.directory.place}: {len(summaries)} recordings"
-        return recordings_html(title, summaries)
-
-    @property
-    def catalog(self) -> Catalog:
-        """Recordings, channels, chunks and schemas, in a local file."""
-        self.shared.check_process()
-        return self.shared.catalog
-
-    @property
-    def repairs(self) -> RepairReport:
-        """Repairs made by this process, and what cannot be read."""
-        return self.shared.repairs
-
     # The index.
-
-    @property
-    def database(self) -> Database | None:
-        """The index, connected on first access; None if MongoDB is unavailable."""
-        return self.shared.index.reached()
 
     @property
     def index(self) -> Index:
         """Makes and describes the index."""
         return Index(self.shared)
-
-    def connect(self) -> Database:
-        """Connect to the index and bring it up to date.
-
-        Raises:
-            DatabaseError: MongoDB does not answer.
-            StoreError: It holds the index of another store, or this store is a copy.
-        """
-        return self._itself().index.connect()
 
     def refresh(self) -> None:
         """Drop the snapshot of the catalog, to see new recordings of other processes."""
@@ -318,10 +259,6 @@ class Store:
 
         chosen = choose(self.session, choice)
         return Recordings(self._source, chosen.summaries, chosen.problem)
-
-    def summaries(self) -> list[RecordingSummary]:
-        """All recordings in short, oldest first; much faster than `recordings`."""
-        return list(self.session.look().summaries)
 
     def entry(self, recording: str) -> RecordingEntry:
         """The entry of a recording, by its id or its name.
@@ -695,7 +632,7 @@ class Store:
             report = record(
                 source,
                 self.directory,
-                self.catalog,
+                self.shared.catalog,
                 FollowerProcess.of_short(shared, "Recording a log", LOOK_S),
                 shared.newest,
                 fingerprint=fingerprint(source.files),
@@ -721,7 +658,7 @@ class Store:
         shared.recover()
         return LiveRecording(
             self.directory,
-            self.catalog,
+            self.shared.catalog,
             FollowerProcess.of_short(shared, "Starting a recording", follow_interval_s(chosen)),
             name,
             chosen,
@@ -745,7 +682,9 @@ class Store:
         """
         from hybridlog.maintenance.sizes import sizes_of
 
-        return sizes_of(self.directory, self.session.select(recordings), self.database)
+        return sizes_of(
+            self.directory, self.session.select(recordings), self.shared.index.reached()
+        )
 
     @again_if_lost
     def verify(
@@ -772,7 +711,7 @@ class Store:
 
     def _with_unreadable(self, names: Names) -> dict[str, str]:
         """Names of recordings by id, where ids of those that cannot be read stand for them."""
-        unreadable, names = self.repairs.unreadable, [*names]
+        unreadable, names = self.shared.repairs.unreadable, [*names]
         found = {one: one for one in names if isinstance(one, str) and one in unreadable}
         others = self.session.select(
             [one for one in names if not isinstance(one, str) or one not in found]
@@ -958,14 +897,10 @@ class Store:
         """
         from hybridlog.maintenance.copying import Copying, CopyOptions, CopyReport
 
-        wanted, found = options or CopyOptions(), report or CopyReport()
-        if wanted.only_fields and wanted.then_expire:
-            raise UsageError("Payloads that are not copied cannot expire: drop one of the two.")
-        if wanted.then_expire:
-            self.directory.check_writable()
-        shared = self._to_change()
-        shared.catch_up()
-        Copying(shared, to, wanted, found, progress).run(self._chosen(recordings))
+        found = report or CopyReport()
+        copying = Copying(self.shared, to, options or CopyOptions(), found, progress)
+        self._to_change()
+        copying.run(self._chosen(recordings))
         return found
 
     def _chosen(self, recordings: Choice | Names | None) -> Sequence[RecordingSummary]:
@@ -974,10 +909,10 @@ class Store:
             chosen = self.choose(recordings)
             return (chosen if recordings.is_everything else chosen.check()).summaries
         if recordings is None:
-            return self.summaries()
+            return self.session.look().summaries
         names = [recordings] if isinstance(recordings, str) else recordings
         ids = {entry.id for entry in self.session.select(names)}
-        return [one for one in self.summaries() if one.id in ids]
+        return [one for one in self.session.look().summaries if one.id in ids]
 
 
 def _query_of(store: Store, name: str | Query, fields: dict[str, Sequence[str]]) -> Query:

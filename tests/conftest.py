@@ -20,7 +20,6 @@ collect_ignore = [
     "benchmarks",
     "formats/test_contributing.py",
     "test_docs.py",
-    "test_notebook.py",
     "test_packaging.py",
 ]
 """Tests that run when they are named, and as steps of `.ci/run`."""

@@ -321,5 +321,5 @@ def test_a_name_means_its_recording_while_others_are_recorded(tmp_path: Path) ->
                     assert [entry.name for entry in found] == [label]
             assert not run("tag", "ended-2", "owner=anna", store=tmp_path / "store").err
             with hl.open(tmp_path / "store") as other:
-                tagged = [one.name for one in other.summaries() if one.tags]
+                tagged = [one.name for one in other.session.look().summaries if one.tags]
             assert tagged == ["ended-2"]

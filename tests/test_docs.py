@@ -575,7 +575,7 @@ def documented_classes() -> list[type]:
     from hybridlog.index.of_store import Index
     from hybridlog.live import LiveOptions, LiveRecording
     from hybridlog.maintenance.copying import CopyOptions, CopyReport
-    from hybridlog.maintenance.report import Repaired, RepairReport
+    from hybridlog.maintenance.report import Repaired
     from hybridlog.maintenance.verify import Finding, Verification
     from hybridlog.query.answers.completeness import Completeness
     from hybridlog.query.answers.statistics import FieldStatistics
@@ -588,7 +588,7 @@ def documented_classes() -> list[type]:
     from hybridlog_storage.segments.segment_writer import SegmentSettings
 
     results = [Counters, RecordReport, RecordingEntry, ChannelEntry, ChannelStats]
-    checks = [Index, Verification, Finding, Repaired, RepairReport, CopyReport, LerobotReport]
+    checks = [Index, Verification, Finding, Repaired, CopyReport, LerobotReport]
     answers = [Completeness, FieldStatistics, Aligned, Synced, Intervals, Interval]
     asking = [Recordings, hl.Query, hl.Message, StoredAttachment, *answers]
     recording = [hl.RecordOptions, CopyOptions, LiveOptions, LiveRecording, SegmentSettings]

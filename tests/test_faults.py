@@ -124,7 +124,7 @@ def test_a_killed_recorder_loses_nothing_that_was_written(
         name = f"torn{number}"
         kill_recorder(path, robot, name, moment)
         with hl.open(path, require_database=True) as store:
-            if name not in {one.name for one in store.summaries()}:
+            if name not in {one.name for one in store.session.look().summaries}:
                 assert moment <= 1
                 continue
             entry = store.entry(name)
@@ -210,11 +210,11 @@ def test_a_disk_that_fills_up(path: Path, robot: Path) -> None:
     with hl.open(path, require_database=True) as store:
         assert store.recordings() == []
         assert places.folders(path) == []
-        assert store.database is not None
-        for name in store.database.list_collections():
+        assert store.shared.index.reached() is not None
+        for name in store.shared.index.reached().list_collections():
             if name not in {"hybridlog.store", "hybridlog.topics"}:
-                assert store.database.count(name, {}) == 0, name
-        assert not store.repairs.recovered
+                assert store.shared.index.reached().count(name, {}) == 0, name
+        assert not store.shared.repairs.recovered
     run("record", robot, "--quiet", store=path, code=0)
 
 
@@ -259,9 +259,9 @@ def test_an_altered_index_is_mended_by_a_rebuild(
     topics = store.topics()
     whole = [store.topic(topic).where(EVERYTHING).count() for topic in topics]
     uri = EmbeddedMongod(store.directory.mongod).start()
-    assert store.database is not None
+    assert store.shared.index.reached() is not None
     with pymongo.MongoClient[dict[str, Any]](uri) as client:
-        alter(client[store.database.name])
+        alter(client[store.shared.index.reached().name])
     store.index.rebuild()
     assert [store.topic(topic).where(EVERYTHING).count() for topic in topics] == whole
     assert sum(count for *_, count in contents(store.shared)) == sum(whole)
@@ -396,6 +396,6 @@ def test_mongod_killed_and_not_to_be_had_again(
         assert content(fetched(store, "robot")) == whole
     monkeypatch.delenv("HYBRIDLOG_MONGOD")
     with hl.open(place, require_database=True) as store:
-        assert store.repairs.indexed["robot"] > 0
+        assert store.shared.repairs.indexed["robot"] > 0
         assert store.verify().findings == []
         assert store.topic("/imu/data").where("_meta.t > 0").count() == len(spoken["/imu/data"])

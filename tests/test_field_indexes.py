@@ -47,9 +47,9 @@ def how(store: hl.Store, collection: str, where: dict[str, object]) -> set[str]:
     """The steps by which MongoDB finds documents."""
     import pymongo
 
-    assert store.database is not None
-    with pymongo.MongoClient[dict[str, Any]](store.database.address) as client:
-        told = client[store.database.name][collection].find(where).explain()
+    assert store.shared.index.reached() is not None
+    with pymongo.MongoClient[dict[str, Any]](store.shared.index.reached().address) as client:
+        told = client[store.shared.index.reached().name][collection].find(where).explain()
     return stages(told["queryPlanner"]["winningPlan"])
 
 

@@ -131,14 +131,14 @@ def test_the_running_question_is_answered(store: Path) -> None:
         asked = opened.topic(IMU).where(EVERYTHING)
         assert asked.count() + asked.counters.unindexed == want[0]
         assert [m.seq for m in opened.topic(SCAN).where(WHERE)] == scans
-        opened.connect()
+        opened.shared.index.connect()
         assert documents(opened) == want
-        assert len(opened.repairs.damage) == 1
-        assert sorted(opened.repairs.indexed) == ["one", "two"]
+        assert len(opened.shared.repairs.damage) == 1
+        assert sorted(opened.shared.repairs.indexed) == ["one", "two"]
     ended(store)
     with hl.open(store) as opened:
         assert documents(opened) == want
-        assert not opened.repairs.damage
+        assert not opened.shared.repairs.damage
 
 
 def test_a_foreign_mongodb_is_only_told_about(store: Path, tmp_path: Path) -> None:
@@ -204,8 +204,8 @@ def test_work_goes_on_though_its_mongod_was_killed(
         WORK[work](opened, template.parent / "one.bag")
         assert not opened.verify().findings
         assert opened.shared.index.unavailable is None
-        assert not opened.repairs.damage
-        assert not opened.repairs.indexed
+        assert not opened.shared.repairs.damage
+        assert not opened.shared.repairs.indexed
         if work == "ask":
             assert documents(opened) == want
             assert imu.where(WHERE).count() > 0
@@ -276,9 +276,9 @@ def test_an_index_deleted_under_an_open_store(store: Path, name: str) -> None:
         else:
             ended(store)  # its keeper notices
         assert sum(documents(opened)) == 0
-        opened.connect()
+        opened.shared.index.connect()
         assert documents(opened) == want
-        assert sorted(opened.repairs.indexed) == ["one", "two"]
+        assert sorted(opened.shared.repairs.indexed) == ["one", "two"]
 
 
 # --- handles, roles ---
@@ -304,7 +304,7 @@ def test_a_user_who_may_only_read_can_ask_everything(
     writes, reads = reader
     with hl.open(store, mongo=reads) as empty:
         assert empty.topic(IMU).where(WHERE).count() > 0
-        assert empty.connect() is not None
+        assert empty.shared.index.connect() is not None
         lacking = empty.topic(IMU).where(EVERYTHING)
         assert (lacking.count(), lacking.counters.unindexed) == (0, empty.topic(IMU).count())
     with hl.open(store, mongo=writes, require_database=True) as opened:
@@ -399,7 +399,7 @@ def test_a_catalog_lost_while_the_store_is_open(store: Path, way: str) -> None:
     ):
         imu = opened.topic(IMU)
         want = imu.count(), imu.where(WHERE).count(), sum(1 for _ in imu)
-        one, two = opened.summaries()
+        one, two = opened.session.look().summaries
         if way == "locked":
             db.execute("BEGIN EXCLUSIVE")
         else:

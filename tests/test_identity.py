@@ -88,7 +88,7 @@ def test_a_folder_with_another_name_is_told_and_left_alone(place: Path) -> None:
     folder.rename(folder.with_name("other"))
     with hl.open(place, mongo=NOWHERE) as store:
         assert [one.status for one in store.recordings()] == ["damaged"]
-        assert "give the folder this name again" in store.repairs.unreadable["other"]
+        assert "give the folder this name again" in store.shared.repairs.unreadable["other"]
         findings = {one.recording: one.problem for one in store.verify().findings}
         assert folder.name in findings["other"]
         assert findings.keys() == {"one", "other"}
@@ -105,7 +105,7 @@ def test_a_copy_inside_a_store_is_told_and_left_alone(place: Path, mongo: str, c
     for _ in range(2):
         with hl.open(place, mongo=mongo) as store:
             assert [r.name for r in store.recordings()] == ["one"]
-            assert "if it is a copy" in store.repairs.unreadable[copy]
+            assert "if it is a copy" in store.shared.repairs.unreadable[copy]
             assert answers(store) == right()
             (finding,) = store.verify().findings
             assert (finding.recording, "if it is a copy" in finding.problem) == (copy, True)
@@ -118,7 +118,7 @@ def test_a_copy_inside_a_store_is_told_and_left_alone(place: Path, mongo: str, c
                 store.remove(copy)
     shutil.rmtree(path)
     with hl.open(place, mongo=mongo) as store:
-        assert not store.repairs.unreadable
+        assert not store.shared.repairs.unreadable
         assert answers(store) == right()
         assert not store.verify().findings
 
@@ -155,7 +155,7 @@ def test_a_copied_store_with_a_uri_removes_nothing(place: Path, mongo: str, tmp_
     places.manifest_of(places.root(copy) / one.name).unlink()
     for _ in range(2):
         with hl.open(copy, mongo=mongo, require_database=True) as store:
-            assert not store.repairs.removed
+            assert not store.shared.repairs.removed
     assert documents(mongo) == before
     with hl.open(place, mongo=mongo) as store:
         assert answers(store) == right()
@@ -173,8 +173,8 @@ def test_a_moved_store_takes_its_index_along(place: Path, mongo: str, tmp_path: 
     moved = place.rename(tmp_path / "moved")
     with hl.open(moved, mongo=mongo) as store:
         assert answers(store) == right()
-        store.connect()
-        assert not store.repairs.indexed
+        store.shared.index.connect()
+        assert not store.shared.repairs.indexed
         store.index.rebuild()
         with Database.connect(mongo) as database:
             owner = IndexState(database).owner()
@@ -224,8 +224,8 @@ def test_intervals_of_a_label_and_of_nobody(place: Path, mongo: str) -> None:
 def test_a_removal_that_was_announced_is_finished(place: Path, mongo: str) -> None:
     places.change_in(places.folder(place, "one"), lambda now: replace(now, status="removed"))
     with hl.open(place, mongo=mongo) as store:
-        store.connect()
-        assert "one" in store.repairs.removed
+        store.shared.index.connect()
+        assert "one" in store.shared.repairs.removed
         assert not store.recordings()
         assert places.folders(place) == []
         database = store.shared.index.database_for("This")
@@ -420,7 +420,7 @@ def test_names_are_unique_when_recordings_begin_and_are_renamed(tmp_path: Path) 
     assert names == ["my run-1", "my run-1-2", "my run-1-3", "my run-1-4"]
     with hl.open(path, mongo=NOWHERE) as store:
         before = places.folders(path)
-        ids = {one.name: one.id for one in store.summaries()}
+        ids = {one.name: one.id for one in store.session.look().summaries}
         assert ids.keys() == {*names}
         assert all(re.fullmatch(r"[0-9]{8}-my-run-1-[0-9a-f]{16}", one) for one in ids.values())
         assert store.edit(ids["my run-1-3"], name="my run/1").name == "my run-1-3"

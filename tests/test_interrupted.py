@@ -214,7 +214,7 @@ def test_an_index_whose_making_was_interrupted_is_completed(
     store: hl.Store, monkeypatch: pytest.MonkeyPatch, method: str, chosen: Sequence[str] | None
 ) -> None:
     with store:
-        store.connect()
+        store.shared.index.connect()
         real, left = getattr(Database, method), [1]
 
         def failing(*words: Any, **options: Any) -> object:
@@ -228,7 +228,7 @@ def test_an_index_whose_making_was_interrupted_is_completed(
             store.index.rebuild(chosen)
         assert left[0] < 0
     with hl.open(store.directory.path, mongo=store.shared.index.wanted) as again:
-        again.connect()
+        again.shared.index.connect()
         assert again.all_topics().where(EVERYTHING).count() == again.all_topics().count()
         assert not again.verify().findings
 
@@ -248,12 +248,12 @@ def test_a_recording_that_is_removed_is_no_unreadable_one(store: hl.Store, calls
     store.refresh()
     with store:
         assert {entry.name for entry in store.recordings()} == {"b"}
-        assert not store.repairs.unreadable
+        assert not store.shared.repairs.unreadable
 
 
 def test_what_the_index_lacks_while_documents_go(store: hl.Store) -> None:
     with store:
-        database = store.connect()
+        database = store.shared.index.connect()
         query = store.topic("/number").where("n >= 0")
         whole, entry = query.count(), store.entry("a")
         with store.directory.writing(entry.id):  # as the other process does
@@ -271,8 +271,8 @@ def test_what_the_index_lacks_while_documents_go(store: hl.Store) -> None:
 
 def test_what_goes_while_it_is_counted_is_noticed(store: hl.Store, calls: Calls) -> None:
     with store, hl.open(store.directory.path, mongo=store.shared.index.wanted) as other:
-        store.connect()
-        other.connect()
+        store.shared.index.connect()
+        other.shared.index.connect()
         query = store.query(["/number"], ["a"]).where({"$expr": {"$gte": ["$n", 0]}})
         whole = query.count()
         asked: list[tuple[object, ...]] = calls(

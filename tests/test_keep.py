@@ -181,7 +181,7 @@ def test_a_recording_goes_with_its_fields(store: Path) -> None:
     keep("--unpin", row["id"], store=store)
     assert re.search(r"(?m)^run +all  ", keep("--fields-age", "0s", store=store).out)
     with hl.open(store, mongo="none") as opened:
-        assert opened.summaries() == []
+        assert opened.session.look().summaries == []
 
 
 def test_saved_rules_are_those_of_later_passes(store: Path) -> None:
@@ -411,7 +411,7 @@ def test_whole_groups_go_when_no_payloads_are_left(store: Path) -> None:
     answer("verify", "--repair", "--mongo", "none", store=store, code=None)
     with hl.open(store, mongo="none") as opened:
         assert opened.topic("/arm").count() == len(arms)
-        (known,) = opened.summaries()
+        (known,) = opened.session.look().summaries
         assert known == summary_of(opened.entry(known.id), known.look)
 
 

@@ -70,7 +70,7 @@ def test_a_question_about_a_recorder_that_died_writes_nothing(died: hl.Store, kn
     assert died.entry(LABEL).status == "unfinished"
     assert files_in(died) == before
     died.shared.recover()
-    assert died.repairs.recovered.keys() == {LABEL}
+    assert died.shared.repairs.recovered.keys() == {LABEL}
     assert died.entry(LABEL).status == "recovered"
     assert not died.shared._running
     assert not any(name.endswith(".mcap.open") for name in files_in(died))

@@ -484,12 +484,12 @@ class Machine(RuleBasedStateMachine):
 
     @rule()
     def lose_the_database(self) -> None:
-        assert self.store.database is not None
-        name = self.store.database.name
+        assert self.store.shared.index.reached() is not None
+        name = self.store.shared.index.reached().name
         with pymongo.MongoClient[dict[str, Any]](self.uri) as client:
             client.drop_database(name)
         self.open_again()
-        assert set(self.store.repairs.indexed) == {k.name for k in self.model.values()}
+        assert set(self.store.shared.repairs.indexed) == {k.name for k in self.model.values()}
         self.changed = True
 
     @rule(how=st.sampled_from(["deleted", "page", "byte"]), spot=st.integers(0, SPOTS))
@@ -509,7 +509,7 @@ class Machine(RuleBasedStateMachine):
         topics = tuple(sorted({t for k in self.model.values() for t in k.topics}))
         if topics:
             check(self.store, self.model, Asked(topics, None, "log", None, None, 1, reverse=False))
-        assert not self.store.repairs.removed
+        assert not self.store.shared.repairs.removed
         assert {f.place for f in self.store.verify().findings} == self.places()
         self.open_again()  # what only decoding tells is found out now, if a question missed it
         self.changed = True
@@ -599,9 +599,9 @@ class Machine(RuleBasedStateMachine):
         if not segments:
             return
         number, path = segments[segment % len(segments)]
-        assert self.store.database is not None
+        assert self.store.shared.index.reached() is not None
         with pymongo.MongoClient[dict[str, Any]](self.uri) as client:
-            index = Index(client[self.store.database.name], recording, number)
+            index = Index(client[self.store.shared.index.reached().name], recording, number)
             gone = {seq for part in index.arrivals().values() for seq in part}
         lost = Lost(path.read_bytes(), [m for m in known.messages if m.seq in gone])
         assert {m.seq for m in lost.messages} == gone
@@ -647,13 +647,13 @@ class Machine(RuleBasedStateMachine):
             known.marks.clear()
             known.messages = [m for m in known.messages if m.topic != MARKS]
         self.open_again()
-        assert self.store.repairs.unreadable.keys() == {recording}
+        assert self.store.shared.repairs.unreadable.keys() == {recording}
         assert recording not in {one.id for one in self.store.recordings()}
         cured = [one.place for one in self.store.verify(repair=True).repaired]
         assert "manifest" in cured
         self.open_again()
-        assert not self.store.repairs.unreadable
-        assert not self.store.repairs.removed
+        assert not self.store.shared.repairs.unreadable
+        assert not self.store.shared.repairs.removed
         self.take_kinds(recording)
         self.changed = True
 
@@ -683,9 +683,9 @@ class Machine(RuleBasedStateMachine):
         laid = Laid.out(content)
         cut = len(content) if part == "sealed" else laid.cut(spot, part)
         whole = [n for n, c in enumerate(laid.chunks) if c.arrivals_end <= cut]
-        assert self.store.database is not None
+        assert self.store.shared.index.reached() is not None
         with pymongo.MongoClient[dict[str, Any]](self.uri) as client:
-            index = Index(client[self.store.database.name], recording, number)
+            index = Index(client[self.store.shared.index.reached().name], recording, number)
             arrivals = index.arrivals()
             assert arrivals.keys() == set(range(len(laid.chunks)))
             # Log first, index second: the index is behind the file by some chunks, and of one
@@ -695,7 +695,7 @@ class Machine(RuleBasedStateMachine):
             index.fall_back_to(kept, half if has_half else [])
         others = {n: digest for n, digest in entry.digests.items() if n != str(number)}
         if others:
-            IndexState(self.store.database).put_segments(entry.key, others)
+            IndexState(self.store.shared.index.reached()).put_segments(entry.key, others)
         # The manifest lists the segment, or nothing from there on.
         change_manifest(path.parent, None if part == "sealed" else number, status="open")
         path.with_name(path.name + ".open").write_bytes(content[:cut])
@@ -705,7 +705,7 @@ class Machine(RuleBasedStateMachine):
         by_seq = {m.seq: m for m in known.messages}
         in_segment = {seq for part in arrivals.values() for seq in part}
         survivors = {seq: m for seq, m in by_seq.items() if seq not in in_segment}
-        assert list(self.store.repairs.recovered) == [known.name]
+        assert list(self.store.shared.repairs.recovered) == [known.name]
         survivors |= {seq: by_seq[seq] for n in whole for seq in arrivals[n]}
         if number == 0 and laid.described > cut and not known.marks:
             assert recording not in self.store.directory.ids()
@@ -804,7 +804,7 @@ def compare(entry: RecordingEntry, known: Recording) -> None:
 
 def mended(store: hl.Store) -> set[str]:
     """What the opening of a store had to put right, by the names of `RepairReport`."""
-    repairs = store.repairs
+    repairs = store.shared.repairs
     return {name for name in repairs.__struct_fields__ if getattr(repairs, name)}
 
 

@@ -84,8 +84,8 @@ def test_every_rebuild_keeps_it(store: hl.Store) -> None:
         assert again.verify().findings == []
         (entry,) = again.recordings()
         assert [c.topic for c in entry.channels if not c.is_indexed] == LEFT_OUT
-        database = again.connect()
-        assert bring_up_to_date(again.directory, again.catalog, entry, database) is None
+        database = again.shared.index.connect()
+        assert bring_up_to_date(again.directory, again.shared.catalog, entry, database) is None
 
 
 @pytest.mark.mongo("embedded")

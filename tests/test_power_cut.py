@@ -90,9 +90,9 @@ def look(found: Path, run: Run, sync: str) -> str:
     with closing(hl.open(found, mongo="none")) as store:
         store.shared.recover()
         entries = store.recordings()
-        if sync == "never" and store.repairs.unreadable:
+        if sync == "never" and store.shared.repairs.unreadable:
             return "unreadable"
-        assert not store.repairs.unreadable
+        assert not store.shared.repairs.unreadable
         if not entries:
             assert not run.is_closed
             assert sync != "chunk" or not run.written

@@ -75,7 +75,7 @@ DAMAGED = {
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
     with hl.open(tmp_path_factory.mktemp("real") / "store", create=True) as opened:
-        assert opened.database is not None, opened.shared.index.unavailable
+        assert opened.shared.index.reached() is not None, opened.shared.index.unavailable
         yield opened
 
 
@@ -142,14 +142,14 @@ def test_segments_pass_the_official_readers(store: hl.Store) -> None:
 
 def dump(store: hl.Store) -> dict[str, list[bytes]]:
     """Everything in the database, as bytes; but for how often it was begun anew."""
-    assert store.database is not None
+    assert store.shared.index.reached() is not None
     found = {
         name: sorted(
             document.raw
-            for raw in store.database.each([(name, {})], lambda _: {"$match": {}})
+            for raw in store.shared.index.reached().each([(name, {})], lambda _: {"$match": {}})
             for document in bson.decode_iter(raw, DEFAULT_RAW_BSON_OPTIONS)
         )
-        for name in store.database.list_collections()
+        for name in store.shared.index.reached().list_collections()
     }
     for name in ("hybridlog.recordings", "hybridlog.store"):
         documents = [bson.decode(document) for document in found[name]]

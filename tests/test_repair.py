@@ -173,7 +173,7 @@ def test_a_manifest_is_made_again_when_it_is_asked_for(
         (folder / MANIFEST_OLD).unlink()
     before = sorted(p.name for p in folder.iterdir())
     with closing(hl.open(store, mongo=NOWHERE)) as opened:
-        (reason,) = opened.repairs.unreadable.values()
+        (reason,) = opened.shared.repairs.unreadable.values()
         assert "`hybridlog verify --repair` makes it again" in reason
         assert [entry.name for entry in opened.recordings()] == ["two"]
         assert opened.topic("/n").count() == COUNT

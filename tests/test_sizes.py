@@ -46,7 +46,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
         store.record(write(folder / "two.mcap", 1200, 0))
         store.record(write(folder / "mute.mcap", 10, 0), no_index=matcher(["/a", "/b"]))
         # Until then MongoDB has no size of new collections.
-        store.connect()._client.admin.command("fsync")
+        store.shared.index.connect()._client.admin.command("fsync")
     return folder / "store"
 
 
@@ -75,14 +75,11 @@ def test_sums_are_those_of_the_files(store: hl.Store) -> None:
         assert row.table_bytes > 0
         assert row.messages == entry.messages
     for groups in (sizes.rows, sizes.by_recording(), sizes.by_topic()):
-        for name in ("messages", "payload_bytes", "segment_bytes", "table_bytes", "index_bytes"):
+        for name in ("messages", "payload_bytes", "segment_bytes", "table_bytes"):
             assert sum(getattr(row, name) for row in groups) == getattr(sizes.total, name)
         totals = [row.total_bytes for row in groups]
         assert totals == sorted(totals, reverse=True)
-        assert all(
-            row.total_bytes == row.segment_bytes + row.table_bytes + row.index_bytes
-            for row in groups
-        )
+        assert all(row.total_bytes == row.segment_bytes + row.table_bytes for row in groups)
     lists_all = (root / "tables/recordings.parquet").stat().st_size
     assert sizes.total.table_bytes == bytes_in(root / "tables") - lists_all
     assert {row.topic for row in sizes.by_topic()} == {"", "/a", "/b", "/large"}
@@ -109,39 +106,12 @@ def test_shares_of_chunks_and_tables(store: hl.Store) -> None:
     )  # both are rounded
 
 
-def test_shares_of_mongodb(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: Counter[str] = Counter()
-    answers = {
-        "a": (1600, 17_600),
-        "b": (2000, 4000),
-        "large": (30, 60),
-    }
-
-    def size(_: Database, collection: str) -> tuple[int, int]:
-        asked[collection] += 1
-        return answers[collection]
-
-    store.connect()
-    monkeypatch.setattr(Database, "size", size)
-    rows = by_name(store.sizes().rows)
-    assert asked == {"a": 1, "b": 1, "large": 1}
-    assert (rows["one", "/a"].index_bytes, rows["two", "/a"].index_bytes) == (4400, 13_200)
-    # Of 2000 documents of /b, the store knows 1600; the others belong to nobody.
-    shares = [rows["one", "/b"], rows["two", "/b"], rows["one", "/large"]]
-    assert [row.index_bytes for row in shares] == pytest.approx([800, 2400, 60], abs=1)
-    assert rows["mute", "/a"].index_bytes == rows["one", ""].index_bytes == 0
-    # A recording's share does not depend on what is asked beside it.
-    assert by_name(store.sizes(["one"]).rows)["one", "/a"].index_bytes == 4400
-    answers["a"] = 0, 16_000  # after a crash, the count may be too small
-    assert by_name(store.sizes(["one"]).rows)["one", "/a"].index_bytes == 16_000
-
-
 def test_the_cost_does_not_depend_on_the_number_of_messages(store: hl.Store, calls: Calls) -> None:
     made: Counter[str] = Counter()
     for method in ("size", "find", "each"):
         calls(Database, method, lambda *_, name=method, **__: made.update([name]))
     calls.fail(hl.Query, "__iter__", AssertionError)
-    store.connect()
+    store.shared.index.connect()
     found = []
     for recording in ("one", "two"):
         made.clear()
@@ -150,11 +120,10 @@ def test_the_cost_does_not_depend_on_the_number_of_messages(store: hl.Store, cal
     assert found == [{"size": 3}, {"size": 2}]
 
 
-def test_without_mongodb(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(type(store), "database", None)
-    sizes = store.sizes()
-    assert sizes.total.index_bytes is None
-    assert sizes.total.total_bytes == sizes.total.segment_bytes + sizes.total.table_bytes
+def test_bytes_of_mongodb(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Database, "size", lambda _, name: (9, {"a": 5, "b": 6, "large": 70}[name]))
+    store.shared.index.connect()
+    assert (store.sizes().index_bytes, store.sizes(["two"]).index_bytes) == (81, 11)
 
 
 def test_as_commands(place: Path) -> None:
@@ -166,7 +135,7 @@ def test_as_commands(place: Path) -> None:
     assert len(both["rows"]) == 8  # with `/large` of `two`, which has no messages
     assert both["total"]["messages"] == 830 + 2400
     lines = run("info", "--sizes", "topic", store=place).lines
-    headings = ["topic", "messages", "payload", "segments", "tables", "MongoDB", "total"]
+    headings = ["topic", "messages", "payload", "segments", "tables", "total"]
     assert lines[0].split() == headings
     assert {line.split()[0] for line in lines[1:-1]} == {"/large", "/a", "/b", "(no"}
     assert lines[-1].startswith("total")

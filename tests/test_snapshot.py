@@ -153,21 +153,24 @@ def test_a_store_without_a_catalog_is_listed_by_its_manifests(tmp_path: Path, ca
                     recording.write(source, b'{"n":1}', log_time=10**18 + time)
         store.mark("run 2", "start", "here")
         store.edit("run 3", note="seen")
-        wanted, entries = store.summaries(), [one.messages for one in store.recordings()]
+        wanted, entries = (
+            store.session.look().summaries,
+            [one.messages for one in store.recordings()],
+        )
     (path / CATALOG).unlink()
     opened, written = calls(SegmentReader, "_records"), calls(Cells, "write")
     with hl.open(path, mongo="none") as store:
-        assert store.summaries() == wanted
+        assert store.session.look().summaries == wanted
         assert (len(opened), len(written), store.topics()) == (0, 1, ["/hybridlog/marks", "/n"])
         assert [one.messages for one in store.recordings()] == entries
         assert not opened
-        store.catalog.summaries()
+        store.shared.catalog.summaries()
         read, listed = calls(DiskManifests, "_get"), calls(Cells, "each")
         for step in ({"note": "more"}, {"tag": {"k": "v"}}, {"name": "run 4"}, {"name": "z"}):
             store.edit("run 4", **step)
         assert (len(opened), [one for one in listed if isinstance(one[-1], str)]) == (0, [])
         assert len(read) <= 4 * 4
-        assert max(one.name for one in store.catalog.summaries()) == "z"
+        assert max(one.name for one in store.shared.catalog.summaries()) == "z"
 
 
 def test_a_recording_is_read_when_its_turn_comes(overlapping: Any, calls: Calls) -> None:
@@ -192,17 +195,34 @@ def test_topics_that_another_process_changes_meanwhile(
     with hl.open(path, mongo="none") as store, hl.open(path, mongo="none") as other:
         assert len(store.recordings()) == 2
         places.change_in(places.folder(path, "b"), lambda now: replace(now, tags={"seen": "yes"}))
-        ask = store.catalog.damaged
+        ask = store.shared.catalog.damaged
 
         def asked(recordings: Collection[str]) -> Any:
             monkeypatch.undo()
             other.mark("a", "start", "a topic of its own")
-            store.catalog.summaries()
+            store.shared.catalog.summaries()
             return ask(recordings)
 
-        monkeypatch.setattr(store.catalog, "damaged", asked)
+        monkeypatch.setattr(store.shared.catalog, "damaged", asked)
         store.shared.invalidate()
-        assert [one.topic_count for one in store.summaries()] == [1, 1]
+        assert [one.topic_count for one in store.session.look().summaries] == [1, 1]
         assert store.topic("/a").count() == store.topic("/b").count() == 1
         store.refresh()
-        assert [one.topic_count for one in store.summaries()] == [2, 1]
+        assert [one.topic_count for one in store.session.look().summaries] == [2, 1]
+
+
+def test_representations_are_short(tmp_path: Path) -> None:
+    many = Channel("/many", "json", None)
+    with hl.open(tmp_path / "store", create=True, mongo="none") as store:
+        with store.start("run") as recording:
+            recording.write(many, json.dumps({f"f{n}": n for n in range(50)}).encode(), log_time=9)
+        assert repr(store) == f"<Store {store.directory.path}>"
+        (entry,) = store.recordings()
+        assert repr(store.recordings()) == "<Recordings run>"
+        assert repr(entry) == "<Recording run; 1 channels, 1 messages>"
+        assert repr(entry.channels[0]) == "<Channel /many ; 1 messages>"
+        query = store.topic("/many").between("+0s", "end").where("f1 > 0").limit(3)
+        right = "<Query /many; recording run; between +0s and end; where f1 > 0; at most 3>"
+        assert repr(query) == right
+        wide = store.all_topics().where(" or ".join(f"f{n} > {n}" for n in range(40)))
+        assert len(repr(wide)) < 450

@@ -65,7 +65,7 @@ def test_what_only_mongodb_can_is_refused(stores: dict[str, hl.Store]) -> None:
         lambda: list(store.topic("scan").where({"range_max": 1})),
         store.index.list,
         store.index.rebuild,
-        store.connect,
+        store.shared.index.connect,
     ):
         with pytest.raises(DatabaseError, match=r"without MongoDB.*--mongo embedded"):
             ask()
@@ -112,10 +112,10 @@ def test_a_server_that_is_away_gets_its_index_later(bag: Path, tmp_path: Path) -
     assert "MongoDB is unavailable, so the index is made later: " in done.err
     assert "not in the index" in done.err
     with hl.open(tmp_path / "store") as store:
-        store.connect()
+        store.shared.index.connect()
         (entry,) = store.recordings()
         assert entry.is_decoded
-        assert store.repairs.indexed == {entry.name: entry.chunks}
+        assert store.shared.repairs.indexed == {entry.name: entry.chunks}
         assert store.verify().findings == []
 
 
@@ -160,11 +160,11 @@ def test_a_store_is_adopted_where_mongodb_is(
     with hl.open(path, mongo=EMBEDDED) as store, monkeypatch.context() as patch:
         Calls(patch)(SegmentReader, "read_chunk", killed)
         with pytest.raises(StoreError, match="killed"):
-            store.connect()
+            store.shared.index.connect()
     with hl.open(path, mongo=EMBEDDED) as store:
-        store.connect()
-        assert "one" not in store.repairs.indexed
-        assert 0 < store.repairs.indexed["two"] <= chunks["two"]
+        store.shared.index.connect()
+        assert "one" not in store.shared.repairs.indexed
+        assert 0 < store.shared.repairs.indexed["two"] <= chunks["two"]
         assert store.verify().findings == []
         assert store.topic("scan").where({"$expr": True}).count() == store.topic("scan").count()
 
@@ -178,7 +178,7 @@ def test_as_many_were_removed_as_recorded_without_mongodb(bag: Path, tmp_path: P
         store.remove("first")
         store.record(bag, name="second")
     with hl.open(path, mongo=EMBEDDED) as store:
-        database = store.connect()
+        database = store.shared.index.connect()
         second = store.entry("second")
         assert IndexState(database).of().keys() == {second.key} != {first.key}
         assert sum(count for *_, count in contents(store.shared)) == second.messages

@@ -155,7 +155,7 @@ def opened_store(
 
 def _repairs(store: Store, doing: str, *, verifies: bool) -> list[str]:
     """Sentences about repairs since the last call, what cannot be mended, and what is missing."""
-    repairs, found = store.repairs, list[str]()
+    repairs, found = store.shared.repairs, list[str]()
     for recording, segments in repairs.recovered.items():
         kept = counted(sum(one.messages for one in segments), "message")
         found.append(f"Recording {recording} was cut short by a crash: {kept} of it are recovered.")

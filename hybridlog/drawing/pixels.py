@@ -12,20 +12,11 @@ from isal import isal_zlib
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-SIDE: Final = 160
-"""Most pixels of a side of a thumbnail."""
 _LUMA: Final = {"yuv422_yuy2": 0, "yuyv": 0, "yuv422": 1, "uyvy": 1}
 """YUV 4:2:2: the channel with the brightness; the other one has a colour."""
 _PLANES: Final = {"nv12": ("uv", 2), "nv21": ("vu", 2), "nv24": ("uv", 1)}
 """Order of the colours, and pixels that share one, in each direction."""
 _BAYER: Final = "bayer_"
-
-
-def thumbnail(image: NDArray[Any], encoding: str = "rgb8") -> bytes:
-    """A picture of at most `SIDE` pixels a side, as PNG; empty for an empty image."""
-    shown = pixels(image, encoding)
-    step = max(1, -(-max(shown.shape[:2]) // SIDE))
-    return png(np.ascontiguousarray(shown[::step, ::step])) if shown.size else b""
 
 
 def pixels(image: NDArray[Any], encoding: str = "rgb8", *, deep: bool = False) -> NDArray[Any]:

@@ -55,7 +55,7 @@ def serve(handle: int) -> None:
         Path("/proc/self/oom_score_adj").write_text(_FIRST_TO_GO, "ascii")
     with Connection(handle) as control, suppress(EOFError, ConnectionError):
         task: Task = control.recv()
-        store = hybridlog.open(task.store, mongo=task.mongo, cache_mb=task.cache_mb)
+        store = hybridlog.open(task.store, mongo=task.mongo)
         beside = _Beside(control, task, store)
         threading.Thread(target=beside.hear, daemon=True).start()
         try:
@@ -200,7 +200,7 @@ class _Beside:
 
     def _derive(self) -> None:
         store, task = self._store, self._task
-        directory, catalog, index = store.directory, store.catalog, store.shared.index
+        directory, catalog, index = store.directory, store.shared.catalog, store.shared.index
         target = index.index_to_record("Recording", brings=False)
         why = index.unavailable
         if why is not None and not isinstance(why, WithoutMongoError):
@@ -228,7 +228,7 @@ class _Beside:
         """Seal what crashes have left of earlier recordings, and make their documents."""
         with hybridlog.open(self._task.store, mongo="none") as store:
             store.shared.recover()
-            for name, segments in store.repairs.recovered.items():
+            for name, segments in store.shared.repairs.recovered.items():
                 kept = sum(one.messages for one in segments)
                 self.tell("say", f"{name} was cut short by a crash: {kept} messages are recovered")
         self._store.shared.invalidate()

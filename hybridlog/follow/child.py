@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from multiprocessing.connection import Connection
 
     from hybridlog.index.indexing import IndexTarget
+    from hybridlog.opened import OpenStore
     from hybridlog.query.predicate.tree import Predicate
-    from hybridlog.shared import Shared
     from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.messages import Channel
@@ -61,7 +61,6 @@ class Task(NamedTuple):
 
     store: str
     mongo: str | None
-    cache_mb: int | None
     recording: str
     triggers: Sequence[str]
     interval_s: float | None
@@ -116,7 +115,7 @@ class FollowerProcess:
 
     @classmethod
     def of_short(
-        cls, shared: Shared, purpose: str, interval_s: float | None
+        cls, shared: OpenStore, purpose: str, interval_s: float | None
     ) -> Callable[[RecordingEntry], FollowerProcess]:
         """How to follow a recording that may be short; `purpose` is what needs the index."""
         index = shared.index
@@ -124,7 +123,7 @@ class FollowerProcess:
 
         def start(entry: RecordingEntry) -> FollowerProcess:
             place = shared.directory.address
-            task = Task(place, index.wanted, index.cache_mb, entry.id, (), interval_s)
+            task = Task(place, index.wanted, entry.id, (), interval_s)
             followed = cls(
                 shared.directory,
                 shared.catalog,

@@ -32,7 +32,7 @@ from hybridlog_storage.settings import (
 if TYPE_CHECKING:
     from hybridlog.index.indexing import IndexTarget
     from hybridlog.maintenance.report import Progress
-    from hybridlog.shared import Shared
+    from hybridlog.opened import OpenStore
     from hybridlog_storage.mongo.database import Database
     from hybridlog_storage.mongo.index_documents import Owner
     from hybridlog_storage.mongo.mongod import EmbeddedMongod
@@ -80,12 +80,9 @@ class IndexAccess:
     Args:
         mongo: URI of the MongoDB, `embedded`, or `none`; None for the one in the store's
             settings.
-        cache_mb: Size of the embedded MongoDB's cache in MiB, if this process starts it; None
-            for the one in the store's settings.
 
     Attributes:
         wanted: The URI that was asked for; None for the one in the store's settings.
-        cache_mb: As above.
         may_write: False if the user of MongoDB may only read.
         id: Id of the index; an index that replaces it has another one. Empty without a
             connection, and for an index without an id that this user may only read.
@@ -94,9 +91,8 @@ class IndexAccess:
 
     def __init__(
         self,
-        shared: Shared,
+        shared: OpenStore,
         mongo: str | None,
-        cache_mb: int | None,
         progress: Progress | None,
     ) -> None:
         self.wanted = mongo
@@ -105,7 +101,6 @@ class IndexAccess:
         self.unavailable: HybridlogError | None = None
         self._shared = shared
         self._directory = shared.directory
-        self.cache_mb = cache_mb
         self._progress = progress
         self._mongod: EmbeddedMongod | None = None
         self._database: Database | None = None
@@ -265,7 +260,7 @@ class IndexAccess:
         from hybridlog_storage.mongo.mongod import EmbeddedMongod
 
         if self._mongod is None:
-            cache_mb = self.cache_mb or _bounded_cache_mb(self._directory.settings.cache_mb)
+            cache_mb = _bounded_cache_mb(self._directory.settings.cache_mb)
             self._mongod = EmbeddedMongod(self._directory.mongod, cache_mb=cache_mb)
         try:
             uri = self._mongod.start()

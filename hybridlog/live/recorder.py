@@ -163,7 +163,7 @@ class Recorder:
         self._started = time.monotonic()
         self._looked = self._written_at = self._started
         self._written = 0
-        self._newest = max(store.summaries(), key=attrgetter("created"), default=None)
+        self._newest = max(store.session.look().summaries, key=attrgetter("created"), default=None)
         self._silence = SilenceWatch(options.contract, self._note_silence)
         self._settled_at = 0.0
         self._ended_at: int | None = None
@@ -174,7 +174,7 @@ class Recorder:
         self._sink: Sink = self._simulated or self
         self._target = LiveRecording(
             store.directory,
-            store.catalog,
+            store.shared.catalog,
             self._begin_to_follow,
             options.name,
             self._of_recording(),
@@ -217,7 +217,6 @@ class Recorder:
         task = Task(
             self._directory.address,
             index.wanted,
-            index.cache_mb,
             entry.id,
             [one.text for one in triggers],
             follow_interval_s(self._of_recording()),

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 _Key = TypeVar("_Key")
-_SUMMED = ("messages", "payload_bytes", "segment_bytes", "column_bytes", "table_bytes")
+_SUMMED = ("messages", "payload_bytes", "segment_bytes", "table_bytes")
 
 
 class Size(Struct, frozen=True):
@@ -41,10 +41,8 @@ class Size(Struct, frozen=True):
             messages, and those that are being written.
         messages: Number of messages.
         payload_bytes: Their payloads, uncompressed.
-        segment_bytes: Their share of the segments.
-        column_bytes: What is left of those that have expired.
+        segment_bytes: Their share of the segments, and what is left of those that have expired.
         table_bytes: Their share of the tables.
-        index_bytes: Their share of MongoDB, estimated; None if it is unavailable.
     """
 
     recording: str
@@ -52,14 +50,12 @@ class Size(Struct, frozen=True):
     messages: int = 0
     payload_bytes: int = 0
     segment_bytes: int = 0
-    column_bytes: int = 0
     table_bytes: int = 0
-    index_bytes: int | None = 0
 
     @property
     def total_bytes(self) -> int:
-        """Sum of segments, files of rows, tables and MongoDB."""
-        return self.segment_bytes + self.column_bytes + self.table_bytes + (self.index_bytes or 0)
+        """Sum of segments and tables."""
+        return self.segment_bytes + self.table_bytes
 
 
 class Sizes(Struct, frozen=True):
@@ -67,9 +63,11 @@ class Sizes(Struct, frozen=True):
 
     Attributes:
         rows: Each topic of each recording, largest first.
+        index_bytes: Bytes in MongoDB of the topics in all recordings; None if it is unavailable.
     """
 
     rows: list[Size]
+    index_bytes: int | None
 
     @property
     def total(self) -> Size:
@@ -97,30 +95,22 @@ def sizes_of(
     database: Database | None,
 ) -> Sizes:
     """Sizes of some recordings."""
-    index = None if database is None else _index_bytes(entries, database)
-    rows: list[Size] = []
+    rows, topics = list[Size](), set[str]()
     tables = table_bytes(directory.path, entries)
     for entry in entries:
         segments, messages = _segment_bytes(directory, entry), entry.messages_by_topic()
-        columns, payload = Counter[str](), Counter[str]()
-        for _, topic, size in entry.rows:
-            columns[topic] += size
+        payload = Counter[str]()
         for channel in entry.channels:
             payload[channel.topic] += channel.stats.payload_bytes
-        rows += [
-            Size(
-                entry.name,
-                topic,
-                messages[topic],
-                payload[topic],
-                segments[topic],
-                columns[topic],
-                tables.get((entry.id, topic), 0),
-                None if index is None else index.get((entry.id, topic), 0),
-            )
-            for topic in {"", *messages}
-        ]
-    return Sizes(_largest_first(rows))
+        for topic in {"", *messages}:
+            table = tables.get((entry.id, topic), 0)
+            size = Size(entry.name, topic, messages[topic], payload[topic], segments[topic], table)
+            rows.append(size)
+        topics.update(messages)
+    index = None
+    if database is not None:
+        index = sum(database.size(collection_of(topic))[1] for topic in topics)
+    return Sizes(_largest_first(rows), index)
 
 
 def disk_bytes(root: Path) -> int:
@@ -137,9 +127,8 @@ def disk_bytes(root: Path) -> int:
 
 
 def _sum(recording: str, topic: str, rows: Sequence[Size]) -> Size:
-    index = [row.index_bytes for row in rows if row.index_bytes is not None]
     sums = {name: sum(getattr(row, name) for row in rows) for name in _SUMMED}
-    return Size(recording, topic, **sums, index_bytes=sum(index) if index or not rows else None)
+    return Size(recording, topic, **sums)
 
 
 def _largest_first(rows: Iterable[Size]) -> list[Size]:
@@ -147,7 +136,7 @@ def _largest_first(rows: Iterable[Size]) -> list[Size]:
 
 
 def _segment_bytes(directory: StoreDirectory, entry: RecordingEntry) -> Counter[str]:
-    """Bytes of the segments by topic; the rest under the empty name."""
+    """Bytes of the segments and files of rows by topic; the rest under the empty name."""
     manifest, whole = directory.manifests.read(entry.id), Counter[str]()
     for number, log in manifest.logs.items():
         if log.is_here and log.parts and str(number) in entry.digests:
@@ -157,8 +146,9 @@ def _segment_bytes(directory: StoreDirectory, entry: RecordingEntry) -> Counter[
                     part.bytes + part.messages * MESSAGE_HEAD.itemsize
                 )
             whole.update(_divided(log.bytes, weights))
-    columns = sum(size for _, _, size in entry.rows)
-    whole[""] += max(0, entry.stored_bytes - columns - whole.total())
+    for _, topic, size in entry.rows:
+        whole[topic] += size
+    whole[""] += max(0, entry.stored_bytes - whole.total())
     return whole
 
 
@@ -183,23 +173,3 @@ def _divided(size: int, weights: Mapping[_Key, int]) -> Counter[_Key]:
     bounds = np.round(ends / ends[-1] * size).astype(np.int64)
     each = np.diff(bounds, prepend=0).tolist()
     return Counter({name: int(share) for name, share in zip(names, each, strict=True)})
-
-
-def _index_bytes(
-    entries: Sequence[RecordingEntry], database: Database
-) -> dict[tuple[str, str], int]:
-    """Bytes in MongoDB by recording and topic: the documents' share of their collection."""
-    documents: dict[str, Counter[tuple[str, str]]] = defaultdict(Counter)
-    for entry in entries:
-        for channel in entry.channels:
-            if channel.is_indexed and channel.stats.messages:
-                count = documents[collection_of(channel.topic)]
-                count[entry.id, channel.topic] += channel.stats.messages
-    found: dict[tuple[str, str], int] = {}
-    for collection, counts in documents.items():
-        number, size = database.size(collection)
-        # Of other recordings, there may be more. After a crash, the count may be too small.
-        others = max(0, number - counts.total())
-        shares = _divided(size, {**counts, ("", ""): others})
-        found.update({key: shares[key] for key in counts})
-    return found

@@ -105,12 +105,6 @@ class Query:
     def __repr__(self) -> str:
         return f"<Query {'; '.join(self._described().values())}>"
 
-    def _repr_html_(self) -> str:
-        """The question in a notebook; no message is read for it."""
-        from hybridlog.drawing.notebook import properties_html
-
-        return properties_html("Query", self._described())
-
     def _described(self) -> dict[str, str]:
         """The parts of the question in words."""
         question = self.question

@@ -143,24 +143,6 @@ def is_uri(mongo: str | None) -> TypeGuard[str]:
     return mongo not in {None, EMBEDDED, NONE}
 
 
-def checked_cache_mb(value: object, name: str) -> int:
-    """A size of the embedded MongoDB's cache in MiB."""
-    if type(value) is not int or not MIN_CACHE_MB <= value <= MAX_CACHE_MB:
-        raise UsageError(
-            f"{name} must be a number of MB from {MIN_CACHE_MB} to {MAX_CACHE_MB}, not {value!r}."
-        )
-    return value
-
-
-def cache_mb_from_environment() -> int | None:
-    """The size of the cache in HYBRIDLOG_CACHE_SIZE, in MiB; None without one."""
-    text = os.environ.get("HYBRIDLOG_CACHE_SIZE")
-    if not text:
-        return None
-    value = int(text) if re.fullmatch(r"[0-9]{1,12}", text) else text
-    return checked_cache_mb(value, "HYBRIDLOG_CACHE_SIZE")
-
-
 def without_password(uri: str) -> str:
     """A connection string with the user's name, but without secrets."""
     parts = _split(uri)

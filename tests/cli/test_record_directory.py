@@ -28,7 +28,7 @@ pytestmark = pytest.mark.mongo
 @pytest.fixture(scope="module")
 def opened(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
     with hl.open(tmp_path_factory.mktemp("directory") / "store", create=True) as opened:
-        opened.connect()
+        opened.shared.index.connect()
         yield opened
 
 
@@ -66,7 +66,7 @@ def record(store: Path, *words: object) -> tuple[int, str, str]:
 
 def counts(store: Path) -> dict[str, int]:
     with hl.open(store) as opened:
-        return {one.name: one.messages for one in opened.summaries()}
+        return {one.name: one.messages for one in opened.session.look().summaries}
 
 
 def test_all_logs_below_a_directory_are_recorded_once(top: Path, store: Path) -> None:

@@ -121,7 +121,7 @@ def _told(path: Path) -> Counter[State]:
         assert (told.expired, told.not_copied) == (found[State.EXPIRED], found[State.NOT_COPIED])
         sql = store.sql("select state, count(*) from cloud group by 1").to_arrow().to_pydict()
         assert dict(zip(*sql.values(), strict=True)) == found
-        (one,) = store.summaries()
+        (one,) = store.session.look().summaries
         assert one.span is not None
         span = one.span[0], one.span[1] + 1
         lane = lane_of(store.session, store.entry(one.id), "/cloud")

@@ -42,7 +42,7 @@ def copied(source: Path, to: dict[str, Any], *names: str, **options: Any) -> Cop
 
 def names_in(path: Path) -> list[str]:
     with hl.open(path, mongo="none") as store:
-        return sorted(one.name for one in store.summaries())
+        return sorted(one.name for one in store.session.look().summaries)
 
 
 def test_all_of_it_is_there(robots: Path, tmp_path: Path, to: To) -> None:
@@ -203,11 +203,11 @@ def test_what_a_stopped_copy_has_left_is_out_of_sight(robots: Path, tmp_path: Pa
         with pytest.raises(KeyboardInterrupt):
             copied(robots, to(lab), "recorded")
     with hl.open(lab, mongo="none") as store:
-        assert (store.summaries(), store.repairs.unreadable) == ([], {})
+        assert (store.session.look().summaries, store.shared.repairs.unreadable) == ([], {})
         assert not store.verify(repair=True).repaired
     report = copied(robots, to(lab), "recorded")
     assert (report.copied, report.bytes_copied) == (["recorded"], 0)
     recording = places.id_of(lab, "recorded")
     (lab / "manifests" / f"{recording}.json").unlink()
     with hl.open(lab, mongo="none") as store:
-        assert [*store.repairs.unreadable] == [recording]
+        assert [*store.shared.repairs.unreadable] == [recording]

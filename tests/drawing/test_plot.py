@@ -127,7 +127,7 @@ def test_without_matplotlib(drive: Drive, tmp_path: Path, calls: Calls) -> None:
 
 
 def test_parts_with_losses(drive: Drive) -> None:
-    (summary,) = (one for one in drive.store.summaries() if one.name == "drive")
+    (summary,) = (one for one in drive.store.session.look().summaries if one.name == "drive")
     entry: RecordingEntry = drive.store.entry(summary.id)
 
     def lost(*rows: tuple[int | None, int | None, int | None, Cause]) -> list[int]:

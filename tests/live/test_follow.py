@@ -30,7 +30,7 @@ def path(tmp_path: Path) -> Path:
 
 
 def wait_until_flushed(store: hl.Store, count: int) -> None:
-    wait_for(lambda: sum(one.messages for one in store.summaries()) >= count)
+    wait_for(lambda: sum(one.messages for one in store.session.look().summaries) >= count)
 
 
 class Followed:
@@ -108,7 +108,7 @@ def test_each_message_comes_once_whenever_it_was_sent(path: Path) -> None:
 
 def test_each_mark_comes_once_whatever_is_removed_meanwhile(path: Path) -> None:
     with talking(path) as (one, store), hl.open(path) as other:
-        (name,) = [found.name for found in store.summaries()]
+        (name,) = [found.name for found in store.session.look().summaries]
         for number in range(3):
             other.mark(name, "start", f"before {number}")
         following = store.topic("marks").follow()

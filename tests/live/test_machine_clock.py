@@ -145,7 +145,7 @@ def test_a_clock_that_is_set_between_recordings(plain: hl.Store) -> None:
     assert told == [("drive", 0, 0), ("drive-2", 1, 1), ("drive-3", 0, 0), ("drive-4", 1, 1)]
     assert robot.said[0].startswith("the clock of this machine says 1970-01-01T00:00:05Z, and rec")
     assert [m.decode()["tags"] for m in plain.topic(MARKS)] == [{"cause": "clock"}] * 2
-    assert len({one.id for one in plain.summaries()}) == 4
+    assert len({one.id for one in plain.session.look().summaries}) == 4
     assert plain.topic("/chatter").between("1970-01-01", "1970-01-02").count() == 6
     # A clock that is wrong while no robot is there leaves no recording.
     robot = Robot(plain, BOOT, RecorderOptions(name="drive", reserve_bytes=0), Absent())

@@ -268,10 +268,10 @@ def test_what_no_follower_derives_is_made_later(store: hl.Store) -> None:
     robot.speaker.say(text_channel(), text("x"), SECOND)
     (report,) = robot.recorder.stop()
     assert (report.entry.messages, report.indexed, report.failure) == (1, 0, None)
-    assert store.repairs.indexed == {}
-    store.connect()
+    assert store.shared.repairs.indexed == {}
+    store.shared.index.connect()
     assert len(documents_of(store, "/chatter")) == 1
-    assert store.repairs.indexed == {robot.recorder.name: 1}
+    assert store.shared.repairs.indexed == {robot.recorder.name: 1}
     store.directory.change_settings(retention={"quota": "1GB"})
     with pytest.raises(UsageError, match="leave out --no-derive"):
         Running(store, alone)

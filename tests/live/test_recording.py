@@ -178,7 +178,9 @@ def test_a_full_disk(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
     own = channel("/talk")
     recording = store.start("talk", flush_interval_s=0.1)
     recording.write(own, text(b"kept"))
-    wait_for(lambda: store.database and store.database.count("talk", {}) == 1)
+    wait_for(
+        lambda: store.shared.index.reached() and store.shared.index.reached().count("talk", {}) == 1
+    )
 
     def full(*_: object) -> int:
         raise OSError(28, "No space left on device")
@@ -352,7 +354,7 @@ def test_a_database_that_refuses_to_the_end_leaves_what_segments_know(
         report = recording.close()
         assert (report.indexed, report.missed) == (0, 6)
         assert isinstance(report.failure, DatabaseError)
-    assert store.database is None
+    assert store.shared.index.reached() is None
     assert [m.raw for m in store.topic("/talk")] == [text(b"kept")] * 5
     with pytest.raises(DatabaseError, match="refuses it"):
         store.topic("/talk").where({"data": "kept"}).count()

@@ -78,7 +78,7 @@ def test_documents_that_mongodb_loses_after_their_messages_expired_are_made_agai
             time.sleep(0.1)
 
         wait_for(lambda: say(10) or has_expired(folder))
-        database = store.connect()
+        database = store.shared.index.connect()
         # Or what is sent now would say anew what is there.
         wait_for(lambda: not recorder.look().lag)
         nothing = {"$set": {"segments": {}}}

@@ -166,7 +166,7 @@ def test_a_killed_recording_is_not_said_to_go_on(tmp_path: Path) -> None:
     with robot(path, "load", flush_s=0.05) as killed:
         killed.say("/a", "x")
         before = hl.open(path)
-        wait_for(lambda: before.summaries()[0].messages)
+        wait_for(lambda: before.session.look().summaries[0].messages)
         assert [entry.status for entry in before.recordings()] == ["open"]
         with pytest.raises(HeldError, match=f"is being written by process {killed.pid}"):
             before.remove("load")
@@ -174,7 +174,7 @@ def test_a_killed_recording_is_not_said_to_go_on(tmp_path: Path) -> None:
     with before:
         with hl.open(path) as after:
             for store in (before, after):
-                assert [one.status for one in store.summaries()] == ["unfinished"]
+                assert [one.status for one in store.session.look().summaries] == ["unfinished"]
                 assert [entry.status for entry in store.recordings()] == ["unfinished"]
                 assert store.recordings()[0].messages > 0
         with hl.open(path) as after:

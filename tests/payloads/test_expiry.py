@@ -40,7 +40,7 @@ def expire(store: Path, groups: Collection[int]) -> Counter[str]:
         numbers = [log.number for log in logs if firsts.index(log.group) in groups]
         with opened.directory.writing(entry.id, entry.name):
             keep.expire(opened.directory, entry.id, numbers)
-            put_entry(opened.directory, opened.catalog, entry.id)
+            put_entry(opened.directory, opened.shared.catalog, entry.id)
     gone = Counter[str]()
     for log in logs:
         for number, part in log.parts.items() if log.is_here and log.number in numbers else ():

@@ -199,7 +199,7 @@ def test_what_pressure_cut_answers_as_what_expired(tmp_path: Path) -> None:
         assert answers_of(store) == before
         with store.directory.writing(entry.id, entry.name):
             expire(store.directory, entry.id, [*store.directory.manifests.read(entry.id).logs])
-            put_entry(store.directory, store.catalog, entry.id)
+            put_entry(store.directory, store.shared.catalog, entry.id)
     with hl.open(tmp_path / "store", mongo="none") as store:
         assert answers_of(store) == before
     assert before["sql"] == [(99.0, None, (1 << 64) - 1), (None, None, None)]

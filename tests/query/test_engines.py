@@ -198,7 +198,7 @@ def _world(place: Path, mongo: str) -> Iterator[World]:
                 )  # fmt: skip
             assert len(everything) == 400 * (seed + 1)
         everything.sort(key=lambda m: (m.log_time, m.recording[-16:], m.seq))
-        assert (store.database is None) == (mongo == NONE)
+        assert (store.shared.index.reached() is None) == (mongo == NONE)
         yield World(store, everything, ids)
 
 
@@ -375,7 +375,7 @@ def check(world: World, question: dict[str, Any]) -> None:
                 predicate = query.question.predicate
                 assert predicate is not None, question
                 assert predicate.filters, question
-                assert world.store.database is None, question
+                assert world.store.shared.index.reached() is None, question
                 continue
             assert count == len(want), (way, question)
             got = [(m.recording, m.topic, m.log_time_ns, m.seq, m.raw) for m in query]

@@ -310,7 +310,7 @@ def test_lost_fields_and_manifests(here: Path, address: str, proxy: Proxy) -> No
         (finding,) = store.verify().findings
         assert (finding.recording, finding.place) == (run, "manifest")
         assert "hybridlog copy" in finding.cure
-        assert "has no manifest" in store.repairs.unreadable[run]
+        assert "has no manifest" in store.shared.repairs.unreadable[run]
     with hl.open(here, mongo="none") as source:
         assert not source.copy(address, ["run"]).refused
     files.mounted.clear()

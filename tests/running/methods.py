@@ -277,7 +277,7 @@ def _right_clocks(known: Known) -> Any:
 
 
 def _during(store: hl.Store) -> Intervals:
-    recording = store.summaries()[0].id
+    recording = store.session.look().summaries[0].id
     return Intervals([(recording, np.array([[FIRST_S, LAST_S, 0]], np.int64))])
 
 
@@ -317,7 +317,6 @@ METHODS: dict[str, Rule] = {
     "__repr__": Rule(
         lambda s: repr(s.topic("said")), lambda _: f"<Query /said; recording {LABEL}>"
     ),
-    "_repr_html_": Rule(lambda s: LABEL in s.topic("said")._repr_html_(), lambda _: True),
     "at": Rule(
         lambda s: [s.topic("said").at(t).seq for t in (FIRST_S, LAST_S + 1, "-0.3s", "end")],
         lambda k: [
@@ -581,7 +580,6 @@ STORE: dict[str, Rule] = {
         lambda _: (sorted(CHANNELS), 0),
     ),
     "__repr__": Rule(lambda s: "<Store " in repr(s), lambda _: True),
-    "_repr_html_": Rule(lambda s: LABEL in s._repr_html_(), lambda _: True),
     "align": Rule(
         lambda s: _aligned(s.align("arm", "said", fields={"arm": ["n"], "said": ["n"]})),
         lambda k: beside(k, "/arm", "/said"),
@@ -643,8 +641,8 @@ STORE: dict[str, Rule] = {
             [(one[3],) for one in ranged(k, "/said", "log", SECOND, -SECOND // 2)],
         ),
     ),
-    "summaries": Rule(
-        lambda s: [(r.name, r.status, r.messages, r.span) for r in s.summaries()],
+    "session": Rule(
+        lambda s: [(r.name, r.status, r.messages, r.span) for r in s.session.look().summaries],
         lambda k: [(LABEL, "open", len(k.of()), k.span)],
     ),
     "sync": Rule(

@@ -121,7 +121,7 @@ def test_a_segment_that_begins_in_the_tick_of_a_look_is_found(
 def test_a_segment_that_is_about_to_be_noted_is_no_problem(running: Running) -> None:
     """A recorder seals a segment first, and then tells the catalog."""
     with hl.open(running.path.parent / "store", mongo=NO_MONGODB) as reader:
-        catalog, directory = reader.catalog, reader.directory
+        catalog, directory = reader.shared.catalog, reader.directory
         catalog.remove(running.entry.id)
         assert not verify(reader.shared, {running.entry.id: "live"}).findings
         put_entry(directory, catalog, running.entry.id)

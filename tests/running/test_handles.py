@@ -135,7 +135,7 @@ def test_chunks_that_are_flushed_while_the_index_is_made_are_not_damaged(
             time.sleep(0.05)
 
     def follow() -> None:
-        follower = Follower(writer.directory, writer.catalog, recording.capture.entry)
+        follower = Follower(writer.directory, writer.shared.catalog, recording.capture.entry)
         while not is_over.is_set():
             follower.follow()
         follower.discard()

@@ -106,7 +106,7 @@ def test_questions_about_little_cost_little(stores: dict[int, Path], name: str) 
         with hl.open(path, require_database=True) as store:
             ASKED[name](store)
             store.refresh()
-            store.connect()
+            store.shared.index.connect()
             costs[count] = cost_of(store, lambda store=store: ASKED[name](store))
     assert costs[MANY].counts == costs[FEW].counts
     # What is compressed has another size on another day. The file of tables that the recording
@@ -136,7 +136,7 @@ def test_opening_asks_once(stores: dict[int, Path]) -> None:
     for count, path in stores.items():
         with hl.open(path, require_database=True) as store:
             store.refresh()
-            counts[count] = cost_of(store, store.connect).counts
+            counts[count] = cost_of(store, store.shared.index.connect).counts
     assert counts[MANY] == counts[FEW]
     assert counts[MANY]["opened"] < 30
 
@@ -209,11 +209,11 @@ def test_a_recording_is_indexed_without_a_look_at_the_others(
         with hl.open(path, mongo="none") as store:
             store.record(tmp_path / "more.mcap")
         with hl.open(path) as store:
-            costs[count] = cost_of(store, store.connect)
-            assert store.repairs.indexed == {"more": 1}
+            costs[count] = cost_of(store, store.shared.index.connect)
+            assert store.shared.repairs.indexed == {"more": 1}
             store.remove("more")
         with hl.open(path) as store:
-            assert not cost_of(store, store.connect).written
+            assert not cost_of(store, store.shared.index.connect).written
     assert costs[MANY].commands == costs[FEW].commands
     # A few files, and each folder that was made just now: not the files of each recording.
     assert len(costs[MANY].opened) < len(costs[FEW].opened) + 2 * MANY
@@ -269,7 +269,7 @@ def test_one_more_recording_costs_the_same(stores: dict[int, Path], tmp_path: Pa
             store.record(tmp_path / "before.mcap")
             counts[count] = cost_of(store, lambda store=store: store.record(tmp_path / "more.mcap"))
             store.remove("before")
-            store.connect()
+            store.shared.index.connect()
             removals[count] = cost_of(store, lambda store=store: store.remove("more"))
             assert store.topic("pose").count() == count * MESSAGES
     check_alike(counts, looks=False)  # no other has its name or its content

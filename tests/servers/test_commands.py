@@ -71,11 +71,11 @@ def asked(path: Path) -> tuple[dict[str, list[Sent]], dict[str, object]]:
         sent.clear()
         more = store.record(log, name="more")
         heard["record"] = [*sent]
-        store.connect()
+        store.shared.index.connect()
         sent.clear()
         store.index.rebuild(["more"])
         heard["reindex"] = [*sent]
-        store.connect()
+        store.shared.index.connect()
         sent.clear()
         store.remove(more.entry.id)
         heard["remove"] = [*sent]

@@ -52,7 +52,7 @@ def store(members: ReplicaSet, tmp_path: Path) -> Iterator[hl.Store]:
 def check(store: hl.Store, messages: int) -> None:
     """All messages are in the index, byte for byte."""
     assert store.verify().findings == []
-    database = store.connect()
+    database = store.shared.index.connect()
     topics = [n for n in database.list_collections() if not n.startswith("hybridlog.")]
     assert sum(database.count(topic, {"_meta.seq": {"$gte": 0}}) for topic in topics) == messages
 
@@ -75,12 +75,12 @@ def test_killed_while_a_log_is_recorded(
     store: hl.Store, log: Path, killing: list[str], limit: Limit
 ) -> None:
     limit(inserted_documents=MESSAGES // 4)
-    database = store.database
+    database = store.shared.index.reached()
     report = store.record(log, settings=SegmentSettings(chunk_size=1 << 12))
     assert len(killing) > KILLED_AT
     assert report.failure is None
     assert report.missed == 0
-    assert store.database is database, "indexing has not gone on, but was begun again"
+    assert store.shared.index.reached() is database, "indexing has not gone on, but was begun again"
     check(store, 3 * MESSAGES)
 
 

@@ -52,7 +52,7 @@ def test_what_comes_into_a_store_is_indexed_once_by_several_that_watch(
         uri = f"mongodb://{server.address}/lab?serverSelectionTimeoutMS=500"
         with hl.open(lab, create=True, mongo=uri) as store:
             arrive(robot, lab, "drive-0")
-            store.connect()
+            store.shared.index.connect()
             with hl.open(lab, mongo=uri) as other:
                 arrive(robot, lab, "drive-4")
                 read = Session.entry_of
@@ -62,12 +62,12 @@ def test_what_comes_into_a_store_is_indexed_once_by_several_that_watch(
                     is_ours = session.shared is store.shared
                     if is_ours and summary.name == "drive-4" and not other.shared.repairs.indexed:
                         other.refresh()
-                        other.connect()
+                        other.shared.index.connect()
                     return entry
 
                 monkeypatch.setattr(Session, "entry_of", overtaken)
                 store.refresh()
-                store.connect()
+                store.shared.index.connect()
                 assert "drive-4" in other.shared.repairs.indexed
                 assert "drive-4" not in store.shared.repairs.indexed
 

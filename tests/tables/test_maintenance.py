@@ -54,11 +54,11 @@ def unfinished(store: hl.Store) -> list[Path]:
 def test_a_mark_changes_no_table(few: hl.Store) -> None:
     before = contents(few)
     few.mark("few", BASE + 5, "here")
-    few.connect()
+    few.shared.index.connect()
     few.mark("few", BASE + 6, "and here")
     assert len(few.topic(MARKS).to_arrow()) == 2
-    few.connect()
-    assert not few.repairs.indexed
+    few.shared.index.connect()
+    assert not few.shared.repairs.indexed
     assert contents(few) == before
     assert few.verify().findings == []
     (entry,) = few.recordings()
@@ -94,7 +94,7 @@ def test_only_what_is_missing_is_made(few: hl.Store, tmp_path: Path, limit: Limi
     kept = other.stat().st_mtime_ns
     one.unlink()
     assert len(making.missing(few.directory, entry)) == 1
-    assert not make_tables(few.directory, few.catalog, entry)
+    assert not make_tables(few.directory, few.shared.catalog, entry)
     assert other.stat().st_mtime_ns == kept
     assert compare(few) == 2490
 
@@ -105,7 +105,7 @@ def test_a_damaged_chunk_costs_no_table(few: hl.Store) -> None:
     (entry,) = few.recordings()
     (path,) = places.folder(few.directory.path, "few").glob("*.mcap")
     flip(path, 2000)
-    make_tables(few.directory, few.catalog, entry, topics=["/a"])
+    make_tables(few.directory, few.shared.catalog, entry, topics=["/a"])
     assert contents(few) == before
     (finding,) = few.verify().findings
     assert finding.cure == RESTORE
@@ -154,7 +154,7 @@ def test_rows_of_another_segment_are_not_kept(few: hl.Store) -> None:
     folders._write(path, pieces)
     assert not making.TableChecker(few.directory).damage(entry)
     assert making.missing(few.directory, entry) == {"/a", "/b"}
-    assert not make_tables(few.directory, few.catalog, entry, topics=["/a"])
+    assert not make_tables(few.directory, few.shared.catalog, entry, topics=["/a"])
     assert making.missing(few.directory, entry) == set()
 
 
@@ -162,7 +162,7 @@ def test_a_store_that_cannot_be_written_makes_none(few: hl.Store, limit: Limit) 
     (entry,) = few.recordings()
     limit(directory_is_writable=False)
     shutil.rmtree(few.directory.path / TABLES)
-    assert make_tables(few.directory, few.catalog, entry)
+    assert make_tables(few.directory, few.shared.catalog, entry)
     assert not folders(few)
 
 
@@ -170,5 +170,5 @@ def test_a_recording_that_is_held_is_left_alone(few: hl.Store) -> None:
     (entry,) = few.recordings()
     shutil.rmtree(few.directory.path / TABLES)
     with few.directory.writing(few.entry("few").id):
-        assert make_tables(few.directory, few.catalog, entry)
+        assert make_tables(few.directory, few.shared.catalog, entry)
     assert not folders(few)

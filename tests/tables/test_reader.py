@@ -110,7 +110,7 @@ def test_damaged_tables_are_none_and_are_made_again(
         assert {f"table of {topic}"} <= {one.place for one in done.repaired}
     else:
         assert not places
-        assert not make_tables(recorded.directory, recorded.catalog, entry)
+        assert not make_tables(recorded.directory, recorded.shared.catalog, entry)
     assert recorded.topic(topic).where("i8 > 0").count() == want
     assert recorded.verify().findings == []
     assert path.read_bytes() == whole

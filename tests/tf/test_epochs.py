@@ -82,7 +82,7 @@ def test_logs_of_several_clocks_have_one_epoch(tmp_path: Path, name: str) -> Non
     with hl.open(tmp_path / "store", create=True, mongo="none") as store:
         store.record(DATA / "real" / name)
         session = store.snapshot().session
-        assert not len(epochs_of(session, store.summaries()[0].id).begins)
+        assert not len(epochs_of(session, store.session.look().summaries[0].id).begins)
 
 
 @pytest.fixture
@@ -163,7 +163,7 @@ def test_the_clock_of_a_simulation_decides(tmp_path: Path) -> None:
     with hl.open(tmp_path / "store", create=True, mongo="none") as store:
         recorded(store, "sim", messages)
         session = store.snapshot().session
-        begins = epochs_of(session, store.summaries()[0].id).begins
+        begins = epochs_of(session, store.session.look().summaries[0].id).begins
         assert begins.tolist() == [BEGIN + 30 * S]
 
 

@@ -65,7 +65,7 @@ class Log:
         self.store = store
 
     def tree(self, *messages: bytes, static: Sequence[bytes] = ()) -> FrameTree:
-        name = f"log {len(self.store.summaries())}"
+        name = f"log {len(self.store.session.look().summaries)}"
         with self.store.start(name) as recording:
             for channel, bodies in ((STATIC, static), (MOVING, messages)):
                 for n, body in enumerate(bodies):

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 def test_a_row_says_what_the_store_says(client: TestClient, demo_store: hl.Store) -> None:
     answer = client.get("recordings").json()
-    (summary,) = demo_store.summaries()
+    (summary,) = demo_store.session.look().summaries
     assert (answer["all"], answer["found"], answer["messages"]) == (1, 1, summary.messages)
     (row,) = answer["rows"]
     assert (row["name"], row["tags"], row["topics"]) == ("robot", {"place": "lab"}, 18)

@@ -107,7 +107,7 @@ def test_a_plot(page: Page, demo_store: hl.Store, start: int, demo_url: str) -> 
     page.mouse.up()
     page.wait_for_selector(".chart[data-exact=true]")
     begin, end = state(page, "begin"), state(page, "end")
-    length = demo_store.summaries()[0].extent[1] - start
+    length = demo_store.session.look().summaries[0].extent[1] - start
     assert begin == pytest.approx(0.5 * length, rel=0.01)
     assert end == pytest.approx(0.6 * length, rel=0.01)
     assert state(page, "at") == 7 * S

@@ -58,7 +58,7 @@ def picture_of(client: TestClient, asked: dict[str, Any]) -> Picture:
 
 
 def test_gaps_are_those_of_queries(client: TestClient, demo_store: hl.Store, start: int) -> None:
-    begin, end = 0, demo_store.summaries()[0].extent[1] - start + 1
+    begin, end = 0, demo_store.session.look().summaries[0].extent[1] - start + 1
     found = picture(client, ["/r_cart/command_pose", "/imu/data", "/map"], begin, end, 2000)
     width = found.head["width"]
     wanted = list(demo_store.topic("/r_cart/command_pose").gaps())
@@ -170,7 +170,7 @@ def test_the_timeline_is_moved_and_zoomed(
     canvas.wait_for()
     box = canvas.bounding_box()
     assert box is not None
-    length = demo_store.summaries()[0].extent[1] - start + 1
+    length = demo_store.session.look().summaries[0].extent[1] - start + 1
     first = page.locator(".timeline .topic").first.inner_text()
 
     # A click sets the cursor; what the tip says is what the store counts.

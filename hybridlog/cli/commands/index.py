@@ -108,7 +108,7 @@ def address(given: _Shared) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class _Rebuild(Choosing, _Shared):
-    pass
+    """Which recordings are indexed again."""
 
 
 @command(_Rebuild, to=index_command)
@@ -189,9 +189,9 @@ def _look(store: Store) -> Iterator[StoreError]:
     """Index what has come since the last look, and print it; yields what cannot be read."""
     store.shared.newest()
     store.shared.recover()
-    repairs = store.repairs
+    repairs = store.shared.repairs
     try:
-        store.connect()
+        store.shared.index.connect()
     finally:
         for name in [*repairs.indexed]:
             chunks = repairs.indexed.pop(name)

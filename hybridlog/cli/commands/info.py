@@ -56,7 +56,7 @@ class _Given(Choosing, InStore, AsJson, Forced):
     )
     sizes: str | None = option(
         "Instead: the bytes of each recording, each topic, or each topic of each recording "
-        "in segments, tables and MongoDB. Shares of what topics have in common are estimates.",
+        "in segments and tables. Shares of what topics have in common are estimates.",
         type=click.Choice(["recording", "topic", "both"]),
         excludes=("topic", "attachments", "attachment"),
     )
@@ -418,22 +418,21 @@ def _show_sizes(store: Store, by: str, given: _Given) -> None:
         for one in (sizes.total, *found)
     )
     if given.as_json:
-        output.print_json({"rows": rows, "total": total})
+        output.print_json({"rows": rows, "total": total, "index_bytes": sizes.index_bytes})
         return
     names = [Column("recording"), Column("topic", lambda row: row.get("topic", "(no topic)"))]
     names = [one for one in names if by in {one.name, "both"}]
     last = total | {"recording": "", "topic": "", names[0].name: "total"}
-    columns = [one for one in _SIZES if one.name != "fields" or total["column_bytes"]]
-    given.show([*rows, last] if rows else [], [*names, *columns], store.session.when_empty)
+    given.show([*rows, last] if rows else [], [*names, *_SIZES], store.session.when_empty)
+    if sizes.index_bytes:
+        output.remarks([f"MongoDB: {output.size(sizes.index_bytes)} for these topics."])
 
 
 _SIZES = [
     Column("messages", side="right", order=1),
     bytes_of("payload", "payload_bytes", order=2),
     bytes_of("segments", "segment_bytes"),
-    bytes_of("fields", "column_bytes"),
     bytes_of("tables", "table_bytes"),
-    bytes_of("MongoDB", "index_bytes"),
     bytes_of("total", "total_bytes"),
 ]
 

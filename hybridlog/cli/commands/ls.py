@@ -25,7 +25,7 @@ def ls_command(given: _Given) -> None:
     with given.opened() as store:
         recordings = given.recordings_in(store.snapshot()).summaries
     found = [recording_dict(one) if given.as_json else one for one in recordings]
-    without = "" if store.repairs.unreadable else store.directory.when_empty
+    without = "" if store.shared.repairs.unreadable else store.directory.when_empty
     given.show(found, RECORDINGS, without)
 
 

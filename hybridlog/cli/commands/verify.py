@@ -67,7 +67,7 @@ def verify_command(given: _Given) -> int:
 
 def _chosen(given: _Given, store: Store) -> tuple[Sequence[RecordingSummary], list[str]]:
     """The chosen recordings, and ids of chosen ones that cannot be read: their names are lost."""
-    choice, known = given.choice, [*store.repairs.unreadable]
+    choice, known = given.choice, [*store.shared.repairs.unreadable]
     unreadable = [one for one in known if any(fnmatchcase(one, name) for name in choice.name)]
     names = tuple(name for name in choice.name if name not in unreadable)
     if unreadable and not names:

@@ -158,12 +158,10 @@ class StoreDirectory:
         path: Path,
         *,
         mongo: str | None = None,
-        cache_mb: int | None = None,
     ) -> StoreDirectory:
         """Create a store, or open an existing one.
 
-        `mongo` is the URI, without a password, of the MongoDB to use instead of the embedded one;
-        `cache_mb`, the size of the latter's cache in MiB, is for a new store only.
+        `mongo` is the URI, without a password, of the MongoDB to use instead of the embedded one.
         """
         if path.exists() and not path.is_dir():
             raise StoreError(f"{path} is a file; a store is a directory. Choose another name.")
@@ -172,7 +170,7 @@ class StoreDirectory:
                 path.mkdir(parents=True, exist_ok=True)
                 # Of several processes, one creates the store and the others open it.
                 with files.locked_folder(path):
-                    settings = StoreSettings(secrets.token_hex(16), mongo=mongo, cache_mb=cache_mb)
+                    settings = StoreSettings(secrets.token_hex(16), mongo=mongo)
                     cls._make(path, settings)
             store = cls(path)
             for folder in (MANIFESTS, RECORDINGS):
