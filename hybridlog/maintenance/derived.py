@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
@@ -31,7 +31,7 @@ from hybridlog_storage.mongo.index_documents import IndexState
 from hybridlog_storage.settings import read_settings
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping, Sequence
+    from collections.abc import Collection, Sequence
 
     from hybridlog.columns.tables import Tables
     from hybridlog.maintenance.report import Progress, RepairReport
@@ -152,9 +152,6 @@ def index_arrays(
     others = [one for one in read_settings(directory.path).arrays if one not in topics]
     directory.change_settings(arrays=tuple(sorted(others if off else {*others, *topics})))
     found = {topic: ArraysOfTopic(topic) for topic in topics}
-    channels = [channel for entry in entries for channel in entry.channels]
-    types = {one: {type_prefix(c.type) for c in channels if c.topic == one} for one in topics}
-    before = _bytes(directory.path, types)
     for entry in entries:
         own = topics_of(entry) & found.keys()
         wanted = {topic for topic in own if _differs(known, entry, topic, off=off)}
@@ -165,20 +162,18 @@ def index_arrays(
         for topic in wanted:
             is_left = _differs(known, entry, topic, off=off)
             (found[topic].left if is_left else found[topic].recordings).append(entry.name)
-    after = _bytes(directory.path, types)
+    channels = [channel for entry in entries for channel in entry.channels]
     for topic, one in found.items():
-        one.bytes_before, one.bytes_after = before[topic], after[topic]
+        types = {type_prefix(one.type) for one in channels if one.topic == topic}
+        one.bytes = _bytes(directory.path, types)
     return list(found.values())
 
 
-def _bytes(root: Path, types: Mapping[str, set[str]]) -> dict[str, int]:
-    """Bytes of all tables of the types of each topic."""
+def _bytes(root: Path, types: Collection[str]) -> int:
+    """Bytes of all tables of some types."""
     from hybridlog.columns.folders import files_of
 
-    sizes: Counter[str] = Counter()
-    for file in files_of(root, set[str]().union(*types.values())):
-        sizes[file.path.parent.name.rpartition("~")[0] + "~"] += file.size_bytes
-    return {topic: sum(sizes[one] for one in own) for topic, own in types.items()}
+    return sum(file.size_bytes for file in files_of(root, {*types})) if types else 0
 
 
 def _differs(known: Tables, entry: RecordingEntry, topic: str, *, off: bool) -> bool:

@@ -14,7 +14,7 @@ from hybridlog.query.times import TimeLike, format_time, parse_range, parse_time
 from hybridlog.record.losses import extent_of
 from hybridlog_storage.disk.directory import LOCK_WAIT_S, gone
 from hybridlog_storage.errors import (
-    ConnectionLostError,
+    DatabaseError,
     RecordingGoneError,
     StoreError,
     TimeError,
@@ -28,7 +28,6 @@ from hybridlog_storage.manifest import (
     Pin,
     new_random,
     replace,
-    with_mark,
 )
 from hybridlog_storage.mongo.index_documents import IndexState
 
@@ -76,15 +75,13 @@ def time_of_mark(entry: RecordingEntry, moment: TimeLike) -> int:
     """
     start, end = extent_of(entry)
     time = parse_time(moment, start=start, end=end)
-    has_messages = entry.messages > len(entry.marks)
     if entry.status == "open":
         end = max(end, clock.time_ns())
-    if has_messages and not start <= time <= end:
+    if entry.messages > len(entry.marks) and not start <= time <= end:
         ends = f"begins at {format_time(start)}" if time < start else f"ends at {format_time(end)}"
-        is_ = f"{moment} is {format_time(time)}, and " if isinstance(moment, str) else ""
         raise TimeError(
-            f"{is_ or f'A mark cannot be at {format_time(time)}: '}{entry.name} {ends}; ten "
-            "seconds from its beginning are +10s, ten before its end -10s."
+            f"A mark cannot be at {format_time(time)}: {entry.name} {ends}; ten seconds from its "
+            "beginning are +10s, ten before its end -10s."
         )
     return time
 
@@ -193,10 +190,7 @@ def mark(
         raise TimeError("A mark cannot end before it begins.")
     said = {text(key): text(value) for key, value in tags.items()}
     made = Mark(new_random(), begin, text(note), said, end)
-    now = change(shared, entry, lambda known: with_mark(known, made))
-    if all(one["id"] != made.id for one in now.marks):
-        raise too_many_marks(entry.name)
-    return now
+    return change(shared, entry, lambda now: _marked(now, made))
 
 
 def mark_now(
@@ -217,25 +211,23 @@ def mark_now(
 
     def how(known: Manifest) -> Manifest:
         if around is None:
-            return with_mark(known, Mark(key, now, text(note), said))
+            return _marked(known, Mark(key, now, text(note), said))
         begin, end = max(now - around[0], 0), now + around[1]
         pins = (*known.pins, Pin(key, begin, end, reason=text(note)))
         # A mark from before the first message would become the beginning of the recording.
         begin = max(begin, min(known.created, now))
-        return with_mark(replace(known, pins=pins), Mark(key, begin, text(note), said, end))
+        return _marked(replace(known, pins=pins), Mark(key, begin, text(note), said, end))
 
-    found = directory.manifests.change(recording, how)
-    if all(one.id != key for one in found.marks):
-        raise too_many_marks(found.name)
-    return found.name
+    return directory.manifests.change(recording, how).name
 
 
-def too_many_marks(name: str) -> StoreError:
-    """The error for a mark that is counted, and not kept."""
-    return StoreError(
-        f"{name} has {MAX_MARKS:,} marks, the most that a recording can have: this one is counted, "
-        "and not kept. Remove others with `hybridlog mark --remove`."
-    )
+def _marked(manifest: Manifest, made: Mark) -> Manifest:
+    if len(manifest.marks) >= MAX_MARKS:
+        raise StoreError(
+            f"{manifest.name} has {MAX_MARKS:,} marks, the most that a recording can have. Remove "
+            "others with `hybridlog mark --remove`."
+        )
+    return replace(manifest, marks=(*manifest.marks, made))
 
 
 def unmark(shared: OpenStore, recording: str, moment: TimeLike | None, note: str) -> RecordingEntry:
@@ -264,7 +256,7 @@ def remove_if(
 
     Its manifest says so first, then its files go, then the manifest; who may write finishes what
     was interrupted. `check` is called with the newest manifest, and raises to keep the recording.
-    If MongoDB fails, the files are gone, and the next connection clears it.
+    If MongoDB fails, the next connection clears it.
     """
     directory = shared.directory
     try:
@@ -279,10 +271,8 @@ def remove_if(
                 tables.remove(directory, entry.id, entry)
                 shared.catalog.remove(entry.id)
             if database is not None:
-                _clear(database, entry)
-    except ConnectionLostError:
-        shared.invalidate()
-        shared.index.connect()  # a new connection removes the rest
+                with suppress(DatabaseError):
+                    _clear(database, entry)
     finally:
         shared.catch_up()
 

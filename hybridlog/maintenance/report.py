@@ -60,17 +60,14 @@ class ArraysOfTopic(Struct):
     Attributes:
         topic: Full name.
         recordings: Names of the recordings whose tables were made anew.
-        bytes_before: Bytes of all tables of its message type before; topics and recordings
-            share files.
-        bytes_after: Bytes of them now.
+        bytes: Bytes of all tables of its message type now; topics and recordings share files.
         left: Names of recordings whose tables are as before: they are being written, or
             cannot be read.
     """
 
     topic: str
     recordings: list[str] = field(default_factory=list)
-    bytes_before: int = 0
-    bytes_after: int = 0
+    bytes: int = 0
     left: list[str] = field(default_factory=list)
 
 

@@ -150,13 +150,10 @@ def arrays(given: _Arrays) -> None:
     """
     with given.opened() as store, Bar("index arrays") as bar:
         found = store.index.arrays(*given.topic, off=given.off, progress=bar.part)
-    arrays = "without arrays" if given.off else "with arrays"
     columns = [
         Column("topic"),
-        Column("tables", lambda row: arrays if row["bytes_after"] else "none yet"),
         Column("made anew", lambda row: len(row["recordings"]), "right"),
-        bytes_of("before", "bytes_before"),
-        bytes_of("after", "bytes_after"),
+        bytes_of("tables", "bytes"),
     ]
     given.show([asdict(one) for one in found], columns)
     if left := {name for one in found for name in one.left}:
