@@ -738,11 +738,22 @@ class Store:
             UsageError: A rule is malformed, or not for a bucket.
             StoreError: Another process deletes here, too; or the store is read-only.
         """
-        from hybridlog.maintenance.keep import keep
+        from hybridlog.maintenance.edit import remove_if
+        from hybridlog.maintenance.keep import Keeper, KeepReport
+        from hybridlog.maintenance.retention import Rules
 
-        shared = self.shared if dry_run else self._itself()
-        shared.check_process()
-        return keep(shared, rules, dry_run=dry_run)
+        self.shared.check_process()
+        wanted = Rules.of(self.directory.settings.retention if rules is None else rules)
+        wanted.check_place(is_remote=self.directory.is_remote)
+        keeper = Keeper(self.directory, partial(remove_if, self.shared))
+        if dry_run:
+            return KeepReport(keeper.plan(wanted))
+        self._to_change()
+        self.directory.check_changes()
+        try:
+            return keeper.keep(wanted)
+        finally:
+            self.refresh()
 
     def pin(
         self,

@@ -112,7 +112,6 @@ def test_a_child_is_told_to_open_the_store(store: hl.Store) -> None:
             store.recordings,
             lambda: recordings[0],
             store.refresh,
-            store.shared.index.connect,
             lambda: store.edit("run", note="x"),
             lambda: store.remove("run"),
             lambda: store.start("another"),

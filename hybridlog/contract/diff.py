@@ -52,7 +52,6 @@ class _Side:
     def __init__(
         self, recordings: Recordings, topics: Collection[str], between: Range | None
     ) -> None:
-        self.summaries = recordings.summaries
         self.topics: dict[str, list[TopicCheck]] = defaultdict(list)
         self.fields: dict[str, dict[str, FieldStatistics]] = defaultdict(dict)
         # Marks are about a recording, and not of it.

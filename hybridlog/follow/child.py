@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from multiprocessing.connection import Connection
 
     from hybridlog.index.indexing import IndexTarget
-    from hybridlog.opened import OpenStore
     from hybridlog.query.predicate.tree import Predicate
+    from hybridlog.shared import Shared
     from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.messages import Channel
@@ -115,7 +115,7 @@ class FollowerProcess:
 
     @classmethod
     def of_short(
-        cls, shared: OpenStore, purpose: str, interval_s: float | None
+        cls, shared: Shared, purpose: str, interval_s: float | None
     ) -> Callable[[RecordingEntry], FollowerProcess]:
         """How to follow a recording that may be short; `purpose` is what needs the index."""
         index = shared.index

@@ -106,7 +106,11 @@ class Copying:
 
     def run(self, chosen: Sequence[RecordingSummary]) -> None:
         """Copy some recordings; after an error what was copied stays, and it can be run again."""
-        self._directory = self.shared.directory
+        self._directory, options = self.shared.directory, self.options
+        if options.only_fields and options.then_expire:
+            raise UsageError("Payloads that are not copied cannot expire: drop one of the two.")
+        if options.then_expire:
+            self._directory.check_writable()
         self._source = self._source_of(self._directory)
         self._arrived: list[str] = []  # ids of recordings of which something was copied
         self._done = 0  # bytes of recordings before, and after this one

@@ -23,11 +23,10 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
 from functools import partial
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 from msgspec import Struct, field, structs
 
-from hybridlog.maintenance.edit import remove_if
 from hybridlog.maintenance.retention import (
     Held,
     Plan,
@@ -66,7 +65,6 @@ from hybridlog_storage.settings import read_settings
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from hybridlog.opened import OpenStore
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.manifest import File
 
@@ -238,22 +236,6 @@ class Keeper:
             return expire(
                 directory, step.id, step.segments, copy=copy, check=check, is_followed=is_own
             )
-
-
-def keep(shared: OpenStore, rules: Mapping[str, Any] | None, *, dry_run: bool) -> KeepReport:
-    """Make a pass over an open store, or only plan it, as of `Store.keep`."""
-    directory = shared.directory
-    wanted = Rules.of(directory.settings.retention if rules is None else rules)
-    wanted.check_place(is_remote=directory.is_remote)
-    keeper = Keeper(directory, partial(remove_if, shared))
-    if dry_run:
-        return KeepReport(keeper.plan(wanted))
-    shared.change()
-    directory.check_changes()
-    try:
-        return keeper.keep(wanted)
-    finally:
-        shared.invalidate()
 
 
 def _check(step: Step, rules: Rules, manifest: Manifest) -> None:

@@ -106,7 +106,7 @@ def sizes_of(
             table = tables.get((entry.id, topic), 0)
             size = Size(entry.name, topic, messages[topic], payload[topic], segments[topic], table)
             rows.append(size)
-        topics.update(messages)
+        topics.update(topic for topic, number in messages.items() if number)
     index = None
     if database is not None:
         index = sum(database.size(collection_of(topic))[1] for topic in topics)

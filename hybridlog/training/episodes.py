@@ -20,7 +20,7 @@ from hybridlog.query.planner import log_times
 from hybridlog.query.query import Query
 from hybridlog.query.question import Question
 from hybridlog.query.ranges import RangeResolver
-from hybridlog.query.times import format_duration, format_time
+from hybridlog.query.times import format_time
 from hybridlog.schema.arrow_types import is_list, is_numeric
 from hybridlog_storage.errors import DefinitionError, PayloadError, TopicError, UsageError
 
@@ -101,7 +101,12 @@ def episodes(
         is_old = {topic: _is_old(grid, own, fps) for topic, own in times.items()}
         late = np.any([*is_old.values()], axis=0)
         if late.any() and on_gap == "refuse":
-            _refuse(name, grid, times, is_old)
+            begins = {one: int(np.argmax(old)) for one, old in is_old.items() if old.any()}
+            topic = min(begins, key=begins.__getitem__)
+            raise UsageError(
+                f"{name}: {topic} has a gap at {format_time(int(grid[begins[topic]]))}. --on-gap "
+                "drop cuts the episode there, --on-gap hold keeps the last value."
+            )
         runs = [(0, len(grid))] if on_gap == "hold" else _runs(~late)
         long_runs = [(low, high) for low, high in runs if high - low >= MIN_FRAMES]
         if dropped is not None and late.any():
@@ -242,22 +247,3 @@ def _is_old(times: NDArray[np.int64], messages: NDArray[np.int64], fps: int) -> 
 def _runs(is_good: NDArray[np.bool_]) -> list[tuple[int, int]]:
     edges = np.flatnonzero(np.diff(np.concatenate([[0], is_good.astype(np.int8), [0]])))
     return [(int(low), int(high)) for low, high in edges.reshape(-1, 2)]
-
-
-def _refuse(
-    name: str,
-    grid: NDArray[np.int64],
-    times: dict[str, NDArray[np.int64]],
-    is_old: dict[str, NDArray[np.bool_]],
-) -> None:
-    """Raise a `UsageError` that says which gap is the first."""
-    first = {topic: int(np.argmax(old)) for topic, old in is_old.items() if old.any()}
-    topic = min(first, key=first.__getitem__)
-    own, moment = times[topic], int(grid[first[topic]])
-    place = int(np.searchsorted(own, moment, "right")) - 1
-    begin = int(own[place])
-    end = int(own[place + 1]) if place + 1 < len(own) else int(grid[-1])
-    raise UsageError(
-        f"{name}: {topic} has a gap of {format_duration(end - begin)} at {format_time(begin)}. "
-        "--on-gap drop cuts the episode there, --on-gap hold keeps the last value."
-    )

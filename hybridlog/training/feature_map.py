@@ -19,9 +19,9 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, Final, TypeAlias
 
-from msgspec import Struct
+from msgspec import Meta, Struct, ValidationError, convert
 
 from hybridlog.arrays.message_arrays import IMAGES, plain_type
 from hybridlog.formats.yaml_values import YamlError, parse_yaml, read_yaml
@@ -45,6 +45,17 @@ _ACTIONS: Final = {
     "sensor_msgs/Joy": ("axes",),
     "std_msgs/Float64MultiArray": ("data",),
 }
+
+
+_Parts: TypeAlias = dict[str, str | Annotated[list[str], Meta(min_length=1)]]
+
+
+class _Given(Struct, forbid_unknown_fields=True):
+    """A map as it is written."""
+
+    features: dict[str, list[_Parts] | _Parts] = {}
+    images: dict[str, Annotated[str, Meta(min_length=1)]] = {}
+    robot_type: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,25 +115,27 @@ class FeatureMap(Struct, frozen=True):
 
     @classmethod
     def of(cls, values: object, name: str = "the map") -> FeatureMap:
-        """A map of plain values; a `UsageError` says where they are wrong and what to write."""
-        root = _mapping(values, name)
-        if unknown := root.keys() - {"robot_type", "features", "images"}:
-            _refuse(name, f"{min(unknown, key=str)!r} is none of robot_type, features, images")
-        vectors = {}
-        for key, parts in _mapping(root.get("features") or {}, f"{name}: features").items():
-            where = f"{name}: {key}"
-            if not _NAME.fullmatch(str(key)) or key in _OWN or str(key).startswith(IMAGE_PREFIX):
-                _refuse(where, "this is no name for a feature; name it like observation.state")
-            rows = parts if isinstance(parts, list) else [parts]
-            vectors[str(key)] = tuple(source for row in rows for source in _sources(row, where))
-        images = {}
-        for key, topic in _mapping(root.get("images") or {}, f"{name}: images").items():
-            if not _NAME.fullmatch(str(key)) or not isinstance(topic, str) or not topic:
-                _refuse(f"{name}: images", "write `front: /camera/image_raw`")
-            images[str(key)] = topic
-        if not vectors and not images:
-            _refuse(name, "it has no features; --propose-map writes a map")
-        return cls(vectors, images, str(root.get("robot_type") or ""))
+        """A map of plain values; a `UsageError` says where they are wrong."""
+        try:
+            given = convert(values, _Given)
+        except ValidationError as error:
+            raise UsageError(f"{name}: {error}; --propose-map shows how it is written.") from error
+        for key in (*given.features, *given.images):
+            if not _NAME.fullmatch(key) or key in _OWN or key.startswith(IMAGE_PREFIX):
+                raise UsageError(
+                    f"{name}: {key!r} is no name for a feature; name it like observation.state."
+                )
+        if not given.features and not given.images:
+            raise UsageError(f"{name}: it has no features; --propose-map writes a map.")
+        vectors = {
+            key: tuple(
+                Source(topic, (paths,) if isinstance(paths, str) else tuple(paths))
+                for row in (parts if isinstance(parts, list) else [parts])
+                for topic, paths in row.items()
+            )
+            for key, parts in given.features.items()
+        }
+        return cls(vectors, given.images, given.robot_type)
 
     def to_yaml(self) -> str:
         """The map as YAML."""
@@ -176,23 +189,3 @@ def proposed(query: Query) -> FeatureMap:
             "There are no joint states, odometry, commands or images: write the map by hand."
         )
     return found
-
-
-def _sources(row: object, where: str) -> list[Source]:
-    found = []
-    for topic, paths in _mapping(row, where).items():
-        names = paths if isinstance(paths, list) else [paths]
-        if not names or not all(isinstance(name, str) and name for name in names):
-            _refuse(where, f"name the fields of {topic}: `- {topic}: [linear.x, angular.z]`")
-        found.append(Source(str(topic), tuple(names)))
-    return found
-
-
-def _mapping(value: object, where: str) -> dict[Any, Any]:
-    if not isinstance(value, dict):
-        _refuse(where, "write `key: value` lines; --propose-map shows how")
-    return value
-
-
-def _refuse(where: str, what: str) -> NoReturn:
-    raise UsageError(f"{where}: {what}.")

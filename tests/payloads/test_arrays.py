@@ -287,7 +287,7 @@ def test_new_recordings_follow_the_setting(tmp_path: Path) -> None:
 
 def test_the_command(copy: Path) -> None:
     said = answer("index", "arrays", "scan", "/later", store=copy).out
-    assert re.search(r"(?m)^/scan +with arrays +1 +\S+ \S+ +\S+ \S+$", said)
+    assert re.search(r"(?m)^/scan +1 +\S+ \S+$", said)
     assert re.search(r"(?m)^/later +0 ", said)
     again = answer("index", "arrays", "scan", "--json", store=copy).json
     assert [(one["topic"], one["recordings"]) for one in again] == [("/scan", [])]

@@ -304,7 +304,7 @@ def test_a_task_may_be_said_by_a_topic(make: Make, tmp_path: Path) -> None:
 
 def test_a_gap_is_refused_cut_or_held(make: Make, tmp_path: Path) -> None:
     with make(Log(silent=SILENT)) as store:
-        with pytest.raises(UsageError, match=r"run0: /go has a gap of 1\.05s at .*:20.98Z"):
+        with pytest.raises(UsageError, match=r"run0: /go has a gap at .*:21.2"):
             export(store, tmp_path / "set")
         report = export(store, tmp_path / "set2", on_gap="drop")
         assert [one["length"] for one in episodes_of(tmp_path / "set2")] == [25, 40]
@@ -355,11 +355,11 @@ def test_what_does_not_fit_is_refused(make: Make, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "match"),
     [
-        ("- a", "key: value"),
-        ("other: 1", "'other' is none of"),
+        ("- a", "Expected `object`"),
+        ("other: 1", "unknown field `other`"),
         ("features: {timestamp: {go: x}}", "no name for a feature"),
-        ("features: {action: {go: [1]}}", "name the fields of go"),
-        ("images: {front: [a]}", "front: /camera/image_raw"),
+        ("features: {action: {go: [1]}}", "Expected `str`"),
+        ("images: {front: [a]}", "Expected `str`"),
         ("robot_type: x", "has no features"),
         ("a: [", "is no YAML"),
     ],
@@ -500,7 +500,7 @@ def test_a_damaged_recording(demo: Path, tmp_path: Path) -> None:
             store.to_lerobot(query, features, tmp_path / name, fps=RATE, task="x", on_gap=on_gap)
             return about(tmp_path / name)
 
-        with pytest.raises(UsageError, match=f"{FRONT} has a gap of"):
+        with pytest.raises(UsageError, match=f"{FRONT} has a gap at"):
             export("refused", "refuse")
         held = export("held", "hold")["episodes"]
         assert [one["held"][FRONT] > 0 for one in held] == [True]
