@@ -282,15 +282,15 @@ def test_what_the_index_says_of_itself_is_put_right_by_the_next_who_connects(
     shared: hl.Store, said: Counter[Message], alter: Callable[[Any], Any]
 ) -> None:
     uri = EmbeddedMongod(shared.directory.mongod).start()
-    assert shared.database is not None
+    assert shared.shared.index.reached() is not None
     with pymongo.MongoClient[dict[str, Any]](uri) as client:
-        found = client[shared.database.name][RECORDINGS]
+        found = client[shared.shared.index.reached().name][RECORDINGS]
         before = list(found.find({}))
-        alter(client[shared.database.name])
+        alter(client[shared.shared.index.reached().name])
         assert list(found.find({})) != before
         if found.count_documents({}) == len(before):
             # All that alters the index notes first that it is not known to be whole.
-            shared.catalog.put_indexed([entry.id for entry in shared.recordings()], "")
+            shared.shared.catalog.put_indexed([entry.id for entry in shared.recordings()], "")
         with reopened(shared) as opened:
             everything = opened.all_topics().where("_meta.seq >= 0")
             assert everything.count() == said.total()
