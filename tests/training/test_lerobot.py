@@ -488,7 +488,7 @@ def test_a_damaged_recording(demo: Path, tmp_path: Path) -> None:
     with hl.open(demo, mongo="none") as store:
         (entry,) = store.recordings()
         ids = [one.channel_id for one in store.session.channels_of(entry, [FRONT])]
-        (_, (chunk, _), *_) = store.session.chunks_before(entry, ids, 2**62)
+        chunk = store.session.chunks(entry, ids, None, "log")[-2]
         data[chunk.place.offset + chunk.place.length // 2] ^= 0xFF
     (tmp_path / "damaged.mcap").write_bytes(data)
     features = {"images": {"front": FRONT}}
