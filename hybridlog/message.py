@@ -75,6 +75,16 @@ class Message:
     def __repr__(self) -> str:
         return f"<Message {self.topic} {format_time(self.log_time_ns)} {len(self._view)} B>"
 
+    def _repr_html_(self) -> str:
+        """The message in a notebook: its first fields."""
+        from hybridlog.drawing.notebook import message_html
+
+        try:
+            fields = self.fields
+        except HybridlogError as error:
+            fields = {"problem": str(error)}
+        return message_html(f"{self.topic} {self.type} {format_time(self.log_time_ns)}", fields)
+
     @property
     def raw(self) -> bytes:
         """The serialized message, byte for byte as received.

@@ -65,6 +65,12 @@ class Recordings(Sequence["RecordingEntry"]):
     def __repr__(self) -> str:
         return f"<Recordings {listed((one.name for one in self.summaries), 5)}>"
 
+    def _repr_html_(self) -> str:
+        """The recordings in a notebook."""
+        from hybridlog.drawing.notebook import recordings_html
+
+        return recordings_html("Recordings", self.summaries)
+
     @property
     def ids(self) -> tuple[str, ...]:
         """Their ids."""

@@ -176,6 +176,12 @@ class Store:
     def __repr__(self) -> str:
         return f"<Store {self.directory.place}>"
 
+    def _repr_html_(self) -> str:
+        """The store in a notebook: its latest recordings."""
+        from hybridlog.drawing.notebook import recordings_html
+
+        return recordings_html(f"Store {self.directory.place}", self.recordings().summaries)
+
     # The index.
 
     @property

@@ -184,11 +184,10 @@ def pyav() -> Any:
 class VideoDecoder:
     """Decodes the frames of a topic, of a form in `CODECS`; the first one is a key frame.
 
-    If it is `in_order`, pictures come in the order in which they are shown, from `take`; else each
-    with its frame, from `decode`. One that `is_over` cannot take further frames.
+    Each picture comes with its frame. One that `is_over` cannot take further frames.
     """
 
-    def __init__(self, form: str, *, in_order: bool = False) -> None:
+    def __init__(self, form: str) -> None:
         av = self._av = pyav()
         self._form = form
         self._order = FrameOrder()
@@ -202,8 +201,7 @@ class VideoDecoder:
         context.options = {
             "err_detect": "explode",
             "max_pixels": str(_MAX_PIXELS),
-            # Strictly, a decoder waits unless a stream says that nothing is out of order.
-            **({"strict": "strict"} if in_order else {"flags": "low_delay"}),
+            "flags": "low_delay",
         }
         self._context: Any = context
 

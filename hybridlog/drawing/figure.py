@@ -32,7 +32,6 @@ MAX_MARKED_POINTS: Final = 100
 """Messages of a line that are marked, each of them."""
 _UNITS = ((300, 1, "seconds"), (3 * 3600, 60, "minutes"), (3 * 86_400, 3600, "hours"))
 _EXACT_COLOURS = 10  # of matplotlib's own
-_ABOVE, _ABOVE_LETTERS = 4, 90  # names in a row above the axes
 
 
 @contextmanager
@@ -85,11 +84,8 @@ def draw(axes: Axes, found: Sequence[Line]) -> None:
         times, values = line.series.polyline()
         at = (times - line.start) / (1e9 * step)
         (curve,) = axes.plot(at, drawable(values), color=colour, linewidth=1.2)
-        is_marked = (
-            line.series.alone() if len(line.series.times) > MAX_MARKED_POINTS else slice(None)
-        )
-        marks = (line.series.times[is_marked] - line.start) / (1e9 * step)
-        axes.plot(marks, drawable(line.series.least[is_marked]), ".", color=colour, markersize=4)
+        # Of very many messages, each is a pixel: so is one between two gaps, without a line.
+        curve.set(marker="." if len(line.series.times) <= MAX_MARKED_POINTS else ",", markersize=4)
         drawn.append(curve)
     recordings = {(line.recording, line.start) for line in found}
     since = "the beginning of each recording"
@@ -105,15 +101,12 @@ def draw(axes: Axes, found: Sequence[Line]) -> None:
     if len(found) == 1:
         _label(axes.set_ylabel(""), names[0])
     elif found:
-        # Beside the title if there is room, else on the right. Matplotlib hides names that
-        # begin with an underscore.
-        is_short = len(found) <= _ABOVE and sum(map(len, names)) <= _ABOVE_LETTERS
+        # Matplotlib hides names that begin with an underscore.
         legend = axes.legend(
             drawn,
             [f" {name}" for name in names],
-            loc="lower right" if is_short else "upper left",
+            loc="upper left",
             bbox_to_anchor=(1, 1),
-            ncols=len(names) if is_short else 1,
             fontsize="small",
             frameon=False,
         )

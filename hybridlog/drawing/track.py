@@ -18,13 +18,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.drawing.series import Numbers
-    from hybridlog.message import Message
     from hybridlog.query.query import Query
     from hybridlog.query.question import Span
 
 _RADIUS = 6_378_137.0  # m, semi-major axis of WGS 84
 _ECCENTRICITY = 6.694379990141317e-3  # squared
-_CHI = 5.991464547107979  # square of the radius that holds 95 % of a normal distribution in 2-D
 _STATUS: Final = "status.status"
 _POSITIONS_PER_PIXEL = 6  # positions of a pixel at most
 
@@ -171,89 +169,3 @@ def _numbers(table: pa.Table, path: str) -> Numbers:
     if values is None:
         raise UsageError(f"{path} is no number: only numbers can be drawn.")
     return values
-
-
-def fix_of(message: Message, prefix: str = "") -> dict[str, Any]:
-    """The position of a message: `time`, log time in ns, and more by name.
-
-    * `latitude`, `longitude`: degrees; None for what is no number. `altitude`: m, None if unknown.
-    * `has_fix`: False if the receiver says that it has none, or the position is none.
-    * `status`: number that the receiver gives; None if the message has none.
-    * `ellipse`: half axes of the ellipse that holds the position with 95 %, m, and the angle of the
-      first one, rad from east to north; None if it is unknown.
-
-    The prefix is from `position_of`.
-    """
-    fields: Any = message.fields
-    inner = _inner(fields, prefix)
-    if not {"latitude", "longitude"} <= inner.keys():
-        raise UsageError(f"This message of {message.topic} has no latitude and longitude.")
-    latitude, longitude, altitude = (
-        _number(inner.get(name)) for name in ("latitude", "longitude", "altitude")
-    )
-    given = fields.get("status")
-    number = given.get("status") if isinstance(given, Mapping) else None
-    status = number if isinstance(number, int) and not isinstance(number, bool) else None
-    is_there = bool(_is_position(np.array(latitude), np.array(longitude)))
-    return {
-        "time": message.log_time_ns,
-        "has_fix": is_there and (status is None or status >= 0),
-        "latitude": _finite(latitude),
-        "longitude": _finite(longitude),
-        "altitude": _finite(altitude),
-        "status": status,
-        "ellipse": _ellipse(fields),
-    }
-
-
-def pose_of(message: Message, prefix: str) -> dict[str, Any]:
-    """The pose of a message: `time`, log time in ns; `x`, `y`, m; `heading`, rad from x to y.
-
-    What is no number or not there is None. The prefix is from `position_of`.
-    """
-    inner = _inner(message.fields, prefix)
-    if not {"x", "y"} <= inner.keys():
-        raise UsageError(f"This message of {message.topic} has no position.")
-    around = _inner(message.fields, prefix.removesuffix("position."))
-    x, y, z, w = (_number(_inner(around, "orientation.").get(name)) for name in "xyzw")
-    length = x * x + y * y + z * z + w * w
-    heading = math.atan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
-    return {
-        "time": message.log_time_ns,
-        "x": _finite(_number(inner["x"])),
-        "y": _finite(_number(inner["y"])),
-        "heading": heading if math.isfinite(length) and length > 0 else None,
-    }
-
-
-def _finite(number: float) -> float | None:
-    return number if math.isfinite(number) else None
-
-
-def _inner(fields: Any, prefix: str) -> Mapping[str, Any]:
-    """The fields below a path that ends with a dot; none if there is no such path."""
-    for name in prefix.split(".")[:-1]:
-        fields = fields.get(name) if isinstance(fields, Mapping) else None
-    return fields if isinstance(fields, Mapping) else {}
-
-
-def _number(value: Any) -> float:
-    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    return float(value) if is_number else math.nan
-
-
-def _ellipse(fields: Mapping[str, Any]) -> tuple[float, float, float] | None:
-    """Half axes and angle of the ellipse of 95 % from the covariance, if it is known."""
-    given = fields.get("position_covariance")
-    if not isinstance(given, list) or len(given) != 9:
-        return None
-    if fields.get("position_covariance_type") == 0:  # unknown
-        return None
-    matrix = np.array([_number(given[at]) for at in (0, 1, 3, 4)]).reshape(2, 2)
-    if not np.isfinite(matrix).all():
-        return None
-    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
-    if values[0] < 0 or values[1] <= 0:
-        return None
-    small, large = np.sqrt(values * _CHI).tolist()
-    return large, small, math.atan2(vectors[1, 1], vectors[0, 1])

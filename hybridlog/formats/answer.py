@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, TypeAlias
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 from msgspec import Struct, field
 
@@ -18,9 +18,6 @@ if TYPE_CHECKING:
     from hybridlog.message import Message
     from hybridlog_storage.messages import Batch, Channel
     from hybridlog_storage.segments.segment_format import Attachment
-
-Line: TypeAlias = "str | Iterator[str]"
-"""A line of JSON, or its pieces."""
 
 
 class Answer(Struct, kw_only=True):
@@ -40,7 +37,7 @@ class Answer(Struct, kw_only=True):
         unreadable: Gets the error of each message that is left out.
     """
 
-    lines: Iterable[Iterable[Line]] = ()
+    lines: Iterable[Iterable[str]] = ()
     tables: Iterable[pa.Table] = ()
     schema: pa.Schema | None = None
     batches: Iterable[tuple[Batch, Sequence[Channel]]] = ()

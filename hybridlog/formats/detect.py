@@ -112,6 +112,14 @@ def natural(path: Path) -> list[tuple[int, str]]:
     ]
 
 
+def part_of(path: Path) -> tuple[tuple[str, str], int]:
+    """The log that a file is a part of, and its number in it, by its name; 0 if it has none."""
+    found = _PART.fullmatch(plain(path))
+    if found is None:
+        return (path.name, ""), 0
+    return (_DATE.sub("*", found["stem"]), found["end"]), int(found["number"])
+
+
 def grouped_parts(paths: Iterable[Path]) -> list[list[Path]]:
     """Files of one directory, with the parts of each split log together and in order.
 
@@ -120,46 +128,36 @@ def grouped_parts(paths: Iterable[Path]) -> list[list[Path]]:
     groups: list[list[Path]] = []
     latest: dict[tuple[str, str], tuple[int, list[Path]]] = {}
     for path in sorted(paths, key=natural):
-        part = _PART.fullmatch(plain(path))
-        group = [path]
-        if part is not None:
-            series, number = (_DATE.sub("", part["stem"]), part["end"]), int(part["number"])
-            before, parts = latest.get(series, (number, group))
-            if number > before:
-                parts.append(path)
-                latest[series] = number, parts
-                continue
-            if number == 0:
-                latest[series] = number, group
-        groups.append(group)
+        series, number = part_of(path)
+        before, group = latest.get(series, (number, []))
+        if number > before:
+            group.append(path)
+        else:
+            groups.append(group := [path])
+        if number == 0 or len(group) > 1:
+            latest[series] = number, group
     return groups
 
 
 def is_split(files: Sequence[LogFile]) -> bool:
     """True if files are the parts of one log, by their names and formats."""
-    found = [_PART.fullmatch(plain(file.path)) for file in files]
-    series = {(_DATE.sub("", each["stem"]), each["end"]) for each in found if each is not None}
-    numbers = {int(each["number"]) for each in found if each is not None}
+    parts = {part_of(file.path) for file in files}
     formats = {file.format for file in files if file.format is not UNKNOWN}
-    return None not in found and len(series) == len(formats) == 1 and len(numbers) == len(files)
+    return len({series for series, _ in parts}) == len(formats) == 1 and len(parts) == len(files)
 
 
 def missing_parts(files: Sequence[LogFile]) -> list[Damage]:
     """The damage for parts that are missing between others, by their numbers."""
-    found = {
-        int(part["number"]): (file.path, part)
-        for file in files
-        if (part := _PART.fullmatch(plain(file.path))) is not None
-    }
-    if len(found) < len(files):
-        return []
+    found = {part_of(file.path)[1]: file.path for file in files}
     damage: list[Damage] = []
     for before, after in pairwise(sorted(found)):
-        if after == before + 1:
+        part = _PART.fullmatch(plain(found[before]))
+        if after == before + 1 or part is None:
             continue
-        path, part = found[before]
-        stem, number = _DATE.sub("*", part["stem"]), str(before + 1).zfill(len(part["number"]))
+        (stem, end), _ = part_of(found[before])
+        number = str(before + 1).zfill(len(part["number"]))
         what = "the file is" if after == before + 2 else f"parts {before + 1} to {after - 1} are"
-        reason = f"{what} missing between {path.name} and {found[after][0].name}"
-        damage.append(Damage(path.with_name(stem + number + part["end"]), None, None, reason, None))
+        reason = f"{what} missing between {found[before].name} and {found[after].name}"
+        path = found[before].with_name(stem + number + end)
+        damage.append(Damage(path, None, None, reason, None))
     return damage

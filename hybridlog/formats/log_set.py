@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from contextlib import nullcontext, suppress
 from stat import S_ISDIR, S_ISREG
 from typing import TYPE_CHECKING
@@ -30,10 +29,11 @@ from hybridlog_storage.messages import MAX_PAYLOAD, Batch
 from hybridlog_storage.times import span_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Generator, Iterator, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
+
 
 _CDR = frozenset({"cdr", ""})  # encodings of ROS 2 messages
 
@@ -288,16 +288,15 @@ class _JoinedSource(Source):
     def _read(self, part: LogFile, inner: Source, done: int, size: int) -> Iterator[Batch]:
         """Yield the messages of one open file, over the channels of this source."""
         numbers = np.empty(0, np.int32)
-        alike: Counter[tuple[object, ...]] = Counter()
         got = 0
         found_before = len(self.damage)
         for batch in self._unpacked(part.path, inner):
             got += len(batch)
-            numbers = self._numbered(inner, numbers, alike)
+            numbers = self._numbered(inner, numbers)
             share = inner.bytes_read / inner.size_bytes if inner.size_bytes else 1.0
             self.bytes_read = done + int(size * min(share, 1.0))
             yield replace(batch, channel=numbers[batch.channel])
-        self._numbered(inner, numbers, alike)
+        self._numbered(inner, numbers)
         self.damage.extend(replace(damage, file=part.path) for damage in inner.damage)
         self.remarks.extend(f"{part.path}: {remark}" for remark in inner.remarks)
         self._got += got
@@ -315,25 +314,13 @@ class _JoinedSource(Source):
         if total is not None:
             self.settle(total, self._got, path / NAME)
 
-    def _numbered(
-        self, inner: Source, numbers: NDArray[np.int32], alike: Counter[tuple[object, ...]]
-    ) -> NDArray[np.int32]:
-        """Numbers of the channels of a file in this source; `alike` is changed.
-
-        Equal channels of one file are publishers of their own, of two files the same ones.
-        """
+    def _numbered(self, inner: Source, numbers: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Numbers of the channels of a file in this source, where equal ones are one."""
         more = []
         for channel in inner.channels[len(numbers) :]:
-            schema = channel.schema
-            key = (
-                channel.topic,
-                channel.message_encoding,
-                None if schema is None else (schema.name, schema.encoding, schema.data),
-                tuple(sorted(channel.metadata.items())),
-                channel.has_publish_time,
-            )
-            alike[key] += 1
-            number = self._numbers.setdefault((alike[key], *key), len(self.channels))
+            metadata = tuple(sorted(channel.metadata.items()))
+            said = channel.topic, channel.message_encoding, channel.schema, metadata
+            number = self._numbers.setdefault(said, len(self.channels))
             if number == len(self.channels):
                 self.channels.append(channel)
             more.append(number)
@@ -345,7 +332,6 @@ class _JoinedSource(Source):
         CDR never begins like a frame. Frames that do not unpack stay as they are.
         """
         may_be = np.empty(0, np.bool_)
-        unpacker = zstandard.ZstdDecompressor()
         broken = 0
         for batch in inner.batches():
             if len(may_be) < len(inner.channels):
@@ -354,25 +340,29 @@ class _JoinedSource(Source):
             if not packed.any():
                 yield batch
                 continue
-            row = 0
-            while row < len(batch):
-                start, size = row, 0
-                payloads: list[bytes] = []
-                while row < len(batch) and size < BATCH_BYTES:
-                    payload = bytes(batch.payload(row))
-                    data = _unpack_payload(unpacker, payload) if packed[row] else payload
-                    broken += data is None
-                    payloads.append(payload if data is None else data)
-                    size += len(payloads[-1])
-                    row += 1
-                length = np.fromiter(map(len, payloads), np.int64, len(payloads))
-                rows = batch.take(slice(start, row))
-                yield replace(
-                    rows, buffer=b"".join(payloads), length=length, offset=length.cumsum() - length
-                )
+            broken += yield from _unpacked_rows(batch, packed)
         if broken:
             reason = f"{broken} payloads are zstd frames that do not unpack; they stay as they are"
             self.damage.append(Damage(path, None, None, reason, 0))
+
+
+def _unpacked_rows(batch: Batch, packed: NDArray[np.bool_]) -> Generator[Batch, None, int]:
+    """A batch with its frames unpacked, in parts; returns how many do not unpack."""
+    unpacker, broken, row = zstandard.ZstdDecompressor(), 0, 0
+    while row < len(batch):
+        start, size = row, 0
+        payloads: list[bytes] = []
+        while row < len(batch) and size < BATCH_BYTES:
+            payload = bytes(batch.payload(row))
+            data = _unpack_payload(unpacker, payload) if packed[row] else payload
+            broken += data is None
+            payloads.append(payload if data is None else data)
+            size += len(payloads[-1])
+            row += 1
+        length = np.fromiter(map(len, payloads), np.int64, len(payloads))
+        rows, offset = batch.take(slice(start, row)), length.cumsum() - length
+        yield replace(rows, buffer=b"".join(payloads), length=length, offset=offset)
+    return broken
 
 
 def _is_frame(batch: Batch) -> NDArray[np.bool_]:

@@ -1,7 +1,7 @@
 """Writes a topic's pictures as a video in an MP4 file, each at its time.
 
-Frames of H.264, H.265 and AV1 are copied; images, and frames in another order than they are shown,
-become H.264. Time 0 is the log time of the first picture, which is in the file's `comment`.
+Frames of H.264, H.265 and AV1 are copied; images become H.264. Time 0 is the log time of the first
+picture, which is in the file's `comment`.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import io
 import os
-from collections import deque
 from datetime import UTC, datetime
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any, Final
@@ -44,6 +43,7 @@ _STREAMS: Final = {"h264": "h264", "h265": "hevc", "av1": "obu"}
 """Names of streams of frames by the format of a message."""
 _ENCODER: Final = {"preset": "veryfast", "crf": "18"}
 _BT601: Final = 6
+_BETWEEN: Final = 3  # the kind of pictures that refer to later ones
 
 
 def write_mp4(answer: Answer, target: Target) -> None:
@@ -74,7 +74,6 @@ class _Video(Whole):
         self._source = ("", "")
         self._form = ""
         self._decoder: VideoDecoder | None = None
-        self._waiting: deque[int] = deque()  # times of pictures that the decoder holds back
         self._begin = self._last = self._tick = 0
         self._step = _ONLY_STEP
 
@@ -86,12 +85,12 @@ class _Video(Whole):
                 "An MP4 is of one topic in one recording: choose one, or `hybridlog export` a file "
                 "for each with --split-by recording."
             )
+        self._source = source
         with failures(self._sink.name):
             if is_video_type(message.type):
                 self._add_frame(message)
             else:
                 self._encode(shown_pixels(message), message.log_time_ns)
-        self._source = source
 
     def _add_frame(self, message: Message) -> None:
         form, data = frame_of(message.decode())
@@ -101,45 +100,35 @@ class _Video(Whole):
                 raise PayloadError(
                     "a frame of video cannot be decoded: there is no key frame before it"
                 )
-            self._end_of_frames()
-            self._form, self._decoder = form, VideoDecoder(form, in_order=True)
+            self._form, self._decoder = form, VideoDecoder(form)
         if form == "av1":
             message.to_numpy()  # the frames themselves do not tell that one is lost
-        try:
-            pictures = self._decoder.take(form, data)
-        except PayloadError:
-            self._end_of_frames()
-            raise
         time = message.log_time_ns
-        self._waiting.append(time)
-        if self._track is None and pictures and len(self._waiting) == 1:
-            self._copied = form
-            with self._av.open(io.BytesIO(data), format=_STREAMS[form]) as stream:
-                track = self._file.add_stream_from_template(stream.streams.video[0], opaque=True)
-            self._start(track, (pictures[0].width, pictures[0].height), time)
-        if not self._copied:
-            self._show(pictures)
-            return
-        self._waiting.clear()
-        if len(pictures) != 1 or form != self._copied:
+        opened: Any = self._stream(form, data) if is_key else contextlib.nullcontext()
+        with opened as stream:
+            is_between = is_key and stream.streams.video[0].codec_context.has_b_frames
+            pictures = [] if is_between else self._decoder.take(form, data)
+            if is_between or any(int(one.pict_type) == _BETWEEN for one in pictures):
+                what = "frames in another order than they are shown"
+                raise UsageError(self._changed(what, time))
+            if len(pictures) != 1:
+                raise PayloadError("a frame of video has no picture")
+            size = pictures[0].width, pictures[0].height
+            if self._track is None:
+                self._copied = form
+                template = stream.streams.video[0]
+                track = self._file.add_stream_from_template(template, opaque=True)
+                self._start(track, size, time)
+        if form != self._copied:
             raise UsageError(self._changed(f"{self._copied}, then other frames", time))
-        self._check_size((pictures[0].width, pictures[0].height), time)
+        self._check_size(size, time)
         packet = self._av.Packet(data)
         packet.pts = packet.dts = self._tick_at(time)
         packet.is_keyframe = is_key
         self._mux(packet)
 
-    def _show(self, pictures: list[Any]) -> None:
-        for one in pictures:
-            self._encode(one.to_ndarray(format="rgb24"), self._waiting.popleft())
-
-    def _end_of_frames(self) -> None:
-        """Write what the decoder holds back; it takes no more."""
-        if self._decoder is not None and self._waiting:
-            with contextlib.suppress(PayloadError):
-                self._show(self._decoder.rest())
-        self._waiting.clear()
-        self._decoder = None
+    def _stream(self, form: str, data: bytes) -> Any:
+        return self._av.open(io.BytesIO(data), format=_STREAMS[form])
 
     def _encode(self, pixels: NDArray[np.uint8], time: int) -> None:
         height, width = pixels.shape[:2]
@@ -208,7 +197,6 @@ class _Video(Whole):
     def commit(self) -> None:
         """Complete the file."""
         with failures(self._sink.name):
-            self._end_of_frames()
             if self._track is None:
                 raise UsageError("There is no image in this answer.")
             if not self._copied:

@@ -9,12 +9,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 from msgspec import Struct
 
-from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.tokens import MAX_TEXT
-from hybridlog.query.predicate.tree import Near
 from hybridlog.query.times import format_time
 from hybridlog.record.losses import extent_of
-from hybridlog_storage.errors import UsageError, WhereError
 
 if TYPE_CHECKING:
     from hybridlog.query.query import Query
@@ -70,20 +67,6 @@ class PageQuestion(Struct, frozen=True):
             "name": self.file_name(),
         }
 
-    def around(self, distance: str) -> PageQuestion:
-        """The messages of all topics near the matches in time, at most a duration away.
-
-        The predicate must have no conditions on other topics.
-        """
-        where = f"{self.topics[0]}: ({self.where})" if len(self.topics) == 1 and self.where else ""
-        if not where or _topic_of(where) != self.topics[0]:
-            raise UsageError(
-                "Messages around matches need a predicate on one topic, without other topics, "
-                "whose name can stand in a predicate."
-            )
-        self.query()  # the predicate is one by itself, without the brackets
-        return PageQuestion(self.store, self.recording, (), where, distance, self.span)
-
     def command(self) -> str:
         """The command line that writes it to a file of `file_name`."""
         words = ["hybridlog", "fetch", "--store", self.store.directory.place]
@@ -125,15 +108,6 @@ class PageQuestion(Struct, frozen=True):
 
     def _topics(self) -> Sequence[str]:
         return self.topics or sorted({channel.topic for channel in self.recording.channels})
-
-
-def _topic_of(where: str) -> str | None:
-    """The topic of a predicate that is one condition on another topic."""
-    try:
-        condition = parse(where).root
-    except WhereError:
-        return None
-    return condition.topic if isinstance(condition, Near) else None
 
 
 def question_of(context: Context, params: RequestParams) -> PageQuestion:

@@ -15,7 +15,7 @@ from rosbags.highlevel import AnyReader
 
 import hybridlog as hl
 from benchmarks.simulator.write import write_bag
-from hybridlog.drawing.track import Grid, Position, fix_of, pose_of, position_of, track
+from hybridlog.drawing.track import Grid, Position, position_of, track
 from hybridlog.query.query import field_types
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.messages import Channel, Schema
@@ -181,37 +181,6 @@ def test_the_grid_is_on_the_ellipsoid() -> None:
         )
 
 
-def test_one_fix(tmp_path: Path) -> None:
-    with hl.open(tmp_path / "store", create=True) as store:
-        fix = channel("/fix")
-        given: list[dict[str, Any]] = [
-            {"covariance": [1, 0, 0, 0, 4, 0, 0, 0, 9]},
-            {"covariance": [2, 1, 0, 1, 2, 0, 0, 0, 9], "altitude": math.nan},
-            {"kind": 0},
-            {"covariance": [-1, 0, 0, 0, 4, 0, 0, 0, 9]},
-            {"covariance": [math.nan, 0, 0, 0, 4, 0, 0, 0, 9]},
-            {"covariance": [0] * 9},
-            {"status": -1},
-            {"status": 2, "latitude": math.inf},
-        ]
-        with store.start("one") as recorder:
-            for at, one in enumerate(given):
-                values = {"latitude": 48.0, "longitude": 11.0, **one}
-                recorder.write(fix, payload(**values), log_time=BASE + at)
-        fixes = [fix_of(message) for message in store.topic("fix")]
-        assert position_of(field_types(store.topic("fix"))) == Position("", is_geographic=True)
-    assert fixes[0]["ellipse"] == pytest.approx((2 * 2.4477, 2.4477, math.pi / 2), abs=1e-3)
-    assert fixes[0]["altitude"] == 12.5
-    assert fixes[0]["time"] == BASE
-    large, small, angle = fixes[1]["ellipse"] or (0, 0, 0)
-    assert (large, small) == pytest.approx((math.sqrt(3) * 2.4477, 2.4477), abs=1e-3)
-    assert angle % math.pi == pytest.approx(math.pi / 4)
-    assert fixes[1]["altitude"] is None
-    assert [one["ellipse"] for one in fixes[2:6]] == [None] * 4
-    assert [one["has_fix"] for one in fixes] == [True] * 6 + [False] * 2
-    assert [one["status"] for one in fixes[-2:]] == [-1, 2]
-
-
 def test_topics_without_positions(store: hl.Store) -> None:
     with pytest.raises(UsageError, match="2 topics in 1 recordings"):
         track(store.topic("fix", "other"), pixels=10)
@@ -247,15 +216,6 @@ def test_poses_of_a_robot(tmp_path: Path) -> None:
         assert {tuple(place) for place in thin["xy"].tolist()} <= {
             tuple(p) for p in got["xy"].tolist()
         }
-        time, pose = read[200]
-        found = pose_of(query.at(time), "pose.pose.position.")
-        assert (found["time"], found["x"], found["y"]) == (time, pose.position.x, pose.position.y)
-        # The robot turns about z only.
-        turned = 2 * math.atan2(pose.orientation.z, pose.orientation.w)
-        assert found["heading"] is not None
-        assert math.cos(found["heading"] - turned) == pytest.approx(1)
         assert position_of(field_types(store.topic("r_cart/command_pose"))) == Position(
             "pose.position.", is_geographic=False
         )
-        with pytest.raises(UsageError, match="has no position"):
-            pose_of(query.at(time), "pose.")

@@ -341,7 +341,9 @@ def test_definitions_without_messages(tmp_path: Path) -> None:
     # The last definition of each id is a channel.
     path = write(tmp_path / "a.mcap", *(channel(9, f"/t{k}") for k in range(70_000)), message())
     assert read(path) == (1, 2, [])
-    flips = [channel(k) for k in range(1, FULL)] + [schema(1, f"a/T{k % 2}") for k in range(10_000)]
+    flips = [channel(k, f"/t{k}") for k in range(1, FULL)] + [
+        schema(1, f"a/T{k % 2}") for k in range(10_000)
+    ]
     assert read(write(tmp_path / "b.mcap", *flips, message())) == (1, FULL - 1, [])
     bag = tmp_path / "a.bag"
     rows = [bags.connection(k, topic=f"/t{k}") for k in range(1, FULL + 100)]

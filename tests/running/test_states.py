@@ -190,6 +190,10 @@ def test_extras_and_what_is_shown(tmp_path: Path) -> None:
             assert (len(extras.attachments), len(extras.metadata)) == (1, 1)
         done = answer("info", LABEL, "--attachments", "--json", store=found.path)
         assert [one["name"] for one in done.json] == [record.name]
+        image = next(iter(found.before.topic("cam")))
+        assert image is not None
+        assert "/cam" in image._repr_html_()
+        assert LABEL in found.before.recordings()._repr_html_()
         assert complete(f"fetch --store {found.path} -t sa") == ["said"]
         assert complete(f"info --store {found.path} l") == [LABEL]
 

@@ -189,16 +189,16 @@ def pixels(png: bytes, colour: tuple[int, int, int]) -> int:
 @pytest.mark.peer("browser")
 def test_a_track_is_drawn(page: Page, url: str) -> None:
     opened(page, url, "yard", ("map", "/fix", {}), at=2 * S)
-    page.wait_for_selector(".space[data-fixes='28'][data-fix]")
+    page.wait_for_selector(".space[data-fixes='28'][data-at]")
     shown = data(page, "/fix")
     assert (shown["points"], shown["messages"], shown["exact"]) == ("31", "31", "true")
     box = json.loads(shown["box"])
     assert (box["left"], box["bottom"]) == (0, 0)
     assert box["right"] == pytest.approx(111.92, abs=0.3)  # 15e-4 degrees at 48 degrees north
-    assert json.loads(shown["fix"])["longitude"] == 11.0002
+    assert json.loads(shown["at"]) == [pytest.approx(14.92, abs=0.05), 0]
     words = page.locator("article .sum").inner_text()
     assert "28 fixes · 3 messages without one" in words
-    assert "95 % within 4.9 m" in page.locator(".facts").inner_text()
+    assert "48° N, 11.0002° E" in page.locator(".facts").inner_text()
     page.wait_for_timeout(100)
     seen = view(page, "plane")
     line, gap, ground = (colour_at(page, seen, (x, y)) for x, y in ((37, 0), (82, 0), (20, 33)))
@@ -211,4 +211,5 @@ def test_a_track_is_drawn(page: Page, url: str) -> None:
     x = box_of["width"] / 2 + (15 * 7.46 - seen[0]) * seen[2]
     y = box_of["height"] / 2 - (5 * 11.12 - seen[1]) * seen[2]
     canvas.click(position={"x": x, "y": y})
-    until(page, lambda: json.loads(data(page, "/fix")["fix"])["latitude"] == 48.0005)
+    there = pytest.approx(5 * 11.12, abs=0.1)
+    until(page, lambda: json.loads(data(page, "/fix")["at"])[1] == there)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -16,8 +15,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from hybridlog.formats.answer import Answer, LogWriter
 from hybridlog.formats.mcap.writer import source_metadata
-from hybridlog.formats.writing import Sink, Target, destination, failures
-from hybridlog_storage.disk.unfinished import beside, scratch_directory
+from hybridlog.formats.writing import Target, destination, failures, path_of
+from hybridlog_storage.disk.unfinished import beside
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
@@ -40,33 +39,21 @@ class BagWriter(LogWriter):
     """Writes one ROS 1 bag, version 2.0, with its index.
 
     Only channels of ROS 1 messages (`message_encoding` is `ros1`) fit into a bag. Its header is
-    written last, so a bag for a stream is written to a temporary file first.
+    written last, so it is no stream.
     """
 
     def __init__(self, target: Target) -> None:
-        self._target = target
+        path = path_of(target, "bag", "a file")
         self._connections: dict[_ConnectionKey, Connection] = {}
         self._known: dict[Channel, Connection] = {}
-        self._final: Path | None = None
-        self._name = str(getattr(target, "name", "the output"))
-        if isinstance(target, str | os.PathLike):
-            self._name = os.fspath(target)
-            with failures(self._name):
-                final, is_atomic = destination(target)
-                self._final = final if is_atomic else None
+        self._name = os.fspath(path)
         with failures(self._name):
-            if self._final is not None:
-                self._unfinished = beside(self._final)
-                self._temporary = self._unfinished.path
-            else:
-                self._unfinished = scratch_directory()
-                self._temporary = self._unfinished.path / "output.bag"
-            self._writer = _ExactWriter(self._temporary)
-            try:
-                self._writer.open()
-            except BaseException:
-                self.abort()
-                raise
+            self._final, is_file = destination(path)
+            if not is_file:
+                raise UsageError(f"bag is no stream, as {path} is: name a file with -o.")
+            self._unfinished = beside(self._final)
+            self._writer = _ExactWriter(self._unfinished.path)
+            self._writer.open()
 
     def write(self, batch: Batch, channels: Sequence[Channel]) -> None:
         """Append messages in the order of the rows."""
@@ -126,17 +113,12 @@ class BagWriter(LogWriter):
         """Complete the bag."""
         with failures(self._name):
             self._writer.close()
-            if self._final is not None:
-                with self._temporary.open("rb") as file:
-                    os.fsync(file.fileno())
-                self._unfinished.publish(self._final)
-                return
-            with Sink(self._target) as sink, self._temporary.open("rb") as file:
-                shutil.copyfileobj(file, sink, 1 << 20)
-        self.abort()
+            with self._unfinished.path.open("rb") as file:
+                os.fsync(file.fileno())
+            self._unfinished.publish(self._final)
 
     def abort(self) -> None:
-        """Remove the file, and its temporary copy."""
+        """Remove the file."""
         with suppress(OSError):
             self._writer.abort()
         self._unfinished.remove()

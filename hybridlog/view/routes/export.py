@@ -60,7 +60,7 @@ def _question(context: Context, params: RequestParams) -> PageQuestion:
     question = question_of(context, params)
     if params.has("begin") or params.has("end"):
         question = replace(question, span=params.span(start_of(question.recording)))
-    return question.around(params.text("around", longest=64)) if params.has("around") else question
+    return question
 
 
 def pieces_of(query: Query) -> Pieces:

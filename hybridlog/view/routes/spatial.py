@@ -10,8 +10,7 @@ from starlette.responses import Response
 
 from hybridlog.drawing.images import picture
 from hybridlog.drawing.points import MAX_POINTS, bounds, points
-from hybridlog.drawing.track import Position, fix_of, pose_of, position_of, track
-from hybridlog.query.query import field_types
+from hybridlog.drawing.track import track
 from hybridlog.view.context import current, json_response, packed_response, route, start_of
 from hybridlog_storage.errors import DefinitionError, MissingDependencyError, PayloadError
 
@@ -89,24 +88,8 @@ def track_of(context: Context, params: RequestParams) -> Response:
     return packed_response(header, arrays)
 
 
-def fix_at(context: Context, params: RequestParams) -> dict[str, Any]:
-    """The position of the message that is current at a time.
-
-    Parameters: `recording`, `topic`, `at`.
-    """
-    shown = current(context, params)
-    answer: dict[str, Any] = {"time": shown.time, "until": shown.until}
-    if shown.message is None:
-        return answer
-    _, query = context.topic(params)
-    position = position_of(field_types(query)) or Position("", is_geographic=True)
-    find = fix_of if position.is_geographic else pose_of
-    return {**find(shown.message, position.prefix), **answer}
-
-
 routes = [
     route("/image", image),
     route("/points", points_at),
     route("/track", track_of),
-    route("/fix", fix_at),
 ]

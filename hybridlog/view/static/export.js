@@ -14,10 +14,6 @@ const PARTS = {
     ask: ({ topic }, range) => ({ topic, ...range }),
   },
   matches: { title: "Matches in this range", ask: (asked, range) => ({ ...asked, ...range }) },
-  around: {
-    title: "All topics around these matches",
-    ask: (asked, range, around) => ({ ...asked, ...range, around }),
-  },
 };
 
 /**
@@ -28,13 +24,6 @@ const PARTS = {
  */
 export function exportForm(recording) {
   const part = element("select", { "aria-label": "Part to export", onchange: load });
-  const around = element("input", {
-    "aria-label": "Time around each match",
-    size: 6,
-    value: "2s",
-    onchange: load,
-  });
-  const distance = element("label", {}, "± ", around);
   const told = element("span", { role: "status" });
   const command = element("pre", { class: "command", tabindex: "0", "aria-label": "Command line" });
   const download = element("a", { class: "button", download: true }, "Download");
@@ -51,7 +40,7 @@ export function exportForm(recording) {
   const form = element(
     "section",
     { class: "export", "aria-label": "Export", hidden: true },
-    element("p", { class: "row" }, part, distance, told),
+    element("p", { class: "row" }, part, told),
     command,
     copies,
     problem,
@@ -80,12 +69,11 @@ export function exportForm(recording) {
   }
 
   async function load() {
-    distance.hidden = part.value !== "around";
     const { begin, end } = { begin: state.get("begin"), end: state.get("end") };
     const range = begin === null ? {} : { begin, end };
     const asked = {
       recording: recording.info.id,
-      ...PARTS[part.value].ask(predicate(recording) ?? {}, range, around.value),
+      ...PARTS[part.value].ask(predicate(recording) ?? {}, range),
     };
     try {
       const ask = recording.isUpdating ? "update" : "ask";

@@ -1,12 +1,11 @@
 /** The track of a satellite receiver, or of a robot, on a grid in metres: no tiles, no network. */
 
-import { ApiError, Question, bytes, get, isAborted } from "../api.js";
+import { ApiError, Question, bytes, isAborted } from "../api.js";
 import { element } from "../dom.js";
 import { unpack } from "../packed.js";
-import { metres, plane } from "../spatial/plane.js";
+import { plane } from "../spatial/plane.js";
 import { instant } from "../state.js";
 import { counted, offset } from "../words.js";
-import { follow } from "./follow.js";
 import { literal, opening } from "./python.js";
 import { ofTypes } from "./types.js";
 
@@ -64,7 +63,6 @@ function mount(body, panel) {
   let track = null; // of the whole recording
   let detail = null; // of the visible range, if that shows more
   let wanted = ""; // the range that was asked for last
-  let fix = null;
   let messages = -1; // of the topic when the track was asked for
   let rested = 0; // when the track may be asked for again
   let timer = 0;
@@ -73,20 +71,6 @@ function mount(body, panel) {
 
   const drawn = plane(place, { label: `Track of ${panel.topic.topic}`, paint, pick });
   fit.addEventListener("click", drawn.reset);
-  const following = follow({
-    load: (at, signal) => get("fix", { ...asked, at, seq: panel.seq() }, { signal }),
-    show(found) {
-      fix = found;
-      describe();
-      drawn.redraw();
-    },
-    fail(error) {
-      fix = null;
-      facts.textContent = error.message;
-      drawn.redraw();
-    },
-    panel,
-  });
   update();
   return {
     update,
@@ -95,19 +79,18 @@ function mount(body, panel) {
       asking.stop();
       looking.stop();
       clearTimeout(timer);
-      following.destroy();
       drawn.destroy();
     },
   };
 
   function update() {
-    following.want(panel.cursor());
     const { topics } = panel.recording.info;
     const now = topics.find(({ topic }) => topic === panel.topic.topic)?.messages;
     clearTimeout(timer);
     if (now === messages) look();
     else if (performance.now() >= rested) load(now);
     else timer = setTimeout(update, rested - performance.now());
+    describe();
     drawn.redraw();
   }
 
@@ -157,10 +140,23 @@ function mount(body, panel) {
     return [turn * grid.east, (latitude - grid.latitude) * grid.north];
   }
 
-  /** Metres of what is current at the cursor; null if it has no position. */
-  function placeOf(found) {
-    if (found?.x !== undefined) return found.x === null || found.y === null ? null : [found.x, found.y];
-    return found?.has_fix && track.grid ? shiftOf(found) : null;
+  /** The last position of the track at the cursor or before it; null if there is none. */
+  function current() {
+    const cursor = panel.cursor();
+    const known = detail?.arrays.times ?? [];
+    const isInside = known.length && instant(known[0]) <= cursor && cursor <= instant(known.at(-1));
+    const part = isInside ? detail : track;
+    const { times, rests, xy } = part.arrays;
+    let [low, high] = [0, times.length];
+    while (low < high) {
+      const middle = (low + high) >> 1;
+      if (instant(times[middle]) + instant(rests[middle]) <= cursor) low = middle + 1;
+      else high = middle;
+    }
+    if (!low || Number.isNaN(xy[2 * low - 2])) return null;
+    const [right, up] = part.shift ?? [0, 0];
+    const time = instant(times[low - 1]) + instant(rests[low - 1]);
+    return { time, x: xy[2 * low - 2] + right, y: xy[2 * low - 1] + up };
   }
 
   function paint(context, view) {
@@ -169,25 +165,10 @@ function mount(body, panel) {
     line(context, view, track, { colour: view.theme.faint, width: 1 });
     const part = detail ?? track;
     line(context, view, part, { colour: view.theme.accent, width: 2, begin, end });
-    const place = placeOf(fix);
-    if (!place) return;
-    const [right, down] = [view.x(place[0]), view.y(place[1])];
+    const found = current();
+    if (!found) return;
+    const [right, down] = [view.x(found.x), view.y(found.y)];
     context.fillStyle = view.theme.mark;
-    context.strokeStyle = view.theme.mark;
-    if (Number.isFinite(fix.heading)) {
-      arrow(context, right, down, -fix.heading);
-      return;
-    }
-    if (fix.ellipse) {
-      const [long, across, angle] = fix.ellipse;
-      context.lineWidth = 1;
-      context.beginPath();
-      context.ellipse(right, down, long * view.scale, across * view.scale, -angle, 0, 2 * Math.PI);
-      context.stroke();
-      context.globalAlpha = 0.15;
-      context.fill();
-      context.globalAlpha = 1;
-    }
     context.beginPath();
     context.arc(right, down, 4, 0, 2 * Math.PI);
     context.fill();
@@ -225,10 +206,18 @@ function mount(body, panel) {
         box: JSON.stringify(boxOf(track.arrays.xy)),
       });
     }
-    if (!fix) return;
-    facts.textContent = fix.time === null ? "Nothing at or before the cursor." : describeFix(fix);
+    const found = track && current();
+    facts.textContent = found ? describePlace(found) : "No position at or before the cursor.";
     facts.title = facts.textContent;
-    place.dataset.fix = JSON.stringify(fix, (_, value) => (typeof value === "bigint" ? `${value}` : value));
+    if (found) place.dataset.at = JSON.stringify([found.x, found.y]);
+    else delete place.dataset.at;
+  }
+
+  function describePlace({ time, x, y }) {
+    const { grid } = track;
+    if (!grid) return `${offset(time)} · x ${x.toFixed(3)} m · y ${y.toFixed(3)} m`;
+    const at = { latitude: grid.latitude + y / grid.north, longitude: grid.longitude + x / grid.east };
+    return `${offset(time)} · ${degrees(at)}`;
   }
 
   function refuse(error) {
@@ -238,21 +227,6 @@ function mount(body, panel) {
     problem.hidden = false;
     place.hidden = true;
   }
-}
-
-/** Draws an arrow at a pixel; the angle is clockwise from the right, in radians. */
-function arrow(context, right, down, angle) {
-  context.save();
-  context.translate(right, down);
-  context.rotate(angle);
-  context.beginPath();
-  context.moveTo(12, 0);
-  context.lineTo(-7, 7);
-  context.lineTo(-3, 0);
-  context.lineTo(-7, -7);
-  context.closePath();
-  context.fill();
-  context.restore();
 }
 
 /** Draws a track, or the part of it in a range; NaN is a gap. */
@@ -303,30 +277,7 @@ function boxOf(xy) {
 }
 
 function degrees({ latitude, longitude }) {
-  const north = `${Math.abs(latitude)}° ${latitude < 0 ? "S" : "N"}`;
-  return `${north}, ${Math.abs(longitude)}° ${longitude < 0 ? "W" : "E"}`;
-}
-
-function describeFix(fix) {
-  return fix.x === undefined ? describeReceiver(fix) : describePose(fix);
-}
-
-function describePose({ time, x, y, heading }) {
-  const turned = heading === null ? null : `${((heading * 180) / Math.PI).toFixed(1)}°`;
-  const values = x === null || y === null ? ["no position"] : [`x ${x.toFixed(3)} m`, `y ${y.toFixed(3)} m`];
-  return [offset(time), ...values, turned].filter((part) => part !== null).join(" · ");
-}
-
-function describeReceiver({ time, has_fix: hasFix, latitude, longitude, altitude, status, ellipse }) {
-  const isPosition = latitude !== null && longitude !== null;
-  return [
-    offset(time),
-    hasFix ? degrees({ latitude, longitude }) : "no fix",
-    !hasFix && isPosition ? `(${degrees({ latitude, longitude })})` : null,
-    altitude === null ? null : `${Number(altitude.toFixed(3))} m high`,
-    status === null ? null : `status ${status}`,
-    ellipse ? `95 % within ${metres(Number(ellipse[0].toPrecision(3)))}` : null,
-  ]
-    .filter((part) => part !== null)
-    .join(" · ");
+  const rounded = (value) => Number(Math.abs(value).toFixed(7));
+  const north = `${rounded(latitude)}° ${latitude < 0 ? "S" : "N"}`;
+  return `${north}, ${rounded(longitude)}° ${longitude < 0 ? "W" : "E"}`;
 }
