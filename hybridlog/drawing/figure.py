@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import groupby
 from typing import TYPE_CHECKING, Final
@@ -13,10 +13,11 @@ import numpy as np
 from msgspec import Struct
 
 from hybridlog.drawing.series import Series, numbers_of, series
+from hybridlog.frames.names import is_summary
 from hybridlog.query.query import field_types, narrowed, spans_of
 from hybridlog.query.times import format_time
 from hybridlog.wording import listed
-from hybridlog_storage.errors import MissingDependencyError, TopicError, UsageError
+from hybridlog_storage.errors import MissingDependencyError, UsageError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -171,52 +172,32 @@ def lines(query: Query, fields: Sequence[str], *, pixels: int) -> list[Line]:
     summaries = {summary.id: summary for summary in query.source.now().summaries_of(query.question)}
     with query.counters.timed():
         found: list[Line] = []
-        missing: dict[str, TopicError] = {}
         had: set[str] = set()
         for one in _by_topic(query):
             for recording in spans_of(one):
-                part = one.in_recording(recording)
-                about = summaries[recording]
-                for group in _groups(part, fields, missing):
-                    try:
-                        drawn = series(part, group, pixels=pixels)
-                    except TopicError as error:
-                        missing.update(dict.fromkeys(group, error))
-                        continue
-                    query.counters.add(part.counters)
-                    had.update(group)
-                    found += [Line(one.topics[0], about.name, about.extent[0], x) for x in drawn]
+                part, about = one.in_recording(recording), summaries[recording]
+                known = field_types(part)
+                own = [x for x in fields if known is None or _is_among(x.partition("[")[0], known)]
+                had.update(own)
+                drawn = series(part, own, pixels=pixels) if own else []
+                query.counters.add(part.counters)
+                found += [Line(one.topics[0], about.name, about.extent[0], x) for x in drawn]
                 if len(found) > MAX_LINES:
                     raise UsageError(
                         f"A plot has at most {MAX_LINES} lines: name fewer fields, or choose "
                         "recordings with -r."
                     )
-    for field, problem in missing.items():
+    for field in fields:
         if field not in had:
-            raise problem
+            narrowed(query, query.topics[0]).fields(field.partition("[")[0])  # says what is wrong
     return found
 
 
-def _groups(
-    query: Query, fields: Sequence[str], missing: dict[str, TopicError]
-) -> Iterator[list[str]]:
-    """The fields that a topic has, together; one by one where only messages tell.
-
-    `missing` gets those that it does not have.
-    """
-    if field_types(query) is None:
-        yield from ([field] for field in fields)
-        return
-    own = []
-    for field in fields:
-        try:
-            query.fields(field.partition("[")[0])
-        except TopicError as error:
-            missing[field] = error
-        else:
-            own.append(field)
-    if own:
-        yield own
+def _is_among(path: str, known: Mapping[str, str]) -> bool:
+    """True for a field, a message with fields, or a summary of an array."""
+    return any(one == path or one.startswith(f"{path}.") for one in known) or is_summary(
+        path, known
+    )
 
 
 def _by_topic(query: Query) -> Iterator[Query]:

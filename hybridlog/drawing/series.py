@@ -14,7 +14,6 @@ import pyarrow.compute as pc
 from msgspec import Struct
 
 from hybridlog.frames.names import FIELD, is_summary
-from hybridlog.query.answers.infer_fields import infer_fields
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.periods import GAP_PERIODS, Steps
 from hybridlog.query.query import field_types, spans_of, tables_of
@@ -374,32 +373,31 @@ MAX_ELEMENTS: Final = 36
 """Most elements of an array that are listed one by one: those of a covariance."""
 
 _SUMMARIES: Final = ("min", "max", "mean", "n")
-_IN_JSON: Final = ("bool", "integer", "number")
+_IN_JSON: Final = {"bool", "integer", "number"}
 
 
 Field: TypeAlias = tuple[str, str]
 """A field, as `series` takes it, and its type."""
 
 
-def fields_of(known: Mapping[str, str] | None, messages: Iterator[Message]) -> list[Field]:
+def fields_of(known: Mapping[str, str], messages: Iterator[Message]) -> list[Field]:
     """Numbers, elements of short arrays and summaries of arrays, in the order of the definition.
 
-    Where no definition fixes the types of fields, those of the first messages count; only these are
-    read.
+    `known` are the types of the fields, by path; the first of the messages tells how long arrays
+    are.
     """
-    found = _observed(messages) if known is None else _defined(known, messages)
-    return list(islice(found, MAX_FIELDS))
+    return list(islice(_fields(known, messages), MAX_FIELDS))
 
 
-def _defined(known: Mapping[str, str], messages: Iterator[Message]) -> Iterator[Field]:
+def _fields(known: Mapping[str, str], messages: Iterator[Message]) -> Iterator[Field]:
     first = None
     with suppress(SegmentError):  # damage hides how long arrays are, and no field
         first = next(messages, None)
     values = {} if first is None else first.fields
     for path, kind in known.items():
-        if "[" in path:
-            continue  # within the elements of an array
-        if kind in NUMERIC:
+        if "[" in path or "`" in path:
+            continue  # within the elements of an array, or a name with dots, which no path has
+        if kind in NUMERIC or not _IN_JSON.isdisjoint(kind.split("|")):
             yield path, kind
             continue
         summaries = (f"{path}.{name}" for name in _SUMMARIES)
@@ -419,11 +417,3 @@ def _width(kind: str, path: str, values: Mapping[str, Any]) -> int:
             value = value.get(name) if isinstance(value, Mapping) else None
         width = len(value) if isinstance(value, list) else 0
     return width if width <= MAX_ELEMENTS else 0
-
-
-def _observed(messages: Iterator[Message]) -> Iterator[Field]:
-    for found in infer_fields(messages):
-        path, kinds = str(found["path"]), str(found["type"]).split("|")
-        # A name within backquotes may have dots, which a path cannot tell from its own.
-        if not found["array"] and "`" not in path and any(kind in _IN_JSON for kind in kinds):
-            yield path, "|".join(kinds)

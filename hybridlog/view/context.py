@@ -52,9 +52,7 @@ MAX_WORKING: Final = 4
 """Number of answers that are worked out at once; others wait for their turn."""
 
 REFRESH_S: Final = 2.0
-"""Least time between two looks for new recordings."""
-REFRESH_SHARE: Final = 0.1
-"""Greatest share of the time that is spent on these looks, in stores of many recordings."""
+"""Time from one look for new recordings to the next, at least."""
 
 
 class Context:
@@ -80,9 +78,9 @@ class Context:
         found.store = self.store.snapshot()
         return found
 
-    def refresh(self, least_s: float = REFRESH_S) -> None:
+    def refresh(self) -> None:
         """See what other processes have recorded since, unless the last look was just now."""
-        self._looks.refresh(least_s)
+        self._looks.refresh()
         if self.store is not self._looks.store:
             self.store = self._looks.store.snapshot()
 
@@ -111,16 +109,13 @@ class _Looks:
         self.store = store
         self._looking = threading.Lock()
         self._looked = time.monotonic()
-        self._took = 0.0
 
-    def refresh(self, least_s: float) -> None:
+    def refresh(self) -> None:
         with self._looking:
-            begun = time.monotonic()
-            if begun >= self._looked + max(least_s, self._took / REFRESH_SHARE):
+            if time.monotonic() >= self._looked + REFRESH_S:
                 self.store.refresh()
                 self.store.shared.now()
                 self._looked = time.monotonic()
-                self._took = self._looked - begun
 
 
 def known_fields(query: Query) -> Mapping[str, str]:

@@ -1,16 +1,15 @@
 """ROS 2 bag directories: `metadata.yaml`, the recorder's description, and the files it lists.
 
-Versions 1 to 9 are parsed alike: every key is optional, and a value of the wrong type
-counts as missing. The files themselves take precedence over it.
+Versions 1 to 9 are parsed alike: every key is optional. Metadata with a value of the wrong type is
+not used. The files themselves take precedence over it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import PureWindowsPath
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, TypeAlias
 
-from msgspec import Struct, field
+from msgspec import Meta, Struct, ValidationError, convert, field
 
 from hybridlog.formats.reading import Damage, cannot_open
 from hybridlog.formats.yaml_values import YamlError, parse_yaml
@@ -73,6 +72,7 @@ MAX_BYTES = 64 << 20
 MAX_FILES = 100_000
 
 _NO_FILES = {"", ".", ".."}
+_Count: TypeAlias = Annotated[int, Meta(ge=0, le=(1 << 63) - 1)]
 
 
 class BagMetadata(Struct, frozen=True):
@@ -89,44 +89,36 @@ class BagMetadata(Struct, frozen=True):
     message_count: int | None = None
 
 
+class _File(Struct):
+    path: str
+    message_count: _Count | None = None
+
+
+class _Bag(Struct):
+    files: list[_File] | None = None
+    relative_file_paths: list[str] | None = None
+    message_count: _Count | None = None
+
+
+class _Document(Struct):
+    bag: _Bag = field(name="rosbag2_bagfile_information")
+
+
 def parse_metadata(text: str) -> BagMetadata:
     """Parse the metadata of a bag."""
     if len(text) > MAX_BYTES:
         raise YamlError(f"it has more than {MAX_BYTES >> 20} MiB")
-    bag = _mapping(parse_yaml(text))
-    bag = _mapping(bag.get("rosbag2_bagfile_information"))
-    if not bag:
-        raise YamlError("it does not describe a bag")
-    listed = _list(bag.get("files"))
-    counts: dict[str, int] = {}
-    for entry in map(_mapping, listed):
-        count = _count(entry.get("message_count"))
-        if isinstance(entry.get("path"), str) and count is not None:
-            counts[_name(str(entry["path"]))] = count
-    paths = [item for item in _list(bag.get("relative_file_paths")) if isinstance(item, str)]
-    files = [_name(item) for item in paths] or list(counts)
+    try:
+        bag = convert(parse_yaml(text), _Document).bag
+    except ValidationError as error:
+        raise YamlError(f"it does not describe a bag: {error}") from error
+    listed = bag.files or []
+    counts = {_name(one.path): one.message_count for one in listed if one.message_count is not None}
+    files = [_name(one) for one in bag.relative_file_paths or [file.path for file in listed]]
     if len(files) > MAX_FILES:
         raise YamlError(f"it lists more than {MAX_FILES} files")
-    total = _count(bag.get("message_count"))
-    return BagMetadata(
-        files=list(dict.fromkeys(name for name in files if name not in _NO_FILES)),
-        counts=counts,
-        message_count=total,
-    )
-
-
-def _mapping(value: object) -> Mapping[object, object]:
-    return value if isinstance(value, Mapping) else {}
-
-
-def _list(value: object) -> list[object]:
-    return value if isinstance(value, list) else []
-
-
-def _count(value: object) -> int | None:
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 2**63:
-        return None
-    return value
+    names = dict.fromkeys(name for name in files if name not in _NO_FILES)
+    return BagMetadata(files=[*names], counts=counts, message_count=bag.message_count)
 
 
 def _name(path: str) -> str:

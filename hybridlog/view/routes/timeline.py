@@ -10,9 +10,7 @@ import numpy as np
 from hybridlog.drawing.series import fields_of
 from hybridlog.drawing.series import series as read_series
 from hybridlog.drawing.times import aligned, lane_of
-from hybridlog.query.answers.infer_fields import SAMPLE
-from hybridlog.query.query import field_types
-from hybridlog.view.context import Context, extent, packed_response, route, start_of
+from hybridlog.view.context import Context, extent, known_fields, packed_response, route, start_of
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
@@ -75,7 +73,7 @@ def _small(counts: NDArray[np.int64]) -> NDArray[Any]:
 def fields(context: Context, params: RequestParams) -> dict[str, Any]:
     """The fields of a topic that can be drawn, and their types."""
     _, query = context.topic(params)
-    found = fields_of(field_types(query), iter(query.limit(SAMPLE)))
+    found = fields_of(known_fields(query), iter(query.limit(1)))
     return {"fields": [{"path": path, "type": kind} for path, kind in found]}
 
 
