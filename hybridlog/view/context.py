@@ -303,11 +303,6 @@ class RequestParams:
         self._parameters = parameters
         self.tag = tag
 
-    @property
-    def encoded(self) -> str:
-        """All of them, for another URL."""
-        return str(self._parameters)
-
     def has(self, name: str) -> bool:
         """True if a parameter is given."""
         return name in self._parameters
