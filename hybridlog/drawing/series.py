@@ -131,18 +131,10 @@ def _check(wanted: Sequence[Wanted], known: Mapping[str, str]) -> None:
         kind = known.get(one.path)
         has_fields = any(path.startswith(f"{one.path}.") for path in known)
         if kind and not (one.access or has_fields or kind in NUMERIC):
-            raise UsageError(_no_number(one.text, kind))
-
-
-def _no_number(text: str, kind: str) -> str:
-    element = element_of(kind)
-    if element is None:
-        return f"{text} is no number but {kind}: only numbers can be drawn."
-    if element in NUMERIC:
-        return (
-            f"{text} is an array ({kind}): name one element, {text}[0], or a summary, {text}.min."
-        )
-    return f"{text} is an array of {element}: name a number in one element, such as {text}[0].x."
+            raise UsageError(
+                f"{one.text} is no number but {kind}: name a number, of an array {one.text}[0], "
+                f"{one.text}[0].x or {one.text}.min."
+            )
 
 
 class Wanted(Struct, frozen=True):

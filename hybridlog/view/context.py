@@ -13,7 +13,7 @@ import traceback
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from copy import copy
-from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from msgspec import Struct
 from starlette.concurrency import run_in_threadpool
@@ -309,12 +309,10 @@ class RequestParams:
 
     def text(self, name: str, default: str | None = None, *, longest: int = 1024) -> str:
         """A text, at most so long; without a default it must be given."""
-        found = self._one(name)
-        if found is None:
-            return _missing(name) if default is None else default
-        if len(found) > longest:
-            raise UsageError(f"{name} is too long: {len(found)} characters, at most {longest}.")
-        return found
+        found = self.texts(name, most=1, longest=longest)
+        if not found and default is None:
+            raise UsageError(f"The parameter {name} is missing.")
+        return found[0] if found else str(default)
 
     def texts(self, name: str, *, most: int, longest: int = 1024) -> list[str]:
         """All values of a parameter that may be repeated, at most so many."""
@@ -322,7 +320,7 @@ class RequestParams:
         if len(found) > most:
             raise UsageError(f"{name} is given {len(found)} times, at most {most} are possible.")
         if any(len(text) > longest for text in found):
-            raise UsageError(f"A value of {name} is longer than {longest} characters.")
+            raise UsageError(f"{name} is too long: at most {longest} characters.")
         return found
 
     def word(self, name: str, words: Collection[str], default: str) -> str:
@@ -334,9 +332,7 @@ class RequestParams:
 
     def integer(self, name: str, least: int, most: int, default: int | None = None) -> int:
         """A whole number between two bounds, both inclusive; without a default it must be given."""
-        text = self._one(name)
-        if text is None:
-            return _missing(name) if default is None else default
+        text = self.text(name, None if default is None else str(default))
         if not _INTEGER.fullmatch(text) or not least <= int(text) <= most:
             raise UsageError(f"{name} is a whole number from {least} to {most}.")
         return int(text)
@@ -363,13 +359,3 @@ class RequestParams:
             raise UsageError("end is greater than begin.")
         last = TIME_LIMIT - 1
         return min(max(start + begin, 0), last - 1), min(max(start + end, 1), last)
-
-    def _one(self, name: str) -> str | None:
-        found = self._parameters.getlist(name)
-        if len(found) > 1:
-            raise UsageError(f"{name} is given {len(found)} times.")
-        return found[0] if found else None
-
-
-def _missing(name: str) -> NoReturn:
-    raise UsageError(f"The parameter {name} is missing.")
