@@ -14,9 +14,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
     from pathlib import Path
 
-    from hybridlog.formats.answer import Answer
     from hybridlog.formats.reading import Source
-    from hybridlog.formats.writing import Target
+    from hybridlog.formats.writing import Answer, Target
 
 Content: TypeAlias = Literal["lines", "table", "log", "payloads", "pictures", "video"]
 
@@ -130,10 +129,10 @@ OUTPUTS: Final[dict[str, OutputFormat]] = {
         is_text=True,
         is_of_places=True,
     ),
-    "ply": OutputFormat("payloads", "hybridlog.formats.ply:write_ply", ()),
-    "raw": OutputFormat("payloads", "hybridlog.formats.raw:write_raw", ()),
-    "png": OutputFormat("pictures", "hybridlog.formats.pictures:write_png", (".png",)),
-    "jpg": OutputFormat("pictures", "hybridlog.formats.pictures:write_jpg", (".jpg", ".jpeg")),
+    "ply": OutputFormat("payloads", "hybridlog.formats.files:write_ply", ()),
+    "raw": OutputFormat("payloads", "hybridlog.formats.files:write_raw", ()),
+    "png": OutputFormat("pictures", "hybridlog.formats.files:write_png", (".png",)),
+    "jpg": OutputFormat("pictures", "hybridlog.formats.files:write_jpg", (".jpg", ".jpeg")),
     "mp4": OutputFormat("video", "hybridlog.formats.mp4:write_mp4", (".mp4",)),
 }
 """Every output format by its name for `--format`."""
@@ -152,7 +151,7 @@ def suffixes_of(names: Iterable[str]) -> dict[str, str]:
 def is_directory(name: str, path: Path) -> bool:
     """True if a format writes a directory with a file a message to this path."""
     if OUTPUTS[name].content == "pictures":
-        from hybridlog.formats.pictures import suffix_of
+        from hybridlog.formats.files import suffix_of
 
         return suffix_of(path) is None
     return not OUTPUTS[name].suffixes

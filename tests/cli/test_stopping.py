@@ -148,7 +148,8 @@ def stop(frame, event, argument):
 
 FILES = (
     "commands/record.py", "cli/app.py",
-    "formats/writing.py", "formats/raw.py", "mcap/writer.py", "rosbag1/writer.py", "unfinished.py",
+    "formats/writing.py", "formats/files.py", "mcap/writer.py", "rosbag1/writer.py",
+    "unfinished.py",
 )
 MOMENT = sys.argv.pop(1)
 sys.setprofile(stop)

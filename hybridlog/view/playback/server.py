@@ -7,22 +7,25 @@ log time then runs slower, and no message is dropped. Only subscribed topics are
 from __future__ import annotations
 
 import asyncio
+import base64
 import contextlib
+import json
 import secrets
+import struct
 import time
-from collections.abc import AsyncIterator, Callable, Collection, Sequence
+from collections.abc import AsyncIterator, Callable, Collection, Iterable, Sequence
 from http import HTTPStatus
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
 
+import msgspec
 import numpy as np
 from msgspec import Struct
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 
-from hybridlog.live.sources.foxglove.protocol import SUBPROTOCOLS
+from hybridlog.live.sources.foxglove.protocol import MESSAGE_DATA, SUBPROTOCOLS
 from hybridlog.view.guard import Admission, listen
-from hybridlog.view.playback import protocol
-from hybridlog.view.playback.played import PlaybackClock
+from hybridlog.view.playback.played import PlaybackClock, PlayedChannel
 from hybridlog_storage.errors import HybridlogError
 
 if TYPE_CHECKING:
@@ -43,6 +46,137 @@ _STEP_S: Final = 0.002  # of waiting, at least, so that many messages are sent a
 _LATE_S: Final = 0.1  # of playing; later than this, the clock waits for the viewer
 _PING_S: Final = 10.0
 _CLOSE_S: Final = 1.0
+
+
+# The protocol. Times are log times in ns, speeds seconds of log time a second.
+
+_BASE64 = frozenset({"protobuf", "flatbuffer"})
+_DATA = struct.Struct("<BIQ")  # opcode, subscription, log time
+_TIME = struct.Struct("<BQ")  # opcode 2, time
+_STATE = struct.Struct("<BBQfBI")  # opcode, status, time, speed, did seek, length of the id
+_CONTROL = struct.Struct("<BBfBQI")  # opcode, command, speed, seeks, time, length of the id
+_PLAYBACK_STATE: Final = 5
+_PLAYBACK_CONTROL: Final = 3
+_PLAY, _PAUSE = 0, 1
+
+PLAYING, PAUSED, ENDED = 0, 1, 3
+"""States of a playback."""
+_ERROR = 2  # severity of a status
+
+
+class RequestError(Exception):
+    """A client violates the protocol; the message is for the client."""
+
+
+_Number = Annotated[int, msgspec.Meta(ge=0, lt=1 << 32)]
+
+
+class Subscription(msgspec.Struct):
+    """A subscription, and the channel that it is for."""
+
+    id: _Number
+    channel: _Number = msgspec.field(name="channelId")
+
+
+class Subscribe(msgspec.Struct, tag_field="op", tag="subscribe"):
+    """A request for channels."""
+
+    subscriptions: list[Subscription]
+
+
+class Unsubscribe(msgspec.Struct, tag_field="op", tag="unsubscribe"):
+    """A request to end subscriptions, by their numbers."""
+
+    subscriptions: list[_Number] = msgspec.field(name="subscriptionIds")
+
+
+class Control(NamedTuple):
+    """A request, by its id: play or pause, a speed, and a log time to go to; None to stay."""
+
+    plays: bool
+    speed: float
+    seek: int | None
+    id: bytes
+
+
+_Text = Subscribe | Unsubscribe
+Request = _Text | Control
+
+
+def server_info(name: str, session: str, begin: int, end: int) -> str:
+    """The first message to a client: the server, this run of it, first and last log time."""
+    return json.dumps(
+        {
+            "op": "serverInfo",
+            "name": name,
+            "capabilities": ["playbackControl", "time"],
+            "sessionId": session,
+            "dataStartTime": {"sec": begin // 10**9, "nsec": begin % 10**9},
+            "dataEndTime": {"sec": end // 10**9, "nsec": end % 10**9},
+        }
+    )
+
+
+def advertise(channels: Iterable[PlayedChannel]) -> str:
+    """The message that offers channels. Channels without a definition have an empty one."""
+    return json.dumps({"op": "advertise", "channels": [_described(each) for each in channels]})
+
+
+def _described(each: PlayedChannel) -> dict[str, Any]:
+    channel = each.channel
+    schema = None if channel.schema is None else channel.schema
+    found = {"id": each.id, "topic": channel.topic, "encoding": channel.message_encoding}
+    if schema is None or not schema.encoding:
+        return {**found, "schemaName": schema.name if schema else "", "schema": ""}
+    text = schema.data.decode("utf-8", "replace")
+    if schema.encoding in _BASE64:
+        text = base64.b64encode(schema.data).decode()
+    more = {"schemaName": schema.name, "schemaEncoding": schema.encoding, "schema": text}
+    return {**found, **more}
+
+
+def problem(text: str) -> str:
+    """A message for the user of the client: what went wrong."""
+    return json.dumps({"op": "status", "level": _ERROR, "message": text})
+
+
+def message_data(subscription: int, log_time: int, payload: memoryview) -> bytes:
+    """A message of a subscription."""
+    return b"".join((_DATA.pack(MESSAGE_DATA, subscription, log_time), payload))
+
+
+def time_now(position: int) -> bytes:
+    """The time of the playback."""
+    return _TIME.pack(2, position)
+
+
+def playback_state(state: int, time: int, speed: float, *, did_seek: bool, request: bytes) -> bytes:
+    """A message with the state of the playback, for the request of an id, or none.
+
+    After a seek, what clients have shown no longer holds.
+    """
+    return _STATE.pack(_PLAYBACK_STATE, state, time, speed, did_seek, len(request)) + request
+
+
+def parse(message: str | bytes) -> Request:
+    """A message of a client; one that is malformed or unknown raises RequestError."""
+    if isinstance(message, str):
+        try:
+            request: _Text = msgspec.json.decode(message, type=_Text)
+        except (msgspec.MsgspecError, RecursionError, UnicodeError) as problem:
+            raise RequestError(f"a message is no request to a playback: {problem}") from problem
+        return request
+    try:
+        kind, command, speed, seeks, position, length = _CONTROL.unpack_from(message)
+    except struct.error as problem:
+        raise RequestError("a message is no whole request to a playback") from problem
+    name = message[_CONTROL.size :]
+    if kind != _PLAYBACK_CONTROL or command not in {_PLAY, _PAUSE} or len(name) != length:
+        raise RequestError("a message is no request to a playback, which takes no messages")
+    return Control(command == _PLAY, speed, position if seeks else None, name)
+
+
+# The server.
 
 
 class PlaybackOptions(Struct, frozen=True):
@@ -70,7 +204,7 @@ class PlaybackServer:
         self._say = say
         self._rules = Admission(origins=options.origins)
         session = secrets.token_hex(8)
-        self._about = protocol.server_info(name, session, log.begin, log.end)
+        self._about = server_info(name, session, log.begin, log.end)
         self._viewers = 0
         self._refused: set[str] = set()
 
@@ -170,7 +304,7 @@ class _Playback:
 
     async def run(self) -> None:
         """Play until the viewer goes."""
-        await self._connection.send(protocol.advertise(self._log.channels))
+        await self._connection.send(advertise(self._log.channels))
         await self._send_state()
         playing = asyncio.create_task(self._play())
         try:
@@ -195,19 +329,19 @@ class _Playback:
                 self._clock.set(runs=False)
                 self._reading = None
                 self._say(str(error))
-                await self._connection.send(protocol.problem(str(error)))
+                await self._connection.send(problem(str(error)))
                 await self._send_state()
 
     async def _send_state(self, *, seek: int | None = None, request: bytes = b"") -> None:
         """Tell a viewer whose protocol has it what the playback does, perhaps after a seek."""
         if self._connection.subprotocol != _WITH_PLAYBACK:
             return
-        state = protocol.PLAYING if self._clock.is_running else protocol.PAUSED
+        state = PLAYING if self._clock.is_running else PAUSED
         if self._has_ended:
-            state = protocol.ENDED
+            state = ENDED
         position = min(self._clock.position, self._log.end) if seek is None else seek
         await self._connection.send(
-            protocol.playback_state(
+            playback_state(
                 state, position, self._clock.speed, did_seek=seek is not None, request=request
             )
         )
@@ -216,33 +350,33 @@ class _Playback:
 
     async def _obey(self, message: str | bytes) -> None:
         try:
-            request = protocol.parse(message)
-        except protocol.RequestError as error:
-            await self._connection.send(protocol.problem(str(error)))
+            request = parse(message)
+        except RequestError as error:
+            await self._connection.send(problem(str(error)))
             return
-        if isinstance(request, protocol.Subscribe):
+        if isinstance(request, Subscribe):
             await self._subscribe(request)
-        elif isinstance(request, protocol.Unsubscribe):
+        elif isinstance(request, Unsubscribe):
             ended, own = set(request.subscriptions), self._subscriptions
             self._subscriptions = {c: s for c, s in own.items() if s not in ended}
             self._read()
         else:
             await self._control(request)
 
-    async def _subscribe(self, request: protocol.Subscribe) -> None:
+    async def _subscribe(self, request: Subscribe) -> None:
         """Begin subscriptions with the messages that are current now."""
         new, own = set(), self._subscriptions
         for each in request.subscriptions:
-            problem = ""
+            wrong = ""
             if each.channel not in self._topics:
-                problem = f"there is no channel {each.channel}"
+                wrong = f"there is no channel {each.channel}"
             elif each.channel in own or each.id in own.values():
-                problem = f"there is a subscription {each.id}, or one to channel {each.channel}"
+                wrong = f"there is a subscription {each.id}, or one to channel {each.channel}"
             else:
                 own[each.channel] = each.id
                 new.add(each.channel)
-            if problem:
-                await self._connection.send(protocol.problem(problem))
+            if wrong:
+                await self._connection.send(problem(wrong))
         self._read()
         await self._send_current(new)
         if new and not self._has_begun:
@@ -250,7 +384,7 @@ class _Playback:
             self._clock.set(runs=True)
             await self._send_state()
 
-    async def _control(self, request: protocol.Control) -> None:
+    async def _control(self, request: Control) -> None:
         """Play, pause, seek or change the speed."""
         self._has_begun = True
         seek = request.seek
@@ -262,7 +396,7 @@ class _Playback:
             self._sent = seek - 1
             self._clock.set(seek)
             await self._send_state(seek=seek, request=request.id)
-            await self._connection.send(protocol.time_now(seek))
+            await self._connection.send(time_now(seek))
             self._read()
             await self._send_current(set(self._topics))
             return
@@ -307,7 +441,7 @@ class _Playback:
         self._sent = max(self._sent, min(self._clock.position, last))
         if self._sent > before and time.monotonic() - self._clock_sent_s > _TICK_S:
             self._clock_sent_s = time.monotonic()
-            await self._connection.send(protocol.time_now(self._sent))
+            await self._connection.send(time_now(self._sent))
         await self._go_on()
 
     async def _next_time(self) -> int | None:
@@ -320,7 +454,7 @@ class _Playback:
         if self._sent >= self._log.end:
             self._clock.set(self._log.end, runs=False)
             self._has_ended = True
-            await self._connection.send(protocol.time_now(self._log.end))
+            await self._connection.send(time_now(self._log.end))
             await self._send_state()
             return
         then = self._log.next_covered(self._sent)
@@ -344,7 +478,7 @@ class _Playback:
         rows = zip(batch.channel.tolist(), batch.log_time.tolist(), strict=True)
         for row, (channel, log_time) in enumerate(rows):
             if channel in own:
-                message = protocol.message_data(own[channel], log_time, batch.payload(row))
+                message = message_data(own[channel], log_time, batch.payload(row))
                 await self._connection.send(message)
 
     def _read(self) -> None:
