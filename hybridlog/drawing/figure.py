@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from msgspec import Struct
 
-from hybridlog.drawing.series import Series, numbers_of, series
+from hybridlog.drawing.series import Series, known_fields, numbers_of, series
 from hybridlog.frames.names import is_summary
-from hybridlog.query.query import field_types, narrowed, spans_of
+from hybridlog.query.query import narrowed, spans_of
 from hybridlog.query.times import format_time
 from hybridlog.wording import listed
 from hybridlog_storage.errors import MissingDependencyError, UsageError
@@ -176,8 +176,8 @@ def lines(query: Query, fields: Sequence[str], *, pixels: int) -> list[Line]:
         for one in _by_topic(query):
             for recording in spans_of(one):
                 part, about = one.in_recording(recording), summaries[recording]
-                known = field_types(part)
-                own = [x for x in fields if known is None or _is_among(x.partition("[")[0], known)]
+                known = known_fields(part)
+                own = [x for x in fields if _is_among(x.partition("[")[0], known)]
                 had.update(own)
                 drawn = series(part, own, pixels=pixels) if own else []
                 query.counters.add(part.counters)

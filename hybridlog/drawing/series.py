@@ -14,6 +14,7 @@ import pyarrow.compute as pc
 from msgspec import Struct
 
 from hybridlog.frames.names import FIELD, is_summary
+from hybridlog.query.answers.infer_fields import infer_fields
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.periods import GAP_PERIODS, Steps
 from hybridlog.query.query import field_types, spans_of, tables_of
@@ -370,6 +371,14 @@ _IN_JSON: Final = {"bool", "integer", "number"}
 
 Field: TypeAlias = tuple[str, str]
 """A field, as `series` takes it, and its type."""
+
+
+def known_fields(query: Query) -> Mapping[str, str]:
+    """Types of fields, by path; of the first messages where no definition fixes them."""
+    known = field_types(query)
+    if known is not None:
+        return known
+    return {str(one["path"]): str(one["type"]) for one in infer_fields(query)}
 
 
 def fields_of(known: Mapping[str, str], messages: Iterator[Message]) -> list[Field]:

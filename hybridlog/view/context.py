@@ -21,8 +21,6 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from hybridlog.query.answers.current import next_time
-from hybridlog.query.answers.infer_fields import infer_fields
-from hybridlog.query.query import field_types
 from hybridlog.query.times import TIME_LIMIT
 from hybridlog.record.losses import extent_of
 from hybridlog.view.sql_process import SqlProcess
@@ -116,14 +114,6 @@ class _Looks:
                 self.store.refresh()
                 self.store.shared.now()
                 self._looked = time.monotonic()
-
-
-def known_fields(query: Query) -> Mapping[str, str]:
-    """Types of fields, by path; of the first messages where no definition fixes them."""
-    known = field_types(query)
-    if known is not None:
-        return known
-    return {str(one["path"]): str(one["type"]) for one in infer_fields(query)}
 
 
 def start_of(recording: RecordingEntry | RecordingSummary) -> int:

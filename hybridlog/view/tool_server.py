@@ -16,6 +16,7 @@ import sys
 import tempfile
 import threading
 from inspect import signature
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from mcp.server import MCPServer
@@ -201,9 +202,10 @@ class Tools:
     ) -> CallToolResult:
         """Draw fields of a topic over time as a picture."""
         given = _given(recording=recording, between=(begin, end), fields=fields)
-        drawn = ["--format=png", "--output=-", "--size=1000x320"]
-        picture, lacks = self._run("plot", [*given, *drawn], topic)
-        return _answer([], lacks, 0, picture)
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "plot.png"
+            _, lacks = self._run("plot", [*given, f"--output={path}"], topic)
+            return _answer([], lacks, 0, path.read_bytes())
 
     def _rows(self, command: str, options: Sequence[str], word: str) -> tuple[list[Any], list[str]]:
         printed, lacks = self._run(command, options, word)

@@ -7,11 +7,12 @@ from collections.abc import Sequence
 from contextlib import closing, suppress
 from typing import TYPE_CHECKING, Any, Final
 
+from hybridlog.drawing.series import known_fields
 from hybridlog.drawing.times import Match, Matches, aligned
 from hybridlog.query.predicate.completion import complete
 from hybridlog.query.predicate.tokens import MAX_TEXT
 from hybridlog.query.topics import resolve
-from hybridlog.view.context import Context, known_fields, route, start_of
+from hybridlog.view.context import Context, route, start_of
 from hybridlog.view.question import program, question_of
 from hybridlog.view.sql_process import SQL_MEMORY
 from hybridlog_storage.errors import HybridlogError, TopicError

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from hybridlog.drawing.series import fields_of
+from hybridlog.drawing.series import fields_of, known_fields
 from hybridlog.drawing.series import series as read_series
 from hybridlog.drawing.times import aligned, lane_of
-from hybridlog.view.context import Context, extent, known_fields, packed_response, route, start_of
+from hybridlog.view.context import Context, extent, packed_response, route, start_of
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
