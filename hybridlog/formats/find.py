@@ -13,8 +13,7 @@ from typing import NamedTuple
 from msgspec import Struct, field
 
 from hybridlog.formats import LOGS
-from hybridlog.formats.detect import UNKNOWN, LogFile, grouped_parts, sniff
-from hybridlog.formats.log_set import LogSet
+from hybridlog.formats.log_set import UNKNOWN, LogFile, LogSet, grouped_parts, sniff
 from hybridlog.formats.reading import cannot_open
 from hybridlog.formats.rosbag2.directory import NAME, BagMetadata, read_metadata
 from hybridlog_storage.errors import SourceError

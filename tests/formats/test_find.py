@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from hybridlog.formats import find
-from hybridlog.formats.detect import grouped_parts
 from hybridlog.formats.find import Found, Watch, find_logs
+from hybridlog.formats.log_set import grouped_parts
 from hybridlog_storage.errors import SourceError
 from hybridlog_storage.messages import Channel
 from tests import places

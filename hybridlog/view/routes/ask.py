@@ -13,7 +13,7 @@ from hybridlog.query.predicate.completion import complete
 from hybridlog.query.predicate.tokens import MAX_TEXT
 from hybridlog.query.topics import resolve
 from hybridlog.view.context import Context, route, start_of
-from hybridlog.view.question import program, question_of
+from hybridlog.view.routes.export import program, question_of
 from hybridlog.view.sql_process import SQL_MEMORY
 from hybridlog_storage.errors import HybridlogError, TopicError
 from hybridlog_storage.stopping import held
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from hybridlog.sql.rows import Reading
     from hybridlog.store import Store
     from hybridlog.view.context import RequestParams
-    from hybridlog.view.question import PageQuestion
+    from hybridlog.view.routes.export import PageQuestion
 
 MAX_LISTED: Final = 200
 """Greatest number of matches that are listed at once."""
