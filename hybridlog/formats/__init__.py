@@ -14,8 +14,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
     from pathlib import Path
 
+    from hybridlog.formats.answer import Answer
     from hybridlog.formats.reading import Source
-    from hybridlog.formats.writing import Answer, Target
+    from hybridlog.formats.writing import Target
 
 Content: TypeAlias = Literal["lines", "table", "log", "payloads", "pictures", "video"]
 

@@ -14,7 +14,8 @@ from collections.abc import Iterable, Iterator
 from itertools import chain, repeat
 from typing import TYPE_CHECKING
 
-from hybridlog.formats.writing import Answer, Sink, Target
+from hybridlog.formats.answer import Answer
+from hybridlog.formats.writing import Sink, Target
 from hybridlog.schema.text import without_nan
 from hybridlog_storage.errors import UsageError
 

@@ -197,7 +197,6 @@ class LogSet(Struct, frozen=True):
     metadata: BagMetadata | None = None
     damage: tuple[Damage, ...] = ()
     gaps: tuple[Damage, ...] = ()
-    unread: tuple[Damage, ...] = ()
     problem: SourceError | None = None
 
     @classmethod
@@ -288,22 +287,18 @@ def _in_folder(folder: Path) -> LogSet:
         _check_one(folder, files, bag)
     first = next((file for file in files if file.format is not UNKNOWN), None)
     paths, names = {file.path for file in files}, {plain(file.path) for file in files}
-    more, unread = [], []
+    more: list[LogFile] = []
     for file in there:
-        reason, lost = "", None
-        if file.path in paths:
-            continue
-        if file.format is not UNKNOWN and plain(file.path) in names:
-            reason, lost = f"it is another form of {plain(file.path)}", 0
-        elif first is not None and is_split([first, file]):
+        is_log, is_known = file.format is not UNKNOWN, file.path in paths
+        if not is_known and is_log and plain(file.path) in names:
+            damage.append(_not_read(file.path, f"it is another form of {plain(file.path)}"))
+        elif not is_known and first is not None and is_split([first, file]):
             more.append(file)
-        elif file.format is not UNKNOWN:
+        elif not is_known and is_log:
             reason = (
-                f"{NAME} does not list it, and its name is not that of a part of the bag; record "
-                "it by its own path"
+                f"{NAME} does not list it, and its name is not that of a part of the bag; record"
             )
-        if reason:
-            unread.append(Damage(file.path, None, None, f"the file is not read: {reason}", lost))
+            damage.append(_not_read(file.path, f"{reason} it by its own path"))
     if more:
         files = sorted([*files, *more], key=lambda file: natural(file.path))
     lacking = {damaged.file for damaged in missing}
@@ -312,7 +307,12 @@ def _in_folder(folder: Path) -> LogSet:
         damage += missing
     else:  # with as many messages as listed, they are the listed files under other names
         gaps = [*missing, *gaps]
-    return LogSet(folder, tuple(files), bag, tuple(damage), tuple(gaps), tuple(unread))
+    return LogSet(folder, tuple(files), bag, tuple(damage), tuple(gaps))
+
+
+def _not_read(path: Path, reason: str) -> Damage:
+    """The damage for a file that is no part of the log, which lacks nothing by that."""
+    return Damage(path, None, None, f"the file is not read: {reason}", 0)
 
 
 def _check_one(folder: Path, logs: Sequence[LogFile], bag: BagMetadata | None) -> None:
@@ -397,7 +397,6 @@ class _JoinedSource(Source):
         if first is not None and failed == len(self._log.parts):
             raise first
         self._check_total()
-        self.damage.extend(self._log.unread)
 
     def _open(self, part: LogFile) -> Source:
         inner = self._unspooled(part) if part.is_packed else part.open()

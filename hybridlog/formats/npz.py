@@ -24,8 +24,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from hybridlog.formats.answer import Answer
 from hybridlog.formats.tables import groups
-from hybridlog.formats.writing import Answer, Sink, Target
+from hybridlog.formats.writing import Sink, Target
 from hybridlog.schema.arrow_types import (
     bounds_of,
     is_bytes,

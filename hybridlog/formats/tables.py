@@ -16,9 +16,10 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from hybridlog.columns.column_file import leaves
+from hybridlog.formats.answer import Answer
 from hybridlog.formats.json_text import base64_column, json_column
 from hybridlog.formats.jsonl import rows_within
-from hybridlog.formats.writing import Answer, Sink, Target
+from hybridlog.formats.writing import Sink, Target
 from hybridlog.schema.arrow_types import column_of, common_schema, is_bytes
 from hybridlog_storage.errors import UsageError
 

@@ -192,9 +192,9 @@ def test_files_that_are_no_parts_are_told(bag: Path) -> None:
     assert found.numbers == FIFTEEN
     assert sorted(found.damage) == [
         ("bag_0.db3.zstd", 0),
-        ("bag_3.mcap", None),
-        ("other.db3", None),
-        ("other_2.db3.zstd", None),
+        ("bag_3.mcap", 0),
+        ("other.db3", 0),
+        ("other_2.db3.zstd", 0),
     ]
 
 

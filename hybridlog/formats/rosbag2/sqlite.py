@@ -249,8 +249,15 @@ class SqliteSource(Source):
             yield batch
 
     def _report_unread(self, first: int, problem: str) -> None:
-        """Report the rows from an id on, counted where an index can be read."""
-        lost = None if self.message_count is None else max(0, self.message_count - self._got)
+        """Report the rows from an id on, counted by an index, or by ids: these have no gaps."""
+        lost = None
+        if self.message_count is not None:
+            lost = max(0, self.message_count - self._got)
+        else:
+            for (last,) in self._optional("SELECT max(rowid) FROM messages"):
+                # The id may be damaged, too; no row takes less than a byte.
+                if last is not None and first <= last < first + self.size_bytes:
+                    lost = last - first + 1
         reason = f"rows from id {first} on cannot be read: SQLite says {problem}"
         self.damage.append(Damage(self.path, None, None, reason, lost))
 
