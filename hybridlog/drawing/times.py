@@ -173,27 +173,19 @@ class Matches:
         begins = np.concatenate([[True], found[1:, 0] - found[:-1, 1] >= width])
         return np.stack([found[begins, 0], found[np.append(begins[1:], True), 1]], axis=1)
 
-    def after(self, place: Match, count: int) -> list[Match]:
-        """The first matches behind a place, in order, at most `count`.
+    def beside(self, place: Match, count: int, *, earlier: bool) -> list[Match]:
+        """The first matches behind a place, or the last ones in front of it, in order.
 
         The place is a match, which is not among them, or a time with the arrival number -1.
         """
-        begin = self.count_before(Match(place.time, place.seq + 1))
-        return self._rows(begin, begin + count)
-
-    def before(self, place: Match, count: int) -> list[Match]:
-        """The last matches in front of a place, in order; see `after`."""
-        end = self.count_before(place)
-        return self._rows(max(end - count, 0), end)
+        begin = self.count_before(place if earlier else Match(place.time, place.seq + 1))
+        rows = slice(max(begin - count, 0), begin) if earlier else slice(begin, begin + count)
+        return [*map(Match, self._times[rows].tolist(), self._seqs[rows].tolist())]
 
     def count_before(self, place: Match) -> int:
-        """Number of matches in front of a place; see `after`."""
+        """Number of matches in front of a place; see `beside`."""
         low, high = (int(np.searchsorted(self._times, place.time, side)) for side in _SIDES)
         return low + int(np.searchsorted(self._seqs[low:high], place.seq))
-
-    def _rows(self, begin: int, end: int) -> list[Match]:
-        times, seqs = self._times[begin:end].tolist(), self._seqs[begin:end].tolist()
-        return [*map(Match, times, seqs)]
 
 
 _SIDES: Final = ("left", "right")

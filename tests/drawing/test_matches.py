@@ -74,8 +74,8 @@ def test_matches_step_by_step(drive: Drive, count: int) -> None:
     for place in (middle, Match(middle.time, -1), Match(BASE - 9, -1), Match(2**62, -1)):
         later = [one for one in want if one > place]
         earlier = [one for one in want if one < place]
-        assert matches.after(place, count) == later[:count]
-        assert matches.before(place, count) == earlier[-count:]
+        assert matches.beside(place, count, earlier=False) == later[:count]
+        assert matches.beside(place, count, earlier=True) == earlier[-count:]
         assert matches.count_before(place) == len(earlier)
 
 

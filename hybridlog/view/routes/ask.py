@@ -61,8 +61,8 @@ def match_list(context: Context, params: RequestParams) -> dict[str, Any]:
     place = Match(params.moment(start), params.integer("seq", -1, END, -1))
     count = params.integer("count", 1, MAX_LISTED, MAX_LISTED)
     matching = _matches(context, question)
-    find = {"later": matching.after, "earlier": matching.before}
-    found = find[params.word("direction", find, "later")](place, count)
+    is_earlier = params.word("direction", ("later", "earlier"), "later") == "earlier"
+    found = matching.beside(place, count, earlier=is_earlier)
     return {
         "rows": [[str(one.time - start), one.seq] for one in found],
         "before": matching.count_before(found[0]) if found else None,
