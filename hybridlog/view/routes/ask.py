@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 from collections.abc import Sequence
 from contextlib import closing, suppress
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from hybridlog.drawing.series import known_fields
 from hybridlog.drawing.times import Match, Matches, aligned
-from hybridlog.query.predicate.completion import complete
+from hybridlog.frames.names import SUMMARIES, is_summary
 from hybridlog.query.predicate.tokens import MAX_TEXT
 from hybridlog.query.topics import resolve
 from hybridlog.view.context import Context, route, start_of
@@ -94,15 +95,19 @@ def completion(context: Context, params: RequestParams) -> dict[str, Any]:
     own = params.text("topic")
     topics = {channel.topic for channel in recording.channels}
 
-    def fields(topic: str | None) -> Mapping[str, str] | None:
-        try:
-            (name,) = resolve([topic or own], topics)
-        except (TopicError, ValueError):
-            return None
-        return known_fields(context.query(recording, name))
-
-    begin, candidates = complete(text[:place], topics - {own}, fields, most=_MAX_CANDIDATES)
-    return {"begin": begin, "candidates": candidates}
+    word = re.findall(r"[^\s()!&|<>=~,\"'{}]*\Z", text[:place])[0]
+    named = re.findall(r"(\S+):\s", text[: place - len(word)])
+    known: Mapping[str, str] = {}
+    with suppress(TopicError, ValueError):
+        (topic,) = resolve(named[-1:] or [own], topics)
+        known = known_fields(context.query(recording, topic))
+    summaries = (f"{path}.{name}" for path in known for name in SUMMARIES)
+    offered = [[path, "field", kind] for path, kind in known.items()]
+    offered += ([path, "field", "summary"] for path in summaries if is_summary(path, known))
+    offered += ([f"{topic}: ", "topic", ""] for topic in sorted(topics - {own}))
+    found = [one for one in offered if word and word.casefold() in one[0].casefold()]
+    found.sort(key=lambda one: not one[0].casefold().startswith(word.casefold()))
+    return {"begin": place - len(word), "candidates": found[:_MAX_CANDIDATES]}
 
 
 def sql(context: Context, params: RequestParams) -> dict[str, Any]:
