@@ -273,7 +273,7 @@ def test_what_goes_while_it_is_counted_is_noticed(store: hl.Store, calls: Calls)
     with store, hl.open(store.directory.path, mongo=store.shared.index.wanted) as other:
         store.shared.index.connect()
         other.shared.index.connect()
-        query = store.query(["/number"], ["a"]).where({"$expr": {"$gte": ["$n", 0]}})
+        query = store.query(["/number"], ["a"]).where({"n": {"$gte": 0}})
         whole = query.count()
         asked: list[tuple[object, ...]] = calls(
             Database, "each", lambda *_: other.remove("a") if len(asked) == 1 else None

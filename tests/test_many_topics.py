@@ -18,7 +18,7 @@ pytestmark = pytest.mark.mongo("embedded")
 
 def least(value: int) -> dict[str, object]:
     """A condition that MongoDB answers."""
-    return {"$expr": {"$gte": ["$data", value]}}
+    return {"data": {"$gte": value}}
 
 
 def database_of(store: hl.Store) -> Database:

@@ -61,7 +61,7 @@ def stores(bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict
 def test_what_only_mongodb_can_is_refused(stores: dict[str, hl.Store]) -> None:
     store = stores[NONE]
     for ask in (
-        lambda: store.topic("scan").where({"$expr": {"$gt": ["$header.seq", 3]}}).count(),
+        lambda: store.topic("scan").where({"header.seq": {"$gt": 3}}).count(),
         lambda: list(store.topic("scan").where({"range_max": 1})),
         store.index.list,
         store.index.rebuild,
@@ -166,7 +166,8 @@ def test_a_store_is_adopted_where_mongodb_is(
         assert "one" not in store.shared.repairs.indexed
         assert 0 < store.shared.repairs.indexed["two"] <= chunks["two"]
         assert store.verify().findings == []
-        assert store.topic("scan").where({"$expr": True}).count() == store.topic("scan").count()
+        every = store.topic("scan").where({"header.seq": {"$gte": 0}})
+        assert every.count() == store.topic("scan").count()
 
 
 def test_as_many_were_removed_as_recorded_without_mongodb(bag: Path, tmp_path: Path) -> None:

@@ -183,7 +183,7 @@ def test_what_has_no_end_yet_is_refused(path: Path) -> None:
             topic.reverse(),
             topic.between("start", "-1s"),
             topic.during(topic.windows(after=1)),
-            topic.where({"$expr": {"$eq": ["$data", "x"]}}),
+            topic.where({"data": "x"}),
         ):
             with pytest.raises(UsageError):
                 asked.follow()

@@ -73,7 +73,7 @@ ASKED: dict[str, Work] = {
         store.topic("pose").where("data > 4.5").between(*day(4)).count()
     ),
     "filter of MongoDB": lambda store: (
-        store.topic("pose").where({"$expr": {"$gt": ["$data", 4.5]}}).between(*day(4)).count()
+        store.topic("pose").where({"data": {"$gt": 4.5}}).between(*day(4)).count()
     ),
     "intervals of a day": lambda store: (
         store.topic("pose").where("data > 4.5").between(*day(4)).intervals()

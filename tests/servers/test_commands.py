@@ -21,7 +21,7 @@ MESSAGES = 12
 GAP = 1000  # messages that would lie between two recordings
 ABSOLUTE = f"{logs.BEGIN_NS + 3 * logs.STEP_NS}ns", f"{logs.BEGIN_NS + 9_005 * logs.STEP_NS}ns"
 RELATIVE = "+0s", "+0.055s"
-RAW = {"$expr": {"$gt": ["$n", 1]}}
+RAW = {"n": {"$gt": 1}}
 BY_COLUMNS: dict[str, Callable[[hl.Store], object]] = {
     "count": lambda s: s.topic("/number").where("x > 1").count(),
     "count of relative times": lambda s: (

@@ -44,30 +44,6 @@ _PLAIN = {
     *("$exists", "$type", "$size", "$mod"),
     *("$bitsAllSet", "$bitsAllClear", "$bitsAnySet", "$bitsAnyClear"),
 }
-_EXPRESSIONS = frozenset(
-    {
-        # comparison and logic
-        *("$eq", "$ne", "$gt", "$gte", "$lt", "$lte", "$cmp", "$and", "$or", "$not"),
-        *("$cond", "$ifNull", "$switch"),
-        # numbers
-        *("$abs", "$add", "$ceil", "$divide", "$exp", "$floor", "$ln", "$log", "$log10", "$mod"),
-        *("$multiply", "$pow", "$round", "$sqrt", "$subtract", "$trunc"),
-        *("$sin", "$cos", "$tan", "$asin", "$acos", "$atan", "$atan2"),
-        *("$degreesToRadians", "$radiansToDegrees"),
-        # arrays; none makes one longer than its input, as a nested `$map` or `$let` would
-        *("$allElementsTrue", "$anyElementTrue", "$arrayElemAt", "$filter", "$first", "$last"),
-        *("$in", "$indexOfArray", "$isArray", "$size", "$slice"),
-        *("$avg", "$max", "$min", "$sum", "$stdDevPop", "$stdDevSamp"),
-        # strings
-        *("$indexOfBytes", "$indexOfCP", "$strcasecmp", "$strLenBytes", "$strLenCP"),
-        *("$substrBytes", "$substrCP", "$toLower", "$toUpper", "$trim", "$ltrim", "$rtrim"),
-        # types
-        *("$convert", "$isNumber", "$toBool", "$toDate", "$toDouble", "$toInt", "$toLong"),
-        *("$toString", "$type"),
-        # values
-        "$literal",
-    }
-)
 _FLAGS = {"i": re.IGNORECASE, "m": re.MULTILINE, "s": re.DOTALL, "": re.UNICODE}
 _PLACE = re.compile(r"0|[1-9][0-9]{0,8}")
 
@@ -214,8 +190,6 @@ class _Checker:
                 place = (*path, key)
                 if key in _LOGICAL:
                     self.query(value, place, above)
-                elif key == "$expr" and not above:
-                    self._expression(value, place)
                 elif key.startswith("$"):
                     raise _refused(place, "the operator is not allowed here")
                 else:
@@ -243,7 +217,7 @@ class _Checker:
             if key == "$regex":
                 self._pattern(name, value, operators.get("$options", ""), place)
             elif key == "$elemMatch":
-                if _has_operators(value) and not {*cast("Filter", value)} & {*_LOGICAL, "$expr"}:
+                if _has_operators(value) and _LOGICAL.isdisjoint(cast("Filter", value)):
                     self._condition(name, value, place)
                 else:
                     self.query(value, place, f"{name}.")
@@ -269,31 +243,6 @@ class _Checker:
             compile_regex(f"(?{options}){value}" if options else str(value))
         except RegexError as error:
             raise _refused(path, f"the pattern is refused: {error}") from None
-
-    def _expression(self, value: object, path: _Path) -> None:
-        """Check an aggregation expression."""
-        if isinstance(value, list):
-            for item in value:
-                self._expression(item, path)
-        elif isinstance(value, dict):
-            for key, inner in value.items():
-                place = (*path, key)
-                is_known = key in _EXPRESSIONS and (key != "$filter" or key not in path)
-                if key.startswith("$") and not is_known:
-                    raise _refused(place, "the operator is not allowed here")
-                if key == "$literal":
-                    _literal(inner, place)
-                else:
-                    self._expression(inner, place)
-        elif isinstance(value, str) and value.startswith("$"):
-            name = value[1:]
-            if name.startswith("$"):
-                variable, _, name = name[1:].partition(".")
-                if variable not in {"ROOT", "CURRENT"}:
-                    return  # of a path that is noted already
-                if not name:
-                    raise _refused(path, f"{value} is the whole document; name a field")
-            self._ask(name, "whole")
 
 
 def _literal(value: object, path: _Path) -> None:
