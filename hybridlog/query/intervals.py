@@ -199,9 +199,7 @@ class Intervals:
         """
         if not events.question.returns_all:
             raise UsageError("limit and every cannot be combined with a test for any message.")
-        known = {*events.recordings}
-        own = Intervals(part for part in self._rows.items() if part[0] in known and len(part[1]))
-        moments = events.during(own).windows(after="1ns") if len(own) else own
+        moments = events.during(self).windows(after="1ns")
 
         def holding(name: str, rows: Rows) -> Rows:
             begin, end = moments.of_recording(name).T

@@ -193,7 +193,7 @@ class Query:
         self, predicate: Predicate, within: DurationLike | tuple[DurationLike, DurationLike] | None
     ) -> Query:
         """Only messages near others, and those that satisfy the rest of a predicate."""
-        from hybridlog.query.near import Windows, split_own
+        from hybridlog.query.answers.interval_queries import near_others, split_own
         from hybridlog.query.predicate.tree import And
 
         if within is None:
@@ -205,10 +205,10 @@ class Query:
             within = within, f"{parse_duration(within) + 1}ns"
         own, others = split_own(predicate.root)
         query = self._satisfying(replace(predicate, root=And(tuple(own))))
-        near = Windows(self.source.now(), query.question, predicate.text, *within)
-        near.answer(others)
-        asked = (Query(self.source, *one) for one in near.asked)
-        return Query(self.source, near.question, conditions=(*self.conditions, *asked))
+        session, text = self.source.now(), predicate.text
+        question, asked = near_others(session, query.question, text, others, within)
+        conditions = (Query(self.source, *one) for one in asked)
+        return Query(self.source, question, conditions=(*self.conditions, *conditions))
 
     def _satisfying(self, predicate: Predicate) -> Query:
         known = self.question.predicate

@@ -1,9 +1,9 @@
-"""Intervals from messages: states, changes of fields, windows around events."""
+"""Intervals from messages: states, changes, windows around events, times near other topics."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
-from functools import partial
+from functools import partial, reduce
 from itertools import groupby
 from operator import itemgetter
 from typing import TYPE_CHECKING
@@ -15,17 +15,20 @@ from hybridlog.query.answers.lost import lost_times
 from hybridlog.query.answers.marks import mark_topics, marks
 from hybridlog.query.intervals import Intervals, changing, clipped, holding
 from hybridlog.query.planner import Planner
+from hybridlog.query.predicate.tree import And, Condition, Near, Node, Not, Or, Predicate, nodes
+from hybridlog.query.predicate.types import check
+from hybridlog.query.question import Counters
 from hybridlog.query.ranges import RangeResolver
-from hybridlog.query.times import DurationLike, parse_duration
+from hybridlog.query.times import TIME_LIMIT, DurationLike, parse_duration
 from hybridlog.record.losses import extent_of
 from hybridlog.wording import listed
-from hybridlog_storage.errors import UsageError
+from hybridlog_storage.errors import UsageError, WhereError
 from hybridlog_storage.times import END, earlier, inside, placed
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.query.question import Counters, Part, Question, Span
+    from hybridlog.query.question import Part, Question, Span
     from hybridlog.query.rows import RowBatch
     from hybridlog.session import Session
 
@@ -214,3 +217,85 @@ def _at(times: NDArray[np.int64]) -> NDArray[np.int64]:
 
 def _bounded(part: Part, span: Span) -> Part:
     return replace(part, bounds=span, clock="log", windows=None)
+
+
+# Conditions on other topics: each becomes the log time around the messages that satisfy it.
+
+
+def near_others(
+    session: Session,
+    question: Question,
+    text: str,
+    nodes: Sequence[Node],
+    reach: tuple[DurationLike, DurationLike],
+) -> tuple[Question, list[tuple[Question, Counters]]]:
+    """The question in the times at which conditions hold, each asked in those of the last one.
+
+    Args:
+        session: The open store.
+        question: The question.
+        text: The predicate as written.
+        nodes: The conditions on other topics.
+        reach: Time before and after a message that satisfies one, durations.
+
+    Returns:
+        Also the questions about other topics, and what their answers have cost.
+    """
+    asked: list[tuple[Question, Counters]] = []
+    everything = np.array([[0, TIME_LIMIT - 1, 0]], np.int64)
+    whole = Intervals((one.id, everything) for one in session.summaries_of(question))
+
+    def holding(node: Node, within: Question) -> Intervals:
+        if isinstance(node, Not):
+            return whole.without(holding(node.item, within))
+        if isinstance(node, And | Or):
+            join = Intervals.common if isinstance(node, And) else Intervals.union
+            return reduce(join, (holding(item, within) for item in node.items))
+        assert isinstance(node, Near)
+        found = _question_about(session, within, node.topic, *reach)
+        if checked := Predicate(node.item, text):
+            check(checked, session.field_types(found.topics, found.recordings))
+            found = replace(found, predicate=checked)
+        counters = Counters()
+        asked.append((found, counters))
+        with counters.timed():
+            return IntervalQueries(session, found, counters).windows(*reach).merged()
+
+    for node in nodes:
+        question = question.within(holding(node, question))
+    return question, asked
+
+
+def split_own(node: Node) -> tuple[list[Node], list[Node]]:
+    """The conditions on the message itself, and those on other topics. All of both must hold."""
+    if not any(isinstance(inner, Near) for inner in nodes(node)):
+        return [node], []
+    if isinstance(node, And):
+        found = [split_own(item) for item in node.items]
+        return [one for own, _ in found for one in own], [one for _, far in found for one in far]
+    for inner in nodes(node):
+        if isinstance(inner, Condition):
+            raise WhereError(
+                f"{inner.field.path!r} is of the message itself, and can only be joined by "
+                "`and` with conditions on other topics. Name its topic to let any message near "
+                "in time satisfy it."
+            )
+    return [], [node]
+
+
+def _question_about(
+    session: Session, question: Question, topic: str, before: DurationLike, after: DurationLike
+) -> Question:
+    """The question about another topic, in the same recordings and only where it matters.
+
+    Wanted messages are at most `before` in front of one of the other topic, and `after` behind it.
+    """
+    found = session.question([topic], question.recordings)
+    if question.is_unbounded or not question.is_by_log_time:
+        return found
+    if {*found.topics} <= {*mark_topics(session)}:
+        return found  # marks may last
+    spans = RangeResolver(session, question).spans()
+    rows = ((one.id, np.array([[begin, end, 0]], np.int64)) for one, (begin, end) in spans)
+    near = Intervals(rows).widened(after, before).merged()
+    return replace(found, during=near)
