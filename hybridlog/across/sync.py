@@ -18,7 +18,6 @@ from hybridlog.across.topic_reader import TopicReader
 from hybridlog.message import messages_in
 from hybridlog.query.answers.completeness import completeness_of
 from hybridlog.query.answers.video import picture_of
-from hybridlog.query.intervals import Intervals
 from hybridlog.query.planner import Planner
 from hybridlog.query.question import Counters
 from hybridlog.query.ranges import RangeResolver
@@ -160,9 +159,11 @@ class Synced(Sequence[tuple["Message", ...]]):
         self, session: Session, question: Question, times: _Times, recording: str, row: int
     ) -> Message:
         _, time, number = map(int, times[:, row])
-        span = Intervals([(recording, np.array([[*span_of(time, time), 1]], np.int64))])
-        own = replace(question, recordings=(recording,), during=span, limit=number + 1)
-        runs = Planner(session, own, self.counters).runs(keeps=True)
+        span = np.array([span_of(time, time)], np.int64)
+        snapshot, ranges = session.snapshot(), RangeResolver(session, question)
+        summary = snapshot.summaries[snapshot.by_id[recording]]
+        bounds = None if question.bounds is None else ranges.bounds_in(summary)
+        runs = Planner(session, question, self.counters).kept(summary, bounds, span)
         messages = [one for run in runs for one in messages_in(run, picture_of(session))]
         if number >= len(messages):
             raise StoreError(

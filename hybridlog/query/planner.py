@@ -122,24 +122,30 @@ class Planner(Rows):
         """Ids of the recordings that have a message in the answer."""
         return {part.recording.id for part in self.parts() if self.count_of([part])}
 
-    def runs(self, *, keeps: bool = False) -> Iterator[MessageRun]:
-        """The messages of the answer, in order; `keeps` as of `ChunkScan`."""
+    def runs(self) -> Iterator[MessageRun]:
+        """The messages of the answer, in order."""
         question = self.question
         if question.limit == 0:
             self._ranges.resolve()  # a range that is outside is refused all the same
             return
-        runs = self._runs(keeps=keeps)
+        runs = self._runs()
         for run in runs if question.returns_all else _decimated(runs, question):
             self.counters.add_messages(run.batch)
             yield run
 
-    def _runs(self, *, keeps: bool) -> Iterator[MessageRun]:
+    def _runs(self) -> Iterator[MessageRun]:
         """All messages that match, in order; recordings are read when their turn comes."""
         limit = self.question.limit
         ahead = limit is None or limit > _READ_AHEAD_FROM
         for group in self.groups():
-            plan = self.plan(group)
-            yield from ChunkScan(plan, self.session, ahead=ahead, keeps=keeps).runs()
+            yield from ChunkScan(self.plan(group), self.session, ahead=ahead).runs()
+
+    def kept(
+        self, summary: RecordingSummary, bounds: Span | None, windows: NDArray[np.int64] | None
+    ) -> Iterator[MessageRun]:
+        """The messages of a part of a recording, in order; `ChunkScan` keeps their chunks."""
+        plan = self.plan([*self.parts_in(summary, bounds, windows)])
+        return ChunkScan(plan, self.session, keeps=True).runs()
 
     def plan(self, parts: Sequence[Part]) -> ScanPlan:
         """The plan for reading the matching messages of some parts, in the answer's order."""

@@ -55,15 +55,15 @@ def message_at(
         latest = min(parse_time(moment, start=start, end=end), end if end == END else end - 1)
         if start < end and start <= latest:
             candidates.append((latest, start, one))
+    planner = Planner(session, replace(question, reverse=True, limit=1), counters)
     best: tuple[tuple[int, str, int], Message] | None = None
     # Ask the recording that could hold the latest message first: it usually does.
     for latest, start, one in sorted(candidates, key=itemgetter(0), reverse=True):
         if best is not None and latest < best[0][0]:
             break
-        recording = session.entry_of(one)
-        found = _last_of(session, question, counters, recording, (start, latest))
+        found = _last_of(planner, one, (start, latest))
         if found is not None:
-            place = found.log_time_ns, recording.key, found.seq
+            place = found.log_time_ns, one.key, found.seq
             if best is None or place > best[0]:
                 best = place, found
     return best[1] if best is not None else None
@@ -82,25 +82,20 @@ def just_before(question: Question, recording: str, begin: int, latest: int) -> 
     )
 
 
-def _last_of(
-    session: Session,
-    question: Question,
-    counters: Counters,
-    recording: RecordingEntry,
-    span: Span,
-) -> Message | None:
+def _last_of(planner: Planner, summary: RecordingSummary, span: Span) -> Message | None:
     """The last message of a recording in `[start, latest]`, ns."""
-    start, latest = span
-    ids = [one.channel_id for one in session.channels_of(recording, {*question.topics})]
+    (start, latest), session = span, planner.session
+    recording = session.entry_of(summary)
+    ids = [one.channel_id for one in session.channels_of(recording, {*planner.question.topics})]
     begins = [first for _, first, _ in recording.spans_with(ids) if first <= latest]
     if not begins:
         return None
     # Of the chunks that begin by then, none later than the last one has an earlier message.
-    firsts = session.parts(recording, ids, (max(begins), latest + 1))["first"]
+    firsts = session.parts(recording, ids, (max(begins), min(latest + 1, END)))["first"]
     near = int(max(firsts[firsts <= latest], default=start))
     for begin in (near, *earlier(near, start)):
-        narrow = just_before(question, recording.id, begin, latest)
-        for run in Planner(session, narrow, counters).runs(keeps=True):
+        for run in planner.kept(summary, span_of(begin, latest), None):
+            planner.counters.add_messages(run.batch.take(slice(1)))
             return next(messages_in(run, picture_of(session)))
     return None
 

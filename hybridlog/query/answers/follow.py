@@ -175,7 +175,7 @@ class Following(Arrivals, Iterator["Message"]):
         """The next message; ends with the recordings."""
         return next(self._messages)
 
-    def _runs(self, *, keeps: bool = False) -> Iterator[MessageRun]:
+    def _runs(self) -> Iterator[MessageRun]:
         goes_on = True
         while goes_on:
             started = time.monotonic()
