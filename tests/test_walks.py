@@ -18,7 +18,7 @@ MODULES: Final = modules()
 Question = Callable[[hl.Store], Any]
 WALKS: Final[dict[str, tuple[int, int, Question]]] = {
     "a topic to pandas": (42, 3, lambda s: s.topic("odom").to_pandas()),
-    "a count by predicate": (27, 2, lambda s: s.topic("scan").where("ranges.min < 0.5").count()),
+    "a count by predicate": (28, 2, lambda s: s.topic("scan").where("ranges.min < 0.5").count()),
     "a second as bytes": (28, 0, lambda s: [m.raw for m in s.topic("scan").between("+1s", "+2s")]),
     "align": (53, 5, lambda s: s.align(s.topic("imu/data"), [s.topic("odom")]).to_pandas()),
     "a count in SQL": (12, 0, lambda s: s.sql("select count(*) from odom").rows()),

@@ -160,8 +160,8 @@ class Synced(Sequence[tuple["Message", ...]]):
     ) -> Message:
         _, time, number = map(int, times[:, row])
         span = np.array([span_of(time, time)], np.int64)
-        snapshot, ranges = session.snapshot(), RangeResolver(session, question)
-        summary = snapshot.summaries[snapshot.by_id[recording]]
+        (summary,) = session.summaries_of(replace(question, recordings=(recording,)))
+        ranges = RangeResolver(session, question)
         bounds = None if question.bounds is None else ranges.bounds_in(summary)
         runs = Planner(session, question, self.counters).kept(summary, bounds, span)
         messages = [one for run in runs for one in messages_in(run, picture_of(session))]

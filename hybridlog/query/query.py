@@ -31,6 +31,7 @@ from hybridlog_storage.errors import (
     TopicError,
     UsageError,
 )
+from hybridlog_storage.times import span_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -666,12 +667,12 @@ def at_time(query: Query, moment: TimeLike) -> Query:
     What is lost between the message and the moment may have been the current one: that is a
     condition of it.
     """
-    from hybridlog.query.answers.current import just_before
-
     now = of_now(query)
     found = _message_at(now, moment)
     time = found.log_time_ns
-    question = just_before(query.question, found.recording, time, time)
+    only: dict[str, Any] = {"recordings": (found.recording,), "bounds": span_of(time, time)}
+    only |= {"clock": "log", "reverse": True, "limit": 1, "every": 1}
+    question = replace(query.question, **only)
     snapshot = now.source.now().snapshot()
     start, end = snapshot.summaries[snapshot.by_id[found.recording]].extent
     latest = max(parse_time(moment, start=start, end=end), time)

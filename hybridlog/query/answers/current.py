@@ -69,19 +69,6 @@ def message_at(
     return best[1] if best is not None else None
 
 
-def just_before(question: Question, recording: str, begin: int, latest: int) -> Question:
-    """The question about the last message of a recording in `[begin, latest]`, ns."""
-    return replace(
-        question,
-        recordings=(recording,),
-        bounds=span_of(begin, latest),
-        clock="log",
-        reverse=True,
-        limit=1,
-        every=1,
-    )
-
-
 def _last_of(planner: Planner, summary: RecordingSummary, span: Span) -> Message | None:
     """The last message of a recording in `[start, latest]`, ns."""
     (start, latest), session = span, planner.session
@@ -90,9 +77,10 @@ def _last_of(planner: Planner, summary: RecordingSummary, span: Span) -> Message
     begins = [first for _, first, _ in recording.spans_with(ids) if first <= latest]
     if not begins:
         return None
-    # Of the chunks that begin by then, none later than the last one has an earlier message.
+    # The chunk that begins last by then has a message by then, so none before it is wanted.
     firsts = session.parts(recording, ids, (max(begins), min(latest + 1, END)))["first"]
-    near = int(max(firsts[firsts <= latest], default=start))
+    begun = firsts[firsts <= latest]
+    near = int(begun.max()) if len(begun) else max(begins)
     for begin in (near, *earlier(near, start)):
         for run in planner.kept(summary, span_of(begin, latest), None):
             planner.counters.add_messages(run.batch.take(slice(1)))
