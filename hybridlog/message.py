@@ -10,7 +10,7 @@ import numpy as np
 from hybridlog.query.times import format_time
 from hybridlog.schema.column import Records
 from hybridlog.schema.states import State
-from hybridlog_storage.errors import PayloadError
+from hybridlog_storage.errors import HybridlogError, PayloadError
 
 if TYPE_CHECKING:
     import pyarrow as pa
