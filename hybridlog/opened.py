@@ -7,7 +7,6 @@ from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from hybridlog.index.access import IndexAccess
-from hybridlog.schema.codecs import unindexed
 from hybridlog.session import Session
 from hybridlog.shared import Shared
 from hybridlog.snapshot import UNFINISHED, Snapshot
@@ -147,6 +146,8 @@ class OpenStore(Shared):
         """See a recording that has ended; if MongoDB is available again, index the rest."""
         self._drop_list()
         self.catch_up(report.entry.id)
+        from hybridlog.schema.codecs import unindexed  # loads numpy
+
         with suppress(HybridlogError):  # its files may have gone already
             report.not_indexed = unindexed(self.now().definitions(report.entry))
         if report.failure is None:

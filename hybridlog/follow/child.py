@@ -91,7 +91,8 @@ class FollowerProcess:
         hit: Callable[[str, int], object] = lambda *_: None,
         say: Callable[[str], None] | None = None,
     ) -> None:
-        self.state = Followed(has_documents)
+        failure = None if target is None else target.failure
+        self.state = Followed(has_documents, failure=failure)
         self.said: list[str] = []
         self.judged: Collection[int] | None = () if triggers else None
         self.wait_s: float | None = None

@@ -13,7 +13,6 @@ from msgspec.structs import replace
 
 from hybridlog.schema.codec import Codec, ObjectCodec, OpaqueCodec
 from hybridlog.schema.column import Records
-from hybridlog.schema.document import BodyGroup, bodies, without_fields
 from hybridlog.schema.states import CAUSES, State, encoding_of, state_of
 from hybridlog_storage.errors import DefinitionError, PayloadError
 from hybridlog_storage.messages import MARKS_CHANNEL
@@ -21,6 +20,7 @@ from hybridlog_storage.messages import MARKS_CHANNEL
 if TYPE_CHECKING:
     from hybridlog.schema.codec import Decoded
     from hybridlog.schema.definition import FieldPath
+    from hybridlog.schema.document import BodyGroup
     from hybridlog.schema.objects import Plain
     from hybridlog_storage.messages import Batch, Buffer, Channel, Schema
 
@@ -129,6 +129,8 @@ def bodies_in(decoded: Decoded | None, messages: int) -> Iterator[BodyGroup]:
 
     Each message is in exactly one group.
     """
+    from hybridlog.schema.document import bodies, without_fields  # loads numpy
+
     if decoded is None:
         if messages:
             yield without_fields(np.arange(messages), None)

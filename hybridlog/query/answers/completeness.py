@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 from msgspec import Struct
 
-from hybridlog.frames.names import is_part
 from hybridlog.query.answers.lost import (
     MAX_NAMES,
     NOT_LOST,
@@ -380,8 +379,12 @@ def _remarks(session: Session, question: Question) -> Iterator[str]:
             yield f"{missing} {are} at no time of the header clock: {none}."
     conditions = () if question.predicate is None else question.predicate.conditions()
     asked = [one.field for one in conditions if one.operands and not is_meta(one.field.path)]
+    if not asked:
+        return
+    from hybridlog.frames.names import is_part  # most questions need none of it
+
     by_topic: dict[str, list[RecordedChannel]] = defaultdict(list)
-    for channel in Planner(session, question).examples if asked else ():
+    for channel in Planner(session, question).examples:
         by_topic[channel.channel.topic].append(channel)
     for topic, own in by_topic.items():
         known = field_types(tuple(one for one in own if one.codec.indexed)) or {}
