@@ -335,20 +335,9 @@ class ColumnFile:
         return {leaf.array: number for number, leaf in leaves if leaf.array is not None}
 
     @lazy
-    def paths(self) -> set[tuple[str, ...]]:
-        """Paths of fields that the messages have."""
-        names = [leaf.array or leaf.names for leaf in self.leaves if not leaf.is_own]
-        return {path[:end] for path in names for end in range(1, len(path) + 1)}
-
-    @lazy
     def own(self) -> set[str]:
         """Columns of the table itself."""
         return {leaf.top for leaf in self.leaves if leaf.is_own}
-
-    @lazy
-    def summary_paths(self) -> set[tuple[str, ...]]:
-        """Paths of the numbers of summaries."""
-        return {leaf.names for leaf in self.leaves if leaf.array is not None}
 
     def choose(
         self, paths: Collection[str] | None, own: Collection[str]

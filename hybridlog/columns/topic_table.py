@@ -27,7 +27,7 @@ from hybridlog_storage.times import placed, span_of
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.columns.column_file import TablePart
+    from hybridlog.columns.column_file import Leaf, TablePart
     from hybridlog.query.intervals import Span
 
 _MAX_TYPES: Final = 64  # sets of fields whose types are kept for a table
@@ -135,11 +135,13 @@ class TopicTable:
         With `summaries` the path may be that of a number of the summary of an array.
         """
         names = names_of(path)
-        return all(
-            names in file.paths
-            or (summaries and names in file.summary_paths and self._is_summarised(names[:-1]))
-            for file in self.files
-        )
+
+        def is_at(leaf: Leaf) -> bool:
+            if (leaf.array or leaf.names)[: len(names)] == names:
+                return not leaf.is_own
+            return summaries and leaf.names == names and self._is_summarised(names[:-1])
+
+        return all(any(map(is_at, file.leaves)) for file in self.files)
 
     def size(
         self,

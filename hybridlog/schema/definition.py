@@ -181,18 +181,18 @@ def _parse_sections(schema: Schema, ros: int) -> tuple[dict[str, list[RawField]]
     blank: dict[str, list[RawField]] = {}
     idl = IdlTypes()
     first = ""
-    for section in split_sections(text):
-        name = canonical(section.name or schema.name)
+    for given, kind, section in split_sections(text):
+        name = canonical(given or schema.name)
         first = first or name
-        kind = section.kind or ("IDL" if schema.encoding in {"ros2idl", "omgidl"} else "MSG")
-        if kind == "IDL" and ros == 2:
-            parse_idl(name, section.text, idl)
+        is_idl = kind == "IDL" or (not kind and schema.encoding in {"ros2idl", "omgidl"})
+        if is_idl and ros == 2:
+            parse_idl(name, section, idl)
             continue
-        if ros == 2 and has_parts(section.text):
-            parsed = parse_parts(name, section.text)
+        if ros == 2 and has_parts(section):
+            parsed = parse_parts(name, section)
         else:
-            parsed = {name: parse_msg(name, section.text, defaults=ros == 2)}
-        if not section.kind and not any(parsed.values()):
+            parsed = {name: parse_msg(name, section, defaults=ros == 2)}
+        if not kind and not any(parsed.values()):
             blank = parsed  # what stands before the header line of the definition
             continue
         for key, fields in parsed.items():

@@ -56,19 +56,6 @@ class RawField(Struct, frozen=True):
     text_bound: int | None = None
 
 
-class Section(Struct, frozen=True):
-    """One definition in a concatenation of definitions.
-
-    Attributes:
-        name: Type name from the header line; empty for a first section without one.
-        kind: `MSG`, `IDL`, `SRV` or `ACTION`; empty without a header line.
-    """
-
-    name: str
-    kind: str
-    text: str
-
-
 def canonical(name: str) -> str:
     """The canonical spelling of a type: `pkg/Name`, `pkg/srv/Name`.
 
@@ -80,22 +67,23 @@ def canonical(name: str) -> str:
     return "/".join(parts)
 
 
-def split_sections(text: str) -> list[Section]:
-    """Split a concatenation at its lines of `=`, each followed by a header line.
+def split_sections(text: str) -> list[tuple[str, str, str]]:
+    """Split a concatenation of definitions at its lines of `=`, each followed by a header line.
 
-    The newlines around such a line may be missing.
+    The newlines around such a line may be missing. Returns type, kind (`MSG`, `IDL`, `SRV` or
+    `ACTION`) and text of each definition; type and kind are empty for a first one without header.
     """
     text = text.removeprefix("\ufeff")
     rules = [*_RULE.finditer(text)]
     begins, ends = [0, *(one.end() for one in rules)], [*(one.start() for one in rules), len(text)]
-    sections = []
+    sections: list[tuple[str, str, str]] = []
     for part in (text[begin:end] for begin, end in zip(begins, ends, strict=True)):
         header = _FIRST_LINE.match(part)
         if header is not None:
-            sections.append(Section(header[2], header[1], part[header.end() :]))
+            sections.append((header[2], header[1], part[header.end() :]))
         elif part.strip() or (part and not sections):
-            sections.append(Section("", "", part))
-    return sections or [Section("", "", "")]
+            sections.append(("", "", part))
+    return sections or [("", "", "")]
 
 
 def parse_msg(name: str, text: str, *, defaults: bool) -> list[RawField]:

@@ -476,21 +476,3 @@ def test_long_and_short_blocks_of_several_rows():
         column = decoded.records.fields["v"]
         assert np.diff(column.offset).tolist() == sizes
         assert column.values.values.tobytes() == b"".join(p[4:] for p in payloads)
-
-
-@pytest.mark.parametrize("between", [[0, 0, 0], [9, 9, 9], [1, 7, 0]])
-@pytest.mark.parametrize("backwards", [False, True])
-def test_long_blocks_of_one_size_at_any_distance(between, backwards):
-    message_type = MessageType("T", (("v", ArrayOf(Primitive("uint16", "u2"))),))
-    arrays = np.random.default_rng(2).integers(0, 1 << 16, (4, 5000)).astype("<u2")
-    payloads = [u4(5000) + array.tobytes() for array in arrays]
-    buffer, offset = b"", []
-    for payload, junk in zip(payloads, [3, *between], strict=True):
-        buffer += b"\xff" * junk
-        offset.append(len(buffer))
-        buffer += payload
-    rows = [3, 2, 1, 0] if backwards else [0, 1, 2, 3]
-    length = np.full(4, len(payloads[0]))
-    decoded = WireReader(message_type, "ros1").read(buffer, np.array(offset)[rows], length)
-    column = decoded.records.fields["v"]
-    np.testing.assert_array_equal(column.values.values.reshape(4, -1), arrays[rows])
