@@ -74,15 +74,9 @@ _GONE: Final = {"expired": (EXPIRED_IDS, EXPIRED), "elsewhere": (2 * EXPIRED_IDS
 _SAID: Final = ("id", "name", "tags", "source", "created")
 
 
-def recording_metadata(entry: RecordingEntry) -> dict[str, object]:
+def recording_metadata(one: RecordingEntry | Manifest) -> dict[str, object]:
     """The metadata of a recording in each of its segments."""
-    return {
-        "id": entry.id,
-        "name": entry.name,
-        "tags": entry.tags,
-        "source": entry.source,
-        "created": entry.created,
-    }
+    return {name: to_builtins(getattr(one, name)) for name in _SAID}
 
 
 def segments_in(
@@ -203,9 +197,9 @@ def _problem(size: int | None, wanted: int) -> str:
 
 def _logs(
     path: Path, manifest: Manifest, listing: Listing, damage: Damage
-) -> tuple[dict[int, File], list[dict[str, Any]]]:
+) -> tuple[dict[int, File], list[truth.Loss]]:
     """The segments that can be read, by number, and rows of the ledger for what is lost."""
-    found, lost = dict[int, File](), list[dict[str, Any]]()
+    found, lost = dict[int, File](), list[truth.Loss]()
     rows, suspects = manifest.rows, {number for number, _ in damage}
     for number, log in sorted(manifest.logs.items()):
         files = [log] if log.is_here else rows[number]
@@ -225,7 +219,7 @@ def entry_of(
     manifest: Manifest,
     logs: Mapping[int, File],
     names: Mapping[int, str],
-    lost: Sequence[dict[str, Any]],
+    lost: Sequence[truth.Loss],
     decoded: Mapping[int, Mapping[int, ChannelStats]],
 ) -> RecordingEntry:
     """The entry of a recording by its manifest.
@@ -241,7 +235,7 @@ def entry_of(
         source=_source_of(manifest.source),
         created=manifest.created,
         status=manifest.status,
-        end=end_values(manifest) if manifest.is_ended else {},
+        end={},
         channels=_channels(manifest, logs, decoded),
         stored_bytes=sum(file.bytes for file in (*rows, *logs.values()) if file.is_here),
         segments=len(logs),
@@ -250,7 +244,16 @@ def entry_of(
         metadata_records=sum(log.metadata for log in logs.values()),
         notes=[structs.asdict(note) for note in manifest.notes],
         marks=[_without_none(mark) for mark in manifest.marks],
-        pins=[pin_values(pin) for pin in manifest.pins],
+        pins=[
+            {
+                "id": pin.id,
+                "from": pin.first,
+                "to": None if pin.last is None else pin.last + 1,
+                "topics": None if pin.topics is None else [*pin.topics],
+                "reason": pin.reason,
+            }
+            for pin in manifest.pins
+        ],
         spans=[
             (number, log.first, log.last)
             for number, log in logs.items()
@@ -264,9 +267,14 @@ def entry_of(
         copies=sorted({file.copy for file in manifest.files if file.copy}),
     )
     noted = [loss_values(row) for log in logs.values() for row in log.losses]
-    made = [] if manifest.is_ended else [*map(loss_values, manifest.losses)]  # to make room
-    if noted or lost or made:
-        entry.end["losses"] = [*joined([*entry.end.get("losses", ()), *noted]), *lost, *made]
+    known, unread = [*map(loss_values, manifest.losses)], [*map(loss_values, lost)]
+    if manifest.is_ended:
+        losses = [*joined([*known, *noted]), *unread] if noted or unread else known
+        entry.end = {"status": manifest.status, "losses": losses}
+    elif known or noted or unread:  # to make room
+        entry.end = {"losses": [*joined(noted), *unread, *known]}
+    if manifest.status == "recovered":
+        entry.end |= {"cut_bytes": manifest.cut_bytes, "damage": [*manifest.damage]}
     return entry
 
 
@@ -421,17 +429,6 @@ def lost_in_crash(manifest: Manifest, after: Sealed) -> list[truth.Loss]:
     ]
 
 
-def end_values(manifest: Manifest) -> dict[str, Any]:
-    """The end of a recording as entries have it."""
-    values: dict[str, Any] = {
-        "status": manifest.status,
-        "losses": [loss_values(one) for one in manifest.losses],
-    }
-    if manifest.status == "recovered":
-        values |= {"cut_bytes": manifest.cut_bytes, "damage": [*manifest.damage]}
-    return values
-
-
 def loss_values(loss: truth.Loss) -> dict[str, Any]:
     """A row of the loss ledger as entries and segments have it."""
     values = structs.asdict(loss)
@@ -439,16 +436,7 @@ def loss_values(loss: truth.Loss) -> dict[str, Any]:
     return dict(sorted({**values, **span}.items()))
 
 
-def pin_values(pin: truth.Pin) -> dict[str, Any]:
-    """A pin as entries have it."""
-    topics = None if pin.topics is None else [*pin.topics]
-    span = {"from": pin.first, "to": None if pin.last is None else pin.last + 1}
-    return {"id": pin.id, **span, "topics": topics, "reason": pin.reason}
-
-
-def _status(
-    manifest: Manifest, lost: Sequence[dict[str, Any]], *, is_open: bool, is_left: bool
-) -> str:
+def _status(manifest: Manifest, lost: Sequence[truth.Loss], *, is_open: bool, is_left: bool) -> str:
     """The status of a recording; `is_left` says that it has segments that are not sealed."""
     if is_open:
         return "open"
@@ -459,19 +447,27 @@ def _status(
     return manifest.status if manifest.is_ended else "recovered"
 
 
-def _losses_of_file(manifest: Manifest, file: File, reason: str) -> list[dict[str, Any]]:
+def _losses_of_file(manifest: Manifest, file: File, reason: str) -> list[truth.Loss]:
     """Rows of the loss ledger for a listed file that cannot be read."""
+    cause = Cause.SEGMENT.value
+    unknown = truth.Loss(cause, count=0, reason=reason, file=file.name, length=file.bytes)
     rows = [
-        _loss(file.name, reason, manifest.channels[number].topic, part, length=file.bytes)
+        truth.replace(
+            unknown,
+            topic=manifest.channels[number].topic,
+            count=part.messages,
+            first=part.first,
+            last=part.last,
+        )
         for number, part in file.parts.items()
         if part.messages
     ]
-    return rows or [_loss(file.name, reason, "", truth.Part(0, 0), length=file.bytes)]
+    return rows or [unknown]
 
 
 def _losses_of_chunks(
     path: Path, manifest: Manifest, log: File, damage: Damage
-) -> tuple[str, list[dict[str, Any]]]:
+) -> tuple[str, list[truth.Loss]]:
     """Why a segment with damage cannot be read at all, if so, and rows for unreadable chunks."""
     try:
         summary = read_summary(path, log.number)
@@ -479,27 +475,27 @@ def _losses_of_chunks(
         return str(error), []
     if not is_of(summary, manifest.id, log, channels_in(manifest), log.number):
         return _ANOTHER, []
-    rows, table = [], summary.table
-    for (segment, number), reason in sorted(damage.items()):
-        if segment != log.number or not WHOLE < number < len(table.chunks):
-            continue
-        chunk = table.chunks[number]
-        place = {name: int(chunk[name]) for name in ("offset", "length")}
-        for part in table.chunk_parts(number):
-            topic = summary.channels[int(part["channel"])].topic
-            lost = truth.Part(int(part["messages"]), 0, int(part["first"]), int(part["last"]))
-            rows.append(_loss(path.name, reason, topic, lost, **place))
-    return "", rows
-
-
-def _loss(
-    file: str, reason: str, topic: str, lost: truth.Part, *, length: int, offset: int | None = None
-) -> dict[str, Any]:
-    """A row of the loss ledger for messages that were stored in a file."""
-    cause, count = Cause.SEGMENT.value, lost.messages
-    return loss_values(
-        truth.Loss(cause, topic, count, lost.first, lost.last, reason, file, offset, length)
-    )
+    table = summary.table
+    chunks = {
+        number: reason
+        for (segment, number), reason in sorted(damage.items())
+        if segment == log.number and WHOLE < number < len(table.chunks)
+    }
+    return "", [
+        truth.Loss(
+            Cause.SEGMENT.value,
+            summary.channels[int(part["channel"])].topic,
+            int(part["messages"]),
+            int(part["first"]),
+            int(part["last"]),
+            reason,
+            path.name,
+            int(table.chunks[number]["offset"]),
+            int(table.chunks[number]["length"]),
+        )
+        for number, reason in chunks.items()
+        for part in table.chunk_parts(number)
+    ]
 
 
 def listed(*segments: Sealed) -> Callable[[Manifest], Manifest]:

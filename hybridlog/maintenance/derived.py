@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from msgspec import Struct
 
 from hybridlog.columns.layout import SHARED, SUFFIX, TABLES, topics_of, type_prefix
-from hybridlog.follow.follower import bring, make_tables
+from hybridlog.follow.follower import Follower, bring, make_tables
 from hybridlog.maintenance.report import ArraysOfTopic
 from hybridlog.snapshot import UNFINISHED
 from hybridlog_storage.disk import files
@@ -92,17 +92,16 @@ class StoreIndex(Struct, frozen=True):
         # The process that holds the lock indexes it.
         with suppress(HeldError, TopicError):
             try:
-                chunks = self._bring(entry)
+                made = self._bring(entry)
             except SegmentError as error:
                 report.unreadable[entry.id] = str(error)
             else:
-                if chunks is not None:
-                    report.indexed[entry.name] = chunks
+                if made is not None:
+                    report.indexed[entry.name] = made.made
 
-    def _bring(self, entry: RecordingEntry, **options: Any) -> int | None:
+    def _bring(self, entry: RecordingEntry, **options: Any) -> Follower | None:
         directory, catalog, database = self.directory, self.catalog, self.database
-        made = bring(directory, catalog, entry, database, progress=self.progress, **options)
-        return None if made is None else made.made
+        return bring(directory, catalog, entry, database, progress=self.progress, **options)
 
     def _remove_orphans(self, known: Iterable[str], report: RepairReport) -> None:
         """Remove recordings without a directory from the index.

@@ -9,7 +9,7 @@ from collections.abc import Collection
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
-from msgspec import Struct, field, to_builtins
+from msgspec import Struct, field
 
 from hybridlog.entries import (
     NO_MANIFEST,
@@ -17,6 +17,7 @@ from hybridlog.entries import (
     ended,
     listed,
     lost_in_crash,
+    recording_metadata,
     see,
     segments_in,
     summary_by,
@@ -186,15 +187,7 @@ def recover_segments(
     from hybridlog_storage.segments.recovery import recover_segment
 
     path = directory.recording(recording)
-    said = None
-    if manifest is not None:
-        said = {
-            "id": manifest.id,
-            "name": manifest.name,
-            "tags": dict(manifest.tags),
-            "source": to_builtins(manifest.source),
-            "created": manifest.created,
-        }
+    said = None if manifest is None else recording_metadata(manifest)
 
     def announce(sealed: Sealed, found: Recovered) -> None:
         if manifest is None:
