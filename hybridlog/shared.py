@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 from hybridlog.columns.recording_logs import RecordingRows
 from hybridlog.entries import with_marks
-from hybridlog.maintenance.opening import StoreFiles, open_catalog
+from hybridlog.maintenance.opening import StoreFiles
 from hybridlog.maintenance.report import RepairReport
 from hybridlog.record.marks import MARK_SCHEMA
 from hybridlog.snapshot import UNFINISHED
 from hybridlog_storage.cache import Cache, lazy
-from hybridlog_storage.catalog import file_of
+from hybridlog_storage.catalog import Catalog, file_of
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.messages import schema_hash
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from hybridlog.query.question import RecordedChannel
     from hybridlog.record.running import RunningRecording
     from hybridlog.snapshot import Snapshot
-    from hybridlog_storage.catalog import Catalog, RecordingEntry
+    from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.segments.segment_reader import SegmentReader
     from hybridlog_storage.summary import RecordingSummary
@@ -86,7 +86,13 @@ class Shared(ABC):
     @lazy
     def catalog(self) -> Catalog:
         """Recordings, channels, chunks and schemas."""
-        return open_catalog(self.directory)
+        directory = self.directory
+        return Catalog(
+            directory.path,
+            directory.settings.store_id,
+            in_memory=not directory.is_writable,
+            cells=directory.cells,
+        )
 
     @lazy
     def tables(self) -> Tables:

@@ -37,16 +37,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.summary import RecordingSummary
 
 
-def open_catalog(directory: StoreDirectory) -> Catalog:
-    """Open the catalog of a store; in memory if the store cannot be written."""
-    return Catalog(
-        directory.path,
-        directory.settings.store_id,
-        in_memory=not directory.is_writable,
-        cells=directory.cells,
-    )
-
-
 class StoreFiles(Struct):
     """The recordings of a store, compared with their files."""
 

@@ -172,7 +172,7 @@ class _Check:
         if not self._lost.keys() <= known.keys():
             self._catalog.put_damage(recording, {**self._lost, **known})
         entry = put_entry(directory, self._catalog, recording)
-        self._result.messages += entry.messages
+        self._result.messages += entry.messages + len(entry.marks)
         if entry.status != "open":
             for topic, problem in self._checker.damage(entry).items():
                 self.found(f"table of {topic}", problem)
