@@ -194,7 +194,7 @@ def test_extras_and_what_is_shown(tmp_path: Path) -> None:
         assert image is not None
         assert "/cam" in image._repr_html_()
         assert LABEL in found.before.recordings()._repr_html_()
-        assert complete(f"fetch --store {found.path} -t sa") == ["said"]
+        assert complete(f"fetch --store {found.path} -t /sa") == ["/said"]
         assert complete(f"info --store {found.path} l") == [LABEL]
 
 
