@@ -273,8 +273,6 @@ def entry_of(
         entry.end = {"status": manifest.status, "losses": losses}
     elif known or noted or unread:  # to make room
         entry.end = {"losses": [*joined(noted), *unread, *known]}
-    if manifest.status == "recovered":
-        entry.end |= {"cut_bytes": manifest.cut_bytes, "damage": [*manifest.damage]}
     return entry
 
 

@@ -80,9 +80,9 @@ def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def manifest(template: Path) -> dict[str, Any]:
     found = replace(
         places.manifest(template, "odd"),
-        status="damaged", losses=(LOSS,), damage=("x",), cut_bytes=4,
-        uncounted_marks=2,
-    )  # fmt: skip
+        status="damaged",
+        losses=(LOSS,),
+    )
     made: dict[str, Any] = json.loads(encode(found).split(b"\n")[0])
     return made
 

@@ -27,7 +27,7 @@ from hybridlog.maintenance import tables
 from hybridlog.snapshot import UNFINISHED, Snapshot
 from hybridlog_storage.catalog import Catalog, Damage
 from hybridlog_storage.errors import DiskFullError, RecordingGoneError, StoreError, TopicError
-from hybridlog_storage.manifest import Manifest, replace
+from hybridlog_storage.manifest import Loss, Manifest, replace
 
 if TYPE_CHECKING:
     from hybridlog.maintenance.report import RepairReport
@@ -184,15 +184,11 @@ def recover_segments(
             return
         before = manifest.logs.get(sealed.file.number)
         if before is None or before.digest != sealed.file.digest:
-            lost = () if before is None else lost_in_crash(manifest, sealed)
+            lost = [] if before is None else lost_in_crash(manifest, sealed)
+            lost += [Loss("damaged segment", reason=one) for one in found.damage]
 
             def change(now: Manifest) -> Manifest:
-                return replace(
-                    listed(sealed)(now),
-                    losses=(*now.losses, *lost),
-                    cut_bytes=now.cut_bytes + found.cut_bytes,
-                    damage=(*now.damage, *found.damage),
-                )
+                return replace(listed(sealed)(now), losses=(*now.losses, *lost))
 
             directory.manifests.change(recording, change)
 

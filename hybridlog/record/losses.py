@@ -133,17 +133,15 @@ def losses_of(entry: RecordingEntry) -> list[dict[str, Any]]:
     """The loss ledger of a recording, with a row for what a crash cut off."""
     losses = [dict(loss) for loss in entry.end.get("losses", [])]
     if entry.status == "unfinished":
-        losses.append(_uncounted(CRASH, "what came after its last flushed message is lost"))
+        losses.append(_of_a_crash("what came after its last flushed message is lost"))
     if "recovered" in {entry.status, entry.end.get("status")}:  # a crash ended it
-        losses.append(_uncounted(CRASH, "what came after its last message was not stored"))
-        damage = entry.end.get("damage", [])
-        losses.extend(_uncounted("damaged segment", str(reason)) for reason in damage)
+        losses.append(_of_a_crash("what came after its last message was not stored"))
     return losses
 
 
-def _uncounted(cause: str, reason: str) -> dict[str, Any]:
+def _of_a_crash(reason: str) -> dict[str, Any]:
     """A loss of an unknown number of messages."""
-    row: dict[str, Any] = {"cause": cause, "file": "", "offset": None, "reason": reason}
+    row: dict[str, Any] = {"cause": CRASH, "file": "", "offset": None, "reason": reason}
     return row | {"count": None, "topic": None}
 
 

@@ -21,7 +21,7 @@ from hybridlog_storage.errors import StoreError
 MAX_BYTES: Final = 64 << 20
 """Largest manifest that is read or written."""
 MAX_MARKS: Final = 10_000
-"""Marks that a recording can have; others are counted."""
+"""Marks that a recording can have."""
 
 Nanoseconds = Annotated[int, Meta(ge=-(1 << 62), le=(1 << 63) - 1)]
 """A time since the epoch."""
@@ -232,11 +232,8 @@ class Manifest(Record, frozen=True):
             again after it was lost; `removed` if its files are being deleted.
         notes: In the order of writing.
         marks: Marks that somebody set, in this order; those of its recorder are messages.
-        uncounted_marks: How many more there would be beyond `MAX_MARKS`.
         channels: By number.
         files: In the order of writing.
-        cut_bytes: Bytes that were cut off after its recorder was killed: records not yet whole.
-        damage: What else was wrong then, in words.
         let_go: What its ring has let go; None for nothing.
     """
 
@@ -249,13 +246,10 @@ class Manifest(Record, frozen=True):
     tags: Tags = {}
     notes: tuple[Note, ...] = ()
     marks: Annotated[tuple[Mark, ...], Meta(max_length=MAX_MARKS)] = ()
-    uncounted_marks: Count = 0
     pins: tuple[Pin, ...] = ()
     channels: dict[ChannelNumber, Channel] = {}
     files: tuple[File, ...] = ()
     losses: tuple[Loss, ...] = ()
-    cut_bytes: Count = 0
-    damage: tuple[Text, ...] = ()
     let_go: LetGo | None = None
 
     @property
@@ -394,10 +388,10 @@ def with_totals(manifest: Manifest) -> Manifest:
 
 
 def with_mark(manifest: Manifest, mark: Mark) -> Manifest:
-    """The manifest with a mark; if it has `MAX_MARKS`, one more is counted."""
-    if len(manifest.marks) < MAX_MARKS:
-        return replace(manifest, marks=(*manifest.marks, mark))
-    return replace(manifest, uncounted_marks=manifest.uncounted_marks + 1)
+    """The manifest with a mark; unchanged if it has `MAX_MARKS`."""
+    if len(manifest.marks) == MAX_MARKS:
+        return manifest
+    return replace(manifest, marks=(*manifest.marks, mark))
 
 
 def with_rows(manifest: Manifest, log: File, rows: Iterable[File]) -> Manifest:

@@ -45,7 +45,6 @@ WHOLE = Manifest(
     tags={"site": "hall 3", "weather": ""},
     notes=(Note(5, "left wheel slips"),),
     marks=(Mark(MARK, 7, "bump", {"side": "left"}, 9), Mark("00112233445566ab", 7, "")),
-    uncounted_marks=3,
     pins=(Pin(MARK, 1, 2, ("/scan",), "incident"), Pin("00112233445566ab")),
     channels={0: Channel("/scan", "ros1", "a/Scan", {"callerid": "/n"}, 5, 6, 7, 8)},
     files=(

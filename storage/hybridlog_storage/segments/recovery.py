@@ -14,7 +14,7 @@ from typing import NamedTuple
 from msgspec import Struct, field
 
 from hybridlog_storage.disk import files
-from hybridlog_storage.disk.append_file import BLOCK, AppendFile
+from hybridlog_storage.disk.append_file import AppendFile
 from hybridlog_storage.errors import SegmentError, StoreError
 from hybridlog_storage.messages import Schema
 from hybridlog_storage.segments.segment_file import (
@@ -35,12 +35,11 @@ from hybridlog_storage.segments.walk import MENDED, Walk
 class Recovered(Struct):
     """The result of recovering an open segment; `path` is None for an empty one, which is removed.
 
-    `cut_bytes` are of records at the end, without an incomplete summary.
+    `damage` says what was wrong before the last whole record.
     """
 
     path: Path | None
     messages: int = 0
-    cut_bytes: int = 0
     damage: list[str] = field(default_factory=list)
 
 
@@ -69,12 +68,10 @@ def recover_segment(
             walk = _walked(reader)
             damage = [f"byte {one.offset}: {one.reason}" for one in walk.damaged]
             if not (walk.recording or walk.chunks or walk.attachments or damage):
-                found = Recovered(None, cut_bytes=_torn(walk, 0))
                 files.unlink(path)
                 files.sync_folder(path.parent)
-                return found
-            messages = sum(walk.table.build().counts().values())
-            found = Recovered(final, messages, _torn(walk, walk.end), damage)
+                return Recovered(None)
+            found = Recovered(final, sum(walk.table.build().counts().values()), damage)
             segment = _reopened(path, number, walk)
             try:
                 _mend(segment, walk, recording)
@@ -94,13 +91,6 @@ def _walked(reader: SegmentReader) -> Walk:
 def _damage(walk: Walk) -> dict[int, str]:
     """Reasons of damage by the byte where it starts, without what a recovery has mended."""
     return {one.offset: one.reason for one in walk.damaged if one.reason != MENDED}
-
-
-def _torn(walk: Walk, end: int) -> int:
-    """Bytes behind the last whole record, but for the zeros that fill the last block."""
-    rest = walk.reader.size - end
-    is_room = rest < BLOCK and not any(walk.reader.read(end, rest))
-    return 0 if is_room or walk.is_complete else rest
 
 
 def _reopened(path: Path, number: int, walk: Walk) -> SegmentFile:
