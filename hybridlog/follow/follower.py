@@ -32,7 +32,7 @@ from hybridlog_storage.errors import (
 from hybridlog_storage.mongo.index_documents import IndexState
 from hybridlog_storage.segments.chunk_table import places_of
 from hybridlog_storage.segments.segment_reader import open_log
-from hybridlog_storage.segments.walk import OpenSegment
+from hybridlog_storage.segments.walk import Walk
 from hybridlog_storage.settings import read_settings
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ class _Segment(Struct):
 
     is_wanted: bool
     sender: Sender | None
-    opened: OpenSegment | None = None
+    opened: Walk | None = None
     chunks: int = 0
     decoded: dict[int, ChannelStats] = field(default_factory=dict)
     is_decoded: bool = False
@@ -207,7 +207,7 @@ class Follower:
     def _read_open(self, number: int) -> None:
         """Read what a segment has got since the last time."""
         segment = self._segment(number)
-        opened = segment.opened = segment.opened or OpenSegment(self._path, number)
+        opened = segment.opened = segment.opened or Walk.opened(self._path, number)
         opened.follow()
         self._read(number, opened.reader, places_of(opened.flushed.table), opened.channels)
 

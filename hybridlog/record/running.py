@@ -20,7 +20,7 @@ from hybridlog_storage.disk.directory import is_stable
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.manifest import Loss
 from hybridlog_storage.segments.segment_file import OPEN_SUFFIX
-from hybridlog_storage.segments.walk import OpenSegment
+from hybridlog_storage.segments.walk import Walk
 
 if TYPE_CHECKING:
     from hybridlog_storage.catalog import RecordingEntry
@@ -54,7 +54,7 @@ class RunningRecording:
         self._read_sealed = sealed
         self._sealed: RecordingEntry | None = None
         self._state = "", False  # the look of its directory, and whether it is being written
-        self._segments: dict[int, OpenSegment] = {}
+        self._segments: dict[int, Walk] = {}
         self._unreadable: dict[int, str] = {}  # why, by number of the segment
         self.entry: RecordingEntry | None = None
         self.topics: frozenset[TopicType] = frozenset()
@@ -110,7 +110,7 @@ class RunningRecording:
             if str(number) in self._sealed.digests:
                 continue
             with self._noting(number):
-                self._segments[number] = before.get(number) or OpenSegment(path, number)
+                self._segments[number] = before.get(number) or Walk.opened(path, number)
 
     def _with_flushed(self, sealed: RecordingEntry) -> RecordingEntry:
         """The entry with what is flushed besides."""
@@ -139,7 +139,7 @@ class RunningRecording:
             found.end["losses"] = losses
         return found
 
-    def _add_channels(self, channels: dict[int, ChannelEntry], segment: OpenSegment) -> None:
+    def _add_channels(self, channels: dict[int, ChannelEntry], segment: Walk) -> None:
         for number, channel in segment.channels.items():
             if number not in channels:
                 channels[number] = found = channel_entry(number, channel)
@@ -148,7 +148,7 @@ class RunningRecording:
 
 
 def _losses(
-    sealed: RecordingEntry, segments: Mapping[int, OpenSegment], unreadable: Mapping[int, str]
+    sealed: RecordingEntry, segments: Mapping[int, Walk], unreadable: Mapping[int, str]
 ) -> Iterator[dict[str, Any]]:
     """The loss ledger: what sealed segments and flushed records say, and what is damaged."""
     before = sealed.end.get("losses", ())

@@ -15,7 +15,7 @@ from hybridlog_storage.mcap.mcap_content import MAGIC, RECORD_HEAD
 from hybridlog_storage.segments.segment_format import (
     ARRIVAL_OPCODE,
 )
-from hybridlog_storage.segments.walk import OpenSegment
+from hybridlog_storage.segments.walk import Walk
 from tests.running.methods import LABEL, rows, sent
 from tests.running.running import Running, begun
 from tests.running.sequence import Known
@@ -123,7 +123,7 @@ def test_a_torn_end_is_no_damage(running: Running, copied: Path) -> None:
             if room and not (cut in starts and data[cut] not in {7, ARRIVAL_OPCODE}):
                 continue  # a writer leaves room behind whole chunks only
             path.write_bytes(data[:cut] + bytes(room))
-            segment = OpenSegment(folder(copied), 0)
+            segment = Walk.opened(folder(copied), 0)
             segment.follow()
             assert segment.damaged == [], cut
         with as_running(copied) as store:

@@ -14,7 +14,7 @@ from hybridlog_storage.segments import walk
 from hybridlog_storage.segments.segment_format import Attachment, FilePart, losses_record
 from hybridlog_storage.segments.segment_reader import SegmentReader, SegmentSummary
 from hybridlog_storage.segments.segment_writer import RecordingWriter, SegmentSettings
-from hybridlog_storage.segments.walk import OpenSegment
+from hybridlog_storage.segments.walk import Walk
 from tests.storage.test_segments import CHANNELS, LOSS, RECORDING, Row, batch_of
 
 
@@ -55,7 +55,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Written:
     return Written(tmp_path_factory.mktemp("open") / "r")
 
 
-def check(segment: OpenSegment, summary: SegmentSummary) -> None:
+def check(segment: Walk, summary: SegmentSummary) -> None:
     """Compare what was read with what the summary says."""
     table, attachments, metadata, _ = segment.flushed
     assert table.chunks.tolist() == summary.table.chunks.tolist()
@@ -85,7 +85,7 @@ def test_a_part_of_a_write_is_no_damage(
     monkeypatch.setattr(walk, "time", SimpleNamespace(sleep=sleep))
     for seen in range(8, len(written.data), step):
         path.write_bytes(written.data[:seen].ljust(len(written.data), b"\0"))
-        segment = OpenSegment(tmp_path, 0)
+        segment = Walk.opened(tmp_path, 0)
         segment.follow()
         path.write_bytes(written.data)
         segment.follow()
@@ -110,7 +110,7 @@ def test_damage_behind_a_chunk_costs_no_other(
             data = bytearray(written.data)
             data[place] ^= bit
             path.write_bytes(data)
-            segment = OpenSegment(tmp_path, 0)
+            segment = Walk.opened(tmp_path, 0)
             segment.follow()
             found = {row[0] for row in segment.flushed.table.chunks.tolist()}
             lost = {row[0] for row in chunks.tolist()} - found

@@ -59,6 +59,8 @@ _INDEX: Final = bytes([Opcode.MESSAGE_INDEX])
 _WINDOW: Final = 4096  # bytes read at once around the heads of records
 _SEARCHED: Final = 1 << 20  # bytes searched at once for the next record
 _MAX_RECORD: Final = 1 << 28  # bytes of what is read into memory as a whole
+_WRITING_S: Final = 0.02  # the time that a writer may take for the rest of a record
+_LOOKS: Final = 5  # at what seems damaged, before it counts as damaged
 
 
 class WalkedChunk(NamedTuple):
@@ -68,6 +70,18 @@ class WalkedChunk(NamedTuple):
     head: ChunkHead
     indexes: dict[int, int]
     """By channel id."""
+
+
+class Flushed(NamedTuple):
+    """Content of a segment at one moment, as the summary of a sealed one says it.
+
+    Attachments and metadata are those of the source, in file order.
+    """
+
+    table: ChunkTable
+    attachments: Sequence[AttachmentIndex]
+    metadata: Sequence[MetadataIndex]
+    reader: SegmentReader
 
 
 class _TornError(SegmentError):
@@ -98,6 +112,14 @@ class Walk:
         self._bytes = RecordFile(reader.read, reader.size, _WINDOW)
         self._begin()
 
+    @classmethod
+    def opened(cls, recording: Path, number: int) -> Walk:
+        """The content that a segment has at this moment; it may be sealed meanwhile."""
+        try:
+            return cls(SegmentReader(recording / f"{number:06d}{OPEN_SUFFIX}", number))
+        except SegmentError:  # it may have been sealed just now
+            return cls(SegmentReader(recording / sealed_name(number), number))
+
     def _begin(self) -> None:
         self.recording: dict[str, Any] | None = None
         self.channels: dict[int, Channel] = {}
@@ -110,6 +132,7 @@ class Walk:
         self.metadata: list[MetadataIndex] = []
         self._damaged: list[Damage] = []
         self._stopped: Damage | None = None  # at the end of the file, if no writer leaves that
+        self._flushed: Flushed | None = None
         self.is_complete = False
         self.end = len(START)
 
@@ -267,36 +290,7 @@ class Walk:
             return False
         return True
 
-
-_WRITING_S: Final = 0.02  # the time that a writer may take for the rest of a record
-_LOOKS: Final = 5  # at what seems damaged, before it counts as damaged
-
-
-class Flushed(NamedTuple):
-    """Content of a segment at one moment, as the summary of a sealed one says it.
-
-    Attachments and metadata are those of the source, in file order.
-    """
-
-    table: ChunkTable
-    attachments: Sequence[AttachmentIndex]
-    metadata: Sequence[MetadataIndex]
-    reader: SegmentReader
-
-
-class OpenSegment(Walk):
-    """The content that a segment has at this moment; it may be sealed meanwhile."""
-
-    def __init__(self, recording: Path, number: int) -> None:
-        try:
-            reader = SegmentReader(recording / f"{number:06d}{OPEN_SUFFIX}", number)
-        except SegmentError:  # it may have been sealed just now
-            reader = SegmentReader(recording / sealed_name(number), number)
-        super().__init__(reader)
-
-    def _begin(self) -> None:
-        super()._begin()
-        self._flushed: Flushed | None = None
+    # While it is written
 
     @property
     def flushed(self) -> Flushed:
