@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import pytest
 from msgspec import UNSET
 
-import hybridlog as hl
 from hybridlog.maintenance.edit import pin_of
 from hybridlog.maintenance.retention import Held, Plan, Rules, held_of, plan
-from hybridlog.record.capture import remote_segment_size
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.manifest import Channel, File, Manifest, Part, replace
 
@@ -290,29 +287,6 @@ def test_ages_in_spite_of_clocks(ages: list[int], last: int | None, old: list[in
 )
 def test_a_quota_says_how_large_segments_are(quota: str | None, size: float) -> None:
     assert Rules.of({} if quota is None else {"quota": quota}).segment_size == size
-
-
-@pytest.mark.parametrize(
-    ("table", "size"),
-    [(None, float("inf")), ({}, 128 << 20), ({"segment-size": "64MiB"}, 64 << 20)],
-)
-def test_a_store_that_is_copied_to_a_bucket_has_small_segments(
-    table: dict[str, str] | None, size: float
-) -> None:
-    assert remote_segment_size(table) == size
-
-
-@pytest.mark.parametrize("line", ['segment-size = "1MiB"', 'size = "64MiB"', "segment-size = []"])
-def test_a_malformed_table_about_buckets_stops_recording(line: str, tmp_path: Path) -> None:
-    with hl.open(tmp_path / "store", create=True, mongo="none"):
-        pass
-    with (tmp_path / "store" / "hybridlog.toml").open("a") as file:
-        file.write(f"[remote]\n{line}\n")
-    with (
-        hl.open(tmp_path / "store") as store,
-        pytest.raises(UsageError, match=r"remote|size"),
-    ):
-        store.start("drive")
 
 
 @pytest.mark.parametrize(

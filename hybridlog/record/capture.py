@@ -6,11 +6,10 @@ recording, provides its writer, and completes or removes the recording.
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from msgspec import convert
 from msgspec.structs import replace
@@ -25,14 +24,12 @@ from hybridlog.entries import (
 )
 from hybridlog.maintenance.retention import Rules
 from hybridlog.query.latching import depth_of
-from hybridlog.wording import parse_size
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.disk.directory import LOCK_WAIT_S
 from hybridlog_storage.errors import (
     DatabaseError,
     DiskFullError,
     HybridlogError,
-    UsageError,
 )
 from hybridlog_storage.manifest import Loss, Manifest, Source, new_id
 from hybridlog_storage.manifest import replace as replaced
@@ -45,10 +42,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.catalog import Catalog
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.segments.segment_file import Sealed
-
-_REMOTE_SEGMENT: Final = "128MiB"
-_REMOTE_SEGMENTS: Final = 64 << 20, 256 << 20
-"""Least and greatest size in bytes: what a cut costs again, and what requests cost."""
 
 
 class Capture:
@@ -101,12 +94,8 @@ class Capture:
         self._make_room = make_room
         self._no_index = no_index or (lambda _: False)
         rules = Rules.of(directory.settings.retention)
-        largest = min(
-            settings.segment_size,
-            rules.segment_size,
-            remote_segment_size(directory.settings.remote),
-        )
-        settings = replace(settings, segment_size=int(largest))
+        largest = int(min(settings.segment_size, rules.segment_size))
+        settings = replace(settings, segment_size=largest)
         self._end: Callable[[Manifest], Manifest] | None = None
         self._held = ExitStack()
         recording = new_id(name)
@@ -241,18 +230,3 @@ class Capture:
         self._held.enter_context(lock)
         create(manifest)
         return put_entry(self._directory, self.catalog, recording)
-
-
-def remote_segment_size(table: Mapping[str, Any] | None) -> float:
-    """The greatest size of a new segment by the store's table `[remote]`.
-
-    Raises:
-        UsageError: The table is malformed.
-    """
-    if table is None:
-        return math.inf
-    size = parse_size(str(table.get("segment-size", _REMOTE_SEGMENT)))
-    least, most = _REMOTE_SEGMENTS
-    if table.keys() - {"segment-size"} or not least <= size <= most:
-        raise UsageError("[remote] in hybridlog.toml has segment-size, from 64MiB to 256MiB.")
-    return size

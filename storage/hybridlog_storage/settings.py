@@ -54,7 +54,6 @@ class StoreSettings(Struct, frozen=True):
         arrays: Topics whose tables have arrays in full.
         cache_mb: Size of the embedded MongoDB's cache in MiB; None for the smallest one.
         retention: The table `[retention]`, as it stands there.
-        remote: The table `[remote]`, the same; None without it.
     """
 
     store_id: Annotated[str, Meta(min_length=1)]
@@ -62,7 +61,6 @@ class StoreSettings(Struct, frozen=True):
     arrays: tuple[str, ...] = ()
     cache_mb: Annotated[int, Meta(ge=MIN_CACHE_MB, le=MAX_CACHE_MB)] | None = None
     retention: dict[str, Any] = {}
-    remote: dict[str, Any] | None = None
 
 
 def read_settings(path: Path) -> StoreSettings:
@@ -131,10 +129,9 @@ def settings_text(settings: StoreSettings) -> bytes:
         lines.append(f"cache_mb = {settings.cache_mb}")
     if settings.arrays:
         lines.append(f"arrays = {_as_toml(settings.arrays)}")
-    for name, table in (("retention", settings.retention or None), ("remote", settings.remote)):
-        if table is not None:
-            lines.append(f"\n[{name}]")
-            lines += [f"{_quoted(k)} = {_as_toml(v)}" for k, v in table.items()]
+    if settings.retention:
+        lines.append("\n[retention]")
+        lines += [f"{_quoted(k)} = {_as_toml(v)}" for k, v in settings.retention.items()]
     return ("\n".join(lines) + "\n").encode()
 
 

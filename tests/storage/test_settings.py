@@ -35,7 +35,6 @@ def write(store: Path, text: str | bytes) -> Path:
         StoreSettings(
             "ab12",
             retention={"quota": "2GB", "topic": {"/c/**": "7d", "/b": "1h"}, "never-tag": ["a=b"]},
-            remote={"segment-size": "64MiB"},
         ),
         StoreSettings("ab12", arrays=("Größe \U0001f600 \x7f\"'\\",)),
     ],
@@ -74,7 +73,6 @@ def test_the_umask_says_who_may_read_it(tmp_path: Path, umask: int, mode: int) -
         (b"format = 4\nstore_id = 'x'\nmongo = 'nowhere'", "mongo"),
         (b"format = 4\nstore_id = 'x'\narrays = '/scan'", "arrays"),
         (b"format = 4\nstore_id = 'x'\nretention = 5", "retention"),
-        (b"format = 4\nstore_id = 'x'\nremote = 'yes'", "remote"),
         (b"format = [", "damaged"),
         (b"\xff\xfe", "damaged"),
         (b"format = " + b"[" * 100_000, "damaged"),
