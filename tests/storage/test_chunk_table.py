@@ -57,29 +57,27 @@ def _set(array: str, row: int, field: str, change: int) -> Callable[[ChunkTable]
 
 
 @pytest.mark.parametrize(
-    ("change", "problem"),
+    "change",
     [
-        (_set("chunks", 1, "offset", -1), "not in order"),
-        (_set("chunks", 0, "length", 1), "not in order"),
-        (_set("chunks", 0, "trailer", 1), "not in order"),
-        (_set("chunks", 1, "trailer", -10), "no bytes"),
-        (_set("chunks", 0, "offset", 2**62), "beyond all files"),
-        (_set("chunks", 0, "length", 2**63), "beyond all files"),
-        (_set("chunks", 0, "parts", 1), "parts do not fit"),
-        (_set("parts", 0, "channel", 9), "not in order"),
-        (_set("parts", 2, "channel", 70_000), "not in order"),
-        (_set("parts", 0, "first", -1), "times"),
-        (_set("parts", 1, "last", 100), "times"),
-        (_set("parts", 0, "last", -1), "times"),
-        (_set("parts", 1, "first", 1), "times"),
-        (_set("chunks", 0, "first", 1), "times"),
-        (_set("chunks", 2, "last", 1), "times"),
-        (_set("parts", 0, "messages", -1), "times"),
+        _set("chunks", 1, "offset", -1),
+        _set("chunks", 0, "length", 1),
+        _set("chunks", 0, "trailer", 1),
+        _set("chunks", 1, "trailer", -10),
+        _set("chunks", 0, "offset", 2**62),
+        _set("chunks", 0, "length", 2**63),
+        _set("chunks", 0, "parts", 1),
+        _set("parts", 0, "channel", 9),
+        _set("parts", 2, "channel", 70_000),
+        _set("parts", 0, "first", -1),
+        _set("parts", 1, "last", 100),
+        _set("parts", 0, "last", -1),
+        _set("parts", 1, "first", 1),
+        _set("chunks", 0, "first", 1),
+        _set("chunks", 2, "last", 1),
+        _set("parts", 0, "messages", -1),
     ],
 )
-def test_a_table_that_contradicts_itself_is_refused(
-    change: Callable[[ChunkTable], None], problem: str
-) -> None:
+def test_a_table_that_contradicts_itself_is_refused(change: Callable[[ChunkTable], None]) -> None:
     builder = TableBuilder()
     for n in range(3):
         builder.chunk((30 + 110 * n, 100, 10), (5, 9), parts([1, 2], [5, 9]))
@@ -87,5 +85,5 @@ def test_a_table_that_contradicts_itself_is_refused(
     copy = ChunkTable(table.chunks.copy(), table.parts.copy())
     assert ChunkTable.from_bytes(copy.to_bytes()).end == 360
     change(copy)
-    with pytest.raises(SegmentError, match=problem):
+    with pytest.raises(SegmentError, match="contradicts itself"):
         ChunkTable.from_bytes(copy.to_bytes())

@@ -138,9 +138,8 @@ class ChunkTable(Struct, frozen=True, eq=False):
             arrays.append(np.frombuffer(raw, dtype, count, at))
             at += size
         table = cls(arrays[0], arrays[1])
-        problem = _problem(table)
-        if problem is not None:
-            raise SegmentError(f"the chunk table is damaged: {problem}")
+        if not _is_consistent(table):
+            raise SegmentError("the chunk table is damaged: it contradicts itself")
         return table
 
 
@@ -197,37 +196,28 @@ def place_of(table: ChunkTable, number: int, bounds: NDArray[np.int64] | None = 
     )
 
 
-def _problem(table: ChunkTable) -> str | None:
-    """The contradiction in a table, None if it is consistent."""
-    chunks = table.chunks
+def _is_consistent(table: ChunkTable) -> bool:
+    """True for a table as a writer makes it."""
+    chunks, parts = table.chunks, table.parts
     sizes = [chunks[name] for name in ("offset", "length", "trailer")]
-    if any((size >= _MAX_FILE).any() for size in sizes):
-        return "a place lies beyond all files"
-    if not all(size.all() for size in sizes):
-        return "something has no bytes"
-    ends = sizes[0] + sizes[1] + sizes[2]
-    if (ends[:-1] > chunks["offset"][1:]).any():
-        return "its chunks are not in order"
-    return _part_problem(table, table.parts)
-
-
-def _part_problem(table: ChunkTable, parts: NDArray[np.void]) -> str | None:
-    if not table.chunks["parts"].all() or int(table.chunks["parts"].sum()) != len(parts):
-        return "its parts do not fit its chunks"
+    if not all(size.all() and (size < _MAX_FILE).all() for size in sizes):
+        return False
+    is_ordered = ((sizes[0] + sizes[1] + sizes[2])[:-1] <= chunks["offset"][1:]).all()
+    if not is_ordered or not chunks["parts"].all() or int(chunks["parts"].sum()) != len(parts):
+        return False
     if not len(parts):
-        return None
-    channel = parts["channel"].astype(np.int64)
+        return True
     starts = table.part_bounds()[:-1]
-    rising = np.diff(channel) > 0
+    rising = np.diff(parts["channel"].astype(np.int64)) > 0
     rising[starts[1:] - 1] = True
-    if not rising.all() or int(channel.max()) > _MAX_CHANNEL:
-        return "the channels of a chunk are not in order"
-    first = np.minimum.reduceat(parts["first"], starts)
-    last = np.maximum.reduceat(parts["last"], starts)
-    same = bool((first == table.chunks["first"]).all() and (last == table.chunks["last"]).all())
-    if not same or not parts["messages"].all() or (parts["first"] > parts["last"]).any():
-        return "the times of its chunks and its parts differ"
-    return None
+    return bool(
+        rising.all()
+        and parts["channel"].max() <= _MAX_CHANNEL
+        and (np.minimum.reduceat(parts["first"], starts) == chunks["first"]).all()
+        and (np.maximum.reduceat(parts["last"], starts) == chunks["last"]).all()
+        and (parts["first"] <= parts["last"]).all()
+        and parts["messages"].all()
+    )
 
 
 def check_parts(
@@ -235,7 +225,7 @@ def check_parts(
 ) -> None:
     """Raise `SegmentError` unless parts fit their chunk; place and span as for `TableBuilder`."""
     table = ChunkTable(np.array([(*place, *span, len(parts))], CHUNK), parts)
-    if _problem(table) or int(parts["messages"].sum()) != messages:
+    if not _is_consistent(table) or int(parts["messages"].sum()) != messages:
         raise SegmentError("what is said of its messages does not fit it")
 
 
