@@ -222,20 +222,16 @@ class RecordChoices(Between, Latched, InStore, AsJson, Quiet):
 
 
 def row_of(report: RecordReport, path: object) -> dict[str, Any]:
-    """A recorded log as a row of JSON."""
+    """A recorded log as a row of JSON: that of `ls`, and what came of the log."""
+    from hybridlog.cli.commands.ls import recording_dict
+    from hybridlog.entries import summary_of
     from hybridlog.record.losses import losses_of
 
     entry = report.entry
     stats = [channel.stats for channel in entry.channels]
     return {
         "path": str(path),
-        "kind": entry.source["kind"],
-        "id": entry.id,
-        "recording": entry.name,
-        "status": entry.status,
-        "tags": entry.tags,
-        "topics": len({c.topic for c in entry.channels}),
-        "messages": entry.messages,
+        **recording_dict(summary_of(entry)),
         "messages_indexed": report.indexed,
         "messages_unreadable": sum(one.unreadable for one in stats),
         "messages_surplus": sum(one.surplus for one in stats),
@@ -246,7 +242,6 @@ def row_of(report: RecordReport, path: object) -> dict[str, Any]:
         "metadata_records": entry.metadata_records,
         # A live source has no size of its own.
         "bytes_in": entry.source["bytes"] or sum(one.payload_bytes for one in stats),
-        "bytes_stored": entry.stored_bytes,
         "seconds": round(report.elapsed_s, 3),
         "losses": losses_of(entry),
         "damage": [{**asdict(d), "file": str(d.file)} for d in report.damage],
@@ -264,14 +259,14 @@ def fields_of(row: Mapping[str, Any]) -> list[tuple[str, object]]:
         "attachments": row["attachments"],
     }
     return [
-        ("recording", row["recording"]),
-        ("source", f"{row['path']} ({row['kind']})"),
+        ("recording", row["name"]),
+        ("source", f"{row['path']} ({row['source']['kind']})"),
         ("topics", row["topics"]),
         ("messages", row["messages"]),
         *(pair for pair in some.items() if pair[1]),
         ("bytes in", output.size(row["bytes_in"])),
-        ("stored", output.size(row["bytes_stored"])),
-        ("ratio", f"{row['bytes_in'] / (row['bytes_stored'] or inf):.2f}"),
+        ("stored", output.size(row["stored_bytes"])),
+        ("ratio", f"{row['bytes_in'] / (row['stored_bytes'] or inf):.2f}"),
         ("indexed", row["messages_indexed"]),
         ("time", f"{row['seconds']:.2f} s"),
         ("messages/s", f"{row['messages'] / (row['seconds'] or inf):,.0f}"),

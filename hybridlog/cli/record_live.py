@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import socket
-import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
@@ -116,7 +115,7 @@ def _record(choices: RecordChoices) -> int:
                 sources = [held.enter_context(source) for source in sources_of(choices)]
             notify_service("STOPPING=1", "STATUS=writing what is left")
             output.remarks(["hybridlog: writing what is left; Ctrl-C leaves at once"])
-            reports += recorder.stop(stop.wait_s, _tell_left)
+            reports += recorder.stop(stop.wait_s)
         broken: list[Result] = []
         if options.contract is not None:
             from hybridlog.contract import judge  # loads pyarrow
@@ -289,12 +288,6 @@ def _say(text: str) -> None:
 
     if not (output.is_quiet() and PINNED in text):  # which is no problem
         output.note(f"hybridlog: {text}")
-
-
-def _tell_left(messages: int) -> None:
-    if sys.stderr.isatty():
-        left = output.counted(messages, "message")
-        output.remarks([f"hybridlog: {left} left for tables and index; Ctrl-C leaves them"])
 
 
 def _show(state: RecorderState, table: output.Drawn | None, *, as_json: bool) -> None:

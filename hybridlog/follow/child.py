@@ -40,7 +40,6 @@ _START: Final = (
     "import sys; sys.path[:] = {!r}; from hybridlog.follow.beside import serve; serve({})"
 )
 _POLL_S: Final = 0.1
-_PATIENCE_S: Final = 1.0  # then the user hears of what is left at the end
 _TRIES: Final = 5
 """So often in a row it may end before it has told how far it is."""
 _PAUSE_S: Final = 1.0
@@ -76,7 +75,7 @@ class FollowerProcess:
     process, at its end.
     `judged` has the numbers of the sealed files that triggers have read; it is None without
     triggers, or when the process is given up. At the end it is waited for `wait_s`, if that is not
-    None, and `left` is told once how many messages are left.
+    None.
     """
 
     def __init__(
@@ -96,7 +95,6 @@ class FollowerProcess:
         self.said: list[str] = []
         self.judged: Collection[int] | None = () if triggers else None
         self.wait_s: float | None = None
-        self.left: Callable[[int], object] = lambda _: None
         self._is_finishing = self._is_left = False
         self._directory = directory
         self._catalog = catalog
@@ -158,16 +156,11 @@ class FollowerProcess:
             return self._finish_here(entry, self._target)
         self._is_finishing = True
         self.order(ENDED)
-        begun, waited, is_told = time.monotonic(), 0.0, False
+        begun = time.monotonic()
         while self._thread.is_alive() and not self._is_left:
-            if self.wait_s is not None and waited >= self.wait_s:
+            if self.wait_s is not None and time.monotonic() - begun >= self.wait_s:
                 break
             self._thread.join(_POLL_S)
-            waited = time.monotonic() - begun
-            left = entry.messages - self.state.read
-            if not is_told and waited >= _PATIENCE_S and left > 0:
-                self.left(left)
-                is_told = True
         if self._thread.is_alive():
             if not self._has_seen:
                 self._say("triggers have not seen the last messages: that takes too long")

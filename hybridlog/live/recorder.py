@@ -282,9 +282,7 @@ class Recorder:
         """Leave to the next command what the follower has not done; False before all is sealed."""
         return self._follower.leave()
 
-    def stop(
-        self, wait_s: float | None = None, left: Callable[[int], object] = lambda _: None
-    ) -> list[RecordReport]:
+    def stop(self, wait_s: float | None = None) -> list[RecordReport]:
         """Stop the sources; flush and seal everything; then wait for the follower.
 
         The recording is removed if no source was ever reached and no message came, or if the
@@ -292,7 +290,6 @@ class Recorder:
 
         Args:
             wait_s: Seconds to wait for the follower; None for as long as it takes.
-            left: Told how many messages it has left, when that takes a while.
 
         Returns:
             A report for each recording.
@@ -306,7 +303,7 @@ class Recorder:
         self._over.set()
         if self._simulated is not None:
             self._simulated.close()
-        self._follower.wait_s, self._follower.left = wait_s, left
+        self._follower.wait_s = wait_s
         self._says.remove()
         self._retention.stop()
         self._incidents.stop(ended_at)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import resource
-import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
@@ -113,14 +112,12 @@ def _first_line(error: Exception) -> str:
 class Worker:
     """Runs calls of one connection in a thread, so that Ctrl-C and timeouts interrupt them.
 
-    The timeout is seconds for all calls, None for no limit. Once `stopped` is set, they end with an
-    error.
+    The timeout is seconds for all calls, None for no limit.
     """
 
-    def __init__(self, cursor: Any, timeout: float | None, stopped: threading.Event) -> None:
+    def __init__(self, cursor: Any, timeout: float | None) -> None:
         self._cursor = cursor
         self._timeout = timeout
-        self._stopped = stopped
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="hybridlog-sql")
         self._until = None if timeout is None else time.monotonic() + timeout
 
@@ -138,8 +135,6 @@ class Worker:
     def _wait(self, future: Future[_T]) -> None:
         while not future.done():
             safe_point()  # Ctrl-C
-            if self._stopped.is_set():
-                raise ResourceError("The query was stopped.")
             left = _POLL_S if self._until is None else self._until - time.monotonic()
             if left <= 0:
                 raise HybridlogError(

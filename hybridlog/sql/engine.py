@@ -109,9 +109,6 @@ class SqlConnection:
     """Runs queries one after the other. Not thread safe.
 
     `memory` is DuckDB's limit, bytes. With `only_reads`, statements other than queries are refused.
-
-    Attributes:
-        stopped: Set it in any thread to end the query that runs, and all later ones.
     """
 
     def __init__(
@@ -127,7 +124,6 @@ class SqlConnection:
         self.cursor = cursor
         self.memory = memory
         self.scope = scope
-        self.stopped = threading.Event()
         self._only_reads = only_reads
         self.reading = Reading()
         self._has_own = False  # views and macros of the user read what a query does not name
@@ -319,7 +315,7 @@ class SqlAnswer:
     def _batches(self, size: int, limit: int | None) -> Iterator[pa.RecordBatch]:
         """The answer in batches of so many rows, up to a limit."""
         connection = self._connection
-        with closing(Worker(connection.cursor, self._timeout, connection.stopped)) as worker:
+        with closing(Worker(connection.cursor, self._timeout)) as worker:
             reader, batch = self._begun(lambda: worker.run(partial(self._stream, size, limit)))
             if batch is None:
                 yield pa.RecordBatch.from_pylist([], schema=reader.schema)

@@ -77,16 +77,3 @@ def test_what_needs_another_option(store: Path) -> None:
         (("fetch", "scan", "--in-frame", "x", "--count"), "exclude each other"),
     ):
         assert said in answer(*words, store=store, code=2).err
-
-
-def test_what_people_read(tmp_path: Path) -> None:
-    """Ends of marks as times."""
-    with hl.open(tmp_path / "s", create=True) as opened:
-        with opened.start("run") as recording:
-            for second in range(3):
-                recording.write(CHANNEL, b'{"age": 1}', log_time=(5 + second) * 10**9)
-        opened.mark("run", "+1s", "slipped", until="+2s")
-    shown = answer("fetch", "marks", "-F", "table", store=tmp_path / "s").lines[1]
-    assert shown.split() == ["1970-01-01T00:00:06Z", "slipped", "1970-01-01T00:00:07Z"]
-    (line,) = answer("fetch", "marks", "-F", "jsonl", store=tmp_path / "s").lines
-    assert json.loads(line)["end"] == 7 * 10**9

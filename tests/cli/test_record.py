@@ -35,7 +35,7 @@ def test_json_is_exact(logs: Path, tmp_path: Path) -> None:
     stored = sum(p.stat().st_size for p in places.folder(tmp_path / "s", "small").glob("*.mcap"))
     assert done["messages"] == done["messages_indexed"] == len(seen)
     assert done["bytes_in"] == (logs / "small.bag").stat().st_size
-    assert done["bytes_stored"] == stored
+    assert done["stored_bytes"] == stored
     assert done["damage"] == []
     assert not misfit(done, schema_of(["record"]))
 

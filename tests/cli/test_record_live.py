@@ -192,7 +192,7 @@ def test_a_recorder_is_visited(logs: Path, tmp_path: Path) -> None:
         assert "is no running recorder" in run("mark", "x", "-r", "zz", store=store, code=2).err
         assert complete(f"mark x --store {store} -r fi") == ["first drive"]
         info = run("info", store=store).out
-        assert "being recorded; `hybridlog top 'first drive'` shows it" in info
+        assert "being recorded" in info
         assert "later losses are to come: first drive." in run("info", "--losses", store=store).err
         assert_ctrl_c_leaves_top(store)
         end(process)
@@ -469,7 +469,7 @@ def test_another_recording_goes_on_when_a_manifest_is_full(
     done = answer("record", *words, "--mongo", "none", store=tmp_path / "store")
     report = json.loads(done.out.splitlines()[-1])["report"]
     names = ["run", "run-2", "run-3"][: -(-said // 3)]
-    assert [one["recording"] for one in report["recordings"]] == names
+    assert [one["name"] for one in report["recordings"]] == names
     assert f"the manifest of {names[-2]} is full: {names[-1]} goes on" in done.err
     with hl.open(tmp_path / "store", mongo="none") as store:
         found = [[int(m.fields["data"]) for m in store.query(["/chatter"], [n])] for n in names]

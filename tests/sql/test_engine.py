@@ -171,14 +171,6 @@ def test_the_first_rows(store: hl.Store) -> None:
     assert store.sql("show tables").first(9, 9999)[0].column_names == ["name"]
 
 
-def test_a_query_is_stopped_from_another_thread(store: hl.Store) -> None:
-    connection = store.sql_engine.connect()
-    timer = threading.Timer(0.2, connection.stopped.set)
-    timer.start()
-    with pytest.raises(ResourceError, match="The query was stopped"):
-        connection.query(ENDLESS).first(5, 99)
-
-
 @pytest.mark.parametrize(
     "text", ["create table a as select 1", "select 1; insert into a values (1)", "explain select 1"]
 )

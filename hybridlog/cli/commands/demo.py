@@ -12,7 +12,7 @@ from typing import Final
 
 from hybridlog import demo
 from hybridlog.cli.binder import argument, command
-from hybridlog_storage.errors import NO_SPACE, DiskFullError, UsageError
+from hybridlog_storage.errors import UsageError
 
 BAG, STORE, SLICE = "robot.bag", "robot-logs", "scan.npz"
 """Names of the files that the tour makes in its directory."""
@@ -73,20 +73,13 @@ def run(directory: Path) -> int:
     """Run the tour, which leaves its bag and store in `directory`.
 
     Returns the exit code of the step that failed, or 0. Raises UsageError where a file of the tour
-    is there already, or the directory cannot be made or written to.
+    is there already.
     """
     for path in (directory / name for name in (BAG, STORE, SLICE)):
         if path.exists():
             raise UsageError(f"{path} exists already; remove it or choose another directory")
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(Path(demo.__file__).with_name(BAG), directory / BAG)
-    except OSError as error:
-        if error.errno in NO_SPACE:
-            raise DiskFullError(f"no space left in {directory}; choose another disk") from error
-        raise UsageError(
-            f"cannot write to {directory}: {error.strerror}; choose another directory"
-        ) from error
+    directory.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(Path(demo.__file__).with_name(BAG), directory / BAG)
     _print(f"The tour runs in {directory}\n{BAG} is the log of a minute of a simulated robot\n")
     for title, typed in STEPS.items():
         _print(f"\n# {title}\n$ {typed}\n")
@@ -96,9 +89,8 @@ def run(directory: Path) -> int:
             sys.stderr.write(f"error: `{typed}` failed with exit code {code}\n")
             # A child that was killed by a signal has a negative code, which shells cannot return.
             return code if code > 0 else 128 - code
-    hybridlog = "hybridlog" if shutil.which("hybridlog") else f"{sys.executable} -m hybridlog"
     place = shlex.quote(str(directory / STORE))
-    _print(f"\nAll files remain in {directory}; look at them: {hybridlog} view --store {place}\n")
+    _print(f"\nAll files remain in {directory}; look at them: hybridlog view --store {place}\n")
     return 0
 
 

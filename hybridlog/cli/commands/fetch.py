@@ -28,8 +28,6 @@ from hybridlog_storage.errors import TopicError, UsageError
 from hybridlog_storage.stopping import at_safe_points
 
 if TYPE_CHECKING:
-    import pyarrow as pa
-
     from hybridlog.query.query import Query
     from hybridlog.store import Store
 
@@ -153,25 +151,12 @@ def _answer(query: Query, choices: _Choices) -> Query:
         write_answer(query, form, choices.place, front=front, strict=strict)
         return query
     from hybridlog.query.query import tables_of
-    from hybridlog.record.marks import MARKS
 
     answered = query if query.question.limit is not None else query.limit(SCREEN_ROWS + 1)
     tables = tables_of(answered)
-    if answered.topics == (MARKS,):
-        tables = map(_with_times, tables)
     completeness = answered.completeness if strict else None
     choices.answer(tables, completeness=completeness, noun="message")
     return answered
-
-
-def _with_times(marks: pa.Table) -> pa.Table:
-    """Marks for people: their ends are times, as their beginnings are."""
-    import pyarrow as pa
-
-    if "end" not in marks.column_names:
-        return marks
-    end = marks["end"].cast(pa.timestamp("ns", "UTC"))
-    return marks.set_column(marks.column_names.index("end"), "end", end)
 
 
 def _follow(query: Query, choices: _Choices) -> None:

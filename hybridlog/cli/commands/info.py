@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from operator import itemgetter
 from pathlib import Path
-from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -163,8 +162,6 @@ def _fields(store: Store, entry: RecordingEntry, about: dict[str, Any]) -> list[
     from hybridlog.query.times import format_duration
 
     status, source = status_text(summary_of(entry)), entry.source["kind"]
-    if entry.status == "open":
-        status += f"; `hybridlog top {quote(entry.name)}` shows it"
     if entry.source["bytes"]:
         source += f", {output.size(entry.source['bytes'])}"
     if entry.source["path"]:

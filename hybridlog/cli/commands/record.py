@@ -209,9 +209,9 @@ class LogRecorder:
             self.exit_code = self.exit_code or _told(piece.path, report)
             row = row_of(report, piece.path)
             about = (
-                f"{output.counted(row['messages'], 'message')}, {output.size(row['bytes_stored'])}"
+                f"{output.counted(row['messages'], 'message')}, {output.size(row['stored_bytes'])}"
             )
-            self._tell("recorded", row, [f"{row['recording']}: {about}, from {piece.path}"])
+            self._tell("recorded", row, [f"{row['name']}: {about}, from {piece.path}"])
 
     def _pieces(self, store: Store, log: LogSet) -> Iterator[LogSet]:
         """The log; in a search, the missing parts of it if others were recorded on their own."""
