@@ -127,9 +127,7 @@ class SqlConnection:
         self._only_reads = only_reads
         self.reading = Reading()
         self._has_own = False  # views and macros of the user read what a query does not name
-        self._content: StoreContent | None = None
         self._names: set[str] = set()
-        self._registered: set[str] = set()
 
     @property
     def content(self) -> StoreContent:
@@ -177,11 +175,10 @@ class SqlConnection:
         return answer
 
     def register(self, content: StoreContent) -> None:
-        """Register the views that were named so far, if they are not those of this content."""
+        """Register the views that were named so far."""
         from hybridlog.sql.source import TopicDataset
 
-        known = set() if content is not self._content else self._registered
-        for name in self._names - known:
+        for name in self._names:
             topic = content.names.topic(name)
             if topic is not None:
                 source: Any = TopicDataset(content.view(topic), lambda: self.reading)
@@ -190,7 +187,6 @@ class SqlConnection:
             else:
                 continue
             self.cursor.register(name, source)
-        self._content, self._registered = content, set(self._names)
 
     def _usage(self, statement: Any) -> Usage:
         if self._has_own:

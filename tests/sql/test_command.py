@@ -1,16 +1,10 @@
-"""`hybridlog sql`: outputs, standard input, the prompt."""
+"""`hybridlog sql`: outputs, standard input."""
 
 from __future__ import annotations
 
 import json
-import os
-import pty
 import re
-import select
 import shutil
-import signal
-import subprocess
-import time
 from pathlib import Path
 
 import pyarrow as pa
@@ -28,7 +22,6 @@ from hybridlog_storage.errors import (
     UsageError,
 )
 from tests import places
-from tests.cli.running import COMMAND, environment
 from tests.sql.conftest import LARGE
 from tests.sql.test_engine import ENDLESS
 from tests.tables.logs import BASE, SECOND, payload, write_log
@@ -192,76 +185,3 @@ def test_losses_are_told(root: Path, tmp_path: Path) -> None:
     for scope in (["-r", "first"], ["--between", BASE, BASE + SECOND]):
         done = run(tmp_path / "store", "select count(*) from large", "--strict", *scope)
         assert (json.loads(done.stdout)["count_star()"], done.stderr) in {(LARGE, ""), (1000, "")}
-
-
-class Person:
-    """Types into a command on a terminal, and reads what it shows."""
-
-    def __init__(self, *arguments: object, **env: str) -> None:
-        self.terminal, theirs = pty.openpty()
-        self.process = subprocess.Popen(
-            [*COMMAND, *map(str, arguments)],
-            stdin=theirs,
-            stdout=theirs,
-            stderr=theirs,
-            env=environment(TERM="xterm", **env),
-            start_new_session=True,
-        )
-        os.close(theirs)
-        self.shown = b""
-        self._read = 0
-
-    def reads(self, text: str) -> None:
-        """Wait until a text is shown."""
-        deadline = time.monotonic() + 120
-        while (found := self.shown.find(text.encode(), self._read)) < 0:
-            assert time.monotonic() < deadline, (text, self.shown)
-            if select.select([self.terminal], [], [], 0.05)[0]:
-                self.shown += os.read(self.terminal, 1 << 16)
-        self._read = found + len(text)
-
-    def types(self, text: str) -> None:
-        os.write(self.terminal, text.encode())
-
-    def leaves(self) -> int:
-        try:
-            return self.process.wait(60)
-        finally:
-            os.close(self.terminal)
-            if self.process.poll() is None:
-                self.process.kill()
-
-
-def test_the_prompt(root: Path) -> None:
-    person = Person("sql", "--store", root)
-    person.reads("sql> ")
-    person.types("create table few as select * from scan limit 3;\r")
-    person.reads("sql> ")
-    person.types("select count(*) + 100 as n\r")
-    person.reads("...> ")
-    person.types("from few;\r")
-    person.reads("103")
-    person.reads("sql> ")
-    person.types("selec 1;\r")
-    person.reads("syntax error")
-    person.reads("LINE 1: selec 1;")
-    person.reads("sql> ")
-    person.types("select max(ranges_summary.max) as most from base__scan;\r")
-    person.reads("998")
-    person.reads("sql> ")
-    person.types(f"{ENDLESS};\r")
-    person.reads(" b;")
-    person.reads("\n")
-    while b"stopped" not in person.shown:  # it may not have begun yet
-        os.kill(person.process.pid, signal.SIGINT)
-        if select.select([person.terminal], [], [], 5)[0]:
-            person.shown += (new := os.read(person.terminal, 1 << 16))
-            if b"sql> " in new and b"stopped" not in person.shown:  # it was cleared as it came
-                person._read = len(person.shown)
-                person.types(f"{ENDLESS};\r")
-                person.reads(" b;")
-                person.reads("\n")
-    person.types("\rselect 6 * 7 as answer;\r")
-    person.reads("42")
-    person.types("quit\r")
-    assert person.leaves() == 0

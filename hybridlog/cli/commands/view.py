@@ -6,7 +6,7 @@ import sys
 from dataclasses import dataclass
 
 from hybridlog.cli import output
-from hybridlog.cli.binder import command, option
+from hybridlog.cli.binder import command
 from hybridlog.cli.options import AsJson, InStore, Served, one_recording
 from hybridlog.cli.signals import ended_by_signal
 from hybridlog_storage.errors import MissingDependencyError
@@ -17,7 +17,6 @@ class _Given(InStore, AsJson, Served):
     recording: str | None = one_recording(
         "Show this one first; without, the list of recordings.", "[RECORDING]"
     )
-    opens: bool = option("Open the page in the browser.", name="--open")
 
 
 @command(_Given)
@@ -27,8 +26,6 @@ def view_command(given: _Given) -> None:
     The page has a timeline, plots, pictures and scans, and takes questions. Only this computer
     can open it, at an address with a secret token. The store is only read. Ctrl-C ends it.
     """
-    import threading
-    import webbrowser
     from urllib.parse import quote
 
     try:
@@ -48,7 +45,5 @@ def view_command(given: _Given) -> None:
         if not given.as_json:
             output.note("Open this address in a browser. Ctrl-C ends the server.")
         sys.stdout.flush()
-        if given.opens:
-            threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
         with ended_by_signal(server.stop):
             server.run()
