@@ -382,14 +382,11 @@ class Plan:
     def _decoded(
         self, recording: TopicOfRecording, places: NDArray[np.int64], window: Span | None
     ) -> Iterator[pa.RecordBatch]:
-        """The rows at some places, from their payloads; only arrays are still to be tested."""
+        """The rows at some places, from their payloads."""
         for (_, *chunk), offsets in offsets_by_chunk(recording.entry.id, places).items():
             one = recording.chunks[chunk[0], chunk[1]]
             for rows in recording.in_chunk(one, self._asked, offsets):
-                holds = np.ones(len(rows.columns), np.bool_)
-                if self._tests_arrays:
-                    holds = self._holds(recording, rows, window)
-                yield from self._finished(recording, rows, holds)
+                yield from self._finished(recording, rows, self._holds(recording, rows, window))
 
     def _holds(self, recording: TopicOfRecording, rows: Rows, window: Span | None) -> Mask:
         """Mask of the rows in a range of log time for which the filter holds."""

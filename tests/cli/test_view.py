@@ -58,12 +58,3 @@ def test_what_is_refused_before_anything_is_served(store: Path) -> None:
     assert "is in use. Give another one with --port, or 0 for any." in taken.err
     unknown = run("view", "monday", store=store, code=2)
     assert (unknown.out, "monday" in unknown.err) == ("", True)
-
-
-def test_of_several_stores_none_is_guessed(tmp_path: Path) -> None:
-    for name in ("one", "two"):
-        StoreDirectory.create(tmp_path / name)
-    running = start(folder=tmp_path)
-    _, errors = running.communicate(timeout=20)
-    assert running.returncode == 5
-    assert errors.endswith("Below this folder: --store one or --store two.\n")
