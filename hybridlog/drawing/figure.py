@@ -85,8 +85,10 @@ def draw(axes: Axes, found: Sequence[Line]) -> None:
         times, values = line.series.polyline()
         at = (times - line.start) / (1e9 * step)
         (curve,) = axes.plot(at, drawable(values), color=colour, linewidth=1.2)
-        # Of very many messages, each is a pixel: so is one between two gaps, without a line.
-        curve.set(marker="." if len(line.series.times) <= MAX_MARKED_POINTS else ",", markersize=4)
+        shown = line.series
+        is_marked = shown.alone() if len(shown.times) > MAX_MARKED_POINTS else slice(None)
+        marks = (shown.times[is_marked] - line.start) / (1e9 * step)
+        axes.plot(marks, drawable(shown.least[is_marked]), ".", color=colour, markersize=4)
         drawn.append(curve)
     recordings = {(line.recording, line.start) for line in found}
     since = "the beginning of each recording"

@@ -63,6 +63,13 @@ class Series(Struct, frozen=True):
     greatest: Numbers
     exact: bool
 
+    def alone(self) -> NDArray[np.bool_]:
+        """bool[n], True for entries between two gaps: no line goes through them."""
+        is_known = np.isfinite(self.least) & np.isfinite(self.greatest)
+        edged = np.concatenate([[False], is_known, [False]])
+        found: NDArray[np.bool_] = is_known & ~edged[:-2] & ~edged[2:]
+        return found
+
     def polyline(self) -> tuple[NDArray[np.int64], Numbers]:
         """Corners of the line: times, ns, and values. A pixel has its least and its greatest."""
         if self.exact:
