@@ -1,7 +1,7 @@
 """A second reader of stores, written from `docs/format.md` alone.
 
-It shares no code with hybridlog: `struct`, `zlib`, `json` and `zstandard` are all it needs, and
-`pyarrow` for fields of expired messages (`format_columns.py`). What it reads, it has checked.
+It shares no code with hybridlog: `struct`, `zlib`, `json`, `lz4` and `zstandard` are all it needs,
+and `pyarrow` for fields of expired messages (`format_columns.py`). What it reads, it has checked.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
+import lz4.frame
 import zstandard
 from blake3 import blake3
 
@@ -194,7 +195,7 @@ class Segment:
         demand(zlib.crc32(data[start : len(data) - 12]) == crc, "the checksum of the summary")
         self.schemas: dict[int, tuple[str, str, bytes]] = {}
         self.channels: dict[int, tuple[int, str, str, dict[str, str]]] = {}
-        self._metadata: list[tuple[int, int, str]] = []
+        self.metadata: list[tuple[int, int, str]] = []
         self._counts: dict[int, int] = {}
         groups: list[int] = []
         table = None
@@ -215,7 +216,7 @@ class Segment:
                     number = content.take("<H")
                     self._counts[number] = content.take("<Q")
             elif opcode == 0x0D:
-                self._metadata.append((content.take("<Q"), content.take("<Q"), content.text()))
+                self.metadata.append((content.take("<Q"), content.take("<Q"), content.text()))
             elif opcode == 0x92:
                 table = body
         known = [0x03, 0x04, 0x0B, 0x08, 0x0A, 0x0D, 0x92]
@@ -267,7 +268,7 @@ class Segment:
     def _json(self, name: str) -> list[dict[str, Any]]:
         """The metadata records of a name, after their checksums."""
         found = []
-        for offset, length, its_name in self._metadata:
+        for offset, length, its_name in self.metadata:
             if its_name != name:
                 continue
             record = self.data[offset : offset + length]
@@ -346,9 +347,11 @@ class Segment:
         demand(times == (place.first, place.last), "the times in the head of a chunk")
         size, crc, compression = body.take("<Q"), body.take("<I"), body.text()
         packed = body.block(body.take("<Q"))
-        demand(compression in {"", "zstd"}, "another compression")
+        demand(compression in {"", "zstd", "lz4"}, "another compression")
         content = packed
-        if compression:
+        if compression == "lz4":
+            content = lz4.frame.decompress(packed)
+        elif compression:
             content = zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
         demand(len(content) == size and zlib.crc32(content) == crc, "the content of a chunk")
         return content

@@ -14,7 +14,7 @@ import random
 import re
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import count, cycle
 from pathlib import Path
@@ -53,6 +53,7 @@ from hybridlog_storage.mongo.index_documents import IndexState
 from hybridlog_storage.mongo.mongod import EmbeddedMongod
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
+from tests.format_reader import Segment
 from tests.independent import write_mcap
 
 pytestmark = pytest.mark.mongo("embedded")
@@ -599,10 +600,7 @@ class Machine(RuleBasedStateMachine):
         if not segments:
             return
         number, path = segments[segment % len(segments)]
-        assert self.store.shared.index.reached() is not None
-        with pymongo.MongoClient[dict[str, Any]](self.uri) as client:
-            index = Index(client[self.store.shared.index.reached().name], recording, number)
-            gone = {seq for part in index.arrivals().values() for seq in part}
+        gone = {seq for part in arrivals_of(Segment(path)) for seq in part}
         lost = Lost(path.read_bytes(), [m for m in known.messages if m.seq in gone])
         assert {m.seq for m in lost.messages} == gone
         path.unlink()
@@ -679,35 +677,33 @@ class Machine(RuleBasedStateMachine):
         known = self.model[recording]
         entry = self.store.entry(recording)
         number, path = places.segments(self.store.directory.path, recording)[-1]
-        content = path.read_bytes()
-        laid = Laid.out(content)
-        cut = len(content) if part == "sealed" else laid.cut(spot, part)
-        whole = [n for n, c in enumerate(laid.chunks) if c.arrivals_end <= cut]
-        assert self.store.shared.index.reached() is not None
+        segment = Segment(path)
+        arrivals, cut = arrivals_of(segment), end_of(segment, spot, part)
+        whole = [n for n, chunk in enumerate(segment.chunks) if sum(chunk[:3]) <= cut]
+        database = self.store.shared.index.reached()
+        assert database is not None
         with pymongo.MongoClient[dict[str, Any]](self.uri) as client:
-            index = Index(client[self.store.shared.index.reached().name], recording, number)
-            arrivals = index.arrivals()
-            assert arrivals.keys() == set(range(len(laid.chunks)))
             # Log first, index second: the index is behind the file by some chunks, and of one
             # it may have documents that it does not count.
             kept = whole[: sum(is_in for _, is_in in zip(whole, cycle(indexed), strict=False))]
-            half = [n for n in whole if n not in kept][:1]
-            index.fall_back_to(kept, half if has_half else [])
+            kept += whole[len(kept) : len(kept) + has_half]
+            fall_back(client[database.name], recording, number, kept)
         others = {n: digest for n, digest in entry.digests.items() if n != str(number)}
         if others:
-            IndexState(self.store.shared.index.reached()).put_segments(entry.key, others)
+            IndexState(database).put_segments(entry.key, others)
         # The manifest lists the segment, or nothing from there on.
         change_manifest(path.parent, None if part == "sealed" else number, status="open")
-        path.with_name(path.name + ".open").write_bytes(content[:cut])
+        path.with_name(path.name + ".open").write_bytes(segment.data[:cut])
         path.unlink()
         self.open_again()
         self.changed = True
         by_seq = {m.seq: m for m in known.messages}
-        in_segment = {seq for part in arrivals.values() for seq in part}
+        in_segment = {seq for part in arrivals for seq in part}
         survivors = {seq: m for seq, m in by_seq.items() if seq not in in_segment}
         assert list(self.store.shared.repairs.recovered) == [known.name]
         survivors |= {seq: by_seq[seq] for n in whole for seq in arrivals[n]}
-        if number == 0 and laid.described > cut and not known.marks:
+        described = min(offset + length for offset, length, _ in segment.metadata)
+        if number == 0 and described > cut and not known.marks:
             assert recording not in self.store.directory.ids()
             del self.model[recording]
             return
@@ -936,99 +932,33 @@ def seen(message: hl.Message) -> tuple[object, ...]:
     )
 
 
-@dataclass(frozen=True)
-class LaidChunk:
-    """Where a chunk lies, and where the record of its arrival numbers ends."""
-
-    offset: int
-    end: int
-    arrivals_end: int
-
-
-@dataclass(frozen=True)
-class Laid:
-    """Where records lie in a segment, read record by record.
-
-    Attributes:
-        described: Where the metadata record ends that says which recording this is.
-        chunks: Its chunks with messages.
-        end: Where the data section ends.
-    """
-
-    described: int
-    chunks: list[LaidChunk]
-    end: int
-
-    def cut(self, spot: int, part: Literal["file", "chunk", "trailer"]) -> int:
-        """A byte at which the file may end: anywhere, in a chunk, or in what follows one."""
-        if part == "file" or not self.chunks:
-            return self.end * spot // SPOTS
-        chunk = self.chunks[spot % len(self.chunks)]
-        start, end = chunk.offset, chunk.end
+def end_of(segment: Segment, spot: int, part: str) -> int:
+    """A byte at which the file may end: anywhere, in a chunk, or in what follows one."""
+    start, end = 0, int(struct.unpack_from("<Q", segment.data, len(segment.data) - 28)[0]) - 13
+    if part == "sealed":
+        return len(segment.data)
+    if part != "file" and segment.chunks:
+        chunk = segment.chunks[spot % len(segment.chunks)]
+        start, end = chunk.offset, chunk.offset + chunk.length
         if part == "trailer":
-            start, end = chunk.end, chunk.arrivals_end
-        return start + (end - start) * spot // SPOTS
-
-    @classmethod
-    def out(cls, content: bytes) -> Laid:
-        described = 0
-        chunks: list[LaidChunk] = []
-        last: tuple[int, int] = (0, 0)
-        has_messages = False
-        at = 8
-        while True:
-            opcode, length = struct.unpack_from("<BQ", content, at)
-            end = at + 9 + length
-            if opcode == 0x0F:
-                return cls(described, chunks, at)
-            if opcode == 0x06:
-                last, has_messages = (at, end), False
-            elif opcode == 0x07:
-                has_messages = True  # others have definitions
-            elif opcode == 0x0C:
-                described = described or end
-            elif opcode == 0x90:
-                assert struct.unpack_from("<Q", content, at + 9) == last[:1]
-                if has_messages:
-                    chunks.append(LaidChunk(*last, end))
-            at = end
+            start, end = end, end + chunk.trailer
+    return start + (end - start) * spot // SPOTS
 
 
-class Index:
-    """What MongoDB holds of one segment, seen past the store."""
+def arrivals_of(segment: Segment) -> list[list[int]]:
+    """Arrival numbers of each chunk's messages."""
+    return [[told.seq for _, told in segment.chunk(n)] for n in range(len(segment.chunks))]
 
-    def __init__(
-        self, database: pymongo.database.Database[dict[str, Any]], recording: str, number: int
-    ) -> None:
-        self._db = database
-        self._key = recording[-16:]
-        self._number = number
-        names = database.list_collection_names()
-        self._topics = [database[name] for name in names if not name.startswith("hybridlog.")]
 
-    def arrivals(self) -> dict[int, list[int]]:
-        """Arrival numbers of each chunk's messages, in the chunk's order."""
-        found: dict[int, list[tuple[int, int]]] = {}
-        mine = {"_meta.rec": self._key, "_meta.ref.seg": self._number}
-        for topic in self._topics:
-            for each in topic.find(mine):
-                ref = each["_meta"]["ref"]
-                found.setdefault(ref["chunk"], []).append((ref["off"], each["_meta"]["seq"]))
-        return {chunk: [seq for _, seq in sorted(part)] for chunk, part in found.items()}
-
-    def fall_back_to(self, kept: Sequence[int], documents_only: Iterable[int]) -> None:
-        """Forget all chunks of the segment but some, by number, and that all is there."""
-        lost = {"$nin": [*kept, *documents_only]}
-        for topic in self._topics:
-            topic.delete_many(
-                {
-                    "_meta.rec": self._key,
-                    "_meta.ref.seg": self._number,
-                    "_meta.ref.chunk": lost,
-                }
-            )
-        begun = {"made": "", "segments": {}}
-        self._db["hybridlog.recordings"].update_one({"_id": self._key}, {"$set": begun})
+def fall_back(database: Any, recording: str, number: int, kept: Sequence[int]) -> None:
+    """Forget the documents of all chunks of a segment but some, and that all is there."""
+    key = recording[-16:]
+    lost = {"_meta.rec": key, "_meta.ref.seg": number, "_meta.ref.chunk": {"$nin": [*kept]}}
+    for name in database.list_collection_names():
+        if not name.startswith("hybridlog."):
+            database[name].delete_many(lost)
+    begun = {"made": "", "segments": {}}
+    database["hybridlog.recordings"].update_one({"_id": key}, {"$set": begun})
 
 
 @pytest.fixture(scope="module")
