@@ -888,7 +888,7 @@ def test_a_damaged_chunk_is_the_same_loss_for_both(recorded: hl.Store, tmp_path:
 
     robot = places.folder(copied(recorded, tmp_path / "store"), "robot")
     whole = FormatReader(tmp_path / "store").recording("robot").segments[1]
-    # In a chunk, in an arrival record, and in a message index, which no message needs.
+    # In a chunk, in an arrival record, and in a message index.
     flips = (
         (0, 60),
         (2, whole.chunks[2].length + whole.chunks[2].trailer - 3),
@@ -901,12 +901,12 @@ def test_a_damaged_chunk_is_the_same_loss_for_both(recorded: hl.Store, tmp_path:
             file.seek(-1, os.SEEK_CUR)
             file.write(bytes([byte ^ 4]))
     second = FormatReader(tmp_path / "store").recording("robot")
-    assert sorted(second.damage) == [(1, 0), (1, 2)]
+    assert sorted(second.damage) == [(1, 0), (1, 2), (1, 3)]
     assert second.status == "damaged"
     with hl.open(tmp_path / "store") as store:
         found = verify(store.shared, {store.entry("robot").id: "robot"})
     assert {f.place.split(" byte ")[0] for f in found.findings} == {"000001.mcap"}
-    assert len(found.findings) == 2
+    assert len(found.findings) == 3
     with hl.open(tmp_path / "store", require_database=True) as store:
         entry = store.entry("robot")
         lost = bare(entry.end["losses"], of_files=True)
