@@ -197,7 +197,7 @@ def test_a_name_that_is_taken(place: Path) -> None:
     write_settings(store, StoreSettings("x"))
     places.root(store).chmod(0o2775)
     store.chmod(0o2775)
-    done = ann.run("verify", "--store", store, code=6)
+    done = ann.run("index", "rebuild", "--store", store, code=6)
     assert "belongs to another user" in done.err
     assert "Remove it" in done.err
 
