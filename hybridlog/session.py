@@ -40,8 +40,7 @@ from hybridlog_storage.times import BEGIN, END, placed
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.columns.tables import Tables
-    from hybridlog.columns.topic_table import TopicTable
+    from hybridlog.columns.tables import Tables, TopicTable
     from hybridlog.query.chunk_columns import Chunk
     from hybridlog.query.predicate.tree import Predicate
     from hybridlog.shared import Shared
@@ -333,8 +332,7 @@ class Session:
     ) -> Predicate:
         """A predicate, or a MongoDB filter, on some topics of some recordings."""
         from hybridlog.query.predicate.mongo_filter import from_json, mongo_filter
-        from hybridlog.query.predicate.parser import parse
-        from hybridlog.query.predicate.tokens import is_filter
+        from hybridlog.query.predicate.parser import is_filter, parse
         from hybridlog.query.predicate.types import check
 
         types = self.field_types(topics, recordings)

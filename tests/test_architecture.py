@@ -55,7 +55,7 @@ ALLOWED = {
         *("hybridlog.sql", "hybridlog.tf", "hybridlog.training"),
     ),
     "pymongo": ("hybridlog_storage.mongo.database",),
-    "re2": ("hybridlog.query.predicate.tokens",),
+    "re2": ("hybridlog.query.predicate.parser",),
     "rclpy": ("hybridlog.live.sources.ros2.child.middleware",),
     "rosbags": (
         "hybridlog.formats.rosbag1.writer",

@@ -21,7 +21,7 @@ from pymongo import MongoClient
 import hybridlog as hl
 from benchmarks.simulator.write import write_bag
 from benchmarks.usage import working_below
-from hybridlog.columns.topic_table import TableRows, TopicTable
+from hybridlog.columns.tables import TableRows, TopicTable
 from hybridlog.index import access
 from hybridlog.query import index_reader
 from hybridlog.query.planner import Planner

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
-from hybridlog.query.predicate.tokens import is_filter
+from hybridlog.query.predicate.parser import is_filter
 from hybridlog.query.question import Question
 from hybridlog.query.topics import split_topic
 from hybridlog.wording import file_name

@@ -25,7 +25,7 @@ from hybridlog_storage.times import inside, placed
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.columns.topic_table import TableRows, TopicTable
+    from hybridlog.columns.tables import TableRows, TopicTable
     from hybridlog.query.chunk_scan import MessageRun
     from hybridlog.query.question import Counters, Part, RecordedChannel
     from hybridlog.session import Session

@@ -19,7 +19,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Collection, Sequence
 
-from hybridlog.query.predicate.tokens import RegexError, compile_regex, is_filter
+from hybridlog.query.predicate.parser import RegexError, compile_regex, is_filter
 from hybridlog.schema.text import repaired_text
 from hybridlog.wording import listed, meant
 from hybridlog_storage.errors import TopicError

@@ -21,7 +21,7 @@ from msgspec.structs import replace
 
 from hybridlog.schema.definition import MessageType, parse_definition, releases, typestore
 from hybridlog.schema.definition_text import canonical
-from hybridlog.schema.wire import WireReader
+from hybridlog.schema.ros_codec import WireReader
 from hybridlog.schema.wire_walk import MAX_PADDING, MisfitError
 from hybridlog_storage.errors import DefinitionError
 from hybridlog_storage.messages import REPLACED, SUPPLIED, Schema

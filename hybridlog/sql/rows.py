@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.columns.column_file import TablePart
-    from hybridlog.columns.topic_table import TopicTable
+    from hybridlog.columns.tables import TopicTable
     from hybridlog.query.chunk_columns import Chunk
     from hybridlog.query.question import Span
     from hybridlog.schema.codec import Decoded

@@ -32,7 +32,7 @@ from mcp.types import (
 from pydantic import Field
 
 from hybridlog import __version__
-from hybridlog.query.predicate.tokens import MAX_TEXT
+from hybridlog.query.predicate.parser import MAX_TEXT
 from hybridlog.wording import listed
 
 if TYPE_CHECKING:

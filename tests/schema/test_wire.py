@@ -18,7 +18,7 @@ from hybridlog.schema.definition import (
     parse_definition,
     paths,
 )
-from hybridlog.schema.wire import WireReader
+from hybridlog.schema.ros_codec import WireReader
 from hybridlog_storage.errors import DefinitionError
 from hybridlog_storage.messages import Schema
 from tests.schema.wire_oracle import assert_same, oracle

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 import hybridlog as hl
-from hybridlog.columns.tables import Tables
-from hybridlog.columns.topic_table import TopicTable
+from hybridlog.columns.tables import Tables, TopicTable
 from hybridlog_storage.errors import PayloadError
 from hybridlog_storage.messages import Channel, Schema
 from tests.independent import write_mcap

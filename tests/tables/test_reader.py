@@ -18,8 +18,7 @@ import hybridlog as hl
 from hybridlog.columns.column_file import ColumnFile, ColumnFileWriter, TablePart
 from hybridlog.columns.fields import FieldShape, joined, records_of
 from hybridlog.columns.layout import Section
-from hybridlog.columns.tables import Tables
-from hybridlog.columns.topic_table import TopicTable
+from hybridlog.columns.tables import Tables, TopicTable
 from hybridlog.follow.follower import make_tables
 from tests.damage import flip
 from tests.some import in_turn

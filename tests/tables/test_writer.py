@@ -15,8 +15,7 @@ import hybridlog as hl
 from hybridlog.columns.folders import TableFolders
 from hybridlog.columns.layout import OWN_COLUMNS, TABLES, parts_folder
 from hybridlog.columns.table_writer import TableWriter
-from hybridlog.columns.tables import Tables
-from hybridlog.columns.topic_table import TableRows
+from hybridlog.columns.tables import TableRows, Tables
 from hybridlog.index.indexing import ChunkIndexer
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.messages import Schema

@@ -179,8 +179,7 @@ def _follow(query: Query, choices: _Choices) -> None:
 
 
 def _query(store: Store, choices: _Choices) -> Query:
-    from hybridlog.query.predicate.parser import parse
-    from hybridlog.query.predicate.tokens import is_filter
+    from hybridlog.query.predicate.parser import is_filter, parse
 
     query = choices.bounded(query_of(store, choices.named(store), choices.choice))
     query = query.clock(choices.clock)

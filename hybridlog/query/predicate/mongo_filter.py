@@ -16,7 +16,7 @@ from bson.codec_options import CodecOptions, TypeRegistry
 from bson.errors import BSONError
 from bson.regex import Regex
 
-from hybridlog.query.predicate.tokens import RegexError, compile_regex
+from hybridlog.query.predicate.parser import RegexError, compile_regex
 from hybridlog.query.predicate.tree import (
     ALWAYS,
     And,

@@ -9,7 +9,7 @@ from typing import Any, Literal, cast
 
 from msgspec import Struct, field
 
-from hybridlog.query.predicate.tokens import error_at
+from hybridlog.query.predicate.parser import error_at
 from hybridlog.query.predicate.tree import (
     Condition,
     Field,

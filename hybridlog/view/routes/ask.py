@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 from hybridlog.drawing.series import known_fields
 from hybridlog.drawing.times import Match, Matches, aligned
 from hybridlog.frames.names import SUMMARIES, is_summary
-from hybridlog.query.predicate.tokens import MAX_TEXT
+from hybridlog.query.predicate.parser import MAX_TEXT
 from hybridlog.query.topics import resolve
 from hybridlog.view.context import Context, route, start_of
 from hybridlog.view.routes.export import program, question_of

@@ -14,7 +14,7 @@ from msgspec.structs import replace
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import StreamingResponse
 
-from hybridlog.query.predicate.tokens import MAX_TEXT
+from hybridlog.query.predicate.parser import MAX_TEXT
 from hybridlog.query.times import format_time
 from hybridlog.record.losses import extent_of
 from hybridlog.view.context import route, start_of

@@ -6,8 +6,7 @@ import pyarrow as pa
 import pytest
 
 from hybridlog.query.predicate.evaluate import on_columns, on_objects
-from hybridlog.query.predicate.parser import parse
-from hybridlog.query.predicate.tokens import compile_regex
+from hybridlog.query.predicate.parser import compile_regex, parse
 
 JOINTS = "joint_{0}: pos=-1.503 vel=0.204 temp=9{0} state=ok;"
 
