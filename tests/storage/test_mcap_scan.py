@@ -371,3 +371,17 @@ def test_memory_stays_bounded_over_a_long_file(tmp_path: Path) -> None:
     assert rows == 30_000
     assert peak < 6 << 20
     assert size > 30_000_000
+
+
+def test_a_torn_chunk_gives_its_beginning(tmp_path: Path) -> None:
+    channel = messages.Channel("/a", "x", None)
+    wanted = [np.random.default_rng(i).bytes(1000) for i in range(1000)]
+    for compression in CompressionType:
+        rows = ((channel, i, payload) for i, payload in enumerate(wanted))
+        path = write_mcap(tmp_path / "a.mcap", rows, compression=compression)
+        items = items_of(path.read_bytes()[:400_000])
+        found = payloads(items)
+        assert found == wanted[: len(found)]
+        assert len(found) > 100
+        (damage,) = damages(items)
+        assert damage.reason == "the file ends in a chunk: its last messages are lost"

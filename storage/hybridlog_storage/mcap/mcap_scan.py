@@ -34,7 +34,7 @@ from hybridlog_storage.mcap.mcap_content import (
     read_record,
 )
 from hybridlog_storage.messages import MAX_PAYLOAD
-from hybridlog_storage.segments.compression import MAX_UNCOMPRESSED, decompress
+from hybridlog_storage.segments.compression import MAX_UNCOMPRESSED, beginning, decompress
 from hybridlog_storage.segments.segment_format import (
     MAX_HEAD,
     Attachment,
@@ -161,6 +161,8 @@ class Scan:
         ends = [said] if head is None else [at + head.end, said]
         is_right = ends == [said, said] and said <= self._bytes.size
         end = said if is_right else next(filter(self._goes_on, ends), None)
+        if end is None and head is not None and min(ends) > self._bytes.size:
+            return self._bytes.size, self._cut(at, head)
         if end is None:
             raise SegmentError(f"a chunk of {said - at} bytes is not whole")
         try:
@@ -184,6 +186,15 @@ class Scan:
         if head.crc not in {0, crc32(content)}:
             raise SegmentError("its checksum differs")
         return parse_content(content, most=MIN_RECORDS + end - start)
+
+    def _cut(self, at: int, head: ChunkHead) -> list[Item]:
+        """What is there of a chunk in which the file ends; no checksum proves it."""
+        self._is_closed, start = True, at + head.start
+        rest = self._bytes.at(start, min(self._bytes.size - start, self._limit))
+        found = beginning(head.codec, rest, min(head.size, self._limit))
+        why = "the file ends in a chunk: its last messages are lost"
+        told = self._told(at, parse_content(found, loose=True))
+        return [Damage(at, self._bytes.size - at, why), *told]
 
     def _told(self, at: int, content: ChunkContent) -> list[Item]:
         """Messages and the definitions between them, behind what is wrong with them."""

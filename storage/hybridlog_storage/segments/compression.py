@@ -7,6 +7,7 @@ compressed form; `Compressor` keeps to that, too.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from functools import lru_cache
 from threading import get_ident
 from typing import TYPE_CHECKING, Literal
@@ -31,6 +32,7 @@ MAX_RATIO = 100
 _MAX_RATIO = {"zstd": 1 << 15, "lz4": 255}
 _RATIO_SLACK = 1 << 17
 
+_PIECE = 1 << 20  # bytes decompressed at once of a frame that is cut
 _SAMPLE = 8192  # bytes of one sample of a chunk
 _SAMPLES = 6
 _MAX_SHARE = 0.97  # of its size that a compressed chunk may have
@@ -69,6 +71,20 @@ def decompress(compression: str, data: Buffer, uncompressed_size: int) -> bytes 
     if len(found) != size:
         raise SegmentError(f"it does not decompress to {size} bytes as it claims")
     return found
+
+
+def beginning(compression: str, data: Buffer, size: int) -> bytes:
+    """What a frame that is cut has of a content of `size` bytes."""
+    if not compression:
+        return bytes(data[:size])
+    found = bytearray()
+    with suppress(zstandard.ZstdError, RuntimeError):
+        if compression == "lz4":
+            return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size))
+        reader = zstandard.ZstdDecompressor().stream_reader(data)
+        while piece := reader.read(min(size - len(found), _PIECE)):
+            found += piece
+    return bytes(found)
 
 
 def is_implausible(uncompressed_size: int, size: int) -> bool:
