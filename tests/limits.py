@@ -50,7 +50,6 @@ PLACES = {
     "export_piece_bytes": "hybridlog.view.routes.export.PIECE",
     "catalog_busy_s": "hybridlog_storage.cells._WAIT_S",
     "matches": "hybridlog.drawing.times.MAX_MATCHES",
-    "direct_flag": "hybridlog_storage.disk.append_file.DIRECT",
     "copy_wait_s": "hybridlog_storage.copy_places.LOCK_WAIT_S",
     "server_copy_wait_s": "hybridlog_storage.server.LOCK_WAIT_S",
     "manifest_bytes": "hybridlog_storage.manifest.MAX_BYTES",

@@ -31,10 +31,6 @@ def scans(seen: list[Seen]) -> list[Seen]:
     return [m for m in seen if m.topic == "/base/scan"]
 
 
-def slice_of(scans: list[Seen], start: int) -> list[Seen]:
-    return [m for m in scans if start + SECOND <= m.log_time < start + 2 * SECOND]
-
-
 def test_a_wrong_predicate_is_pointed_at(store: Path) -> None:
     done = run(*SCAN, "--where", "ranges.min << 0.5", store=store, code=2)
     message, text, caret = done.err.splitlines()

@@ -19,8 +19,6 @@ from tests.cli.within import Answer, answer
 
 from .conftest import BASE, Drive
 
-NAN = float("nan")
-
 
 def plot(drive: Drive, *arguments: object, code: int = 0) -> Answer:
     return answer("plot", *arguments, store=drive.directory, code=code)

@@ -33,7 +33,6 @@ BASE = 1_748_937_600 * 10**9
 STEP = 100 * MS
 COUNT, GROUP = 12, 5
 WIDTH, HEIGHT = 64, 48
-KEYS = [n for n in range(COUNT) if n % GROUP == 0]
 ENCODERS: dict[str, tuple[str, dict[str, str]]] = {
     "h264": (
         "libx264",
