@@ -9,7 +9,6 @@ import pytest
 
 import hybridlog as hl
 from hybridlog_storage.mongo.database import Database
-from hybridlog_storage.mongo.index_documents import collection_of
 from tests.calls import Calls
 from tests.many_topics import topic, write_log
 
@@ -19,22 +18,6 @@ pytestmark = pytest.mark.mongo("embedded")
 def least(value: int) -> dict[str, object]:
     """A condition that MongoDB answers."""
     return {"data": {"$gte": value}}
-
-
-def database_of(store: hl.Store) -> Database:
-    return store.shared.index.database_for("this test")
-
-
-def test_few_commands_verify_many_topics(tmp_path: Path, calls: Calls) -> None:
-    log = write_log(tmp_path / "log.mcap", 200)
-    with hl.open(tmp_path / "store", create=True, require_database=True) as store:
-        store.record(log)
-        sent = commands_of(calls)
-        assert store.verify().findings == []
-        assert store.verify(["log"]).findings == []
-        assert sent.total() <= 40, sent
-        assert database_of(store).delete(collection_of(topic(7)), {}) == 5
-        assert "messages in the segments" in store.verify().findings[-1].problem
 
 
 def commands_of(calls: Calls) -> Counter[str]:

@@ -55,6 +55,7 @@ from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
 from tests.format_reader import Segment
 from tests.independent import write_mcap
+from tests.indexed import misindexed
 
 pytestmark = pytest.mark.mongo("embedded")
 
@@ -752,6 +753,8 @@ class Machine(RuleBasedStateMachine):
         assert result.messages == sum(len(k.messages) for k in self.model.values())
         topics = tuple(sorted({t for k in self.model.values() for t in k.topics}))
         assert tuple(self.store.topics()) == topics
+        self.store.shared.index.connect()
+        assert misindexed(self.store) == {}
         if topics:
             check(self.store, self.model, Asked(topics, None, "log", None, None, 1, reverse=False))
         for topic in topics:

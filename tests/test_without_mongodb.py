@@ -29,6 +29,7 @@ from hybridlog_storage.settings import (
 )
 from tests.calls import Calls
 from tests.cli.within import answer
+from tests.indexed import misindexed
 from tests.running.running import NO_MONGODB
 
 pytestmark = pytest.mark.mongo("embedded")
@@ -116,7 +117,7 @@ def test_a_server_that_is_away_gets_its_index_later(bag: Path, tmp_path: Path) -
         (entry,) = store.recordings()
         assert entry.is_decoded
         assert store.shared.repairs.indexed == {entry.name: entry.chunks}
-        assert store.verify().findings == []
+        assert misindexed(store) == {}
 
 
 def test_a_live_recording_while_the_server_comes(tmp_path: Path, calls: Calls) -> None:
@@ -138,7 +139,7 @@ def test_a_live_recording_while_the_server_comes(tmp_path: Path, calls: Calls) -
             away = False
         report = recording.close()
         assert (report.failure, report.indexed) == (None, report.entry.documents)
-        assert store.verify().findings == []
+        assert misindexed(store) == {}
 
 
 def test_a_store_is_adopted_where_mongodb_is(
@@ -165,7 +166,7 @@ def test_a_store_is_adopted_where_mongodb_is(
         store.shared.index.connect()
         assert "one" not in store.shared.repairs.indexed
         assert 0 < store.shared.repairs.indexed["two"] <= chunks["two"]
-        assert store.verify().findings == []
+        assert misindexed(store) == {}
         every = store.topic("scan").where({"header.seq": {"$gte": 0}})
         assert every.count() == store.topic("scan").count()
 

@@ -16,7 +16,7 @@ from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.mongo.index_documents import RECORDINGS
 from hybridlog_storage.settings import write_settings
 from tests import places
-from tests.indexed import documents_of
+from tests.indexed import documents_of, misindexed
 from tests.live.speaker import Recorded
 from tests.test_faults import kill_mongod
 from tests.waiting import wait_for
@@ -92,3 +92,4 @@ def test_documents_that_mongodb_loses_after_their_messages_expired_are_made_agai
         assert store.topic("/camera").count() == sent
         assert len(documents_of(store, "/camera")) == sent
         assert store.verify().findings == []
+        assert misindexed(store) == {}

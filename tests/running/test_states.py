@@ -22,7 +22,7 @@ from tests import places
 from tests.cli.running import complete
 from tests.cli.within import answer
 from tests.imports import ROOT
-from tests.indexed import documents_of
+from tests.indexed import documents_of, misindexed
 from tests.running.methods import LABEL, METHODS, rows, same, sent
 from tests.running.running import NO_MONGODB, Running, begun
 from tests.running.sequence import SAID, START, Known, messages
@@ -116,6 +116,7 @@ def test_payloads_expire_while_it_is_recorded(tmp_path: Path) -> None:
         assert store.entry(LABEL).status == "complete"
         check_expired(store, known)
         assert store.verify().findings == []
+        assert misindexed(store) == {}
 
 
 @pytest.mark.parametrize("kind", ["one", "many"])

@@ -14,6 +14,7 @@ from hybridlog_storage.mongo.database import Database
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import logs
 from tests.calls import Calls
+from tests.indexed import misindexed
 from tests.limits import Limit
 from tests.servers.commands import commands
 from tests.servers.mongods import Mongod, ReplicaSet, eventually, replica_set
@@ -51,10 +52,8 @@ def store(members: ReplicaSet, tmp_path: Path) -> Iterator[hl.Store]:
 
 def check(store: hl.Store, messages: int) -> None:
     """All messages are in the index, byte for byte."""
-    assert store.verify().findings == []
-    database = store.shared.index.connect()
-    topics = [n for n in database.list_collections() if not n.startswith("hybridlog.")]
-    assert sum(database.count(topic, {"_meta.seq": {"$gte": 0}}) for topic in topics) == messages
+    assert misindexed(store) == {}
+    assert store.all_topics().count() == messages
 
 
 @pytest.fixture
