@@ -15,6 +15,7 @@ PLACES = {
     "shared_file_rows": "hybridlog.columns.folders.MAX_SHARED_ROWS",
     "long_table_rows": "hybridlog.columns.table_writer.LONG_ROWS",
     "group_bytes": "hybridlog.follow.follower._GROUP_BYTES",
+    "short_recording_s": "hybridlog.follow.child.SHORT_S",
     "table_left_bytes": "hybridlog.columns.table_writer._LEFT",
     "table_open_files": "hybridlog.columns.table_writer._OPEN_FILES",
     "table_pending_bytes": "hybridlog.columns.table_writer._PENDING",

@@ -25,6 +25,7 @@ from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import independent, places
 from tests.cli.running import run, started
 from tests.indexed import misindexed
+from tests.limits import Limit
 from tests.waiting import wait_for
 
 pytestmark = pytest.mark.mongo("embedded")
@@ -378,13 +379,23 @@ def test_while_the_index_is_made_anew_others_answer_as_always(
     assert misindexed(store) == {}
 
 
+@pytest.mark.parametrize("short_s", [0.0, 60.0], ids=["process", "here"])
 def test_mongod_killed_and_not_to_be_had_again(
-    tmp_path: Path, robot: Path, spoken: dict[str, list[Message]], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    robot: Path,
+    spoken: dict[str, list[Message]],
+    monkeypatch: pytest.MonkeyPatch,
+    limit: Limit,
+    short_s: float,
 ) -> None:
+    """Whoever follows the recording: a process, or its own at the end."""
+    limit(short_recording_s=short_s)
     place = tmp_path / "store"
     progress, _ = killing(place, lambda: monkeypatch.setenv("HYBRIDLOG_MONGOD", "/bin/false"))
     whole = Counter(m for part in spoken.values() for m in part)
     with hl.open(place, create=True, require_database=True) as store:
+        if not short_s:
+            progress(0, 1 << 30)  # the process finds none
         report = store.record(robot, progress=progress)
         assert isinstance(report.failure, DatabaseError)
         assert report.missed > 0

@@ -55,6 +55,7 @@ class Task(NamedTuple):
     """What the process is to do.
 
     `interval_s` lies between two looks of the follower; with None it does everything at the end.
+    A MongoDB that `had_mongo` says was there is told as lost if it is not to be had.
     After an earlier process has died (`is_again`), `seen` tells what the triggers have seen.
     """
 
@@ -63,6 +64,7 @@ class Task(NamedTuple):
     recording: str
     triggers: Sequence[str]
     interval_s: float | None
+    had_mongo: bool = False
     is_again: bool = False
     seen: Any = None
 
@@ -122,7 +124,7 @@ class FollowerProcess:
 
         def start(entry: RecordingEntry) -> FollowerProcess:
             place = shared.directory.address
-            task = Task(place, index.wanted, entry.id, (), interval_s)
+            task = Task(place, index.wanted, entry.id, (), interval_s, target.is_wanted)
             followed = cls(
                 shared.directory,
                 shared.catalog,
