@@ -301,12 +301,12 @@ def test_the_cure_cures(tmp_path: Path, template: Path) -> None:
     store = planted(template, tmp_path, "mongod", victims.folder(None))
     victims.watch()
     with hl.open(store) as away:
-        assert away.database is None
+        assert away.shared.index.reached() is None
         assert "Remove" in str(away.shared.index.unavailable)
         assert away.topic("/imu/data").count() > 0
     (store / "mongod").unlink()
     with hl.open(store) as back:
-        assert back.database is not None
+        assert back.shared.index.reached() is not None
         assert back.topic("/imu/data").where("header.seq >= 0").count() > 0
     victims.check()
 

@@ -22,7 +22,7 @@ from hybridlog.schema.arrow_columns import DURATION
 from hybridlog.schema.arrow_types import column_of, common_schema
 from hybridlog.schema.column import STAMP
 from hybridlog.tf.epochs import Epochs, epochs_of
-from hybridlog.tf.in_frame import stream
+from hybridlog.tf.in_frame import Known, stream
 from hybridlog_storage.cache import lazy
 from hybridlog_storage.errors import TimeError, UsageError
 from hybridlog_storage.times import BEGIN, END, placed
@@ -101,6 +101,7 @@ class TopicReader:
         self.is_apart = is_apart
         self.counters = Counters()
         self._epochs: dict[str, Epochs] = {}
+        self._trees: Known = {}
         self._session = session
         self._time = {"log": TIME, "publish": "publish_time", "header": STAMP}[clock]
         self._hidden = {TIME} if is_apart else {TIME, RECORDING}
@@ -165,7 +166,7 @@ class TopicReader:
 
     def _stream(self, question: Question, counters: Counters) -> Iterator[pa.Table]:
         with suppress(TimeError):  # the range does not touch the recording
-            for table in stream(Planner(self._session, question, counters)):
+            for table in stream(Planner(self._session, question, counters), self._trees):
                 if table.num_rows:
                     yield table
 

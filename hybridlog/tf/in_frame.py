@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 import pyarrow as pa
@@ -72,6 +72,10 @@ class _Places(NamedTuple):
             yield from (f"{pose.rotation}.{axis}" for axis in ("xyzw" if pose.rotation else ""))
 
 
+Known: TypeAlias = "dict[str, Trees | TopicError]"
+"""The trees of recordings, or why the frame that is asked for is not there."""
+
+
 class Points(NamedTuple):
     """The points of a message in the frame.
 
@@ -85,16 +89,17 @@ class Points(NamedTuple):
     points: NDArray[Any]
 
 
-def stream(planner: Planner) -> Iterator[pa.Table]:
+def stream(planner: Planner, known: Known | None = None) -> Iterator[pa.Table]:
     """The tables of an answer, see `frames.answer.stream`; in the frame of the question, if any.
 
-    Scans and clouds are lists then, one for each field of their points.
+    Scans and clouds are lists then, one for each field of their points. Pieces of an answer have
+    one `known`, so that transforms are read once.
     """
     if planner.question.frame is None:
         return answer.stream(planner)
     if has_points(planner):
-        return _tables_of_points(planner)
-    return _tables_of_poses(planner)
+        return _tables_of_points(planner, known)
+    return _tables_of_poses(planner, known)
 
 
 def has_points(planner: Planner) -> bool:
@@ -110,12 +115,14 @@ def has_places(planner: Planner) -> bool:
     return has_points(planner) or _places_in(planner) is not None
 
 
-def points_of(session: Session, question: Question, counters: Counters) -> Iterator[Points]:
+def points_of(
+    session: Session, question: Question, counters: Counters, known: Known | None = None
+) -> Iterator[Points]:
     """The points of messages in the frame of the question, in order.
 
     Messages that cannot be arrays are left out; `counters.unreadable` counts them.
     """
-    looked = _Looked(session, question, counters)
+    looked = _Looked(session, question, counters, known)
     for run in Planner(session, replace(question, frame=None), counters).runs():
         found: list[tuple[Points, dict[str, object]]] = []
         for message in messages_in(run):
@@ -146,13 +153,15 @@ def points_of(session: Session, question: Question, counters: Counters) -> Itera
 class _Looked:
     """Looks up transforms to the frame of a question, and counts what is missing."""
 
-    def __init__(self, session: Session, question: Question, counters: Counters) -> None:
+    def __init__(
+        self, session: Session, question: Question, counters: Counters, known: Known | None
+    ) -> None:
         self._session = session
         self._counters = counters
         self.target = str(question.frame)
         self._question = question
         self._topic = question.topics[0]
-        self._trees: dict[str, Trees | TopicError] = {}
+        self._trees: Known = {} if known is None else known
 
     def _of(self, recording: str) -> Trees | TopicError:
         """The trees of a recording, or why the frame asked for is not there."""
@@ -207,7 +216,7 @@ class _Looked:
         return made
 
 
-def _tables_of_points(planner: Planner) -> Iterator[pa.Table]:
+def _tables_of_points(planner: Planner, known: Known | None) -> Iterator[pa.Table]:
     question = planner.question
     if question.fields is not None:
         raise UsageError("Points in a frame have the fields of their points: leave out fields.")
@@ -216,7 +225,7 @@ def _tables_of_points(planner: Planner) -> Iterator[pa.Table]:
     names = {one.id: one.name for one in summaries}
     stamp = pa.timestamp("ns", "UTC")
     given = False
-    for message, time, points in points_of(planner.session, question, planner.counters):
+    for message, time, points in points_of(planner.session, question, planner.counters, known):
         own = {
             "log_time": pa.array([message.log_time_ns], stamp),
             **({"recording": pa.array([names[message.recording]])} if several else {}),
@@ -247,9 +256,9 @@ def _places_in(planner: Planner) -> _Places | None:
     return _Places(poses, stamp, frame)
 
 
-def _tables_of_poses(planner: Planner) -> Iterator[pa.Table]:
+def _tables_of_poses(planner: Planner, known: Known | None) -> Iterator[pa.Table]:
     session, question = planner.session, planner.question
-    looked = _Looked(session, question, planner.counters)
+    looked = _Looked(session, question, planner.counters, known)
     found = _places_in(planner)
     if found is None:
         raise UsageError(

@@ -89,7 +89,7 @@ LARGE = 6_000_000
     [
         (LAUGHS + BAG, None),
         (MERGES + BAG, None),
-        (BAG + "  files: &a [*a, *a]\n  message_count: *none\n", None),
+        (BAG + "  files: &a [*a, *a]\n  message_count: *none\n", "does not describe a bag"),
         (BAG + "".join(f"  k{k}: 1\n" for k in range(LARGE // 30)), None),
         (BAG + "  junk: " + "word " * (LARGE // 5), None),
         (BAG + "  junk: &" + "a" * LARGE + " x\n", None),
