@@ -168,6 +168,17 @@ def test_the_first_log_of_a_group_stays() -> None:
     assert found.is_short
 
 
+def test_what_tables_give_back_is_measured_before_fields_go() -> None:
+    """Tables with arrays shrink with the payloads; whole recordings went for what they had."""
+    first = held("old", sealed(0, 50, group=0), sealed(1, 50, group=0))
+    rules, room = Rules.of({"quota": "1MB"}), {"used": 100 * MB, "free": 10**12, "now": NOW}
+    (step,) = plan([first], rules, **room, has_arrays=True).steps
+    assert step.segments == (1,)
+    gone = held("old", sealed(0, 50, group=0))
+    (step,) = plan([gone], rules, **room, has_arrays=True).steps
+    assert step.segments == ()
+
+
 def test_whole_groups_go_the_oldest_first() -> None:
     """When no payloads are left to go; not those that a pin touches, or that are recorded."""
     first = [sealed(n, 50 - n, CAMERA, group=n) for n in range(3)]

@@ -134,7 +134,9 @@ class Keeper:
         used, free = self._directory.listed_bytes(), None
         if used is None:
             used, free = disk_bytes(path), shutil.disk_usage(path).free
-        return plan(self._held(now), rules, used=used, free=free, now=now)
+        has_arrays = bool(self._directory.settings.arrays)
+        held = self._held(now)
+        return plan(held, rules, used=used, free=free, now=now, has_arrays=has_arrays)
 
     def keep(self, rules: Rules) -> KeepReport:
         """Let go what has to go; HeldError while another process makes a pass."""

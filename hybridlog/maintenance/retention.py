@@ -304,17 +304,20 @@ def plan(
     used: int,
     free: int | None,
     now: int,
+    has_arrays: bool = False,
 ) -> Plan:
     """Plan deletions: their order, and the reason of each.
 
     `held` are recordings with their logs, none of those that another process records; `used` and
-    `free` are bytes, the latter None in a bucket; `now` is ns.
+    `free` are bytes, the latter None in a bucket; `now` is ns. With `has_arrays` tables shrink with
+    the payloads that go, so nothing else goes before it was measured how much is left.
     """
-    return _Planning(rules, Plan(used, free), now).made(held)
+    return _Planning(rules, Plan(used, free), now, has_arrays).made(held)
 
 
 class _Planning:
-    def __init__(self, rules: Rules, made: Plan, now: int) -> None:
+    def __init__(self, rules: Rules, made: Plan, now: int, has_arrays: bool) -> None:  # noqa: FBT001
+        self._has_arrays = has_arrays
         self._rules, self._plan, self._now = rules, made, now
         self._freed = 0
         self._left: list[Held] = []  # logs of recordings of which something may go
@@ -363,7 +366,8 @@ class _Planning:
             if need > 0:
                 reason = f"{rule.pattern}: {self._reason(_TOPICS_FROM, _TOPICS_BELOW)}"
                 self._take(reason, rule, need=need)
-        if self._short(_SEGMENTS_FROM, 1.0) > 0:
+        is_known = not (self._has_arrays and self._going)
+        if is_known and self._short(_SEGMENTS_FROM, 1.0) > 0:
             self._groups()
 
     def _groups(self) -> None:

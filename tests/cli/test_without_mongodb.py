@@ -34,7 +34,7 @@ main()
 """
 COMMANDS = {
     "sql": ["sql", "select avg(ranges[1]) from scan where ranges_summary.min < 1"],
-    "bag": ["fetch", "-t", "/imu/data", "--between", "+1s", "+2s", "-F", "bag"],
+    "mcap": ["fetch", "-t", "/imu/data", "--between", "+1s", "+2s", "-F", "mcap"],
     "jsonl": ["fetch", "-t", "/imu/data", "--between", "+1s", "+2s", "-F", "jsonl"],
     "csv": ["fetch", "-t", "/imu/data", "--between", "+1s", "+2s", "-F", "csv"],
     "parquet": ["fetch", "-t", "/imu/data", "--between", "+1s", "+2s", "-F", "parquet"],
