@@ -432,7 +432,7 @@ def test_a_forged_cell_is_no_error(truth: Truth, tmp_path: Path, kind: str) -> N
         with closing(sqlite3.connect(path)) as made, made:
             made.execute(*put(kind, key, forged))
         with closing(Catalog(tmp_path, STORE, in_memory=True)) as opened:
-            known = {one.id: one for one in opened.session.look().summaries}
+            known = {one.id: one for one in opened.summaries()}
             for one in known.values():
                 assert opened.topics(one.topics)
                 assert one.span is None or all(type(time) is int for time in one.span)
