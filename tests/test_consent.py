@@ -78,7 +78,7 @@ def test_no_command_connects_to_the_server_of_another_owner(
 ) -> None:
     done = run(*command, store=foreign, code=None)
     assert listener.visits == 0
-    if command[0] in {"verify", "index"}:
+    if command[0] == "index":
         assert done.code == 6
         assert "name it by `--mongo URI`" in done.err
 
@@ -91,7 +91,7 @@ def test_what_is_named_or_owned_is_used(
     env = {"HYBRIDLOG_MONGO_URI": listener.uri} if way == "variable" else {}
     if way == "owner":
         monkeypatch.setattr(access, "is_own", is_own)
-    run("verify", *extra, store=foreign, code=6, **env)
+    run("index", "rebuild", *extra, store=foreign, code=6, **env)
     assert listener.visits > 0
 
 
@@ -117,5 +117,5 @@ def test_the_password_goes_only_to_a_server_that_was_named(
 
     monkeypatch.setattr(Database, "connect", connect)
     env = {"HYBRIDLOG_MONGO_PASSWORD": "hunter2"}
-    run("verify", *(["--mongo", uri] if is_named else []), store=tmp_path, code=6, **env)
+    run("index", "rebuild", *(["--mongo", uri] if is_named else []), store=tmp_path, code=6, **env)
     assert {*given} == {uri.replace("me@", "me:hunter2@") if is_named else uri}
