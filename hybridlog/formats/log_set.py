@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from contextlib import nullcontext, suppress
 from itertools import pairwise
 from stat import S_ISDIR, S_ISREG
@@ -425,15 +426,16 @@ class _JoinedSource(Source):
     def _read(self, part: LogFile, inner: Source, done: int, size: int) -> Iterator[Batch]:
         """Yield the messages of one open file, over the channels of this source."""
         numbers = np.empty(0, np.int32)
+        alike: Counter[tuple[object, ...]] = Counter()
         got = 0
         found_before = len(self.damage)
         for batch in self._unpacked(part.path, inner):
             got += len(batch)
-            numbers = self._numbered(inner, numbers)
+            numbers = self._numbered(inner, numbers, alike)
             share = inner.bytes_read / inner.size_bytes if inner.size_bytes else 1.0
             self.bytes_read = done + int(size * min(share, 1.0))
             yield replace(batch, channel=numbers[batch.channel])
-        self._numbered(inner, numbers)
+        self._numbered(inner, numbers, alike)
         self.damage.extend(replace(damage, file=part.path) for damage in inner.damage)
         self.remarks.extend(f"{part.path}: {remark}" for remark in inner.remarks)
         self._got += got
@@ -451,13 +453,20 @@ class _JoinedSource(Source):
         if total is not None:
             self.settle(total, self._got, path / NAME)
 
-    def _numbered(self, inner: Source, numbers: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Numbers of the channels of a file in this source, where equal ones are one."""
+    def _numbered(
+        self, inner: Source, numbers: NDArray[np.int32], alike: Counter[tuple[object, ...]]
+    ) -> NDArray[np.int32]:
+        """Numbers of the channels of a file in this source; `alike` is changed.
+
+        Equal channels of one file are publishers of their own, of two files the same ones.
+        """
         more = []
         for channel in inner.channels[len(numbers) :]:
             metadata = tuple(sorted(channel.metadata.items()))
-            said = channel.topic, channel.message_encoding, channel.schema, metadata
-            number = self._numbers.setdefault(said, len(self.channels))
+            own = channel.topic, channel.message_encoding, channel.schema, metadata
+            said = *own, channel.has_publish_time
+            alike[said] += 1
+            number = self._numbers.setdefault((alike[said], *said), len(self.channels))
             if number == len(self.channels):
                 self.channels.append(channel)
             more.append(number)
