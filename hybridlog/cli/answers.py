@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from hybridlog.attachments import Extras
-    from hybridlog.formats.answer import Answer
+    from hybridlog.formats.answer import Answer, Line
     from hybridlog.formats.slices import Front
     from hybridlog.formats.writing import Target
     from hybridlog.message import Message
@@ -371,7 +371,7 @@ def _pictures(query: Query, form: str, target: Target, front: Front) -> Answer:
     return answer
 
 
-def _lines_of(table: pa.Table) -> Iterator[list[str]]:
+def _lines_of(table: pa.Table) -> Iterator[list[Line]]:
     """Rows as JSON objects: the log time as `log_time_ns`, as in all JSON lines."""
     import pyarrow as pa
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from msgspec import Struct, field
 
@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from hybridlog.message import Message
     from hybridlog_storage.messages import Batch, Channel
     from hybridlog_storage.segments.segment_format import Attachment
+
+Line: TypeAlias = "str | Iterator[str]"
+"""A line of JSON, or its pieces."""
 
 
 class Answer(Struct, kw_only=True):
@@ -37,7 +40,7 @@ class Answer(Struct, kw_only=True):
         unreadable: Gets the error of each message that is left out.
     """
 
-    lines: Iterable[Iterable[str]] = ()
+    lines: Iterable[Iterable[Line]] = ()
     tables: Iterable[pa.Table] = ()
     schema: pa.Schema | None = None
     batches: Iterable[tuple[Batch, Sequence[Channel]]] = ()

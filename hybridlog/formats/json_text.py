@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import base64
 import json
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import pyarrow as pa
@@ -24,6 +25,12 @@ from hybridlog.schema.arrow_types import (
 )
 from hybridlog_storage.errors import UsageError
 
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+PIECE_BYTES: Final = 3 << 17
+"""Bytes of values whose text is made at once where it is made in pieces."""
+
 
 def json_column(array: pa.Array) -> pa.Array:
     """The values of an array as JSON, one string a row; a null is the text `null`.
@@ -32,6 +39,38 @@ def json_column(array: pa.Array) -> pa.Array:
     """
     text = _values(array)
     return pc.fill_null(text, "null") if text.null_count else text
+
+
+def json_pieces(array: pa.Array) -> Iterator[str]:
+    """The JSON of an array of one row, in pieces: the text of a long array is never whole."""
+    kind = array.type
+    if array.nbytes <= PIECE_BYTES or array.null_count:
+        yield json_column(array)[0].as_py()
+    elif pa.types.is_struct(kind):
+        for index, field in enumerate(kind):
+            yield f"{', ' if index else '{'}{json.dumps(field.name)}: "
+            yield from json_pieces(array.field(index))
+        yield "}"
+    elif is_list(kind):
+        elements = array.flatten()
+        rows = max(PIECE_BYTES * len(elements) // max(elements.nbytes, 1), 1)
+        yield "["
+        for begin in range(0, len(elements), rows):
+            part = elements.slice(begin, rows)
+            yield ", " if begin else ""
+            if len(part) == 1:
+                yield from json_pieces(part)
+            else:
+                yield ", ".join(json_column(part).to_pylist())
+        yield "]"
+    elif is_bytes(kind):
+        data = memoryview(array[0].as_buffer())
+        yield '"'
+        for begin in range(0, len(data), PIECE_BYTES):  # a multiple of three bytes
+            yield base64.b64encode(data[begin : begin + PIECE_BYTES]).decode()
+        yield '"'
+    else:
+        yield json_column(array)[0].as_py()
 
 
 def _values(array: pa.Array) -> pa.Array:  # noqa: PLR0911 - a case a type

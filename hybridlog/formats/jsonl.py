@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator
 from itertools import chain, repeat
 from typing import TYPE_CHECKING
 
-from hybridlog.formats.answer import Answer
+from hybridlog.formats.answer import Answer, Line
 from hybridlog.formats.writing import Sink, Target
 from hybridlog.schema.text import without_nan
 from hybridlog_storage.errors import UsageError
@@ -30,7 +30,9 @@ def write_jsonl(answer: Answer, target: Target) -> None:
     """Write JSON lines."""
     with Sink(target) as sink:
         for lines in answer.lines:
-            _write(sink, (f"{line}\n" for line in lines))
+            _write(
+                sink, (chain((line,) if isinstance(line, str) else line, "\n") for line in lines)
+            )
             if answer.is_live:
                 sink.flush()
 
@@ -40,16 +42,22 @@ def write_json(answer: Answer, target: Target) -> None:
     with Sink(target) as sink:
         between = chain(("[\n  ",), repeat(",\n  "))
         for lines in answer.lines:
-            _write(sink, (f"{next(between)}{line}" for line in lines))
+            _write(
+                sink,
+                (
+                    chain((next(between),), (line,) if isinstance(line, str) else line)
+                    for line in lines
+                ),
+            )
         sink.write(b"\n]\n" if sink.tell() else b"[]\n")
 
 
-def _write(sink: Sink, lines: Iterable[str]) -> None:
+def _write(sink: Sink, pieces: Iterable[Iterable[str]]) -> None:
     block: list[str] = []
     size = 0
-    for line in lines:
-        block.append(line)
-        size += len(line)
+    for piece in chain.from_iterable(pieces):
+        block.append(piece)
+        size += len(piece)
         if size >= _BLOCK:
             sink.write("".join(block).encode("utf-8", "backslashreplace"))
             block, size = [], 0
@@ -63,13 +71,17 @@ def rows_within(size: int, rows: int) -> int:
     return int(min(_ROWS, max(1, (16 << 20) // per_row)))
 
 
-def json_rows(records: pa.StructArray) -> Iterator[str]:
-    """Rows of columns as lines."""
-    from hybridlog.formats.json_text import json_column
+def json_rows(records: pa.StructArray) -> Iterator[Line]:
+    """Rows of columns as lines, long ones in pieces."""
+    from hybridlog.formats.json_text import PIECE_BYTES, json_column, json_pieces
 
     rows = rows_within(records.nbytes, len(records))
     for begin in range(0, len(records), rows):
-        yield from json_column(records.slice(begin, rows)).to_pylist()
+        part = records.slice(begin, rows)
+        if part.nbytes > PIECE_BYTES * rows:
+            yield from (json_pieces(part.slice(row, 1)) for row in range(len(part)))
+        else:
+            yield from json_column(part).to_pylist()
 
 
 def json_line(row: object) -> str:

@@ -7,6 +7,7 @@ null, and a new one is an error, because these formats fix their columns.
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Iterator
 from typing import Protocol
 
@@ -17,7 +18,12 @@ import pyarrow.parquet
 
 from hybridlog.columns.column_file import leaves
 from hybridlog.formats.answer import Answer
-from hybridlog.formats.json_text import base64_column, json_column
+from hybridlog.formats.json_text import (
+    PIECE_BYTES,
+    base64_column,
+    json_column,
+    json_pieces,
+)
 from hybridlog.formats.jsonl import rows_within
 from hybridlog.formats.writing import Sink, Target
 from hybridlog.schema.arrow_types import column_of, common_schema, is_bytes
@@ -179,9 +185,10 @@ def _without_empty_structs(table: pa.Table) -> pa.Table:
 
 
 class _CsvFile:
-    """Rows as text."""
+    """Rows as text, long ones cell by cell and in pieces."""
 
     def __init__(self, sink: Sink, table: pa.Table) -> None:
+        self._sink = sink
         has_columns = bool(table.column_names)
         schema = _as_text(table.slice(0, 0)).schema
         self._writer = pa.csv.CSVWriter(sink, schema) if has_columns else None
@@ -192,12 +199,39 @@ class _CsvFile:
             return
         rows = rows_within(table.nbytes, table.num_rows)
         for begin in range(0, table.num_rows, rows):
-            self._writer.write_table(_as_text(table.slice(begin, rows)))
+            part = table.slice(begin, rows)
+            if part.nbytes <= PIECE_BYTES * rows:
+                self._writer.write_table(_as_text(part))
+                continue
+            for row in range(part.num_rows):
+                for piece in _row_pieces(part.slice(row, 1)):
+                    self._sink.write(piece)
 
     def close(self) -> None:
         """End the file."""
         if self._writer is not None:
             self._writer.close()
+
+
+def _row_pieces(row: pa.Table) -> Iterator[bytes]:
+    """The text of one row in pieces."""
+    for index, column in enumerate(row.columns):
+        yield b"," if index else b""
+        array = column.combine_chunks()
+        if array.null_count or not (pa.types.is_nested(column.type) or is_bytes(column.type)):
+            cell = io.BytesIO()
+            pa.csv.write_csv(
+                _as_text(row.select([index])), cell, pa.csv.WriteOptions(include_header=False)
+            )
+            yield cell.getvalue()[:-1]
+        elif pa.types.is_nested(column.type):
+            yield b'"'
+            for piece in json_pieces(array):
+                yield piece.replace('"', '""').encode("utf-8", "backslashreplace")
+            yield b'"'
+        else:
+            yield from (piece.encode() for piece in json_pieces(array))
+    yield b"\n"
 
 
 def _as_text(table: pa.Table) -> pa.Table:

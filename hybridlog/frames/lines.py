@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 import pyarrow as pa
 from pyarrow import types
 
+from hybridlog.formats.answer import Line
 from hybridlog.formats.jsonl import json_line, json_rows
 from hybridlog.frames.answer import Decoder, leaves_of, text_column
 from hybridlog.frames.names import arranged, free_name
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     from hybridlog.query.query import Query
 
 
-def lines(planner: Planner) -> Iterator[list[str]]:
+def lines(planner: Planner) -> Iterator[list[Line]]:
     """The messages of an answer in order, in batches: one JSON object for each message.
 
     It has `log_time_ns`, `topic`, `recording` if there are several, and the fields of the message,
@@ -46,13 +47,13 @@ def lines(planner: Planner) -> Iterator[list[str]]:
 def json_lines(query: Query) -> Iterator[str]:
     """The answer of a query as lines of JSON, in order."""
     planner = Planner(query.source.now(), query.question, query.counters)
-    for batch in lines(planner):
-        yield from batch
+    for line in (line for batch in lines(planner) for line in batch):
+        yield line if isinstance(line, str) else "".join(line)
 
 
-def _lines_of(run: MessageRun, decoder: Decoder, fields: Sequence[str] | None) -> list[str]:
+def _lines_of(run: MessageRun, decoder: Decoder, fields: Sequence[str] | None) -> list[Line]:
     """The lines of a run, in its order."""
-    found: list[str | None] = [None] * len(run.batch)
+    found: list[Line | None] = [None] * len(run.batch)
     for number, rows in rows_by_channel(run.batch.channel):
         channel, batch, seq = run.channels[number], run.batch.take(rows), run.seq[rows]
         decoded = decoder.decoded(channel, batch)
@@ -79,7 +80,7 @@ def _lines_of(run: MessageRun, decoder: Decoder, fields: Sequence[str] | None) -
 
 def _of_objects(
     firsts: Mapping[str, pa.Array[Any]], messages: Sequence[Mapping[str, Any]]
-) -> Iterator[str]:
+) -> Iterator[Line]:
     """Lines of messages with different fields; they begin with built-in columns."""
     columns = zip(*map(plain_values, firsts.values()), strict=True)
     for values, message in zip(columns, messages, strict=True):
