@@ -155,7 +155,7 @@ def _watch(publisher: subprocess.Popen[str], subscribers: Subscribers) -> None:
     """Wait until all that is published has been taken, or the backend has failed."""
     while not subscribers.join(_LOOK_S):
         if subscribers.failed.is_set():
-            _end(publisher)
+            publisher.kill()  # waited for when all was measured: its time is not the backend's
             # Those that hang in the backend end with the process.
             subscribers.join(_END_S)
             return

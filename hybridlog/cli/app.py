@@ -1,4 +1,4 @@
-"""The root command: it lists the commands, and loads the module of the one that runs."""
+"""Opens the store of a command, and turns errors into exit codes; the root command."""
 
 from __future__ import annotations
 

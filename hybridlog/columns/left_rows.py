@@ -1,4 +1,4 @@
-"""What is left of messages without payload: rows of a file, or of a reduced message.
+"""Messages without payload: their fields, from a file of rows or a reduced message.
 
 A recorder under pressure stores the row of a message in place of its payload, as an Arrow
 stream. It has the columns of fields, `error`, and of `ref` size, SHA-256 and surplus.

@@ -1,4 +1,4 @@
-"""Rows of tables: messages by columns, and the columns that every table has."""
+"""Rows of tables: messages by columns, the columns that every table has, and points of clouds."""
 
 from __future__ import annotations
 

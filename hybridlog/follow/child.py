@@ -45,7 +45,7 @@ _TRIES: Final = 5
 _PAUSE_S: Final = 1.0
 LOOK_S: Final = 0.5  # between two looks at the recording of a log
 SHORT_S: Final = 2.0
-"""A recording that takes less is not worth a process."""
+"""Seconds; a shorter recording gets no process of its own, which takes half a second to start."""
 _OF_SERVICE: Final = {"NOTIFY_SOCKET", "WATCHDOG_PID", "WATCHDOG_USEC"}
 ENDED: Final = "ended"
 """Tells it that the recording is sealed."""
@@ -55,7 +55,7 @@ class Task(NamedTuple):
     """What the process is to do.
 
     `interval_s` lies between two looks of the follower; with None it does everything at the end.
-    A MongoDB that `had_mongo` says was there is told as lost if it is not to be had.
+    With `had_mongo` the recorder reached MongoDB: if the process does not, that is a failure.
     After an earlier process has died (`is_again`), `seen` tells what the triggers have seen.
     """
 
@@ -118,7 +118,10 @@ class FollowerProcess:
     def of_short(
         cls, shared: Shared, purpose: str, interval_s: float | None
     ) -> Callable[[RecordingEntry], FollowerProcess]:
-        """How to follow a recording that may be short; `purpose` is what needs the index."""
+        """A function that starts the follower of a recording, which may be a short one.
+
+        Errors of the index name the `purpose`.
+        """
         index = shared.index
         target = index.index_to_record(purpose)
 

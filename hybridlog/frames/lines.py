@@ -1,4 +1,4 @@
-"""Messages as JSON lines, with all fields."""
+"""Messages as JSON lines with all fields, and rows of tables as text for the terminal."""
 
 from __future__ import annotations
 

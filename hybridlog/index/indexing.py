@@ -1,4 +1,4 @@
-"""Decodes the messages of a recording, once for its tables, index documents and statistics.
+"""Decodes the messages of a recording, once for tables, documents and statistics; sends documents.
 
 All that is derived of them needs only chunks and their channels, so it is disposable.
 """

@@ -1,4 +1,4 @@
-"""Repairs of a store: those made, and those to be made."""
+"""Reports of maintenance: repairs, progress, and how far a follower is."""
 
 from __future__ import annotations
 

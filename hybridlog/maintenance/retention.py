@@ -309,14 +309,15 @@ def plan(
     """Plan deletions: their order, and the reason of each.
 
     `held` are recordings with their logs, none of those that another process records; `used` and
-    `free` are bytes, the latter None in a bucket; `now` is ns. With `has_arrays` tables shrink with
-    the payloads that go, so nothing else goes before it was measured how much is left.
+    `free` are bytes, the latter None in a bucket; `now` is ns. With `has_arrays`, tables
+    shrink when payloads go, by unknown amounts: whole groups wait for the next plan, which
+    measures again.
     """
-    return _Planning(rules, Plan(used, free), now, has_arrays).made(held)
+    return _Planning(rules, Plan(used, free), now, has_arrays=has_arrays).made(held)
 
 
 class _Planning:
-    def __init__(self, rules: Rules, made: Plan, now: int, has_arrays: bool) -> None:  # noqa: FBT001
+    def __init__(self, rules: Rules, made: Plan, now: int, *, has_arrays: bool) -> None:
         self._has_arrays = has_arrays
         self._rules, self._plan, self._now = rules, made, now
         self._freed = 0

@@ -9,7 +9,7 @@ Durations are nanoseconds. Fields without a common exact type are JSON text.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
@@ -34,9 +34,6 @@ from hybridlog.schema.arrow_types import (
     with_values,
 )
 from hybridlog_storage.errors import UsageError
-
-if TYPE_CHECKING:
-    pass
 
 OWN: Final = pa.schema(
     [

@@ -1,4 +1,4 @@
-"""A cache of what was read or worked out, bounded in bytes."""
+"""Values that are computed or imported at first use, and a cache of them, bounded in bytes."""
 
 from __future__ import annotations
 

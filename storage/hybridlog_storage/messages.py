@@ -1,4 +1,4 @@
-"""Schemas, channels and batches of messages.
+"""Schemas, channels and batches of messages, and the order of their rows.
 
 Messages are handled in batches. A `Batch` is a buffer and a table of numpy columns with
 the position of each payload. So copying, indexing and decoding thousands of messages take

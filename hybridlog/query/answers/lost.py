@@ -1,4 +1,4 @@
-"""The loss ledger as questions see it: its rows and their times."""
+"""The loss ledger as questions see it: its rows, their times, and sentences about them."""
 
 from __future__ import annotations
 

@@ -188,7 +188,7 @@ class Scan:
         return parse_content(content, most=MIN_RECORDS + end - start)
 
     def _cut(self, at: int, head: ChunkHead) -> list[Item]:
-        """What is there of a chunk in which the file ends; no checksum proves it."""
+        """The first messages of a chunk in which the file ends; no checksum proves them."""
         self._is_closed, start = True, at + head.start
         rest = self._bytes.at(start, min(self._bytes.size - start, self._limit))
         found = beginning(head.codec, rest, min(head.size, self._limit))

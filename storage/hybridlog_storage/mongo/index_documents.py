@@ -1,4 +1,4 @@
-"""Assembles index documents as bytes around the fields of messages.
+"""Index documents as bytes around the fields of messages; which recordings a database has.
 
 A document is `_id`, the message's fields, and `_meta` (see `docs/format.md`). The fields
 are given as BSON elements. Thousands of documents are assembled at once: a template row is

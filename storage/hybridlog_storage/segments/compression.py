@@ -74,7 +74,7 @@ def decompress(compression: str, data: Buffer, uncompressed_size: int) -> bytes 
 
 
 def beginning(compression: str, data: Buffer, size: int) -> bytes:
-    """What a frame that is cut has of a content of `size` bytes."""
+    """The first bytes of a content of `size` bytes, as far as a truncated frame holds them."""
     if not compression:
         return bytes(data[:size])
     found = bytearray()

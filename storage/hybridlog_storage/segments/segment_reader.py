@@ -1,4 +1,4 @@
-"""Reads segments: their summary, and chunks one at a time.
+"""Reads segments, and rows of those that are gone: their summary, and chunks one at a time.
 
 A sealed segment never changes and every read names its position, so several threads may
 share a reader.
