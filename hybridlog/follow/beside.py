@@ -58,6 +58,9 @@ def serve(handle: int) -> None:
         Path("/proc/self/oom_score_adj").write_text(_FIRST_TO_GO, "ascii")
     with Connection(handle) as control, suppress(EOFError, ConnectionError):
         task: Task = control.recv()
+        if not task.triggers:  # it takes the time that nobody else wants
+            with suppress(AttributeError, OSError):
+                os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
         store = hybridlog.open(task.store, mongo=task.mongo)
         beside = _Beside(control, task, store)
         threading.Thread(target=beside.hear, daemon=True).start()
