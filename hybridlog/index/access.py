@@ -21,7 +21,6 @@ from hybridlog_storage.errors import (
 )
 from hybridlog_storage.settings import (
     EMBEDDED,
-    MIN_CACHE_MB,
     NAME,
     NONE,
     is_own,
@@ -222,15 +221,12 @@ class IndexAccess:
 
     @property
     def place(self) -> str:
-        """Description of the index's location; does not contact MongoDB."""
-        uri = self._named
-        if uri == EMBEDDED:
-            return "the MongoDB that comes with hybridlog"
-        if uri == NONE:
-            return "none"
+        """Its URI without secrets, `embedded` or `none`."""
+        if self._named in {EMBEDDED, NONE}:
+            return self._named
         from hybridlog_storage.mongo.database import without_secrets
 
-        return without_secrets(uri)
+        return without_secrets(self._named)
 
     def _another(self) -> Database:
         """A new connection; starts the embedded MongoDB if it is not running."""
@@ -246,9 +242,8 @@ class IndexAccess:
         if uri == EMBEDDED:
             return Database.connect(self._started(), timeout_s=_EMBEDDED_TIMEOUT_S)
         if self.wanted is not None:
-            # No other server gets the password: an unpacked store is a user's own, too.
-            return Database.connect(with_password(uri), timeout_s=_TIMEOUT_S)
-        if not is_own(self._directory.path):
+            uri = with_password(uri)  # no other server gets it: an unpacked store is one's own, too
+        elif not is_own(self._directory.path):
             raise DatabaseError(
                 f"The store {self._directory.path} names a MongoDB at {without_secrets(uri)}, and "
                 f"its {NAME} is not yours: if that server is, name it by `--mongo URI`."
@@ -260,8 +255,7 @@ class IndexAccess:
         from hybridlog_storage.mongo.mongod import EmbeddedMongod
 
         if self._mongod is None:
-            cache_mb = _bounded_cache_mb(self._directory.settings.cache_mb)
-            self._mongod = EmbeddedMongod(self._directory.mongod, cache_mb=cache_mb)
+            self._mongod = EmbeddedMongod(self._directory.mongod)
         try:
             uri = self._mongod.start()
         except StoreError as error:
@@ -319,14 +313,3 @@ class IndexAccess:
         self.id = "" if owner is None else owner.made
         self._owns = owner is not None and owner.place == self._own_place
         return database
-
-
-def _bounded_cache_mb(stored: int | None) -> int:
-    """The size of the cache in a store's settings, at most half of the memory.
-
-    The store may come from a larger machine, or from somebody else.
-    """
-    if stored is None:
-        return MIN_CACHE_MB
-    memory_mb = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") >> 20
-    return max(MIN_CACHE_MB, min(stored, memory_mb // 2))

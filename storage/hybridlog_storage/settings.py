@@ -52,14 +52,12 @@ class StoreSettings(Struct, frozen=True):
         mongo: URI, without a password, of the MongoDB to use; `none` to use no MongoDB; None for
             the embedded one.
         arrays: Topics whose tables have arrays in full.
-        cache_mb: Size of the embedded MongoDB's cache in MiB; None for the smallest one.
         retention: The table `[retention]`, as it stands there.
     """
 
     store_id: Annotated[str, Meta(min_length=1)]
     mongo: str | None = None
     arrays: tuple[str, ...] = ()
-    cache_mb: Annotated[int, Meta(ge=MIN_CACHE_MB, le=MAX_CACHE_MB)] | None = None
     retention: dict[str, Any] = {}
 
 
@@ -125,8 +123,6 @@ def settings_text(settings: StoreSettings) -> bytes:
     if settings.mongo is not None:
         mongo = without_password(settings.mongo) if is_uri(settings.mongo) else settings.mongo
         lines.append(f"mongo = {_quoted(mongo)}")
-    if settings.cache_mb is not None:
-        lines.append(f"cache_mb = {settings.cache_mb}")
     if settings.arrays:
         lines.append(f"arrays = {_as_toml(settings.arrays)}")
     if settings.retention:

@@ -48,7 +48,7 @@ def test_info(logs: Path, store: Path) -> None:
     assert "/base/scan" in text
     assert "sensor_msgs/LaserScan" in text
     assert "latched" in text
-    assert re.search(r"^index +the MongoDB that comes with hybridlog *$", text, re.MULTILINE)
+    assert re.search(r"^index +embedded *$", text, re.MULTILINE)
     assert re.search(rf"^id +{found['id']} *$", text, re.MULTILINE)
     assert re.fullmatch("[0-9]{8}-robot-[0-9a-f]{16}", found["id"])
 

@@ -30,7 +30,6 @@ def write(store: Path, text: str | bytes) -> Path:
     [
         StoreSettings("ab12"),
         StoreSettings("ab12", "mongodb://me@h1:1,h2/db?tls=true"),
-        StoreSettings("ab12", cache_mb=300),
         StoreSettings("ab12", arrays=("/scan", "/points")),
         StoreSettings(
             "ab12",

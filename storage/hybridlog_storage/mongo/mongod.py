@@ -45,7 +45,6 @@ from hybridlog_storage.errors import (
     StoreError,
     UsageError,
 )
-from hybridlog_storage.settings import MIN_CACHE_MB
 
 START_LIMIT_S = 60.0
 """Seconds for a start; one that takes longer goes on, and the next command finds it."""
@@ -91,8 +90,6 @@ class EmbeddedMongod:
     Args:
         directory: Directory of mongod's data, log and lock files; created if missing, in an
             existing parent. If it belongs to another user, `<name>-<uid>` beside it is used.
-        cache_mb: Limit of mongod's cache in MiB; less than 256 counts as 256. The process that
-            starts mongod decides.
         linger_s: Seconds for which mongod runs after its last use; None takes
             HYBRIDLOG_MONGOD_LINGER_S, or 5. The process that starts mongod decides.
 
@@ -100,12 +97,9 @@ class EmbeddedMongod:
         damage: The reason why the last start replaced the data files; None if it did not.
     """
 
-    def __init__(
-        self, directory: Path, *, cache_mb: int = MIN_CACHE_MB, linger_s: float | None = None
-    ) -> None:
+    def __init__(self, directory: Path, *, linger_s: float | None = None) -> None:
         place = Path(os.path.abspath(directory))  # noqa: PTH100 - `resolve` follows the last part
         self._given = self._directory = place.parent.resolve() / place.name
-        self._cache_mb = max(cache_mb, MIN_CACHE_MB)
         text = os.environ.get("HYBRIDLOG_MONGOD_LINGER_S") or "5"
         if not re.fullmatch(r"[0-9]{1,9}(\.[0-9]+)?", text):
             raise UsageError(f"HYBRIDLOG_MONGOD_LINGER_S is {text!r}; give seconds, for example 5.")
@@ -266,7 +260,7 @@ class EmbeddedMongod:
             "--noscripting",
             "--quiet",
             *("--slowms", "5000"),
-            *("--wiredTigerCacheSizeGB", f"{self._cache_mb / 1024:g}"),
+            *("--wiredTigerCacheSizeGB", "0.25"),
             # An empty database then takes 11 MB instead of 300 MB.
             *("--wiredTigerEngineConfigString", "log=(prealloc=false,file_max=10MB)"),
             *("--setParameter", "diagnosticDataCollectionEnabled=false"),
