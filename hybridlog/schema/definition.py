@@ -37,10 +37,8 @@ MAX_DEFINITION = 1 << 20
 """Largest definition, in bytes."""
 MAX_DEPTH = 62
 """Deepest nesting of messages, arrays of messages counted twice: deeper columns cannot be read."""
-MAX_FIELDS = 100_000
+MAX_FIELDS = 10_000
 """Most fields of an unfolded type; nested ones count at each occurrence."""
-MAX_PATH_CHARACTERS = 1 << 24
-"""Most characters of the paths of all these fields."""
 MAX_WIDTH = 1 << 28
 """Most elements of a fixed array."""
 MAX_FIXED_BYTES = 1 << 40
@@ -216,11 +214,10 @@ def standard_text(name: str, ros: int) -> str | None:
 
 
 class _Extent(Struct, frozen=True):
-    """Size of an unfolded type: levels, fields, characters of their paths, least bytes."""
+    """Size of an unfolded type: levels, fields, least bytes."""
 
     depth: int
     fields: int
-    characters: int
     size: int
 
 
@@ -257,7 +254,7 @@ class _Resolver:
             raw_fields = []
         self._open.add(name)
         fields: dict[str, FieldType] = {}
-        depth, count, characters, size = 0, 0, 0, 0
+        depth, count, size = 0, 0, 0
         for raw in raw_fields:
             if not NAME.match(raw.name) or len(raw.name) > MAX_NAME:
                 raise self._fail(f"{name} has a field that cannot be named {raw.name[:80]!r}")
@@ -266,10 +263,9 @@ class _Resolver:
             fields[raw.name], inner = self._field(name, raw)
             depth = max(depth, inner.depth)
             count += 1 + inner.fields
-            characters += (len(raw.name) + 3) * (1 + inner.fields) + inner.characters
             size += inner.size
         self._open.discard(name)
-        extent = _Extent(depth + 1, count, characters, size)
+        extent = _Extent(depth + 1, count, size)
         self._check(name, extent)
         self._done[name] = MessageType(name, tuple(fields.items())), extent
         return self._done[name]
@@ -281,8 +277,6 @@ class _Resolver:
             raise self._fail(
                 f"{name} unfolds to {extent.fields} fields; at most {MAX_FIELDS} are indexed"
             )
-        if extent.characters > MAX_PATH_CHARACTERS:
-            raise self._fail(f"the paths of the fields of {name} are too long")
         if extent.size > MAX_FIXED_BYTES:
             raise self._fail(f"{name} takes {extent.size} bytes at the least: no message can")
 
@@ -293,15 +287,13 @@ class _Resolver:
         width = raw.width
         depth = extent.depth + (extent.depth > 0)
         if width is None:
-            return ArrayOf(element, None, raw.bound), _Extent(
-                depth, extent.fields, extent.characters, 4
-            )
+            return ArrayOf(element, None, raw.bound), _Extent(depth, extent.fields, 4)
         if width > MAX_WIDTH or (width == 0 and self._ros == 2):
             least = 0 if self._ros == 1 else 1
             raise self._fail(
                 f"{owner}.{raw.name} has {width} elements; from {least} to {MAX_WIDTH} are indexed"
             )
-        extent = _Extent(depth, extent.fields, extent.characters, extent.size * width)
+        extent = _Extent(depth, extent.fields, extent.size * width)
         return ArrayOf(element, width), extent
 
     def _element(self, owner: str, raw: RawField) -> tuple[FieldType, _Extent]:
@@ -311,14 +303,14 @@ class _Resolver:
         if kind in _NOT_PORTABLE:
             raise self._fail(f"not indexed: {kind} has no portable wire form")
         if kind == "string":
-            return Text(raw.text_bound), _Extent(0, 0, 0, 4)
+            return Text(raw.text_bound), _Extent(0, 0, 4)
         if kind in _WORDS:
             code = "i1" if kind == "byte" and self._ros == 1 else DTYPES[kind]
             primitive = Primitive(kind, code)
-            return primitive, _Extent(0, 0, 0, primitive.size)
+            return primitive, _Extent(0, 0, primitive.size)
         name = self._name(owner, kind)
         if (instant := self._instant(name)) is not None:
-            return instant, _Extent(0, 0, 0, 8)
+            return instant, _Extent(0, 0, 8)
         return self.message(name)
 
     def _name(self, owner: str, kind: str) -> str:

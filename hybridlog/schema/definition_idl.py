@@ -228,8 +228,6 @@ class _Parser:
             return RawField("", word, text_bound=self._size(scope, ">"))
         if word in _WORDS:
             return RawField("", _WORDS[word])
-        if word in {"map", "any", "fixed", "union", "struct", "enum", "bitset", "bitmask"}:
-            raise self._fail(f"not indexed: IDL {word!r} has no ROS wire form")
         if not (word[0].isalpha() or word[0] in "_:") or " " in word:
             raise self._fail(f"expected a type, found {word[:40]!r}")
         return RawField("", word)
@@ -237,23 +235,20 @@ class _Parser:
     def _size(self, scope: str, end: str) -> int:
         """An array size and the sign behind it."""
         begin, number = self._at, self._value(scope, end)
-        if number is None or number < 0:
+        if number is None:
             found = " ".join(self._tokens[begin : self._at - 1])
             raise self._fail(f"an array size must be a number or a constant, found {found[:40]!r}")
         return number
 
     def _value(self, scope: str, end: str) -> int | None:
-        """A number or a constant with or without a sign, up to a sign; None for anything else."""
+        """A number or a constant, up to a sign; None for anything else."""
         tokens: list[str] = []
         while (token := self._next()) != end:
             tokens.append(token)
-        sign = -1 if tokens[:1] == ["-"] else 1
-        rest = tokens[1:] if tokens[:1] in (["-"], ["+"]) else tokens
-        if len(rest) != 1:
+        if len(tokens) != 1:
             return None
-        known = map(self._types.constants.get, _candidates(scope, rest[0]))
-        numbers = (one for one in (_integer(rest[0]), *known) if one is not None)
-        return next((sign * one for one in numbers), None)
+        known = map(self._types.constants.get, _candidates(scope, tokens[0]))
+        return next((n for n in (_integer(tokens[0]), *known) if n is not None), None)
 
     def _constant(self, scope: str) -> None:
         self._type(scope)

@@ -7,6 +7,8 @@ field that tracks its presence is null.
 
 from __future__ import annotations
 
+import re
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from graphlib import CycleError, TopologicalSorter
@@ -48,22 +50,7 @@ _MAX_DEPTH = 32
 _MAX_PATHS = 10_000
 _PART = 256  # messages made plain together: each key of their maps is a column
 
-_STANDARD = frozenset(
-    f"google/protobuf/{name}.proto"
-    for name in (
-        "any",
-        "api",
-        "descriptor",
-        "duration",
-        "empty",
-        "field_mask",
-        "source_context",
-        "struct",
-        "timestamp",
-        "type",
-        "wrappers",
-    )
-)
+_STANDARD = re.compile(r"google/protobuf/([a-z_]+)\.proto")
 """Protobuf's own files, which some writers leave out."""
 
 TIMES = {"google.protobuf.Timestamp": "time", "google.protobuf.Duration": "duration"}
@@ -185,11 +172,12 @@ def _fill(pool: DescriptorPool, data: bytes) -> Exception | None:
     """
     from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
 
-    given = {file.name: file for file in FileDescriptorSet.FromString(data).file}
-    standard = sorted(_STANDARD - given.keys()) if b"google.protobuf." in data else []
-    files = {name: _standard_file(name) for name in standard} | given
-    for name in {name for file in given.values() for name in file.dependency} - files.keys():
-        files[name] = FileDescriptorProto(name=name)
+    files = {file.name: file for file in FileDescriptorSet.FromString(data).file}
+    pending = [*files.values()]
+    while pending:
+        for name in {*pending.pop().dependency} - files.keys():
+            files[name] = _standard_file(name) or FileDescriptorProto(name=name)
+            pending.append(files[name])
     graph = {name: set(file.dependency) for name, file in files.items()}
     problem: Exception | None = None
     try:
@@ -203,12 +191,15 @@ def _fill(pool: DescriptorPool, data: bytes) -> Exception | None:
     return problem
 
 
-def _standard_file(name: str) -> FileDescriptorProto:
+def _standard_file(name: str) -> FileDescriptorProto | None:
     """One of protobuf's own files."""
     from google.protobuf.descriptor_pb2 import FileDescriptorProto
 
-    module = import_module(f"{name.removesuffix('.proto').replace('/', '.')}_pb2")
-    return FileDescriptorProto.FromString(module.DESCRIPTOR.serialized_pb)
+    if (found := _STANDARD.fullmatch(name)) is not None:
+        with suppress(ImportError):
+            module = import_module(f"google.protobuf.{found[1]}_pb2")
+            return FileDescriptorProto.FromString(module.DESCRIPTOR.serialized_pb)
+    return None
 
 
 def _add_paths(
