@@ -385,7 +385,7 @@ def known_fields(query: Query) -> Mapping[str, str]:
     known = field_types(query)
     if known is not None:
         return known
-    return {str(one["path"]): str(one["type"]) for one in infer_fields(query)}
+    return {one.path: one.type for one in infer_fields(query)}
 
 
 def fields_of(known: Mapping[str, str], messages: Iterator[Message]) -> list[Field]:
@@ -405,7 +405,7 @@ def _fields(known: Mapping[str, str], messages: Iterator[Message]) -> Iterator[F
     for path, kind in known.items():
         if "[" in path or "`" in path:
             continue  # within the elements of an array, or a name with dots, which no path has
-        if kind in NUMERIC or not _IN_JSON.isdisjoint(kind.split("|")):
+        if kind in NUMERIC or kind in _IN_JSON:
             yield path, kind
             continue
         summaries = (f"{path}.{name}" for name in _SUMMARIES)

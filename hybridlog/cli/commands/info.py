@@ -290,9 +290,7 @@ def _topic_dict(store: Store, recorded: RecordedChannel) -> dict[str, Any]:
     schema, text = channel.schema, None
     if schema is not None and schema.encoding in _READABLE:
         text = bytes(schema.data).decode("utf-8", "replace")
-    fields: list[dict[str, object]] = [
-        {"path": p.path, "type": p.type, "array": p.array} for p in codec.paths()
-    ]
+    fields = codec.paths()
     observed = codec.indexed and not fields
     if observed:
         fields = infer_fields(store.query([channel.topic], [recorded.recording.id]))
@@ -306,7 +304,7 @@ def _topic_dict(store: Store, recorded: RecordedChannel) -> dict[str, Any]:
         "not_indexed": codec.reason,
         "observed": observed,
         "arrays": channel.topic in store.directory.settings.arrays,
-        "fields": fields,
+        "fields": [{"path": p.path, "type": p.type, "array": p.array} for p in fields],
     }
 
 

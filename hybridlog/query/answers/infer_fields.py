@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from itertools import islice
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from hybridlog.schema.definition import FieldPath
 from hybridlog_storage.errors import PayloadError
 
 if TYPE_CHECKING:
@@ -15,64 +17,38 @@ if TYPE_CHECKING:
 SAMPLE = 100
 """Messages that are read."""
 _MAX_FIELDS = 1000
-_MAX_DEPTH = 50
-_WORDS = ((bool, "bool"), (int, "integer"), (float, "number"), (str, "string"))
+_WORDS = {"int64": "integer", "uint64": "integer", "double": "number"}
 _PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
-def infer_fields(messages: Iterable[Message]) -> list[dict[str, object]]:
-    """Paths and types of the fields that the first messages have, in their order.
+def infer_fields(messages: Iterable[Message]) -> list[FieldPath]:
+    """Fields that the first messages have, which are in JSON, with the types of their columns.
 
-    Args:
-        messages: Messages in JSON; those that cannot be read are skipped.
-
-    Returns:
-        `path` as a predicate takes it, `type` (several joined by `|`), and whether a
-        message may hold several values there.
+    What cannot be read is skipped. Names that no path can have are in backticks.
     """
-    found: dict[str, tuple[set[str], bool]] = {}
+    from hybridlog.schema.arrow_columns import objects_array  # loads pyarrow
+
+    values: list[Any] = []
     for message in islice(messages, SAMPLE):
-        try:
-            _visit(message.decode(), "", found, within_array=False)
-        except PayloadError:
-            continue
-    return [
-        {"path": path, "type": _spelled(kinds), "array": array}
-        for path, (kinds, array) in found.items()
-    ]
+        with suppress(PayloadError):
+            values.append(message.decode())
+    records = objects_array([one for one in values if isinstance(one, dict)], None)
+    return [*islice(_fields(records.type, "", within_array=False), _MAX_FIELDS)]
 
 
-def _visit(
-    value: object, path: str, found: dict[str, tuple[set[str], bool]], *, within_array: bool
-) -> None:
-    if path.count(".") >= _MAX_DEPTH:
-        return
-    if isinstance(value, dict):
-        for name, item in value.items():
-            plain = _PLAIN.fullmatch(name) is not None
-            part = name if plain else f"`{name}`"
-            below = f"{path}.{part}" if path else part
-            if below not in found and len(found) >= _MAX_FIELDS:
-                return
-            kinds, array = found.get(below, (set(), within_array))
-            kinds.add(_kind(item))
-            found[below] = kinds, array or isinstance(item, list)
-            _visit(item, below, found, within_array=within_array)
-    elif isinstance(value, list) and path:
-        for item in value:
-            if isinstance(item, dict):
-                _visit(item, f"{path}[]", found, within_array=True)
+def _fields(kind: Any, prefix: str, *, within_array: bool) -> Iterator[FieldPath]:
+    import pyarrow as pa
 
+    from hybridlog.schema.arrow_types import is_list
 
-def _spelled(kinds: set[str]) -> str:
-    # In JSON, 1 is also a number, without a fraction.
-    return "|".join(sorted(kinds - {"integer"} if "number" in kinds else kinds))
-
-
-def _kind(value: object) -> str:
-    if isinstance(value, list):
-        inner = _spelled({_kind(item) for item in value})
-        return "array" if not inner or "|" in inner else f"{inner}[]"
-    if isinstance(value, dict):
-        return "object"
-    return next((word for kind, word in _WORDS if isinstance(value, kind)), "null")
+    for field in kind:
+        path = prefix + (field.name if _PLAIN.fullmatch(field.name) else f"`{field.name}`")
+        inner, brackets = field.type, ""
+        while is_list(inner):
+            inner, brackets = inner.value_type, f"{brackets}[]"
+        is_object = pa.types.is_struct(inner)
+        word = "any" if inner == pa.json_() else _WORDS.get(str(inner), str(inner))
+        is_array = within_array or bool(brackets)
+        yield FieldPath(path, ("object" if is_object else word) + brackets, is_array)
+        if is_object:
+            yield from _fields(inner, f"{path}{brackets}.", within_array=is_array)
