@@ -20,7 +20,6 @@ from hybridlog.query.predicate.parser import parse
 from hybridlog.query.topics import TopicMatcher, matcher, split_topic
 from hybridlog_storage.errors import (
     DiskFullError,
-    HybridlogError,
     StoreError,
     UsageError,
     WhereError,
@@ -41,7 +40,7 @@ _START: Final = (
 )
 _POLL_S: Final = 0.1
 _TRIES: Final = 5
-"""So often in a row it may end before it has told how far it is."""
+"""So often in a row it may end without being farther."""
 _PAUSE_S: Final = 1.0
 LOOK_S: Final = 0.5  # between two looks at the recording of a log
 SHORT_S: Final = 2.0
@@ -103,7 +102,6 @@ class FollowerProcess:
         self._triggers = triggers
         self._task = task
         self._has_seen = not triggers
-        self._has_told = False
         self._why = "their process ends again and again"
         self._target = target
         self._hit = hit
@@ -151,16 +149,12 @@ class FollowerProcess:
         if any(one.fits(channel.topic) for one in self._triggers):
             self._orders.append(channel)
 
-    def order(self, what: str) -> None:
-        """Tell it that something has happened."""
-        self._orders.append(what)
-
     def finish(self, entry: RecordingEntry) -> RecordingEntry:
         """Wait until it has done everything, but no longer than wanted."""
         if self._target is not None and time.monotonic() - self._begun < SHORT_S:
             return self._finish_here(entry, self._target)
         self._is_finishing = True
-        self.order(ENDED)
+        self._orders.append(ENDED)
         begun = time.monotonic()
         while self._thread.is_alive() and not self._is_left:
             if self.wait_s is not None and time.monotonic() - begun >= self.wait_s:
@@ -197,28 +191,18 @@ class FollowerProcess:
         if self._thread.is_alive():
             self._thread.join()
 
-    def forget(self, entry: RecordingEntry) -> None:
-        """Remove the documents of a removed recording, or leave them to the next connection."""
-        if self._target is not None and self._target.database is not None:
-            from hybridlog_storage.mongo.index_documents import IndexState
-
-            with suppress(HybridlogError):
-                IndexState(self._target.database).forget([entry.key])
-
     def _run(self) -> None:
         if self._target is not None and self._over.wait(SHORT_S):
             return
-        tries, deaths = _TRIES, 0
-        while tries and not self._over.is_set():
-            before, self._has_told, is_done = (self._task.seen, self.state), False, False
+        failed = 0
+        while failed < _TRIES and not self._over.is_set():
+            before = self._task.seen, self.state
             with suppress(EOFError, OSError):
-                is_done = self._follow()
-            if is_done:
-                return
-            tries = _TRIES if self._has_told else tries - 1
-            deaths = 0 if (self._task.seen, self.state) != before else deaths + 1
+                if self._follow():
+                    return
+            failed = 0 if (self._task.seen, self.state) != before else failed + 1
             self._task = self._task._replace(is_again=True)
-            self._over.wait(_PAUSE_S * 2 ** min(deaths, _TRIES))
+            self._over.wait(_PAUSE_S * 2**failed)
         self.judged = None
         if not self._over.is_set():
             what = "triggers are evaluated no more" if self._triggers else "tables are made later"
@@ -252,12 +236,12 @@ class FollowerProcess:
                     for at in times:
                         self._hit(text, at)
                 case ("read", seen):
-                    self._has_told, self.judged = True, seen[1]
+                    self.judged = seen[1]
                     self._task = self._task._replace(seen=seen)
                 case ("seen",):
                     self._has_seen = True
                 case ("state", state):
-                    self._has_told, self.state = True, state
+                    self.state = state
                 case ("say", text):
                     self._say(text)
                 case ("failed", why):

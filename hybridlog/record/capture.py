@@ -220,7 +220,6 @@ class Capture:
             manifests.remove(entry.id)
         with suppress(HybridlogError):
             self.catalog.remove(entry.id)
-        self.follower.forget(entry)
         self._held.close()
 
     def _begin(self, create: Callable[[Manifest], None], manifest: Manifest) -> RecordingEntry:
