@@ -17,7 +17,6 @@ PLACES = {
     "group_bytes": "hybridlog.follow.follower._GROUP_BYTES",
     "short_recording_s": "hybridlog.follow.child.SHORT_S",
     "table_left_bytes": "hybridlog.columns.table_writer._LEFT",
-    "table_open_files": "hybridlog.columns.table_writer._OPEN_FILES",
     "table_pending_bytes": "hybridlog.columns.table_writer._PENDING",
     "table_reserve_bytes": "hybridlog.columns.table_writer._RESERVE",
     "group_rows": "hybridlog.follow.follower._GROUP_ROWS",

@@ -15,7 +15,7 @@ from contextlib import suppress
 from itertools import count
 from pathlib import Path
 from typing import Any, Final, NamedTuple
-from weakref import WeakValueDictionary
+from weakref import WeakSet
 
 import msgspec
 import pyarrow as pa
@@ -36,7 +36,6 @@ from hybridlog_storage.errors import HybridlogError, StoreError, exhausted
 from hybridlog_storage.manifest import digest_of
 
 _OPEN_FILES: Final = 256
-_MAX_FIELD_SETS: Final = 64  # sets of fields whose columns are known for a file
 _AT_ONCE: Final = 1 << 20  # bytes read together for a digest, and written together
 _TAIL: Final = 8  # bytes: length of the footer, `PAR1`
 _SEAL: Final = 4  # bytes: CRC-32 of the footer, in front of it
@@ -201,7 +200,7 @@ class TablePart(NamedTuple):
 class ColumnFile:
     """Reads one file; FileNotFoundError without it. Thread safe.
 
-    Files that were opened long ago are closed if too many are open, and opened again.
+    If too many are open, files are closed, and opened again.
     """
 
     def __init__(self, path: Path, cache: Cache | None = None) -> None:
@@ -212,7 +211,7 @@ class ColumnFile:
         self._lock = threading.Lock()
         self._chosen: dict[tuple[Any, ...], dict[str, tuple[int, ...]]] = {}
         try:
-            self._source = _Source(path, self.number)
+            self._source = _Source(path)
             metadata = pq.read_metadata(pa.BufferReader(b"PAR1" + self._source.footer))
             self.about = About.from_json(metadata.metadata.get(ABOUT, b""))
             self._parquet = pq.ParquetFile(
@@ -354,8 +353,6 @@ class ColumnFile:
             for number, leaf in enumerate(self.leaves):
                 if leaf.top in own if leaf.is_own else self._is_wanted(leaf, wanted):
                     found[leaf.top] = (*found.get(leaf.top, ()), number)
-            if len(self._chosen) >= _MAX_FIELD_SETS:
-                self._chosen.clear()
             self._chosen[key] = found
         return found
 
@@ -390,17 +387,16 @@ class ColumnFile:
 class _Source:
     """Provides Parquet's bytes, after verifying the checksum of the footer."""
 
-    def __init__(self, path: Path, number: int) -> None:
+    def __init__(self, path: Path) -> None:
         self.closed = False
         self._path = path
-        self._number = number
         self._lock = threading.Lock()
         self._fd = -1
         self._position = 0
         self._same: tuple[int, ...] | None = None
         with self._lock:
             self._open()
-        self.size = os.fstat(self._fd).st_size
+            self.size = os.fstat(self._fd).st_size
         tail = self._raw(self.size - _TAIL, self.size) if self.size > 2 * _TAIL else b""
         length = int.from_bytes(tail[:4], "little") + _TAIL
         if tail[4:] != b"PAR1" or length > min(self.size - _SEAL, _MAX_FOOTER):
@@ -447,15 +443,13 @@ class _Source:
     def __del__(self) -> None:
         self.release()
 
-    def release(self, *, wait: bool = True) -> bool:
+    def release(self, *, wait: bool = True) -> None:
         """Close the file until it is read again; without `wait` not one that is just read."""
-        if not self._lock.acquire(wait):
-            return False
-        if self._fd >= 0:
-            os.close(self._fd)
-        self._fd = -1
-        self._lock.release()
-        return True
+        if self._lock.acquire(wait):
+            if self._fd >= 0:
+                os.close(self._fd)
+            self._fd = -1
+            self._lock.release()
 
     def _open(self) -> None:
         self._fd = files.open_file(self._path, os.O_RDONLY)
@@ -466,11 +460,11 @@ class _Source:
             raise StoreError("it was replaced")
         self._same = same
         with _OPENING:
-            _OPENED[self._number] = self
-            for number in [*_OPENED][: -files.most_open(_OPEN_FILES)]:
-                source = _OPENED.get(number)
-                if source is not None and source.release(wait=False):
-                    del _OPENED[number]
+            if len(_OPENED) >= files.most_open(_OPEN_FILES):
+                for source in [*_OPENED]:
+                    source.release(wait=False)
+                _OPENED.clear()
+            _OPENED.add(self)
 
     def seek(self, position: int, whence: int = os.SEEK_SET) -> int:
         base = {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: self.size}[whence]
@@ -484,5 +478,5 @@ class _Source:
         """Do nothing: the file remains open as long as its reader."""
 
 
-_OPENED: Final[WeakValueDictionary[int, _Source]] = WeakValueDictionary()  # the oldest ones first
+_OPENED: Final[WeakSet[_Source]] = WeakSet()
 _OPENING: Final = threading.Lock()

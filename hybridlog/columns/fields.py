@@ -13,7 +13,7 @@ renamed from its field has the field's name in its metadata.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -42,67 +42,61 @@ SUMMARY_FIELDS: Final = ("n", "min", "max", "mean")
 """Fields of a summary of numbers."""
 
 
-class FieldShape:
-    """Turns fields of messages into columns, with `arrays` in full at any length."""
+def as_columns(records: Array, *, arrays: bool = False) -> Array:
+    """Fields of messages as columns: the fields of a struct array; `arrays` at any length."""
+    return _struct_columns(records, OWN_COLUMNS, arrays=arrays)
 
-    def __init__(self, *, arrays: bool = False) -> None:
-        self._has_arrays = arrays
-        self._plain: set[Any] = set()  # types of messages that are columns as they are
 
-    def columns(self, records: Array) -> Array:
-        """Fields as columns: the fields of a struct array."""
-        return self._struct(records, OWN_COLUMNS)
+def _as_column(array: Array, *, arrays: bool) -> Array:
+    kind = array.type
+    if pa.types.is_struct(kind):
+        if kind.num_fields == 0:
+            return pa.array(np.ones(len(array), np.bool_), mask=missing_of(array))
+        return _struct_columns(array, (), arrays=arrays)
+    if is_list(kind):
+        values = _as_column(array.flatten(), arrays=arrays)
+        is_same = pa.types.is_list(kind) and values.type == kind.value_type
+        return array if is_same else with_values(array, values)
+    return array
 
-    def _column(self, array: Array) -> Array:
-        kind = array.type
-        if pa.types.is_struct(kind):
-            if kind.num_fields == 0:
-                return pa.array(np.ones(len(array), np.bool_), mask=missing_of(array))
-            return self._struct(array, ())
-        if is_list(kind):
-            values = self._column(array.flatten())
-            is_same = pa.types.is_list(kind) and values.type == kind.value_type
-            return array if is_same else with_values(array, values)
+
+def _struct_columns(array: Array, reserved: Collection[str], *, arrays: bool) -> Array:
+    kind = array.type
+    columns: list[tuple[str, Array, dict[bytes, str]]] = []
+    for number, field in enumerate(kind):
+        name, values = field.name, array.field(number)
+        about = {EMPTY: ""} if _is_empty(field.type) else {}
+        width = field.type.list_size if pa.types.is_fixed_size_list(field.type) else LIMIT + 1
+        if is_array(field.type) and width > LIMIT:
+            values, summaries = _split(values, arrays=arrays)
+            columns.append((name, values, about))
+            columns.append((f"{name}_summary", summaries, {SUMMARY: name}))
+        else:
+            columns.append((name, _as_column(values, arrays=arrays), about))
+    fields = []
+    named = column_names([name for name, _, _ in columns], reserved)
+    for (name, column), (_, values, about) in zip(named, columns, strict=True):
+        if column != name and SUMMARY not in about:
+            about[ORIGINAL] = name
+        fields.append(pa.field(column, values.type, metadata=about or None))
+    if kind == pa.struct(fields) and not any(field.metadata for field in fields):
         return array
+    found = {field.name: values for field, (_, values, _) in zip(fields, columns, strict=True)}
+    return structs(found, len(array), missing_of(array), fields)
 
-    def _struct(self, array: Array, reserved: Collection[str]) -> Array:
-        kind = array.type
-        if kind in self._plain:
-            return array
-        columns: list[tuple[str, Array, dict[bytes, str]]] = []
-        for number, field in enumerate(kind):
-            name, values = field.name, array.field(number)
-            about = {EMPTY: ""} if _is_empty(field.type) else {}
-            width = field.type.list_size if pa.types.is_fixed_size_list(field.type) else LIMIT + 1
-            if is_array(field.type) and width > LIMIT:
-                values, summaries = self._split(values)
-                columns.append((name, values, about))
-                columns.append((f"{name}_summary", summaries, {SUMMARY: name}))
-            else:
-                columns.append((name, self._column(values), about))
-        fields = []
-        named = column_names([name for name, _, _ in columns], reserved)
-        for (name, column), (_, values, about) in zip(named, columns, strict=True):
-            if column != name and SUMMARY not in about:
-                about[ORIGINAL] = name
-            fields.append(pa.field(column, values.type, metadata=about or None))
-        if kind == pa.struct(fields) and not any(field.metadata for field in fields):
-            self._plain.add(kind)
-            return array
-        found = {field.name: values for field, (_, values, _) in zip(fields, columns, strict=True)}
-        return structs(found, len(array), missing_of(array), fields)
 
-    def _split(self, array: Array) -> tuple[Array, Array]:
-        """Arrays within the limit, and summaries of the others."""
-        is_long = np.zeros(len(array), np.bool_)
-        if not self._has_arrays or _is_of_bytes(array.type):
-            is_long = _over(array, LIMIT)
-        if not is_long.any():
-            return self._column(array), pa.nulls(len(array), summary(array.slice(0, 0)).type)
-        rows = np.flatnonzero(is_long)
-        short = array.take(pa.array(np.arange(len(array)), mask=is_long))
-        long = array if len(rows) == len(array) else array.take(pa.array(rows))
-        return self._column(short), without(summary(long), rows, len(array))
+def _split(array: Array, *, arrays: bool) -> tuple[Array, Array]:
+    """Arrays within the limit, and summaries of the others."""
+    is_long = np.zeros(len(array), np.bool_)
+    if not arrays or _is_of_bytes(array.type):
+        is_long = _over(array, LIMIT)
+    if not is_long.any():
+        none = pa.nulls(len(array), summary(array.slice(0, 0)).type)
+        return _as_column(array, arrays=arrays), none
+    rows = np.flatnonzero(is_long)
+    short = array.take(pa.array(np.arange(len(array)), mask=is_long))
+    long = array if len(rows) == len(array) else array.take(pa.array(rows))
+    return _as_column(short, arrays=arrays), without(summary(long), rows, len(array))
 
 
 def _is_of_bytes(kind: Any) -> bool:
@@ -235,6 +229,13 @@ def without(array: Array, rows: Any, total: int) -> Array:
     missing = np.ones(total, np.bool_)
     missing[rows] = False
     return array.take(pa.array(places, mask=missing))
+
+
+def side_by_side(own: Mapping[str, Array], others: Array) -> Array:
+    """Columns by name, and behind them those of a struct array, as one struct array."""
+    kinds = [pa.field(name, column.type) for name, column in own.items()]
+    columns = {**own, **dict(zip(others.type.names, others.flatten(), strict=True))}
+    return structs(columns, len(others), None, [*kinds, *others.type])
 
 
 def names_of(path: str) -> tuple[str, ...]:

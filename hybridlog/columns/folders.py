@@ -95,7 +95,7 @@ class TableFolders:
         place = self._root / TABLES / folder
         names = [n for n in files.names(place) if n.endswith(SUFFIX)]
         shared = [*shared_for(shared_times(names), self._created)]
-        waiting, old = addition, list[Path]()
+        pieces, old = addition.pieces, list[Path]()
         if goes is not None:
             own = [name for name in sorted(names) if name.startswith(f"{self._recording}-")]
             readers = [reader for name in own if (reader := _reader(place / name)) is not None]
@@ -103,16 +103,16 @@ class TableFolders:
             for name in shared:
                 reader = _reader(place / name)
                 if reader is not None and reader.about.has(self._recording):
-                    self._rewrite(place / name, reader, waiting, goes)
-                    waiting = Addition()
+                    self._rewrite(reader, pieces, goes)
+                    pieces = []
                     break
-        if waiting.pieces:
-            self._merge(place, shared, waiting)
+        if pieces:
+            self._merge(place, shared, pieces)
         self._publish(place, addition.files, old)
         with suppress(OSError), files.folder(place.parent) as fd:
             files.system.rmdir(folder, dir_fd=fd)
 
-    def _merge(self, place: Path, shared: Sequence[str], addition: Addition) -> None:
+    def _merge(self, place: Path, shared: Sequence[str], pieces: Sequence[_Piece]) -> None:
         """Add rows to the shared file that may have them, or to a new one."""
         reader = next(filter(None, (_reader(place / name) for name in shared)), None)
         own = _shared_name(0 if reader is None else max(self._created or 0, 0))
@@ -121,40 +121,35 @@ class TableFolders:
             or (
                 len({one.id for one in reader.about.sections}) < MAX_SHARED_RECORDINGS
                 and reader.size_bytes < MAX_SHARED_BYTES
-                and reader.rows + sum(one.rows for one, _ in addition.pieces) <= MAX_SHARED_ROWS
+                and reader.rows + sum(one.rows for one, _ in pieces) <= MAX_SHARED_ROWS
             )
         ):
-            self._rewrite(reader.path, reader, addition, lambda _: False)
+            self._rewrite(reader, pieces, lambda _: False)
         else:
-            self._write(place / own, addition.pieces)
+            self._write(place / own, pieces)
 
     def _rewrite(
-        self,
-        path: Path,
-        reader: ColumnFile,
-        addition: Addition,
-        goes: Callable[[str], bool],
+        self, reader: ColumnFile, new: Sequence[_Piece], goes: Callable[[str], bool]
     ) -> None:
         """Replace a shared file by one with other rows of the recording."""
-        pieces = [*addition.pieces]
-        new = {section.topic for section, _ in pieces}
+        pieces, topics = [*new], {section.topic for section, _ in new}
         try:
             table = reader.table()
             for before, section in reader.sections():
-                stays = section.topic not in new and not goes(section.topic)
+                stays = section.topic not in topics and not goes(section.topic)
                 if section.id != self._recording or stays:
                     pieces.append((section, table.slice(before, section.rows)))
         except StoreError as error:
             # Its other recordings get their tables again when they are asked about.
             _log.info("%s", error)
         if pieces:
-            self._write(path, pieces)
+            self._write(reader.path, pieces)
         else:
-            files.unlink(path)
+            files.unlink(reader.path)
 
     def _write(self, path: Path, pieces: Iterable[_Piece]) -> None:
         """Write a shared file, and give it its name by one rename."""
-        pieces = sorted(pieces, key=lambda one: (one[0].begin, one[0].id, one[0].topic))
+        pieces = sorted(pieces, key=lambda one: (one[0].id, one[0].topic))
         found = [section for section, _ in pieces]
         schema = pieces[0][1].schema
         table = pa.concat_tables(

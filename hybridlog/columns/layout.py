@@ -122,7 +122,7 @@ def column_names(
 
 
 class Section(Struct, frozen=True):
-    """Rows of one topic of one recording in a file; `begin` is of the recording, ns.
+    """Rows of one topic of one recording in a file.
 
     `segments` has the digest of each segment with rows in it, by its number as text. So many rows
     are `unreadable`. With `arrays` these are in full, but for bytes, else up to a limit.
@@ -130,7 +130,6 @@ class Section(Struct, frozen=True):
 
     id: str
     topic: str
-    begin: int
     segments: Mapping[str, str]
     rows: int
     unreadable: int = 0

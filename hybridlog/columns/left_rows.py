@@ -20,12 +20,13 @@ from msgspec.structs import replace
 
 from hybridlog.columns.fields import (
     SUMMARY_FIELDS,
-    FieldShape,
+    as_columns,
     has_summaries,
     joined,
     names_of,
     original_name,
     records_of,
+    side_by_side,
 )
 from hybridlog.columns.layout import OWN_COLUMNS
 from hybridlog.schema.arrow_columns import objects_array, structs
@@ -254,7 +255,7 @@ def reduced(codec: Codec, payload: bytes) -> bytes:
         if decoded.unreadable:
             error = decoded.unreadable[0].reason
         else:
-            fields = FieldShape().columns(decoded.arrow())
+            fields = as_columns(decoded.arrow())
     if fields.nbytes > MAX_BYTES:
         fields, error = structs({}, 1), f"its fields take more than {MAX_BYTES >> 20} MiB"
     row = _row(fields, error, len(payload), sha256(payload).digest(), surplus=surplus)
@@ -295,10 +296,7 @@ def _row(
         "sha256": pa.array([digest], pa.binary()),
         "surplus": pa.array([surplus]),
     }
-    own = {"error": pa.array([error], pa.string()), "ref": structs(about, 1)}
-    columns = dict(zip([field.name for field in fields.type], fields.flatten(), strict=True))
-    kinds = [pa.field(name, array.type) for name, array in own.items()]
-    return structs(own | columns, 1, None, [*kinds, *fields.type])
+    return side_by_side({"error": pa.array([error], pa.string()), "ref": structs(about, 1)}, fields)
 
 
 _EMPTY: Final = _row(structs({}, 1), None, 0, b"")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from hybridlog_storage.cache import Cache, lazy
 from hybridlog_storage.errors import SegmentError, StoreError
@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from hybridlog.columns.rows_file import RowsFile
     from hybridlog_storage.manifest import File
     from hybridlog_storage.messages import Batch
+
+
+_RESTORE: Final = " Restore it from a copy; `hybridlog verify` shows what is affected."
 
 
 class RecordingRows:
@@ -42,17 +45,17 @@ class RecordingRows:
     def left(self, log: int, chunk: int) -> tuple[Batch, NDArray[np.int64]]:
         """The rows that remain of a chunk, and the arrival numbers of its messages."""
         from hybridlog.columns.left_rows import messages_left
-        from hybridlog.columns.rows_file import RESTORE
 
         files = self._of(log)
         readable = [file for file in files if not isinstance(file, StoreError)]
         try:
             found = [file.of_chunk(chunk) for file in readable if chunk in file.places]
         except StoreError as error:
-            raise SegmentError(f"{error}{RESTORE}") from error
+            raise SegmentError(f"{error}{_RESTORE}") from error
         if not found:
             problems = " ".join(str(file) for file in files if isinstance(file, StoreError))
-            raise SegmentError(problems or f"Rows are in no file of {self._recording}.")
+            problems = problems or f"Rows are in no file of {self._recording}."
+            raise SegmentError(f"{problems}{_RESTORE}")
         return messages_left(found)
 
     def _of(self, log: int) -> list[RowsFile | StoreError]:

@@ -11,84 +11,52 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from msgspec import Struct, field
 
 from hybridlog.arrays.point_arrays import MAX_FIELDS, POINT_MAKERS
-from hybridlog.columns.fields import joined, without
+from hybridlog.columns.fields import as_columns, joined, without
 from hybridlog.columns.layout import OWN, POINTS, column_names
 from hybridlog.columns.left_rows import LeftFields
 from hybridlog.schema.arrow_columns import lists, numbers, structs
-from hybridlog.schema.codec import no_rows, stamp_array
+from hybridlog.schema.codec import stamp_array
 from hybridlog.schema.states import State
 from hybridlog_storage.errors import PayloadError
-from hybridlog_storage.messages import EXPIRED_IDS, distinct
+from hybridlog_storage.messages import EXPIRED_IDS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable
 
     from numpy.typing import NDArray
 
-    from hybridlog.columns.fields import FieldShape
     from hybridlog.schema.codec import Decoded
     from hybridlog_storage.messages import Channel
     from hybridlog_storage.segments.chunk import Placed
 
 
-class Piece(Struct):
-    """Rows of a topic in some segments; so many are `unreadable`.
-
-    Attributes:
-        own: The columns that every table has, by name.
-        fields: A struct array, null where a message is unreadable; None without any fields.
-        surplus: Rows of messages with bytes left over behind them.
-    """
-
-    segments: set[int]
-    own: Mapping[str, Any]
-    fields: Any
-    unreadable: int = 0
-    surplus: NDArray[np.intp] = field(default_factory=no_rows)
-
-    @property
-    def rows(self) -> int:
-        """Number of messages."""
-        return len(self.own["t"])
-
-    @property
-    def size(self) -> int:
-        """Bytes in memory."""
-        arrays = [*self.own.values(), *([] if self.fields is None else [self.fields])]
-        return sum(int(array.nbytes) for array in arrays)
-
-    def fields_as(self, kind: Any) -> Any:
-        """The fields; without any, nulls of a type."""
-        return pa.nulls(self.rows, kind) if self.fields is None else self.fields
-
-
-def piece_of(
+def rows_of(
     placed: Placed,
     decoded: Decoded | None,
     state: State,
     *,
     has_publish_time: bool,
     columns: Callable[[Decoded], Any],
-) -> Piece:
+) -> tuple[dict[str, Any], Any]:
     """Rows of decoded messages of one topic and state, which readable ones have.
 
-    `columns` turns fields into columns. Without a definition nothing is decoded.
+    `columns` turns fields into columns. Without a definition nothing is decoded. First come the
+    columns that every table has, by name; then the others, a struct array that is null where a
+    message is unreadable.
     """
     batch = placed.batch
     count = len(batch)
     errors: list[str | None] = [None] * count
-    found, surplus = None, no_rows()
+    fields = pa.nulls(count, pa.struct([]))
     if decoded is not None:
-        surplus = decoded.surplus
         for bad in decoded.unreadable:
             for row in bad.rows.tolist():
                 errors[row] = bad.reason
         if len(decoded.rows):
-            found = without(columns(decoded), decoded.rows, count)
-    stamps = None if found is None else stamp_array(found)
+            fields = without(columns(decoded), decoded.rows, count)
+    stamps = stamp_array(fields)
     error = pa.array(errors, pa.string())
     states = pa.repeat(pa.scalar(str(state)), count)
     if error.null_count < count:
@@ -108,27 +76,16 @@ def piece_of(
         "channel": pa.array(batch.channel % EXPIRED_IDS),
         "state": states,
         "error": error,
-        "ref": pa.StructArray.from_arrays([*ref.values()], names=[*ref]),
+        "ref": structs(ref, count),
     }
-    unreadable = count - error.null_count
-    return Piece({*distinct(placed.segment).tolist()}, own, found, unreadable, surplus=surplus)
+    return own, fields
 
 
-def columns_from(decoded: Decoded, shape: FieldShape) -> Any:
+def columns_from(decoded: Decoded, *, arrays: bool = False) -> Any:
     """The fields of decoded messages as columns; of those without payload, what is left."""
     if isinstance(decoded.records, LeftFields):
         return decoded.records.columns
-    return shape.columns(decoded.arrow())
-
-
-def as_table(own: Mapping[str, Any], fields: Any) -> Any:
-    """Columns of rows as a table; `fields` is a struct array, or None."""
-    schema = [pa.field(name, column.type) for name, column in own.items()]
-    arrays = [*own.values()]
-    if fields is not None:
-        schema += list(fields.type)
-        arrays += fields.flatten()
-    return pa.Table.from_arrays(arrays, schema=pa.schema(schema))
+    return as_columns(decoded.arrow(), arrays=arrays)
 
 
 _CLOUDS: Final = frozenset({"sensor_msgs/PointCloud2", "sensor_msgs/msg/PointCloud2"})

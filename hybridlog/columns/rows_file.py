@@ -15,10 +15,10 @@ import pyarrow as pa
 from msgspec import Struct, field
 
 from hybridlog.columns.column_file import ColumnFile, ColumnFileWriter
-from hybridlog.columns.fields import FieldShape
+from hybridlog.columns.fields import side_by_side
 from hybridlog.columns.layout import Section
 from hybridlog.columns.left_rows import digest_in, with_rows
-from hybridlog.columns.rows import as_table, columns_from, piece_of
+from hybridlog.columns.rows import columns_from, rows_of
 from hybridlog.index.indexing import ChunkIndexer
 from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.codecs import LeftCodec
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.messages import Channel
     from hybridlog_storage.segments.chunk import StoredChunk
 
-RESTORE: Final = " Restore it from a copy; `hybridlog verify` shows what is affected."
 _GROUP_BYTES: Final = 4 << 20  # of a row group in memory
 _LEVEL: Final = 3  # of zstd: 9 takes 1 to 5 % less, for much more time
 _MAX_OPEN = 8  # files of different columns: each row group of them waits in memory
@@ -48,13 +47,10 @@ class RowsFile(ColumnFile):
 
     def __init__(self, folder: Path, listed: File, cache: Cache | None = None) -> None:
         self._listed = listed
-        path = folder / listed.name
         try:
-            super().__init__(path, cache)
+            super().__init__(folder / listed.name, cache)
         except FileNotFoundError as error:
-            raise StoreError(f"The file of rows {path} is missing.{RESTORE}") from error
-        except StoreError as error:
-            raise StoreError(f"{error}{RESTORE}") from error
+            raise StoreError(f"The file of rows {folder / listed.name} is missing.") from error
         rows = sum(part.messages for part in listed.parts.values())
         if (self.size_bytes, self.rows) != (listed.bytes, rows):
             raise self._other()
@@ -67,9 +63,7 @@ class RowsFile(ColumnFile):
         return digest
 
     def _other(self) -> StoreError:
-        return StoreError(
-            f"The file of rows {self.path} is not the one that the manifest lists.{RESTORE}"
-        )
+        return StoreError(f"The file of rows {self.path} is not the one that the manifest lists.")
 
     @lazy
     def places(self) -> dict[int, tuple[int, int, int]]:
@@ -145,7 +139,6 @@ class RowsWriter:
         self._front = front
         self._version = version
         self._indexer = ChunkIndexer(folder.name)
-        self._shape = FieldShape()
         self._open: dict[tuple[str, pa.Schema], _OpenFile] = {}  # by topic and columns
         self.names: list[str] = []
         """Names of the files, the first one first."""
@@ -153,7 +146,7 @@ class RowsWriter:
     def add(self, chunk: StoredChunk) -> None:
         """Add the messages of a chunk."""
         for messages in self._indexer.messages_in([chunk], self._channels):
-            table = _table(messages, self._shape)
+            table = _table(messages)
             self._file(messages.channel.topic, table.schema).tables.append(table)
         for file in self._open.values():  # between chunks: none is in two row groups
             if sum(one.nbytes for one in file.tables) >= _GROUP_BYTES:
@@ -186,34 +179,35 @@ class RowsWriter:
         if file.tables:
             file.flush()
         digests = {str(self._log.number): self._log.digest}
-        section = Section(self._folder.name, file.topic, 0, digests, file.writer.rows)
+        section = Section(self._folder.name, file.topic, digests, file.writer.rows)
         file.writer.close([section], sync=True)
 
 
-def _table(messages: Messages, shape: FieldShape) -> pa.Table:
+def _table(messages: Messages) -> pa.Table:
     """Rows of messages of one type in a chunk."""
-    state, batch = State.EXPIRED, messages.placed.batch
+    state, batch, decoded = State.EXPIRED, messages.placed.batch, messages.decoded
     if isinstance(messages.codec, LeftCodec):
         state, batch = State.REDUCED, with_rows(batch)
-    piece = piece_of(
+    own, fields = rows_of(
         messages.placed,
-        messages.decoded,
+        decoded,
         state,
         has_publish_time=True,  # channels that have none repeat log times
-        columns=lambda decoded: columns_from(decoded, shape),
+        columns=columns_from,
     )
-    surplus = np.zeros(piece.rows, np.bool_)
-    surplus[piece.surplus] = True
+    surplus = np.zeros(len(batch), np.bool_)
+    if decoded is not None:
+        surplus[decoded.surplus] = True
     if (left := batch.left) is None:
         about = [(len(p), sha256(p).digest()) for p in map(batch.payload, range(len(batch)))]
     else:
         about = [digest_in(left, row) for row in range(len(batch))]
-    ref = piece.own["ref"]
     more = {
-        **dict(zip([field.name for field in ref.type], ref.flatten(), strict=True)),
         "sequence": pa.array(batch.sequence),
         "size": pa.array([size for size, _ in about], pa.uint64()),
         "sha256": pa.array([digest for _, digest in about], pa.binary()),
         "surplus": pa.array(surplus),
     }
-    return as_table({**piece.own, "ref": structs(more, piece.rows)}, piece.fields)
+    ref = dict(zip(own["ref"].type.names, own["ref"].flatten(), strict=True))
+    own["ref"] = structs(ref | more, len(batch))
+    return pa.Table.from_struct_array(side_by_side(own, fields))

@@ -19,10 +19,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import pyarrow as pa
+import pyarrow.compute as pc
 from msgspec.structs import replace
 
 from hybridlog.columns.column_file import ColumnFileWriter
-from hybridlog.columns.fields import FieldShape, copied, joined
+from hybridlog.columns.fields import copied, joined, side_by_side
 from hybridlog.columns.folders import Addition, TableFolders
 from hybridlog.columns.layout import (
     SUFFIX,
@@ -33,13 +34,13 @@ from hybridlog.columns.layout import (
     type_prefix,
 )
 from hybridlog.columns.left_rows import LeftFields
-from hybridlog.columns.rows import Piece, PointColumns, as_table, columns_from, is_cloud, piece_of
+from hybridlog.columns.rows import PointColumns, columns_from, is_cloud, rows_of
 from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.codec import no_messages
 from hybridlog.schema.codecs import codec_for
-from hybridlog.schema.states import encoding_of, state_of
+from hybridlog.schema.states import State, encoding_of, state_of
 from hybridlog_storage.disk import files
-from hybridlog_storage.messages import order_of
+from hybridlog_storage.messages import EXPIRED_IDS, distinct, order_of
 from hybridlog_storage.settings import read_settings
 
 if TYPE_CHECKING:
@@ -60,7 +61,6 @@ LONG_ROWS = 10_000
 LONG_BYTES = 1 << 20
 """Bytes of rows in memory from which a topic has files of its own."""
 _RESERVE = 256 << 20  # bytes of the disk reserved for segments
-_OPEN_FILES = 128  # maximum number of unfinished files
 _log = logging.getLogger(__name__)
 
 # Loads pandas, if it is installed: amid a recording, that would hold up all threads for a while.
@@ -70,22 +70,22 @@ pa.array([0]).to_numpy(zero_copy_only=False)
 class _Topic:
     """Messages of one topic and definition."""
 
-    def __init__(self, recording: str, channel: Channel, *, arrays: bool = False) -> None:
-        self.recording = recording
+    def __init__(self, recording: str, channel: Channel, *, arrays: bool) -> None:
+        self._names = {"recording": recording, "topic": channel.topic}
         self.name = channel.topic
         self.type = channel.schema.name if channel.schema is not None else ""
         self.has_arrays = arrays
         encoding = encoding_of(channel.message_encoding, channel.metadata)
         whole = replace(channel, message_encoding=encoding)
-        self.shape = FieldShape(arrays=arrays)
-        self.points = PointColumns() if arrays and is_cloud(whole) else None
+        self._points = PointColumns() if arrays and is_cloud(whole) else None
         codec = codec_for(whole)
         decoded = codec.columns_of(no_messages()) if codec.indexed else None
-        self.none = structs({}, 0) if decoded is None else self.shape.columns(decoded.arrow())
-        """No fields, with the columns that the definition fixes."""
+        # No rows, with the columns that the definition fixes.
+        self._none = structs({}, 0) if decoded is None else columns_from(decoded, arrays=arrays)
         self.rows = 0
-        self.pieces: list[Piece] = []
-        """Rows in memory."""
+        self.waiting: list[Any] = []
+        """Rows in memory, with all columns but those of `_names`."""
+        self._segments: set[int] = set()  # of these
         self.files: list[_File] = []
         """Unfinished files, with rows of segments that are not closed yet."""
         self.finished: list[tuple[str, Path]] = []
@@ -95,96 +95,98 @@ class _Topic:
     @property
     def size(self) -> int:
         """Bytes of the rows in memory."""
-        return sum(piece.size for piece in self.pieces)
+        return sum(rows.nbytes for rows in self.waiting)
 
     @property
     def is_long(self) -> bool:
         """True if the rows in memory have a file of their own."""
-        return sum(one.rows for one in self.pieces) >= LONG_ROWS or self.size >= LONG_BYTES
+        return sum(map(len, self.waiting)) >= LONG_ROWS or self.size >= LONG_BYTES
 
-    def add(self, piece: Piece) -> None:
-        """Add rows."""
-        self.pieces.append(piece)
-        self.rows += piece.rows
-        if len(self.pieces) >= _PIECES:
-            self.pieces = [self._joined()]
-
-    def take(self) -> tuple[Piece, pa.Table]:
-        """Remove and return the rows in memory, of which there are some, also as a table.
-
-        That is in the order of log time and arrival.
-        """
-        piece, self.pieces = self._joined(), []
-        names = {"recording": self.recording, "topic": self.name}
-        columns = {name: pa.repeat(pa.scalar(value), piece.rows) for name, value in names.items()}
-        table = as_table({**columns, **piece.own}, piece.fields)
-        order = order_of(piece.own["t"].to_numpy(), piece.own["seq"].to_numpy())
-        return piece, table if order is None else table.take(pa.array(order))
-
-    def _joined(self) -> Piece:
-        pieces = self.pieces
-        fields = joined([self.none, *(piece.fields_as(self.none.type) for piece in pieces)])
-        own = {
-            name: pa.concat_arrays([piece.own[name] for piece in pieces]) for name in pieces[0].own
-        }
-        return Piece(
-            set[int]().union(*(piece.segments for piece in pieces)),
-            own,
-            fields,
-            sum(piece.unreadable for piece in pieces),
+    def add(self, messages: Messages) -> None:
+        """Make rows of messages."""
+        own, fields = rows_of(
+            messages.placed,
+            messages.decoded,
+            state_of(messages.channel.message_encoding),
+            has_publish_time=messages.channel.has_publish_time,
+            columns=self._columns,
         )
+        self.waiting.append(side_by_side(own, fields))
+        self._segments.update(distinct(messages.placed.segment).tolist())
+        self.rows += len(fields)
+        if len(self.waiting) >= _PIECES:
+            self.waiting = [joined(self.waiting)]
+
+    def take(self) -> tuple[set[int], pa.Table]:
+        """Remove the rows in memory, of which there are some; returns their segments, and them.
+
+        They are in the order of log time and arrival.
+        """
+        rows, segments = joined([*self.waiting, self._none]), self._segments
+        self.waiting, self._segments = [], set()
+        named = {
+            name: pa.repeat(pa.scalar(value), len(rows)) for name, value in self._names.items()
+        }
+        table = pa.Table.from_struct_array(side_by_side(named, rows))
+        order = order_of(table["t"].to_numpy(), table["seq"].to_numpy())
+        return segments, table if order is None else table.take(pa.array(order))
 
     def give_up(self) -> None:
         """Make no table of the topic."""
         self.has_failed, self.rows = True, 0
-        self.pieces.clear()
+        self.waiting.clear()
         self.finished.clear()
         for file in self.files:
             file.discard()
         self.files.clear()
 
-    def columns(self, decoded: Decoded) -> Any:
-        """The fields of decoded messages as columns."""
-        columns = columns_from(decoded, self.shape)
-        if self.points is not None and not isinstance(decoded.records, LeftFields):
-            columns = self.points.with_points(columns, decoded.arrow())
+    def _columns(self, decoded: Decoded) -> Any:
+        columns = columns_from(decoded, arrays=self.has_arrays)
+        if self._points is not None and not isinstance(decoded.records, LeftFields):
+            columns = self._points.with_points(columns, decoded.arrow())
         return copied(columns)
 
 
+def _unreadable_in(table: pa.Table) -> int:
+    """Number of rows without fields."""
+    return pc.sum(pc.equal(table["state"], State.UNREADABLE.value)).as_py() or 0
+
+
 class _File(ColumnFileWriter):
-    """An unfinished file of one topic; it counts what a piece counts."""
+    """An unfinished file of one topic."""
 
     def __init__(self, path: Path, schema: pa.Schema) -> None:
         super().__init__(path, schema)
         self.segments: set[int] = set()
         self.unreadable = 0
 
-    def add(self, piece: Piece, table: pa.Table) -> None:
-        """Write rows as row groups."""
+    def add(self, segments: set[int], table: pa.Table) -> None:
+        """Write rows of some segments as row groups."""
         rows = max(table.num_rows, 1)
         step = max(min(GROUP_ROWS, rows * GROUP_BYTES // max(table.nbytes, 1)), 1)
         for begin in range(0, table.num_rows, step):
             self.write(table.slice(begin, step))
-        self.segments |= piece.segments
-        self.unreadable += piece.unreadable
+        self.segments |= segments
+        self.unreadable += _unreadable_in(table)
 
 
 class TableWriter:
     """Writes the tables of one recording, which this process has locked for writing.
 
-    Those of the topics that the store's settings name have arrays in full. Without `topics`, all
-    have tables, and there are none yet.
+    Those of the topics that the store's settings name have arrays in full, unless payloads have
+    expired. Without `topics`, all have tables, and there are none yet.
     """
 
     def __init__(
-        self, root: Path, recording: str, name: str, topics: Collection[str] | None = None
+        self, root: Path, entry: RecordingEntry, topics: Collection[str] | None = None
     ) -> None:
         self._root = root
-        self._recording = recording
-        self._name = name
+        self._recording = entry.id
+        self._name = entry.name
         self._wanted = topics
-        self._arrays = frozenset(read_settings(root).arrays)
-        self._parts = parts_folder(root, recording)
+        expired = {channel.topic for channel in entry.channels if channel.id >= EXPIRED_IDS}
+        self._arrays = {*read_settings(root).arrays} - expired
+        self._parts = parts_folder(root, entry.id)
         self._numbers = 0
         self._has_ended = False
         self.problem = ""  # why no table was written
@@ -198,13 +200,13 @@ class TableWriter:
         with self._harmless():
             for one in messages:
                 if self._wanted is None or one.channel.topic in self._wanted:
-                    self._add(one)
+                    topic = self._topic(one.channel)
+                    with self._only(topic):
+                        topic.add(one)
             self._spill()
 
     def cut(self, segment: int, digest: str) -> None:
         """Finish the files of a segment; topics with few rows wait for the next one."""
-        if self._has_ended:
-            return
         with self._harmless():
             self._cut[segment] = digest
             for topic in self._topics.values():
@@ -215,9 +217,8 @@ class TableWriter:
 
     def close(self, entry: RecordingEntry) -> None:
         """Finish all tables; topics with another number of messages keep an older one."""
-        if not self._has_ended:
-            with self._harmless():
-                self._close(entry)
+        with self._harmless():
+            self._close(entry)
         self.discard()
 
     def discard(self) -> None:
@@ -239,26 +240,12 @@ class TableWriter:
             _log.warning("No tables of recording %s were written: %s", self._name, self.problem)
             self.discard()
 
-    def _add(self, messages: Messages) -> None:
-        """Make rows of messages."""
-        channel = messages.channel
+    def _topic(self, channel: Channel) -> _Topic:
         key = channel.topic, table_schema_of(channel)
-        topic = self._topics.get(key)
-        if topic is None:
+        if key not in self._topics:
             arrays = channel.topic in self._arrays
-            topic = self._topics[key] = _Topic(self._recording, channel, arrays=arrays)
-        if topic.has_failed:
-            return
-        with self._only(topic):
-            state = state_of(channel.message_encoding)
-            found = piece_of(
-                messages.placed,
-                messages.decoded,
-                state,
-                has_publish_time=channel.has_publish_time,
-                columns=topic.columns,
-            )
-            topic.add(found)
+            self._topics[key] = _Topic(self._recording, channel, arrays=arrays)
+        return self._topics[key]
 
     @contextmanager
     def _only(self, topic: _Topic) -> Iterator[None]:
@@ -282,23 +269,19 @@ class TableWriter:
             if left <= _LEFT:
                 return
             left -= topic.size
-            opened = sum(len(topic.files) for topic in self._topics.values())
-            if opened >= _OPEN_FILES and not topic.files:
-                topic.give_up()
-                continue
             with self._only(topic):
                 self._write(topic)
 
     def _write(self, topic: _Topic) -> None:
         """Write rows to an unfinished file of a topic."""
-        if topic.pieces:
+        if topic.waiting:
             self._check_room()
-            piece, table = topic.take()
+            segments, table = topic.take()
             file = next((one for one in topic.files if one.schema == table.schema), None)
             if file is None:
                 file = _File(self._new_part(), table.schema)
                 topic.files.append(file)
-            file.add(piece, table)
+            file.add(segments, table)
 
     def _new_part(self) -> Path:
         if not self._numbers:
@@ -316,22 +299,21 @@ class TableWriter:
         """Finish a topic's files of closed segments."""
         for file in [one for one in topic.files if one.segments <= self._cut.keys()]:
             topic.files.remove(file)
-            file.close([self._section(topic, file)])
+            file.close([self._section(topic, file.segments, file.rows, file.unreadable)])
             folder = shape_folder(topic.type, file.schema)
             place = self._parts / folder / file.path.name
             files.make_folders(place.parent)
             files.rename(file.path, place)
             topic.finished.append((folder, place))
 
-    def _section(self, topic: _Topic, found: Piece | _File, begin: int = 0) -> Section:
+    def _section(self, topic: _Topic, segments: set[int], rows: int, unreadable: int) -> Section:
         """The description of rows in their file."""
-        digests = {str(number): self._cut[number] for number in sorted(found.segments)}
-        counts = found.rows, found.unreadable, topic.has_arrays
-        return Section(self._recording, topic.name, begin, digests, *counts)
+        digests = {str(number): self._cut[number] for number in sorted(segments)}
+        counts = rows, unreadable, topic.has_arrays
+        return Section(self._recording, topic.name, digests, *counts)
 
     def _close(self, entry: RecordingEntry) -> None:
         incomplete = self._incomplete(entry)
-        begin = min((first for _, first, _ in entry.spans), default=entry.created)
         additions = defaultdict[str, Addition](Addition)
         for topic in sorted(self._topics.values(), key=lambda topic: topic.name):
             if topic.name in incomplete:
@@ -340,9 +322,10 @@ class TableWriter:
                 if topic.is_long:
                     self._write(topic)
                     self._finish(topic)
-                elif topic.pieces:
-                    piece, table = topic.take()
-                    rows = self._section(topic, piece, begin), table
+                elif topic.waiting:
+                    segments, table = topic.take()
+                    counts = table.num_rows, _unreadable_in(table)
+                    rows = self._section(topic, segments, *counts), table
                     additions[shape_folder(topic.type, table.schema)].pieces.append(rows)
             for folder, path in topic.finished:
                 additions[folder].files.append(path)

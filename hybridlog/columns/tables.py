@@ -13,7 +13,7 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections import OrderedDict, defaultdict
+from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
@@ -56,9 +56,6 @@ if TYPE_CHECKING:
     from hybridlog.columns.column_file import Leaf, TablePart
     from hybridlog.query.intervals import Span
     from hybridlog_storage.catalog import ChannelEntry, RecordingEntry
-
-
-_MAX_TYPES: Final = 64  # sets of fields whose types are kept for a table
 
 
 class TableRows(Struct, frozen=True, eq=False):
@@ -105,23 +102,18 @@ class TableRows(Struct, frozen=True, eq=False):
 
 
 class TopicTable:
-    """All messages of a topic in the `segments` of a recording that it covers, by number.
-
-    If it `hides_arrays`, only summaries of arrays are in answers: their payloads have expired.
-    """
+    """All messages of a topic in the `segments` of a recording that it covers, by number."""
 
     def __init__(
         self,
         parts: Sequence[TablePart],
         *,
         unreadable: int = 0,
-        hides_arrays: bool = False,
         segments: Iterable[int] = (),
     ) -> None:
         self.segments = frozenset(segments)
         self.rows = sum(part.rows for part in parts)
         self.unreadable = unreadable
-        self.hides_arrays = hides_arrays
         self.files = list({part.file.number: part.file for part in parts}.values())
         self._parts = parts
         self._types: dict[frozenset[str] | None, Any] = {}
@@ -134,8 +126,6 @@ class TopicTable:
         """
         key = None if paths is None else frozenset(paths)
         if key not in self._types:
-            if len(self._types) >= _MAX_TYPES:
-                self._types.clear()
             self._types[key] = self._find_type(paths)
         return self._types[key]
 
@@ -153,7 +143,7 @@ class TopicTable:
     @property
     def points(self) -> Any:
         """Type of the column of points that all rows have; None without."""
-        if self.hides_arrays or any(POINTS not in file.own for file in self.files):
+        if any(POINTS not in file.own for file in self.files):
             return None
         return joined([pa.nulls(0, file.schema.field(POINTS).type) for file in self.files]).type
 
@@ -270,7 +260,7 @@ class TopicTable:
     def _is_summarised(self, array: tuple[str, ...]) -> bool:
         """True if an array may be a summary in some row."""
         if array not in self._summarised:
-            self._summarised[array] = self.hides_arrays or any(
+            self._summarised[array] = any(
                 part.file.summarises(part.group, array) for part in self._parts
             )
         return self._summarised[array]
@@ -336,8 +326,7 @@ class _Listing:
         except OSError as error:
             raise unreadable(error, self._path) from error
         # A change within the same tick of the clock would have the same time.
-        is_stable = time.time_ns() - now[1] > _STABLE_NS
-        self._read_at = now if is_stable else None
+        self._read_at = now if time.time_ns() - now[1] > _STABLE_NS else None
         return True
 
 
@@ -383,15 +372,12 @@ class _Folder(_Listing):
         status = self.names.get(name)
         if name in self._files or status is None:
             return self._files[name][1] if status is not None else None
-        file: ColumnFile | None = None
-        for _ in range(2):  # of an object in a bucket, the first look tells that it has gone
-            try:
-                file = ColumnFile(self._path / name, self._cache)
-            except FileNotFoundError:
-                return None
-            except StoreError:
-                continue
-            break
+        try:
+            file: ColumnFile | None = ColumnFile(self._path / name, self._cache)
+        except FileNotFoundError:
+            return None
+        except StoreError:
+            file = None
         self._add(name, _identity(status), file)
         return file
 
@@ -437,10 +423,10 @@ class Tables:
     def __init__(self, root: Path, cache: Cache | None = None) -> None:
         self._root = root
         self._cache = cache or Cache()
-        self._found: OrderedDict[tuple[str, str], TopicTable | None] = OrderedDict()
+        self._found: dict[tuple[str, str], TopicTable | None] = {}
         self._folders = _Folders(root / TABLES, self._cache)
         self._looked_at: set[str] = set()  # types whose folders were looked at
-        self._sealed: OrderedDict[str, _Folders] = OrderedDict()
+        self._sealed: dict[str, _Folders] = {}  # of recordings in progress
         self._channels: tuple[RecordingEntry, dict[str, list[ChannelEntry]]] | None = None
         self._lock = threading.RLock()
 
@@ -449,12 +435,9 @@ class Tables:
         key = recording.id, topic
         with self._lock:
             if key not in self._found:
-                found = None
-                with suppress(FileNotFoundError, StoreError):
-                    found = self.check(recording, topic)
-                self._found[key] = found
-                if len(self._found) > _MAX_FOUND:
-                    self._found.popitem(last=False)
+                if len(self._found) >= _MAX_FOUND:
+                    self._found.clear()
+                self._found[key] = self._find(recording, topic)
             return self._found[key]
 
     def look_again(self) -> None:
@@ -474,27 +457,21 @@ class Tables:
         parts = [TablePart(file, group, 0, rows) for group, rows in enumerate(file.groups)]
         return TopicTable(parts, unreadable=unreadable)
 
-    def check(self, recording: RecordingEntry, topic: str) -> TopicTable:
-        """The table of a topic in a recording; FileNotFoundError if these segments have none."""
-        if recording.status == "open" or not self.can_have(recording, topic):
-            raise FileNotFoundError
-        with self._lock:
-            rows = self._look(recording, [topic])[topic]
-            folders = self._folders.of(self._types_of(recording, topic))
-            damaged = [path for folder in folders for path in folder.damaged]
-        table = self._table(recording, topic, rows)
-        if table is None:
-            if damaged:
-                raise StoreError(f"The table {damaged[0]} is damaged.")
-            raise FileNotFoundError
-        messages = self._messages_of(recording, topic)
-        if table.rows != messages:
-            raise StoreError(
-                f"The tables of {topic} have {table.rows} messages, the segments {messages}."
-            )
-        return table
+    def damaged(self, recording: RecordingEntry, topic: str) -> list[str]:
+        """Files that may have rows of a topic, which were looked at and cannot be read."""
+        folders = self._folders.of(self._types_of(recording, topic))
+        return [path for folder in folders for path in folder.damaged]
 
-    def can_have(self, recording: RecordingEntry, topic: str) -> bool:
+    def _find(self, recording: RecordingEntry, topic: str) -> TopicTable | None:
+        if recording.status == "open" or not self._can_have(recording, topic):
+            return None
+        with suppress(StoreError):
+            table = self._table(recording, topic, self._look(recording, [topic])[topic])
+            if table is not None and table.rows == self._messages_of(recording, topic):
+                return table
+        return None
+
+    def _can_have(self, recording: RecordingEntry, topic: str) -> bool:
         """True if a topic has a table when all is well: only with one definition."""
         found = {
             (encoding_of(channel.message_encoding, channel.metadata), channel.schema)
@@ -528,13 +505,13 @@ class Tables:
 
         `messages` counts those of the topic by segment.
         """
-        if not self.can_have(recording, topic):
+        if not self._can_have(recording, topic):
             return None
         with self._lock:
             place = _Folders(parts_folder(self._root, recording.id), self._cache)
             place = self._sealed.setdefault(recording.id, place)
             if len(self._sealed) > _MAX_RUNNING:
-                self._sealed.popitem(last=False)
+                del self._sealed[next(iter(self._sealed))]
             rows = self._look(recording, [topic], place)[topic]
         try:
             table = self._table(recording, topic, rows)
@@ -585,11 +562,12 @@ class Tables:
         """The table of a topic from some files; None without rows of it, or with stale ones."""
         if not found or not all(rows.is_of(recording) for rows in found):
             return None
-        is_expired = any(one.id >= EXPIRED_IDS for one in self._channels_of(recording, topic))
+        has_arrays = any(one.section.arrays for one in found)
+        if has_arrays and any(c.id >= EXPIRED_IDS for c in self._channels_of(recording, topic)):
+            return None  # its arrays have expired with their payloads
         table = TopicTable(
             [part for one in found for part in one.file.parts(one.begin, one.section.rows)],
             unreadable=sum(one.section.unreadable for one in found),
-            hides_arrays=is_expired and any(one.section.arrays for one in found),
             segments=(int(number) for one in found for number in one.section.segments),
         )
         if len(table.files) > 1:

@@ -122,7 +122,7 @@ class Follower:
         self._gap: DatabaseError | None = None  # why the index has missed something
         from hybridlog.columns.table_writer import TableWriter  # loads pyarrow
 
-        self._tables = TableWriter(self._directory.path, entry.id, entry.name, topics)
+        self._tables = TableWriter(self._directory.path, entry, topics)
         self._damage = self._catalog.damage(entry.id)
         self._segments: dict[int, _Segment] = {}
         self._ended: set[int] = set()
@@ -184,7 +184,7 @@ class Follower:
                     done += self._read_sealed(number, file_of(entry, number), digest, report)
             if self._sender is not None and self._gap is None:
                 self._sender.ended.update(entry.digests)  # also of segments without messages
-            self._send(wait=True)
+            self._send()
             if self._damage != self._catalog.damage(entry.id):
                 self._catalog.put_damage(entry.id, self._damage)
             entry = put_entry(self._directory, self._catalog, entry.id)
@@ -328,10 +328,10 @@ class Follower:
             self.failure = None
             self._sender = Sender(self._entry.key, database)
 
-    def _send(self, *, wait: bool = False) -> None:
+    def _send(self) -> None:
         if self._sender is not None:
             with self._noting_failure():
-                self._sender.send(wait=wait)
+                self._sender.send()
 
     @contextmanager
     def _noting_failure(self) -> Iterator[None]:
@@ -346,9 +346,7 @@ class Follower:
             self._retry_at = time.monotonic() + _RETRY_S
 
     def _stop_sending(self) -> None:
-        if self._sender is not None:
-            self._sender.close()
-            self._indexed, self._sender = self.indexed, None
+        self._indexed, self._sender = self.indexed, None
 
 
 def make_rows_ahead(

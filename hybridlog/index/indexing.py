@@ -22,11 +22,9 @@ from hybridlog_storage.catalog import ChannelStats
 from hybridlog_storage.messages import EXPIRED_IDS, Channel, run_starts
 from hybridlog_storage.mongo.index_documents import DocumentAssembler, IndexState, collection_of
 from hybridlog_storage.segments.chunk import Placed, StoredChunk
-from hybridlog_storage.threads import Threads
 
 if TYPE_CHECKING:
     from collections.abc import Hashable
-    from concurrent.futures import Future
 
     import numpy as np
     from numpy.typing import NDArray
@@ -85,28 +83,31 @@ class ChunkIndexer:
         Returns uint8[k, width] each, a whole BSON document a row; none without `has_documents`.
         """
         channel, placed = messages.channel, messages.placed
-        batch, found = placed.batch, _Results(len(placed.batch))
+        batch, found = placed.batch, messages.decoded
+        unreadable, surplus = np.zeros((2, len(batch)), np.bool_)
         tables = []
         if has_documents and channel.is_indexed:
             key = channel.topic, channel.has_publish_time
             if key not in self._assemblers:
                 self._assemblers[key] = DocumentAssembler(self._key, channel)
-            for group in bodies_in(messages.decoded, len(batch)):
-                found.unreadable[group.rows] = group.error is not None
+            for group in bodies_in(found, len(batch)):
+                unreadable[group.rows] = group.error is not None
                 made = self._assemblers[key].assemble(placed, group.rows, group.body, group.error)
                 tables.append(made)
-        elif messages.decoded is not None:
-            for bad in messages.decoded.unreadable:
-                found.unreadable[bad.rows] = True
+        elif found is not None:
+            for bad in found.unreadable:
+                unreadable[bad.rows] = True
             large = np.flatnonzero(placed.length > _LARGE)
             for group in bodies_in(messages.codec.columns_of(batch.take(large)), len(large)):
-                found.unreadable[large[group.rows]] = group.error is not None
-        if messages.decoded is not None:
-            found.surplus[messages.decoded.surplus] = True
-            found.add_stamps(messages)
+                unreadable[large[group.rows]] = group.error is not None
+        if found is not None:
+            surplus[found.surplus] = True
+        stamped, stamps = _stamps_of(messages)
         for number, rows in rows_by_channel(batch.channel):
-            known = decoded.setdefault(number % EXPIRED_IDS, ChannelStats())
-            known.add(found.stats(batch.log_time, rows))
+            own = rows[stamped[rows]]
+            stats = stamp_stats(batch.log_time[own], stamps[own])
+            stats.unreadable, stats.surplus = int(unreadable[rows].sum()), int(surplus[rows].sum())
+            decoded.setdefault(number % EXPIRED_IDS, ChannelStats()).add(stats)
         return tables
 
 
@@ -130,53 +131,38 @@ def rows_by_channel(channel: NDArray[np.int32]) -> Iterator[tuple[int, NDArray[n
         yield int(ids[start]), order[start:end]
 
 
-class _Results:
-    """Results of decoding so many messages.
+def _stamps_of(messages: Messages) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """Which of n messages have a header stamp, bool[n], and the stamps, int64[n]."""
+    decoded, batch = messages.decoded, messages.placed.batch
+    stamped, stamps = np.zeros(len(batch), np.bool_), np.zeros(len(batch), np.int64)
+    if decoded is None:
+        return stamped, stamps
+    rows, found = decoded.rows, None
+    if isinstance(decoded.records, Records):
+        found = header_stamps(decoded.records)
+    elif any(one.path == STAMP and one.type == "time" for one in messages.codec.paths()):
+        rows, found = stamps_of(messages.codec, batch)
+    if found is not None:
+        stamped[rows], stamps[rows] = True, found
+    return stamped, stamps
 
-    Attributes:
-        unreadable: bool[n], messages that cannot be read.
-        surplus: bool[n], those with bytes left over.
-        stamped: bool[n], those with a header stamp, which may be zero: not set.
-        stamps: int64[n], the stamps.
+
+def stamp_stats(log_time: NDArray[np.int64], stamps: NDArray[np.int64]) -> ChannelStats:
+    """Statistics of messages with a header stamp, which may be zero: not set.
+
+    The sum of skews is exact.
     """
-
-    def __init__(self, messages: int) -> None:
-        self.unreadable, self.surplus, self.stamped = np.zeros((3, messages), np.bool_)
-        self.stamps = np.zeros(messages, np.int64)
-
-    def add_stamps(self, messages: Messages) -> None:
-        """Add header stamps, also of messages of which no more can be read."""
-        decoded, batch = messages.decoded, messages.placed.batch
-        assert decoded is not None
-        if isinstance(decoded.records, Records):
-            stamps = header_stamps(decoded.records)
-            if stamps is not None:
-                self.stamped[decoded.rows] = True
-                self.stamps[decoded.rows] = stamps
-        if any(one.path == STAMP and one.type == "time" for one in messages.codec.paths()):
-            left = np.flatnonzero(~self.stamped)
-            if len(left):
-                own, values = stamps_of(messages.codec, batch.take(left))
-                self.stamped[left[own]] = True
-                self.stamps[left[own]] = values
-
-    def stats(self, log_time: NDArray[np.int64], rows: NDArray[np.intp]) -> ChannelStats:
-        """The results of some messages as statistics; the sum of skews is exact."""
-        stamped = rows[self.stamped[rows]]
-        stamps = self.stamps[stamped]
-        known = stamps[stamps != 0]
-        skew = (log_time[stamped] - stamps)[stamps != 0]
-        found = ChannelStats(
-            unreadable=int(self.unreadable[rows].sum()),
-            surplus=int(self.surplus[rows].sum()),
-            stamped=len(stamps),
-            unset=len(stamps) - len(skew),
-            skew_sum=(int((skew >> 32).sum()) << 32) + int((skew & 0xFFFF_FFFF).sum()),
-        )
-        if len(skew):
-            found.first_stamp, found.last_stamp = int(known.min()), int(known.max())
-            found.skew_min, found.skew_max = int(skew.min()), int(skew.max())
-        return found
+    known = stamps[stamps != 0]
+    skew = log_time[stamps != 0] - known
+    found = ChannelStats(
+        stamped=len(stamps),
+        unset=len(stamps) - len(skew),
+        skew_sum=(int((skew >> 32).sum()) << 32) + int((skew & 0xFFFF_FFFF).sum()),
+    )
+    if len(skew):
+        found.first_stamp, found.last_stamp = int(known.min()), int(known.max())
+        found.skew_min, found.skew_max = int(skew.min()), int(skew.max())
+    return found
 
 
 _SEND_BYTES: Final = 8 << 20  # documents that are sent together, at most
@@ -208,7 +194,7 @@ class IndexTarget(Struct, frozen=True):
 
 
 class Sender:
-    """Sends documents to the index on a thread of its own, while more are made.
+    """Sends documents to the index.
 
     Attributes:
         database: The index.
@@ -221,8 +207,6 @@ class Sender:
         self.messages = 0
         self._key = key
         self._collections: set[str] = set()  # that exist
-        self._thread = Threads(1, "hybridlog-send")
-        self._sending: Future[None] | None = None
         self._begin()
 
     def _begin(self) -> None:
@@ -231,11 +215,7 @@ class Sender:
         self.ended: dict[str, str] = {}
 
     def add(self, documents: Iterable[tuple[str, NDArray[np.uint8]]], messages: int) -> None:
-        """Add the documents of some messages, in tables of their topics.
-
-        Raises:
-            HybridlogError: An earlier sending has failed.
-        """
+        """Add the documents of some messages, in tables of their topics; errors as of `send`."""
         for topic, table in documents:
             self._documents[topic].append(table)
             self._size += table.size
@@ -243,39 +223,18 @@ class Sender:
         if self._size >= _SEND_BYTES:
             self.send()
 
-    def send(self, *, wait: bool = False) -> None:
-        """Send what was added; `wait` until the index has it.
-
-        Raises:
-            HybridlogError: This sending has failed, or an earlier one.
-        """
-        if self._sending is not None:
-            self._sending.result()
-        sent = self._documents, self._added, self.ended
-        self._begin()
-        self._sending = self._thread.submit(self._send, *sent)
-        if wait:
-            self._sending.result()
-
-    def close(self) -> None:
-        """Stop sending."""
-        self._thread.shutdown(wait=True, cancel_futures=True)
-
-    def _send(
-        self,
-        documents: Mapping[str, list[NDArray[np.uint8]]],
-        messages: int,
-        segments: Mapping[str, str],
-    ) -> None:
-        if documents and not self._collections:
+    def send(self) -> None:
+        """Send what was added; HybridlogError if MongoDB fails."""
+        if self._documents and not self._collections:
             # One command, where creating each would be one for each topic.
             self._collections.update(self.database.list_collections())
-        for topic, tables in documents.items():
+        for topic, tables in self._documents.items():
             name = collection_of(topic)
             if name not in self._collections:
                 self.database.ensure_collection(name)
                 self._collections.add(name)
             self.database.insert_raw(name, [row.tobytes() for table in tables for row in table])
-        if segments:
-            IndexState(self.database).put_segments(self._key, segments)
-        self.messages += messages
+        if self.ended:
+            IndexState(self.database).put_segments(self._key, self.ended)
+        self.messages += self._added
+        self._begin()

@@ -40,15 +40,14 @@ class TableChecker:
         """Problems of the existing tables, by topic. Reads every byte of them."""
         found: dict[str, str] = {}
         for topic in sorted(topics_of(entry)):
-            try:
-                problems = map(self._problem, self.tables.check(entry, topic).files)
-                problem = next(filter(None, problems), "")
-            except FileNotFoundError:
-                continue  # a missing table is no problem
-            except StoreError as error:
-                problem = str(error)
-            if problem:
-                found[topic] = problem
+            table = self.tables.of(entry, topic)
+            if table is not None:
+                problems = [*filter(None, map(self._problem, table.files))]
+            else:  # a missing one is no problem
+                damaged = self.tables.damaged(entry, topic)
+                problems = [f"The table {path} is damaged." for path in damaged]
+            if problems:
+                found[topic] = problems[0]
         return found
 
     def _problem(self, file: ColumnFile) -> str:

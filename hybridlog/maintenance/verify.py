@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 from msgspec import Struct, field, structs
 
-from hybridlog.columns import rows_file
 from hybridlog.columns.recording_logs import RecordingRows
+from hybridlog.columns.rows_file import RowsFile
 from hybridlog.entries import free_name_in, made_again, put_entry, segments_in
 from hybridlog.follow.follower import bring, make_tables
 from hybridlog.maintenance import tables
@@ -201,9 +201,9 @@ class _Check:
             yield file.name, "it is missing", RESTORE if file.kind == "rows" else _RESTORE_LOST
         elif file.kind == "rows":
             try:
-                rows_file.RowsFile(self._path, file).check()
+                RowsFile(self._path, file).check()
             except StoreError as error:
-                yield file.name, str(error).removesuffix(rows_file.RESTORE), RESTORE
+                yield file.name, str(error), RESTORE
         else:
             try:
                 found, has_summary = damage_of(path, file.digest, tell)

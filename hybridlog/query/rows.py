@@ -345,7 +345,7 @@ class Rows:
             if any(map(is_meta, part.predicate.fields())):
                 continue  # known of the part, not of a row
             found = self.tabled(part)
-            if found is None or found.rest is not None or found.table.hides_arrays:
+            if found is None or found.rest is not None:
                 continue
             if len(found.table.files) == 1:
                 by_file[found.table.files[0].number].append(found)

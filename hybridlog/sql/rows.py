@@ -21,7 +21,7 @@ from hybridlog.columns.column_file import FIRST
 from hybridlog.columns.fields import records_of
 from hybridlog.columns.layout import POINTS
 from hybridlog.columns.left_rows import LeftFields
-from hybridlog.columns.rows import NEEDED, PointColumns, is_cloud, piece_of
+from hybridlog.columns.rows import NEEDED, PointColumns, is_cloud, rows_of
 from hybridlog.query.question import Counters, RecordedChannel
 from hybridlog.query.rows import offsets_by_chunk, places_of
 from hybridlog.schema.arrow_types import has_empty, is_array
@@ -259,10 +259,10 @@ class TopicOfRecording:
                 decoded = channel.codec.columns_of(placed.batch, paths)
                 counters.payload_bytes += placed.batch.payload_bytes * (not channel.is_reduced)
             has_times = channel.channel.has_publish_time
-            piece = piece_of(
+            own, fields = rows_of(
                 placed, decoded, channel.state, has_publish_time=has_times, columns=columns_of
             )
-            yield Rows(piece.own, piece.fields_as(pa.struct([])))
+            yield Rows(own, fields)
 
 
 class Asked:

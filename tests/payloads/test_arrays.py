@@ -21,7 +21,7 @@ from rosbags.typesys import Stores, get_typestore
 
 import hybridlog as hl
 from hybridlog.arrays.message_arrays import to_numpy
-from hybridlog.columns.fields import FieldShape
+from hybridlog.columns.fields import as_columns
 from hybridlog.columns.rows import PointColumns
 from hybridlog.query.planner import Planner
 from hybridlog.schema.codecs import codec_for
@@ -350,7 +350,7 @@ def test_points_are_those_of_the_messages(
     codec = codec_for(standard_channel(CLOUD))
     records = codec.columns_of(batch_of(good, payload)).arrow()
     maker = PointColumns()
-    columns = maker.with_points(FieldShape(arrays=True).columns(records), records)
+    columns = maker.with_points(as_columns(records, arrays=True), records)
     found = columns.field("points")
     assert found[0].as_py()["w"] == [0.0, 1.0, 2.0]
     try:

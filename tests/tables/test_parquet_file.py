@@ -42,7 +42,7 @@ def write(path: Path, table: pa.Table, groups: int = 2) -> Section:
     writer = ColumnFileWriter(path, table.schema)
     for _ in range(groups):
         writer.write(table)
-    section = Section("id", "/a", 0, {"0": "d"}, rows * groups)
+    section = Section("id", "/a", {"0": "d"}, rows * groups)
     writer.close([section])
     return section
 

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 import hybridlog as hl
 from hybridlog.columns.column_file import ColumnFile, ColumnFileWriter, TablePart
-from hybridlog.columns.fields import FieldShape, joined, records_of
+from hybridlog.columns.fields import as_columns, joined, records_of
 from hybridlog.columns.layout import Section
 from hybridlog.columns.tables import Tables, TopicTable
 from hybridlog.follow.follower import make_tables
@@ -57,7 +57,7 @@ def test_parts_are_merged(runs: list[list[tuple[int, int]]], size: int) -> None:
             writer = ColumnFileWriter(Path(folder) / f"{number}.parquet", table.schema)
             for begin in range(0, len(own), size):
                 writer.write(table.slice(begin, size))
-            writer.close([Section("r", "t", 0, {}, len(own))])
+            writer.close([Section("r", "t", {}, len(own))])
             parts += ColumnFile(writer.path).parts(0, len(own))
         if not parts:
             return
@@ -200,7 +200,7 @@ def test_fields_become_columns_and_fields_again(rows: list[Any], start: int) -> 
         if row and row["inner"] and row["inner"]["x"]:
             row["inner"]["x"] = abs(row["inner"]["x"])
     array = pa.array(rows, KIND).slice(start)
-    columns = FieldShape().columns(array)
+    columns = as_columns(array)
     columns.validate(full=True)
     names = [columns.type.field(n).name for n in range(7)]
     assert names == ["a", "A_2", "list", "list_summary", "inner", "many", "many_summary"]

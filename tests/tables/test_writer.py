@@ -201,7 +201,7 @@ def close(writer: TableWriter, entry: RecordingEntry) -> None:
 
 def waiting(writer: TableWriter) -> int:
     """Rows in memory."""
-    return sum(piece.rows for topic in writer._topics.values() for piece in topic.pieces)
+    return sum(len(rows) for topic in writer._topics.values() for rows in topic.waiting)
 
 
 def test_memory_does_not_grow_with_the_recording(
@@ -213,7 +213,7 @@ def test_memory_does_not_grow_with_the_recording(
         said = [(BASE + n, f"/{n % 3}", payload(n)) for n in range(count)]
         path = write_log(tmp_path / f"{count}.mcap", said)
         entry = store.record(path, name=str(count), settings=SMALL_CHUNKS).entry
-        writer = TableWriter(store.directory.path, entry.id, entry.name, topics_of(entry))
+        writer = TableWriter(store.directory.path, entry, topics_of(entry))
         held, indexer = [], ChunkIndexer(entry.id)
         for chunk, channels in chunks_of(store, entry):
             writer.add(indexer.messages_in([chunk], channels))
@@ -262,15 +262,3 @@ def test_whatever_fails_the_recording_goes_on(
     assert not list(store.directory.path.glob("**/*.parquet"))
     assert store.topic("/large").count() == 1470
     assert store.verify().findings == []
-
-
-def test_too_many_topics_for_the_files_of_a_process(
-    store: hl.Store, tmp_path: Path, limit: Limit
-) -> None:
-    limit(table_pending_bytes=1, table_left_bytes=0, table_open_files=3, group_bytes=1)
-    said = [(BASE + n, f"/{n % 10}", varied(n)) for n in range(200)]
-    write_log(tmp_path / "log.mcap", said)
-    entry = store.record(tmp_path / "log.mcap", name="log", settings=SMALL_CHUNKS).entry
-    assert entry.status == "complete"
-    tables = Tables(store.directory.path)
-    assert 0 < sum(tables.of(entry, topic) is not None for topic in topics_of(entry)) < 10
