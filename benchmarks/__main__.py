@@ -9,13 +9,13 @@ import argparse
 import re
 import shutil
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
-from benchmarks.progress import Progress
-from benchmarks.samples import NAME, Journal, Scale
+from benchmarks.samples import NAME, Journal
 from benchmarks.side import SideError
 from hybridlog.cli import signals
 from hybridlog.cli.app import of_os_error
@@ -29,12 +29,12 @@ if TYPE_CHECKING:
 
 ROOT = Path(__file__).parents[1]
 PAGE = "benchmarks.md"
-README = "readme.md"
-UNTIL: Mapping[Scale, float] = {"full": 49.0, "tiny": 0.0}
+UNTIL = {"full": 49.0, "tiny": 0.0}
 """Minutes until which the repetition of a search is begun."""
+PARTS = ("tasks", "queries", "reading", "live", "logs", "record")
 _EPILOG = """\
 parts:
-  tasks    commands, SQL, many recordings and the page
+  tasks    commands, SQL, many recordings
   queries  the paper's questions to every system
   reading  slices, messages at a time and whole tables from every system
   live     recording a running robot
@@ -48,53 +48,23 @@ exit codes: 0 done; 1 something failed, or answers differ; 2 wrong usage; 130 Ct
 """
 
 
-class Piece(NamedTuple):
-    """A part of a run that is done as a whole.
+def pieces() -> list[tuple[str, Callable[[Context], None], bool]]:
+    """All of a run in its order: the part, what is done as a whole, whether it repeats a search."""
+    from benchmarks.studies import answers, live, record, tasks
 
-    Attributes:
-        part: The part that it belongs to.
-        name: For people.
-        run: Does it.
-        is_extra: It repeats a search, and is left out when there is no time for it.
-    """
-
-    part: str
-    name: str
-    run: Callable[[Context], None]
-    is_extra: bool = False
-
-
-def pieces() -> list[Piece]:
-    """All of a run, in its order."""
-    from benchmarks.live import cases
-    from benchmarks.studies import logs, queries, reading, record, tasks
-
-    def task(group: str) -> Piece:
-        return Piece("tasks", group, lambda context: tasks.run(context, group))
-
-    def case(name: str) -> Piece:
-        return Piece("live", name, lambda context: cases.run(context, name))
-
-    def play(repetition: int) -> Piece:
-        return Piece("logs", "logs", lambda c: logs.run(c, repetition), repetition > 0)
-
-    def stream(size: int, repetition: int) -> Piece:
-        name = f"record {size // 1000} kB"
-        return Piece("record", name, lambda c: record.run(c, size, repetition), repetition > 0)
-
-    return [
-        *map(task, tasks.GROUPS),
-        Piece("queries", "queries", queries.run),
-        Piece("reading", "reading", reading.run),
-        *map(case, cases.CASES),
-        play(0),
-        *(stream(size, 0) for size in record.SIZES),
-        *(stream(size, 1) for size in record.SIZES),
-        play(1),
+    found: list[tuple[str, Callable[[Context], None], bool]] = [
+        *(("tasks", partial(tasks.run, group=group), False) for group in tasks.GROUPS),
+        ("queries", answers.queries, False),
+        ("reading", answers.reading, False),
+        *(("live", partial(live.run, name=name), False) for name in live.CASES),
     ]
-
-
-PARTS = ("tasks", "queries", "reading", "live", "logs", "record")
+    for n in (0, 1):
+        found.append(("logs", partial(record.play, repetition=n), n > 0))
+        found += [
+            ("record", partial(record.stream, size=size, repetition=n), n > 0)
+            for size in record.SIZES
+        ]
+    return found
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -139,42 +109,31 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-# --- a run ----------------------------------------------------------------------------
-
-
 def _run(chosen: argparse.Namespace, command: list[str]) -> int:
     from benchmarks.machine import describe
     from benchmarks.studies.runs import Context
 
-    backends = _backends(chosen.backends)
-    planned = [piece for piece in pieces() if not chosen.only or piece.part in chosen.only]
+    backends, is_broken = _backends(chosen.backends), False
     with TemporaryDirectory(prefix="hybridlog-bench-", dir=chosen.work) as directory:
         work = Path(directory)
         about = {"scale": chosen.scale, "seed": chosen.seed, "command": command}
         journal = Journal(chosen.out, {**about, **describe(work)})
-        context = Context(work, backends, journal, chosen.scale, chosen.seed, Progress())
-        context.missing.update(_missing(backends))
+        context = Context(work, backends, journal, chosen.scale, chosen.seed, _missing(backends))
         try:
-            failures = _pieces(context, planned)
+            for part, run, is_extra in pieces():
+                is_late = is_extra and context.minutes > UNTIL[chosen.scale]
+                if is_late or part not in (chosen.only or PARTS):
+                    continue
+                try:
+                    run(context)
+                except (HybridlogError, SideError, RuntimeError, ValueError, ImportError) as error:
+                    # The others go on.
+                    context.say(f"{part} FAILED: {printable(str(error))}")
+                    is_broken = True
         except signals.Stopped as stopped:
             stopped.consequence = f"What was measured is in {journal.path}."
             raise
-        return max(_write(journal, chosen), int(failures))
-
-
-def _pieces(context: Context, planned: Sequence[Piece]) -> bool:
-    """Do the pieces of a run; returns whether any broke off."""
-    is_broken = False
-    for piece in planned:
-        if piece.is_extra and context.progress.minutes > UNTIL[context.scale]:
-            continue
-        try:
-            piece.run(context)
-        except (HybridlogError, SideError, RuntimeError, ValueError, ImportError) as error:
-            # The others go on.
-            context.progress.say(f"{piece.name} FAILED: {printable(str(error))}")
-            is_broken = True
-    return is_broken
+        return max(_write(journal, chosen), int(is_broken))
 
 
 def _backends(names: str | None) -> dict[str, type[Backend]]:
@@ -187,26 +146,26 @@ def _backends(names: str | None) -> dict[str, type[Backend]]:
     return {name: kind for name, kind in BACKENDS.items() if name in chosen}
 
 
-def _missing(backends: Mapping[str, type[Backend]]) -> Iterator[tuple[str, str]]:
+def _missing(backends: Mapping[str, type[Backend]]) -> dict[str, str]:
     """Backends that cannot be used here, and why."""
     from benchmarks.backends.base import BackendMissingError
 
+    found = {}
     for name, kind in backends.items():
         try:
             kind.check()
         except BackendMissingError as error:
             note(f"benchmarks: {name} is left out: {error}")
-            yield name, str(error)
-
-
-# --- the page -------------------------------------------------------------------------
+            found[name] = str(error)
+    return found
 
 
 def _write(journal: Journal, chosen: argparse.Namespace) -> int:
+    """Write the page; returns 1 if anything failed."""
     from benchmarks import page
 
     text, table = page.page(journal), page.readme(journal)
-    for name, content in ((PAGE, text), (README, table + "\n")):
+    for name, content in ((PAGE, text), ("readme.md", table + "\n")):
         (chosen.out / name).write_text(content, encoding="utf-8")
     if chosen.docs:
         (ROOT / "docs" / PAGE).write_text(text, encoding="utf-8")
@@ -219,11 +178,11 @@ def _write(journal: Journal, chosen: argparse.Namespace) -> int:
         if count != 1:
             raise UsageError(f"{readme} lacks {page.BEGIN} or {page.END}.")
         readme.write_text(new, encoding="utf-8")
-    results_ = page.Results(journal)
-    for one in results_.failed:
+    failed = page.Results(journal).failed
+    for one in failed:
         print(f"FAILED {one.study}, {one.backend}: {printable(one.reason)}")
     note(f"benchmarks: wrote {chosen.out / PAGE}{', the page and README.md' * chosen.docs}")
-    return int(bool(results_.failed))
+    return int(bool(failed))
 
 
 if __name__ == "__main__":

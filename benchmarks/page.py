@@ -8,11 +8,11 @@ from statistics import median
 from typing import Any, NamedTuple
 
 from benchmarks.backends.registry import BACKENDS
-from benchmarks.live.cases import CASES
 from benchmarks.loads.robot import RATE
 from benchmarks.numbers import FLOORS, OURS, number, percent, size, title
 from benchmarks.samples import Journal, Sample
 from benchmarks.studies import record
+from benchmarks.studies.live import CASES
 from benchmarks.studies.search import Found, searches
 from hybridlog.cli.output import printable
 
@@ -317,8 +317,8 @@ def _in_use(results: Results) -> list[str]:
     return [
         "## A store in use",
         f"A recording of {case['seconds']} s of the robot's log, {case['seconds'] * RATE:,} "
-        f"messages; then a store of {case['recordings']:,} recordings, and the page of "
-        "`hybridlog view`. Commands are processes of their own.",
+        f"messages; then a store of {case['recordings']:,} recordings. Commands are processes of "
+        "their own.",
         _table(["", "ms", "of the processor", "memory, MB"], lines),
     ]
 

@@ -1,7 +1,6 @@
-"""What a system must be able to do to take part: this is all that the harness knows.
+"""What a system must be able to do to take part: this is all that the studies know.
 
-To add one, write a class in a module of its own, and name it in `registry.py`. Classes in
-`benchmarks.questions` ask it and read from it.
+To add one, write a class in a module of its own, and name it in `registry.py`.
 """
 
 from __future__ import annotations
@@ -11,10 +10,25 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, Final
+
+import numpy as np
 
 if TYPE_CHECKING:
+    import pandas as pd
+    from numpy.typing import NDArray
+
     from hybridlog_storage.messages import Channel
+
+GRIPPER: Final = "/r_gripper_controller/command"
+VIEWPOINT: Final = "/rviz_camera_publisher/camera_pose"
+ARM: Final = "/r_cart/command_pose"
+HALF_NS: Final = 500_000_000
+"""Half of the window of Q4, as the code in the paper's appendix has it."""
+IMU_COLUMNS: Final = tuple(
+    f"{name}.{axis}" for name in ("angular_velocity", "linear_acceleration") for axis in "xyz"
+)
+"""What is compared of an IMU's table."""
 
 
 class BackendMissingError(Exception):
@@ -48,6 +62,12 @@ def failing(system: str, *errors: type[Exception]) -> Iterator[None]:
         raise BackendFailedError(f"{system}: {' '.join(str(error).split())}") from error
 
 
+def sums(rows: Sequence[Sequence[float]]) -> list[float]:
+    """Number of rows, and the sum of each of three columns."""
+    columns = np.array(rows, np.float64).reshape(-1, 3).sum(axis=0)
+    return [float(len(rows)), *map(float, columns)]
+
+
 class Backend(ABC):
     """One system under test. Made once a run, in a process of its own.
 
@@ -59,15 +79,15 @@ class Backend(ABC):
         name: As on the command line.
         title: As in tables.
         records: Whether streams and logs are published to it.
-        asker: Class that asks it the questions, `module:class`; empty for none.
-        reader: Class that reads messages back from it, the same way.
+        answers: Whether it is asked the paper's questions.
+        reads: Whether messages are read back from it.
     """
 
     name: ClassVar[str]
     title: ClassVar[str]
     records: ClassVar[bool] = True
-    asker: ClassVar[str] = ""
-    reader: ClassVar[str] = ""
+    answers: ClassVar[bool] = False
+    reads: ClassVar[bool] = False
 
     def __init__(self, directory: Path) -> None:
         self.directory = directory
@@ -116,3 +136,39 @@ class Backend(ABC):
     def processes(self) -> Sequence[int]:
         """Process ids of the servers that belong to it, without their children."""
         return ()
+
+    # The paper's questions, in the system's own language.
+
+    def closings(self) -> int:
+        """Q1: how many times was the right gripper closed."""
+        raise NotImplementedError
+
+    def behind(self) -> int:
+        """Q2, as the appendix counts it: viewpoints behind the robot."""
+        raise NotImplementedError
+
+    def positions(self) -> list[float]:
+        """Q2, as its text asks: those viewpoints; their number, sums of x, y and z."""
+        raise NotImplementedError
+
+    def in_region(self) -> int:
+        """Q3: how many times was the gripper moved in a region."""
+        raise NotImplementedError
+
+    def grasps(self) -> int:
+        """Q4: closings with a viewpoint in front of the robot nearer than `HALF_NS`."""
+        raise NotImplementedError
+
+    # What comes after a question.
+
+    def slice(self, topic: str, begin: int, end: int) -> NDArray[np.float32]:
+        """Field `ranges` of the messages with a log time in `[begin, end)`, in order."""
+        raise NotImplementedError
+
+    def last(self, topic: str, time: int) -> NDArray[np.float32]:
+        """Field `ranges` of the last message with a log time up to `time`."""
+        raise NotImplementedError
+
+    def table(self, topic: str) -> pd.DataFrame:
+        """All messages of a topic in the order of log time, at least with `IMU_COLUMNS`."""
+        raise NotImplementedError

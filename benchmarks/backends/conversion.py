@@ -78,7 +78,7 @@ class Converter:
             payload: The serialized message.
         """
         document = self._to_bson(self._types.deserialize_ros1(payload, self._name))
-        document[META] = {"inserted_at": _date(log_time), "t": log_time}
+        document[META] = {"inserted_at": date_of(log_time), "t": log_time}
         return document
 
     def text(self, log_time: int, payload: bytes) -> str:
@@ -103,7 +103,7 @@ def converter_for(schema: Schema) -> Converter:
 
 def iso_text(log_time: int) -> str:
     """A log time, ns, as text: `2015-07-14T09:26:53.589Z`."""
-    return _date(log_time).isoformat(timespec="milliseconds") + "Z"
+    return date_of(log_time).isoformat(timespec="milliseconds") + "Z"
 
 
 def typestore_of(schema: Schema) -> tuple[Typestore, str]:
@@ -179,5 +179,5 @@ def _of_array(types: Typestore, element: Any, *, for_json: bool) -> Convert | No
     return lambda values: values.tolist()
 
 
-def _date(log_time: int) -> datetime:
+def date_of(log_time: int) -> datetime:
     return _EPOCH + timedelta(microseconds=log_time // 1_000_000 * 1000)

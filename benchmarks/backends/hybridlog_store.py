@@ -7,12 +7,26 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from benchmarks.backends.base import Backend, BackendFailedError, BackendMissingError, failing
+import numpy as np
+
+from benchmarks.backends.base import (
+    ARM,
+    GRIPPER,
+    HALF_NS,
+    VIEWPOINT,
+    Backend,
+    BackendFailedError,
+    BackendMissingError,
+    failing,
+)
 from benchmarks.usage import wait_for_mongods, working_below
 from hybridlog_storage.errors import HybridlogError, MissingDependencyError
 from hybridlog_storage.mongo.index_documents import collection_of
 
 if TYPE_CHECKING:
+    import pandas as pd
+    from numpy.typing import NDArray
+
     from hybridlog.live import LiveRecording
     from hybridlog.store import Store
     from hybridlog_storage.messages import Channel
@@ -22,8 +36,7 @@ class Hybridlog(Backend):
     """A store with its default settings; each run is a recording of its own."""
 
     name = title = "hybridlog"
-    asker = "benchmarks.questions.api:HybridlogAsker"
-    reader = "benchmarks.questions.api:HybridlogReading"
+    answers = reads = True
 
     def __init__(self, directory: Path) -> None:
         super().__init__(directory)
@@ -115,3 +128,37 @@ class Hybridlog(Backend):
 
     def processes(self) -> Sequence[int]:
         return working_below(self.path, "mongod") if self._opened is not None else ()
+
+    def closings(self) -> int:
+        return self.store.topic(GRIPPER).where("position == 0").count()
+
+    def behind(self) -> int:
+        return self.store.topic(VIEWPOINT).where("position.x <= 0").count()
+
+    def positions(self) -> list[float]:
+        axes = [f"position.{axis}" for axis in "xyz"]
+        frame = self.store.topic(VIEWPOINT).where("position.x <= 0").fields(*axes).to_pandas()
+        return [float(len(frame)), *map(float, frame[axes].sum())]
+
+    def in_region(self) -> int:
+        region = (
+            "pose.position.z > 1 and -0.5 < pose.position.y < 0.5 and 0.5 < pose.position.x < 1"
+        )
+        return self.store.topic(ARM).where(region).count()
+
+    def grasps(self) -> int:
+        half = f"{HALF_NS}ns"
+        closings = self.store.topic(GRIPPER).where("position == 0").windows(half, half)
+        in_front = self.store.topic(VIEWPOINT).where("position.x >= 0")
+        return len(closings.containing(in_front))
+
+    def slice(self, topic: str, begin: int, end: int) -> NDArray[np.float32]:
+        query = self.store.topic(topic).between(f"{begin}ns", f"{end}ns").fields("ranges")
+        return np.stack(list(query.to_pandas()["ranges"]))
+
+    def last(self, topic: str, time: int) -> NDArray[np.float32]:
+        found: NDArray[np.float32] = self.store.topic(topic).at(f"{time}ns").decode().ranges
+        return found
+
+    def table(self, topic: str) -> pd.DataFrame:
+        return self.store.topic(topic).to_pandas()

@@ -7,18 +7,31 @@ import threading
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
-from benchmarks.backends.base import BackendMissingError, failing
-from benchmarks.backends.conversion import INSERTED_AT
+import numpy as np
+
+from benchmarks.backends.base import (
+    ARM,
+    GRIPPER,
+    HALF_NS,
+    VIEWPOINT,
+    BackendMissingError,
+    failing,
+    sums,
+)
+from benchmarks.backends.conversion import INSERTED_AT, date_of
 from benchmarks.backends.database import DatabaseBackend
 from benchmarks.backends.server import Server
 from hybridlog_storage.mongo.index_documents import collection_of
 
 if TYPE_CHECKING:
+    import pandas as pd
     from bson.raw_bson import RawBSONDocument
+    from numpy.typing import NDArray
     from pymongo import MongoClient
     from pymongo.collection import Collection
     from pymongo.database import Database
@@ -75,7 +88,7 @@ class Mongo(DatabaseBackend):
         _program()
 
     @property
-    def database(self) -> Database[Document]:
+    def _database(self) -> Database[Document]:
         """The database with the collections, through pymongo; between `open` and `close`."""
         assert self._client is not None
         return self._client[DATABASE]
@@ -110,15 +123,15 @@ class Mongo(DatabaseBackend):
         self._batches = [_Batch() for _ in channels]
 
     def _make_collections(self) -> None:
-        there = set(self.database.list_collection_names())
+        there = set(self._database.list_collection_names())
         for topic, groups in self._topics().items():
             name = collection_of(topic)
             if name not in there:
-                self.database.create_collection(name)
+                self._database.create_collection(name)
             if self._is_indexed:
                 for keys in (_keys(group) for group in [*groups, (INSERTED_AT,)]):
-                    self.database[name].create_index(keys)
-        self._collections = [self.database[collection_of(c.topic)] for c in self._channels]
+                    self._database[name].create_index(keys)
+        self._collections = [self._database[collection_of(c.topic)] for c in self._channels]
 
     def insert(self, channel: int, log_time: int, payload: bytes) -> None:
         from bson import ObjectId, encode
@@ -155,7 +168,7 @@ class Mongo(DatabaseBackend):
 
         with failing("MongoDB", PyMongoError):
             return {
-                topic: self.database[collection_of(topic)].count_documents({})
+                topic: self._database[collection_of(topic)].count_documents({})
                 for topic in self._topics()
             }
 
@@ -187,10 +200,60 @@ class MongoIndexed(Mongo):
     `_meta.inserted_at`.
     """
 
-    name, records = "mongo_indexed", False
-    asker = "benchmarks.questions.mongo:MongoAsker"
-    reader = "benchmarks.questions.mongo:MongoReading"
+    name, records, answers, reads = "mongo_indexed", False, True, True
     _is_indexed = True
+
+    def closings(self) -> int:
+        return self._of(GRIPPER).count_documents({"position": 0.0})
+
+    def behind(self) -> int:
+        return self._of(VIEWPOINT).count_documents({"position.x": {"$lte": 0}})
+
+    def positions(self) -> list[float]:
+        found = self._of(VIEWPOINT).find({"position.x": {"$lte": 0}}, {"_id": 0, "position": 1})
+        return sums([tuple(row["position"][axis] for axis in "xyz") for row in found])
+
+    def in_region(self) -> int:
+        return self._of(ARM).count_documents(
+            {
+                "pose.position.z": {"$gt": 1},
+                "pose.position.y": {"$gt": -0.5, "$lt": 0.5},
+                "pose.position.x": {"$gt": 0.5, "$lt": 1},
+            }
+        )
+
+    def grasps(self) -> int:
+        """As in the appendix, which counts a closing without a viewpoint, too."""
+        half = timedelta(microseconds=HALF_NS // 1000)
+        viewpoints = self._of(VIEWPOINT)
+        found = 0
+        for closing in self._of(GRIPPER).find({"position": 0.0}):
+            time = closing["_meta"]["inserted_at"]
+            within = {"$lt": time + half, "$gt": time - half}
+            row = viewpoints.find_one({"position.x": {"$gte": 0}, INSERTED_AT: within})
+            found += row is not None
+        return found
+
+    def slice(self, topic: str, begin: int, end: int) -> NDArray[np.float32]:
+        within = {"$gte": date_of(begin), "$lt": date_of(end)}
+        order, fields = [(INSERTED_AT, 1)], {"_id": 0, "ranges": 1}
+        rows = self._of(topic).find({INSERTED_AT: within}, fields, sort=order)
+        return np.array([row["ranges"] for row in rows], np.float32)
+
+    def last(self, topic: str, time: int) -> NDArray[np.float32]:
+        until, fields = {INSERTED_AT: {"$lte": date_of(time)}}, {"_id": 0, "ranges": 1}
+        row = self._of(topic).find_one(until, fields, sort=[(INSERTED_AT, -1)])
+        assert row is not None
+        return np.array(row["ranges"], np.float32)
+
+    def table(self, topic: str) -> pd.DataFrame:
+        import pandas as pd
+
+        frame = pd.json_normalize(list(self._of(topic).find({}, {"_id": 0})))
+        return frame.sort_values("_meta.t", kind="stable")
+
+    def _of(self, topic: str) -> Collection[Document]:
+        return self._database[collection_of(topic)]
 
 
 def _keys(group: tuple[str, ...]) -> list[tuple[str, int]]:

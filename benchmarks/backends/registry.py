@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from benchmarks.backends.bagfile import BagFile
 from benchmarks.backends.base import Backend
+from benchmarks.backends.files import BagFile, McapFile
 from benchmarks.backends.hybridlog_store import Hybridlog
-from benchmarks.backends.mcap_file import McapFile
 from benchmarks.backends.mongo import Mongo, MongoIndexed
 from benchmarks.backends.nothing import Nothing
 from benchmarks.backends.postgres import Postgres, PostgresIndexed

@@ -4,25 +4,25 @@ A user drags the arms of a PR2 about by markers, looks at it from viewpoints tha
 changed now and then, and opens and closes the grippers. Topics and types are those that
 the study's own launch file records; `docs/benchmarks-method.md` has the sources.
 
-Everything is planned first, so what must be answered about the load is known before a
-message is made: a file of answers lies beside it. No viewpoint lies within a millisecond of
-the edge of a window, so that a system that keeps milliseconds finds the same.
+What must be answered is worked out from the plan of the sessions, and lies beside the load.
+Positions are multiples of 1/64 m and 1/256 m, exact in any floating point. No viewpoint lies
+within a millisecond of the edge of a window, so that a system that keeps milliseconds finds
+the same: closings come half a tick before a viewpoint's.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections import Counter
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from benchmarks.loads import made, user
-from benchmarks.loads.made import RobotTypes, Values, payloads, yaw
+from benchmarks.backends.base import ARM, GRIPPER, HALF_NS, VIEWPOINT
+from benchmarks.loads.robot import RobotTypes
 from benchmarks.loads.spool import Spool
-from benchmarks.loads.user import ARM_GRID, GRASPS, TICK_NS, Drag, ViewpointPlan, plan_drags
-from benchmarks.questions.base import ARM, GRIPPER, VIEWPOINT, Answer
+from benchmarks.simulator.topics import Values, xyz, yaw
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -31,31 +31,18 @@ if TYPE_CHECKING:
 
     from benchmarks.loads.base import Load
 
-Times = np.ndarray[Any, np.dtype[np.int64]]
+    Times = NDArray[np.int64]
+    Points = NDArray[np.float64]
+
+Answer = int | list[float]
+"""A number, or a number and what else tells one answer from another."""
 
 LEFT_GRIPPER = "/l_gripper_controller/command"
 LEFT_ARM = "/l_cart/command_pose"
 FEEDBACK = "/pr2_marker_control_transparent/feedback"
 DIAGNOSTICS = "/diagnostics_agg"
 ROSOUT = "/rosout"
-
-_ANSWERS = "answers.json"
 _GRIPPER = "pr2_controllers_msgs/msg/Pr2GripperCommand"
-START_NS = 1_383_588_000_000_000_000  # 2013-11-04 18:00 UTC
-GAP_S = 1200
-"""Seconds between two sessions: another user comes."""
-_INFO_LEVEL, _WARN_LEVEL = 2, 4
-_REST = {ARM: 20, LEFT_ARM: 400}
-"""Mean ticks between two drags of an arm."""
-_MARKERS = {ARM: "r_gripper_control", LEFT_ARM: "l_gripper_control"}
-_POSE_UPDATE, _MOUSE_DOWN, _MOUSE_UP = 1, 4, 5
-_REMARKS = (
-    (_INFO_LEVEL, "Re-initializing all control markers"),
-    (_INFO_LEVEL, "sending gripper command"),
-    (_WARN_LEVEL, "waitForTransform r_wrist_roll_link took 0.31 s"),
-    (_WARN_LEVEL, "Marker name [r_upper_arm_link] not handled"),
-)
-
 _TYPES = {
     GRIPPER: (_GRIPPER, "/pr2_marker_control"),
     LEFT_GRIPPER: (_GRIPPER, "/pr2_marker_control"),
@@ -68,6 +55,25 @@ _TYPES = {
 }
 """Type and node of each topic."""
 
+_ANSWERS = "answers.json"
+_START_NS = 1_383_588_000_000_000_000  # 2013-11-04 18:00 UTC
+_GAP_S = 1200  # between two sessions: another user comes
+_TICK_NS = 33_000_000  # the timer of the viewpoint's publisher
+_OPEN = 0.088  # metres that the gripper is sent to
+_GRID, _ARM_GRID = 64, 256  # parts of a metre in which positions are counted
+_REST = {ARM: 20, LEFT_ARM: 400}  # mean ticks between two drags of an arm
+_MARKERS = {ARM: "r_gripper_control", LEFT_ARM: "l_gripper_control"}
+_INSIDE = ((129, -127, 257), (256, 128, 401))  # least, and more than the most, of the region
+_AROUND = ((64, -230, 64), (321, 231, 401))
+_POSE_UPDATE, _MOUSE_DOWN, _MOUSE_UP = 1, 4, 5
+_INFO, _WARN = 2, 4
+_REMARKS = (
+    (_INFO, "Re-initializing all control markers"),
+    (_INFO, "sending gripper command"),
+    (_WARN, "waitForTransform r_wrist_roll_link took 0.31 s"),
+    (_WARN, "Marker name [r_upper_arm_link] not handled"),
+)
+
 
 def hcr_like(directory: Path, *, seed: int, sessions: int, minutes: float) -> Load:
     """Make a load of some sessions, one after the other with a gap, and its answers.
@@ -78,19 +84,19 @@ def hcr_like(directory: Path, *, seed: int, sessions: int, minutes: float) -> Lo
         sessions: How many, above 0.
         minutes: Length of each, at least 1.
     """
-    types = RobotTypes()
-    topics = list(_TYPES)
-    channels = [types.channel(topic, *_TYPES[topic]) for topic in topics]
-    ticks = round(minutes * 60e9 / TICK_NS)
-    plans = []
-    spool = Spool(directory)
+    types, spool = RobotTypes(), Spool(directory)
+    answers: Counter[str] = Counter()
+    positions = np.zeros(4)
     for number in range(sessions):
-        start = START_NS + number * round((minutes * 60 + GAP_S) * 1e9)
-        plan = _plan(seed, number, start, ticks)
-        _write(spool, types, topics, plan)
-        plans.append(plan)
-    load = spool.finish(seed, channels)
-    (directory / _ANSWERS).write_text(json.dumps(_answers(plans)))
+        start = _START_NS + number * round((minutes * 60 + _GAP_S) * 1e9)
+        rng = np.random.default_rng([seed, number])
+        one = _Session(types, spool, start, round(minutes * 60e9 / _TICK_NS), rng)
+        one.write()
+        answers.update(one.answers)
+        positions += one.positions
+    load = spool.finish(seed, [types.channel(topic, *_TYPES[topic]) for topic in _TYPES])
+    found: dict[str, Answer] = {**answers, "Q2 positions": positions.tolist()}
+    (directory / _ANSWERS).write_text(json.dumps(found))
     return load
 
 
@@ -100,158 +106,159 @@ def true_answers(load: Load) -> dict[str, Answer]:
     return found
 
 
-@dataclass(slots=True)
-class _Plan:
-    """One session: all log times, and what happens."""
+class _Session:
+    """One session of a user."""
 
-    seed: int
-    number: int
-    start: int
-    viewpoint: ViewpointPlan
-    drags: Mapping[str, list[Drag]]
-    left: NDArray[np.float64]
-    times: dict[str, Times] = field(default_factory=dict)
+    def __init__(
+        self, types: RobotTypes, spool: Spool, start: int, ticks: int, rng: np.random.Generator
+    ) -> None:
+        self.answers: dict[str, int] = {}
+        self.positions = np.zeros(4)
+        self._types, self._spool, self._start = types, spool, start
+        self._ticks, self._rng = ticks, rng
 
-    def rng(self, use: str) -> np.random.Generator:
-        """The random numbers of one part of the session."""
-        return made.generator(self.seed, self.number, use)
+    def write(self) -> None:
+        """Make the messages, and count what is asked about them."""
+        in_front = self._write_viewpoint()
+        closed = self._write_grippers()
+        near = np.searchsorted(in_front, closed + HALF_NS) > np.searchsorted(
+            in_front, closed - HALF_NS, "right"
+        )
+        self.answers |= {"Q1": len(closed), "Q4": int(near.sum())}
+        for arm in _REST:
+            self._write_arm(arm)
+        self._write_robot()
 
-    @property
-    def seconds(self) -> float:
-        """Its length."""
-        return self.viewpoint.ticks * TICK_NS / 1e9
+    def _number(self, least: int, most: int) -> int:
+        return int(self._rng.integers(least, most + 1))
 
-    def at(self, ticks: Any, offset_ms: float) -> Times:
+    def _at(self, ticks: Any, offset_ms: float) -> Times:
         """Log times so many milliseconds after ticks."""
-        return self.start + np.asarray(ticks, np.int64) * TICK_NS + round(offset_ms * 1e6)
+        found: Times = self._start + np.asarray(ticks, np.int64) * _TICK_NS + round(offset_ms * 1e6)
+        return found
 
+    def _add(self, topic: str, times: Times, values: Values, columns: Values) -> None:
+        kind, number = _TYPES[topic][0], [*_TYPES].index(topic)
+        filled = self._types.filled(self._types.make(kind, values), columns, len(times))
+        payloads = (self._types.encode(message, kind) for message in filled)
+        self._spool.messages(np.full(len(times), number, np.int32), payloads, times)
 
-def _plan(seed: int, number: int, start: int, ticks: int) -> _Plan:
-    """Plan a session; the order of the ways to grasp goes on from session to session."""
-    rng = made.generator(seed, number, "user")
-    first = number % len(GRASPS)
-    plan = _Plan(
-        seed,
-        number,
-        start,
-        ViewpointPlan(ticks, rng, GRASPS[first:] + GRASPS[:first]),
-        {arm: plan_drags(ticks, rng, rest) for arm, rest in _REST.items()},
-        np.resize([0.0, user.OPEN], int(rng.integers(2, 3 + ticks // 1000))),
-    )
-    times = plan.times
-    jitter = rng.uniform(0, 3e6, ticks).astype(np.int64)
-    times[VIEWPOINT] = plan.at(np.arange(ticks), 1) + jitter
-    times[GRIPPER] = plan.at([c.tick for c in plan.viewpoint.commands], -TICK_NS / 2e6)
-    times[LEFT_GRIPPER] = plan.at(np.sort(rng.choice(ticks, len(plan.left), replace=False)), 20)
-    feedback = []
-    for arm, offset in ((ARM, 11), (LEFT_ARM, 13)):
-        moved = _ticks_of(plan.drags[arm], ends=False)
-        times[arm] = plan.at(moved, offset) + rng.integers(0, 2_000_000, len(moved))
-        feedback.append(plan.at(_ticks_of(plan.drags[arm], ends=True), offset - 4))
-    times[FEEDBACK] = np.concatenate(feedback)
-    _plan_robot(plan)
-    return plan
+    def _write_viewpoint(self) -> Times:
+        """A viewpoint a tick, which rests or moves; returns the times of those in front."""
+        knots, points = [0], [(-2 * _GRID, 0, 96)]
+        while knots[-1] < self._ticks:
+            knots.append(knots[-1] + self._number(1, 60))
+            points.append(points[-1])
+            side = self._number(-1, 1)  # in front of the robot, behind it, or at x = 0
+            x = side * self._number(_GRID // 4, 4 * _GRID)
+            y, z = self._number(-3 * _GRID, 3 * _GRID), self._number(_GRID // 2, 3 * _GRID)
+            knots.append(knots[-1] + self._number(8, 40))
+            points.append((x, y, z))
+        at = _line(knots, points, np.arange(self._ticks)) / _GRID
+        times = self._at(np.arange(self._ticks), 1) + self._rng.integers(0, 3_000_000, self._ticks)
+        # It looks at the robot; so it turns when it moves, and only then.
+        turned = yaw("orientation", np.arctan2(-at[:, 1], -at[:, 0]))
+        self._add(VIEWPOINT, times, {}, xyz("position", *at.T) | turned)
+        behind = at[at[:, 0] <= 0]
+        self.answers["Q2"] = len(behind)
+        self.positions = np.array([len(behind), *behind.sum(axis=0)])
+        return times[at[:, 0] >= 0]
 
+    def _write_grippers(self) -> Times:
+        """Both grippers; returns when the right one was closed."""
+        commands: list[tuple[int, float, float]] = []
+        tick = self._number(60, 240)
+        while tick + 460 < self._ticks:
+            presses = 1 + (self._rng.random() < 0.1)  # an impatient user
+            commands += [
+                (tick + 9 * n, 0.0, (50.0, 100.0)[self._number(0, 1)]) for n in range(presses)
+            ]
+            tick += self._number(60, 450)
+            commands.append((tick, _OPEN, 100.0))
+            tick += self._number(60, 300)
+        ticks, *columns = zip(*commands, strict=True)
+        times = self._at(ticks, -_TICK_NS / 2e6)
+        about = dict(zip(("position", "max_effort"), columns, strict=True))
+        self._add(GRIPPER, times, {}, about)
+        count = self._number(2, 2 + self._ticks // 1000)
+        left = self._at(np.sort(self._rng.choice(self._ticks, count, replace=False)), 20)
+        about = {"position": np.resize([0.0, _OPEN], count), "max_effort": np.full(count, 100.0)}
+        self._add(LEFT_GRIPPER, left, {}, about)
+        return times[np.array(columns[0]) == 0]
 
-def _ticks_of(drags: Sequence[Drag], *, ends: bool) -> Times:
-    """Ticks of all points of drags, and of the mouse's button before and after each."""
-    found = [np.arange(d.tick - ends, d.tick + len(d.points) + ends) for d in drags]
-    return np.concatenate([np.empty(0, np.int64), *found])
-
-
-def _plan_robot(plan: _Plan) -> None:
-    """Log times of what the robot says whatever the user does."""
-    times, seconds = plan.times, plan.seconds
-    rng = plan.rng("robot")
-    remarks = np.sort(rng.choice(int(seconds * 1000), int(seconds / 4), replace=False))
-    times[ROSOUT] = plan.start + remarks * 1_000_000 + 500_000
-    stamps = made.steady(rng, 1.0, seconds - 0.2, phase=0.4)
-    times[DIAGNOSTICS] = made.received(rng, plan.start + stamps, 0.004, 0.001)
-
-
-def _answers(plans: Sequence[_Plan]) -> dict[str, Answer]:
-    """What the plans say, added up."""
-    behind = np.concatenate([plan.viewpoint.behind() for plan in plans])
-    users = [plan.viewpoint for plan in plans]
-    return {
-        "Q1": sum(command.position == 0.0 for one in users for command in one.commands),
-        "Q2": len(behind),
-        "Q3": sum(drag.inside for plan in plans for drag in plan.drags[ARM]),
-        "Q4": sum(one.wide for one in users),
-        "Q2 positions": [float(len(behind)), *(behind.sum(axis=0) / user.GRID).tolist()],
-    }
-
-
-def _write(spool: Spool, types: RobotTypes, topics: Sequence[str], plan: _Plan) -> None:
-    """Add the messages of a session."""
-
-    def add(topic: str, times: Times, values: Values, columns: Values) -> None:
-        if len(times):
-            rows = payloads(types, _TYPES[topic][0], values, columns)
-            spool.messages(np.full(len(times), topics.index(topic)), rows, times)
-
-    at = plan.viewpoint.points() / user.GRID
-    # It looks at the robot; so it turns when it moves, and only then.
-    turned = yaw("orientation", np.arctan2(-at[:, 1], -at[:, 0]))
-    add(VIEWPOINT, plan.times[VIEWPOINT], {}, made.xyz("position", *at.T) | turned)
-    commands = plan.viewpoint.commands
-    right = {name: [getattr(c, name) for c in commands] for name in ("position", "max_effort")}
-    add(GRIPPER, plan.times[GRIPPER], {}, right)
-    left = {"position": plan.left, "max_effort": np.full(len(plan.left), 100.0)}
-    add(LEFT_GRIPPER, plan.times[LEFT_GRIPPER], {}, left)
-    _write_arms(add, plan)
-    times = plan.times[DIAGNOSTICS]
-    warns = plan.rng("warnings").random(len(times)) < 0.05
-    columns = _stamped(times, 4_000_000) | {"status.3.level": warns.astype(np.uint8)}
-    add(DIAGNOSTICS, times, {"status": _diagnostics(types)}, columns)
-    _write_rosout(add, plan)
-
-
-_Add = Callable[[str, Times, Values, Values], None]
-
-
-def _write_arms(add: _Add, plan: _Plan) -> None:
-    first = 0
-    nowhere = np.empty((0, 3), np.int64)
-    for arm, drags in plan.drags.items():
-        times, points = plan.times[arm], [drag.points for drag in drags]
-        where = np.concatenate([nowhere, *points]) / ARM_GRID
-        columns = _stamped(times, 2_000_000) | _posed("pose.", where)
-        add(arm, times, {"header.frame_id": "base_link"}, columns)
-        # The button goes down on the first point and up on the last one.
-        held = [np.pad(p, ((1, 1), (0, 0)), mode="edge") for p in points]
-        where = np.concatenate([nowhere, *held]) / ARM_GRID
-        events = [np.pad(np.full(len(p), _POSE_UPDATE), 1) for p in points]
-        for event in events:
-            event[0], event[-1] = _MOUSE_DOWN, _MOUSE_UP
-        times = plan.times[FEEDBACK][first : first + len(where)]
-        first += len(where)
-        columns = _stamped(times, 0) | _posed("pose.", where)
-        columns["event_type"] = np.concatenate([nowhere[:, 0], *events])
+    def _write_arm(self, arm: str) -> None:
+        """The marker of an arm is held by the mouse and moved, over and over."""
+        moved, held = [], []
+        tick = self._number(10, 40)
+        while True:
+            count = self._number(2, 5)
+            knots = np.cumsum([0, *self._rng.integers(10, 60, count)])
+            if tick + knots[-1] + 2 > self._ticks:
+                break
+            box = _INSIDE if self._rng.random() < 0.4 else _AROUND
+            ticks = np.arange(knots[-1] + 1)
+            points = _line(knots, self._rng.integers(*box, (count + 1, 3)), ticks)
+            moved.append(np.column_stack((tick + ticks, points)))
+            # The button goes down on the first point and up on the last one.
+            events = np.pad(np.full(len(ticks), _POSE_UPDATE), 1)
+            events[0], events[-1] = _MOUSE_DOWN, _MOUSE_UP
+            around = np.pad(points, ((1, 1), (0, 0)), mode="edge")
+            held.append(np.column_stack((tick - 1 + np.arange(len(events)), around, events)))
+            tick += len(events) + self._number(_REST[arm] // 2, _REST[arm] * 2)
+        offset = 11 if arm == ARM else 13
+        rows = np.concatenate(moved)
+        times = self._at(rows[:, 0], offset) + self._rng.integers(0, 2_000_000, len(rows))
+        columns = _stamped(times, 2_000_000) | _posed(rows[:, 1:] / _ARM_GRID)
+        self._add(arm, times, {"header.frame_id": "base_link"}, columns)
+        if arm == ARM:
+            low, high = np.array(_INSIDE)
+            within = (rows[:, 1:] >= low) & (rows[:, 1:] < high)
+            self.answers["Q3"] = int(within.all(axis=1).sum())
+        rows = np.concatenate(held)
+        times = self._at(rows[:, 0], offset - 4)
+        columns = _stamped(times, 0) | _posed(rows[:, 1:4] / _ARM_GRID)
+        columns["event_type"] = rows[:, 4].astype(np.uint8)
         values = {"header.frame_id": "base_link", "client_id": "/rviz/PR2 control markers"}
         values |= {"marker_name": _MARKERS[arm], "control_name": "move"}
-        add(FEEDBACK, times, values, columns)
+        self._add(FEEDBACK, times, values, columns)
+
+    def _write_robot(self) -> None:
+        """What the robot says whatever the user does."""
+        seconds = self._ticks * _TICK_NS // 10**9
+        times = (
+            self._start
+            + np.arange(seconds) * 10**9
+            + self._rng.integers(4 * 10**8, 41 * 10**7, seconds)
+        )
+        warns = (self._rng.random(seconds) < 0.05).astype(np.uint8)
+        columns = _stamped(times, 4_000_000) | {"status.3.level": warns}
+        self._add(DIAGNOSTICS, times, {"status": _diagnostics(self._types)}, columns)
+        moments = np.sort(self._rng.choice(seconds * 1000, seconds // 4, replace=False))
+        times = self._start + moments * 1_000_000 + 500_000
+        chosen = [_REMARKS[n] for n in self._rng.integers(0, len(_REMARKS), len(times)).tolist()]
+        columns = dict(zip(("level", "msg"), zip(*chosen, strict=True), strict=True))
+        values = {"topics": ["/rosout", *_MARKERS], "name": "/pr2_marker_control"}
+        self._add(ROSOUT, times, values, _stamped(times, 500_000) | columns)
 
 
-def _write_rosout(add: _Add, plan: _Plan) -> None:
-    times = plan.times[ROSOUT]
-    chosen = plan.rng("texts").integers(0, len(_REMARKS), len(times)).tolist()
-    columns = {name: [_REMARKS[n][at] for n in chosen] for at, name in enumerate(("level", "msg"))}
-    values = {"topics": ["/rosout", *_MARKERS], "name": "/pr2_marker_control"}
-    add(ROSOUT, times, values, _stamped(times, 500_000) | columns)
+def _line(knots: Any, points: Any, ticks: Any) -> Points:
+    """Straight lines from knot to knot, in whole parts of a metre; float64[n, 3]."""
+    axes = [np.interp(ticks, knots, axis) for axis in np.array(points, np.float64).T]
+    found: Points = np.rint(np.stack(axes, axis=1))
+    return found
 
 
 def _stamped(times: Times, before_ns: int) -> Values:
     return {"header.stamp": times - before_ns, "header.seq": np.arange(len(times))}
 
 
-def _posed(path: str, where: NDArray[np.float64]) -> Values:
+def _posed(where: Points) -> Values:
     """The hand points away from the shoulder."""
     heading = np.arctan2(where[:, 1] + 0.2, where[:, 0])
-    return made.xyz(f"{path}position", *where.T) | yaw(f"{path}orientation", heading)
+    return xyz("pose.position", *where.T) | yaw("pose.orientation", heading)
 
 
-def _diagnostics(types: RobotTypes) -> list[Any]:
+def _diagnostics(types: RobotTypes) -> Sequence[Any]:
     keys = ("state", "temperature", "last update", "errors since start")
     kind = "diagnostic_msgs/msg/KeyValue"
     pairs = [types.make(kind, {"key": key, "value": "nominal"}) for key in keys]

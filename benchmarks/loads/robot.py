@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.loads.made import RobotTypes
 from benchmarks.loads.spool import Spool
+from benchmarks.simulator.topics import Types
+from hybridlog_storage.messages import Channel, Schema
+from tests.independent import write_mcap
 
 if TYPE_CHECKING:
     from benchmarks.loads.base import Load
-    from hybridlog_storage.messages import Channel
-from tests.independent import write_mcap
 
 START_NS = 1_700_000_000 * 10**9
 SECOND_NS = 10**9
@@ -64,6 +64,17 @@ FIX = _packed(
     ("status", "i1"), ("service", "<u2"), ("place", "<f8", 3), ("a", "<f8", 9), ("kind", "u1"),
 )  # fmt: skip
 MODE = _packed(("data", "u1"), header=False)
+
+
+class RobotTypes(Types):
+    """The message types of ROS 1, and the channels of a bag."""
+
+    def channel(self, topic: str, msgtype: str, node: str) -> Channel:
+        """The channel of a topic, as a ROS 1 bag describes it."""
+        text, checksum = self.store.generate_msgdef(msgtype, ros_version=1)
+        schema = Schema(msgtype.replace("/msg/", "/"), "ros1msg", text.encode())
+        metadata = {"callerid": node, "latching": "0", "md5sum": checksum}
+        return Channel(topic, "ros1", schema, metadata, has_publish_time=False)
 
 
 def _speed(seconds: Seconds) -> Seconds:

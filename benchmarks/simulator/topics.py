@@ -222,11 +222,13 @@ def topic(*settings: Any, **others: Any) -> Callable[[Fill], Fill]:
     return add
 
 
-def _yaw(path: str, heading: Floats) -> Values:
+def yaw(path: str, heading: Floats) -> Values:
+    """A turn about the vertical axis."""
     return {f"{path}.z": np.sin(heading / 2), f"{path}.w": np.cos(heading / 2)}
 
 
-def _xyz(path: str, *columns: Any) -> Values:
+def xyz(path: str, *columns: Any) -> Values:
+    """Up to three columns of a vector."""
     return {f"{path}.{axis}": column for axis, column in zip("xyz", columns, strict=False)}
 
 
@@ -247,7 +249,7 @@ def _static(speaker: Speaker, ticks: Ticks) -> Filled:
     transforms = []
     for frame, x, z, turn in mounts:
         values: Values = {"header.frame_id": "base_link", "child_frame_id": frame}
-        values |= _xyz("transform.translation", x, 0.0, z) | _xyz("transform.rotation", *turn)
+        values |= xyz("transform.translation", x, 0.0, z) | xyz("transform.rotation", *turn)
         values["transform.rotation.w"] = turn[3]
         transforms.append(speaker.types.make("geometry_msgs/msg/TransformStamped", values))
     stamps = {f"transforms.{k}.header.stamp": ticks.stamp for k in range(len(mounts))}
@@ -359,8 +361,8 @@ def _odom(speaker: Speaker, ticks: Ticks) -> Filled:
     values["twist.covariance"] = _diagonal(0.001, 1e-6, 1e6, 1e6, 1e6, 0.004)
     measured = speaker.odometry(ticks)
     noise = 0.003 * ticks.rng.standard_normal((2, len(ticks.seconds)))
-    columns = _xyz("pose.pose.position", measured.x, measured.y)
-    columns |= _yaw("pose.pose.orientation", measured.heading)
+    columns = xyz("pose.pose.position", measured.x, measured.y)
+    columns |= yaw("pose.pose.orientation", measured.heading)
     columns["twist.twist.linear.x"] = measured.speed + noise[0]
     columns["twist.twist.angular.z"] = measured.yaw_rate + noise[1]
     return values, columns
@@ -384,8 +386,8 @@ def _transforms(speaker: Speaker, ticks: Ticks) -> Filled:
         transforms.append(speaker.types.make("geometry_msgs/msg/TransformStamped", frames))
         link = f"transforms.{number}"
         columns |= {f"{link}.header.stamp": ticks.stamp, f"{link}.header.seq": ticks.number}
-        columns |= _xyz(f"{link}.transform.translation", right, up)
-        columns |= _yaw(f"{link}.transform.rotation", heading)
+        columns |= xyz(f"{link}.transform.translation", right, up)
+        columns |= yaw(f"{link}.transform.rotation", heading)
     return {"transforms": transforms}, columns
 
 
@@ -415,8 +417,8 @@ def _imu(speaker: Speaker, ticks: Ticks) -> Filled:
     state = speaker.robot.at(ticks.seconds)
     yaw_rate, *acceleration = sensors.inertial(state, ticks.rng)
     tilt = 0.001 * ticks.rng.standard_normal((2, len(ticks.seconds)))
-    columns = _yaw("orientation", state.heading) | _xyz("angular_velocity", *tilt, yaw_rate)
-    return values, columns | _xyz("linear_acceleration", *acceleration)
+    columns = yaw("orientation", state.heading) | xyz("angular_velocity", *tilt, yaw_rate)
+    return values, columns | xyz("linear_acceleration", *acceleration)
 
 
 @topic("/cmd_vel", "geometry_msgs/Twist", "/move_base", 20, 0.004, (0.0005, 0.0002))
@@ -453,7 +455,7 @@ def _arm(speaker: Speaker, ticks: Ticks) -> Filled:
         part = np.where(moves, here, part)
     # To the shelf and back.
     reach = np.sin(np.pi * part)
-    columns = _xyz("pose.position", 0.42 + 0.08 * reach, -0.18 - 0.4 * reach, 0.62 + 0.35 * reach)
+    columns = xyz("pose.position", 0.42 + 0.08 * reach, -0.18 - 0.4 * reach, 0.62 + 0.35 * reach)
     return {"header.frame_id": "base_link", "pose.orientation.w": 1.0}, columns
 
 
@@ -467,10 +469,10 @@ def _view(speaker: Speaker, ticks: Ticks) -> Filled:
     bursts, clock = np.divmod(ticks.seconds, 7.0)
     part = np.clip((clock - 1.0) / 2.5, 0, 1)
     orbit = 0.9 * (bursts + part * part * (3 - 2 * part))
-    down, yaw = np.arctan2(1.6, 3.0) / 2, orbit / 2 + np.pi / 2
-    columns = _xyz("position", state.x + 3.0 * np.cos(orbit), state.y + 3.0 * np.sin(orbit))
-    columns |= _xyz("orientation", -np.sin(yaw) * np.sin(down), np.cos(yaw) * np.sin(down))
-    columns |= _yaw("orientation", 2 * yaw)
+    down, turn = np.arctan2(1.6, 3.0) / 2, orbit / 2 + np.pi / 2
+    columns = xyz("position", state.x + 3.0 * np.cos(orbit), state.y + 3.0 * np.sin(orbit))
+    columns |= xyz("orientation", -np.sin(turn) * np.sin(down), np.cos(turn) * np.sin(down))
+    columns |= yaw("orientation", 2 * turn)
     columns |= {
         f"orientation.{axis}": columns[f"orientation.{axis}"] * np.cos(down) for axis in "zw"
     }

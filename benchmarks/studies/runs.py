@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -12,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 
 from benchmarks.harness.run import run as run_load
 from benchmarks.loads.base import Load
-from benchmarks.progress import Progress
 from benchmarks.samples import Journal, Sample, Scale
 
 if TYPE_CHECKING:
@@ -32,7 +32,6 @@ class Context:
         journal: Where samples go.
         scale: How much is measured.
         seed: Of all loads.
-        progress: Where steps are told.
         missing: Why backends are missing that were found so: they are not tried again.
         quiet_at: When the machine will be done with what the last run left, seconds of
             `time.monotonic`.
@@ -43,9 +42,26 @@ class Context:
     journal: Journal
     scale: Scale = "full"
     seed: int = 1
-    progress: Progress = field(default_factory=lambda: Progress(quiet=True))
     missing: dict[str, str] = field(default_factory=dict)
     quiet_at: float = 0.0
+    _begun: float = field(default_factory=time.monotonic)
+
+    @property
+    def minutes(self) -> float:
+        """Since the run was started."""
+        return (time.monotonic() - self._begun) / 60
+
+    @contextmanager
+    def step(self, text: str) -> Iterator[None]:
+        """Write a line to standard error when the block has ended well."""
+        started = time.monotonic()
+        yield
+        self.say(f"{text} ({time.monotonic() - started:.1f} s)")
+
+    def say(self, text: str) -> None:
+        """Write a line, with the time so far."""
+        minutes, seconds = divmod(round(self.minutes * 60), 60)
+        print(f"[{minutes}:{seconds:02}] {text}", file=sys.stderr, flush=True)
 
     def load(self, name: str, settings: Mapping[str, Any], make: Callable[[Path], Load]) -> Load:
         """A load that is made once.
@@ -76,7 +92,9 @@ class Context:
         if reason is not None:
             sample = replace(wanted, status="missing", reason=reason)
         else:
-            with self.progress.step(_described(wanted)):
+            case = ", ".join(f"{name} {value}" for name, value in wanted.case.items())
+            text = f"{wanted.study}: {wanted.backend}, {case}, round {wanted.repetition + 1}"
+            with self.step(text):
                 sample = self._run(wanted, load(), speed)
         if sample.status == "missing":
             self.missing[wanted.backend] = sample.reason
@@ -84,31 +102,17 @@ class Context:
         return sample
 
     def _run(self, wanted: Sample, load: Load, speed: float) -> Sample:
-        backend = self.backends[wanted.backend]
         if self.scale == "full":
             time.sleep(max(self.quiet_at - time.monotonic(), 0))
         with run_directory(self.work) as directory:
-            outcome = run_load(load, backend, directory, speed)
-        self.quiet_at = time.monotonic() + _digesting_s(outcome.values)
+            outcome = run_load(load, self.backends[wanted.backend], directory, speed)
+        # A virtual machine returns freed memory to its host bit by bit, every two seconds. The
+        # host then loses sight of the pages that are in use, too, and who touches them next pays
+        # for it: 100 to 300 ms of a run's first seconds, when the one before had kept gigabytes.
+        kept: float = outcome.values.get("persisted_bytes", 0)
+        self.quiet_at = time.monotonic() + min(kept / _DIGESTED_S, _DIGESTING_S)
         values = {name: v for name, v in outcome.values.items() if name != "topics"}
         return replace(wanted, status=outcome.status, values=values, reason=outcome.reason)
-
-
-def _described(sample: Sample) -> str:
-    """A run in a line of progress."""
-    case = ", ".join(f"{name} {value}" for name, value in sample.case.items())
-    return f"{sample.study}: {sample.backend}, {case}, round {sample.repetition + 1}"
-
-
-def _digesting_s(values: Mapping[str, Any]) -> float:
-    """Seconds for which a machine may be busy with what a run has left behind.
-
-    A virtual machine returns freed memory to its host bit by bit, every two seconds. The
-    host then loses sight of the pages that are in use, too, and who touches them next pays
-    for it: 100 to 300 ms of a run's first seconds, when the one before had kept gigabytes.
-    """
-    kept: float = values.get("persisted_bytes", 0)
-    return min(kept / _DIGESTED_S, _DIGESTING_S)
 
 
 @contextmanager

@@ -1,8 +1,7 @@
 """The search for the greatest rate at which a backend still keeps everything.
 
-The rate is doubled until something is lost, then the gap is halved a few times. Chance
-decides about the last trials, so each search is made several times, and every one of them
-begins anew.
+The rate is doubled until something is lost, then the gap is halved once. Chance decides about
+the last trials, so each search is made twice where there is time, and begins anew.
 """
 
 from __future__ import annotations
@@ -10,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from benchmarks.samples import Sample
 
@@ -21,21 +20,12 @@ _LATE_SHARE = 0.05
 _LATE_S = 0.1
 
 
-@dataclass(frozen=True, slots=True)
-class Bounds:
-    """Where a search looks.
-
-    Attributes:
-        start: Rate of the first trial.
-        lowest: No rate below is tried.
-        highest: No rate above is tried.
-        halvings: Of the gap between the rates that was kept and that was not.
-    """
+class Bounds(NamedTuple):
+    """Where a search looks: its first rate, and the least and greatest that it tries."""
 
     start: float
     lowest: float
     highest: float
-    halvings: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,14 +53,9 @@ def verdict(sample: Sample) -> Verdict:
 
 
 def bracket(kept: Mapping[float, bool]) -> tuple[float | None, float | None]:
-    """Between which rates the limit lies.
+    """The greatest rate that was kept below all that were not, and the least that was not.
 
-    Args:
-        kept: Of the rates that were tried, whether all was kept.
-
-    Returns:
-        The greatest rate that was kept below all that were not, and the least that was
-        not; None for each that there is not. Luck above a loss does not count.
+    Luck above a loss does not count.
     """
     lost = min((rate for rate, good in kept.items() if not good), default=None)
     below = (rate for rate, good in kept.items() if good and (lost is None or rate < lost))
@@ -78,27 +63,21 @@ def bracket(kept: Mapping[float, bool]) -> tuple[float | None, float | None]:
 
 
 def next_rate(kept: Mapping[float, bool], bounds: Bounds) -> float | None:
-    """The rate to try next.
+    """The rate to try next; None when the search is over.
 
     Args:
         kept: Of the rates that were tried, whether all was kept.
         bounds: Where to look.
-
-    Returns:
-        None when the search is over.
     """
-    if not kept:
-        return bounds.start
     best, lost = bracket(kept)
-    if lost is None:
-        assert best is not None
-        return best * 2 if best * 2 <= bounds.highest else None
+    if best is None and lost is None:
+        return bounds.start
     if best is None:
+        assert lost is not None
         return lost / 2 if lost / 2 >= bounds.lowest else None
-    # The gap was once as wide as the rate below it, which was `start`, doubled or halved.
-    first_gap = bounds.start * 2.0 ** math.floor(math.log2(best / bounds.start) + 1e-9)
-    is_wide = lost - best > first_gap / 2**bounds.halvings * 1.001
-    return (best + lost) / 2 if is_wide else None
+    if lost is None:
+        return best * 2 if best * 2 <= bounds.highest else None
+    return best * 1.5 if best * 1.5 < lost else None
 
 
 def take_turns(searches: Iterable[Search]) -> None:
@@ -118,8 +97,7 @@ def _try(search: Search) -> bool:
     return found.status != "missing"
 
 
-@dataclass(frozen=True, slots=True)
-class Found:
+class Found(NamedTuple):
     """The end of one search.
 
     Attributes:
@@ -142,24 +120,18 @@ def searches(samples: Iterable[Sample], axis: str, harness: str) -> dict[str, li
         harness: The backend that keeps nothing, and so shows what the harness can carry.
     """
     trials: dict[tuple[str, int], dict[float, Sample]] = {}
+    carried = math.inf
     for sample in samples:
         if sample.status != "missing":
-            by_rate = trials.setdefault((sample.backend, sample.repetition), {})
-            by_rate[float(sample.case[axis])] = sample
-    carried = min(
-        (
-            rate
-            for (name, _), by_rate in trials.items()
-            for rate, sample in by_rate.items()
-            if name == harness and verdict(sample) != "kept"
-        ),
-        default=math.inf,
-    )
+            rate = float(sample.case[axis])
+            trials.setdefault((sample.backend, sample.repetition), {})[rate] = sample
+            if sample.backend == harness and verdict(sample) != "kept":
+                carried = min(carried, rate)
     found: dict[str, list[Found]] = {}
     for (name, _), by_rate in trials.items():
         verdicts = {rate: verdict(sample) for rate, sample in by_rate.items()}
-        rate, lost = bracket({rate: shown == "kept" for rate, shown in verdicts.items()})
+        best, lost = bracket({rate: shown == "kept" for rate, shown in verdicts.items()})
         is_above = lost is None or verdicts[lost] == "late" or lost >= carried
-        best = None if rate is None else by_rate[rate]
-        found.setdefault(name, []).append(Found(rate, best, is_above))
+        trial = None if best is None else by_rate[best]
+        found.setdefault(name, []).append(Found(best, trial, is_above))
     return found

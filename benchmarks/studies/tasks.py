@@ -1,4 +1,4 @@
-"""What a user does with a store: commands, SQL, many recordings, the page.
+"""What a user does with a store: commands, SQL, many recordings.
 
 All of it but `many` is about one recording of the robot's log. Each group runs
 in a process of its own; a figure is the median of several times after a first one, on the clock
@@ -7,7 +7,6 @@ and of the processor (that of MongoDB is not counted).
 
 from __future__ import annotations
 
-import json
 import os
 import statistics
 import struct
@@ -15,8 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -24,18 +22,16 @@ from benchmarks.loads import robot
 from benchmarks.samples import Sample, Scale
 from benchmarks.side import SideError, Values, run_side
 from benchmarks.studies.runs import Context, run_directory
-from benchmarks.usage import disk_bytes
 from hybridlog_storage.messages import Channel, Schema
 from tests.independent import write_mcap
 
 if TYPE_CHECKING:
-    from hybridlog.store import Store
+    pass
 
 STUDY = "tasks"
 _TIMEOUT_S = 900.0
 _DAY_NS = 86_400 * 10**9
 _MANY_MESSAGES = 200
-PIXELS = 1600
 
 
 class Settings(NamedTuple):
@@ -106,7 +102,7 @@ def run(context: Context, group: str) -> None:
     """
     settings = SETTINGS[context.scale]
     wanted = Sample(STUDY, {"group": group, **settings._asdict()}, "hybridlog", 0)
-    with context.progress.step(f"tasks: {group}"), run_directory(context.work) as directory:
+    with context.step(f"tasks: {group}"), run_directory(context.work) as directory:
         arguments = {"directory": str(directory), "seed": context.seed, **settings._asdict()}
         try:
             if group != "many":
@@ -198,13 +194,10 @@ def commands_side(*, store: str, directory: str, times: int, **_: Any) -> Values
     log = place.parent / "robot.mcap"
     fresh = Path(directory) / "store"
     rows = {"`record` of the log": _recorded(log, fresh)}
-    stored = disk_bytes(fresh)
-    segments = sum(path.stat().st_size for path in fresh.rglob("*.mcap"))
     rows["`index arrays` of the scans"] = command(("index", "arrays", "scan"), fresh)
     for name, arguments in COMMANDS.items():
         rows[name] = _commands(arguments, place, times)
-    about = {"log_bytes": log.stat().st_size, "disk_bytes": stored, "segment_bytes": segments}
-    return {"rows": rows, **about}
+    return {"rows": rows}
 
 
 def sql_side(*, store: str, times: int, **_: Any) -> Values:
@@ -237,9 +230,13 @@ def many_side(*, directory: str, recordings: int, times: int, **_: Any) -> Value
     import hybridlog as hl
 
     place, logs = Path(directory) / "many", Path(directory)
+
+    def record(day: int) -> None:
+        store.record(_write_day(logs / "day.mcap", day), name=f"day{day:05d}")
+
     with hl.open(place, create=True) as store:
         for day in range(recordings):
-            store.record(_write_day(logs / "day.mcap", day), name=f"day{day:05d}")
+            record(day)
     listing = _commands(("ls",), place, times)
     del listing["peak_mb"]  # that of this process, of which a child is a copy at first
     rows = {
@@ -256,13 +253,9 @@ def many_side(*, directory: str, recordings: int, times: int, **_: Any) -> Value
             "count of a day by a predicate": timed(of_a_day.where("x > 7").count, times),
             "count of all by a predicate": timed(pose.where("x > 7").count, times),
             "count of the matches in one of all": timed(pose.where("y == 3").count, times),
-            "record one more": timed(lambda: _record_day(store, logs, next(days)), times),
+            "record one more": timed(lambda: record(next(days)), times),
         }
     return {"rows": rows}
-
-
-def _record_day(store: Store, logs: Path, day: int) -> None:
-    store.record(_write_day(logs / "more.mcap", day), name=f"more{day}")
 
 
 def _write_day(path: Path, day: int) -> Path:
@@ -277,73 +270,5 @@ def _write_day(path: Path, day: int) -> Path:
     return write_mcap(path, said)
 
 
-def page_side(*, store: str, times: int, seed: int, **_: Any) -> Values:
-    """What the page of `hybridlog view` asks for, 1,600 pixels wide, with all topics."""
-    import httpx2
-    import numpy as np
-
-    random = np.random.default_rng(seed)
-    with _viewed(store) as (address, pid), httpx2.Client(base_url=address, timeout=120) as client:
-
-        def get(path: str, **parameters: Any) -> tuple[float, Any]:
-            begun = time.perf_counter()
-            answer = client.get(path, params=parameters)
-            answer.raise_for_status()
-            return 1e3 * (time.perf_counter() - begun), answer
-
-        listing = [get("recordings", count=100) for _ in range(times + 1)]
-        chosen = listing[0][1].json()["rows"][0]["id"]
-        about = get("recording", recording=chosen)[1].json()
-        begin, end = int(about["begin"]), int(about["end"])
-        topics = [topic["topic"] for topic in about["topics"]]
-
-        def timeline(begin: int, end: int) -> tuple[float, int]:
-            span = {"begin": begin, "end": end, "pixels": PIXELS}
-            ms, answer = get("timeline", recording=chosen, topic=topics, **span)
-            return ms, len(answer.content)
-
-        first = timeline(begin, end)
-        zooms = []
-        for number in range(8 * times):
-            width = max((end - begin) >> (number % 8 + 1), 1_000_000)
-            at = begin + int(random.random() * max(end - begin - width, 1))
-            zooms.append(timeline(at, at + width))
-        memory = _resident_mb(pid)
-    return {
-        "rows": {
-            "list of recordings": _spread([ms for ms, _ in listing[1:]]),
-            "first timeline": _spread([first[0]]),
-            "zoom": _spread([ms for ms, _ in zooms]),
-        },
-        "timeline_bytes": first[1],
-        "memory_mb": memory,
-    }
-
-
-@contextmanager
-def _viewed(store: str) -> Iterator[tuple[str, int]]:
-    """The address of `hybridlog view` on a store, and its process."""
-    arguments = [sys.executable, "-m", "hybridlog", "view", "--json", "--store", store]
-    with subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            assert process.stdout is not None
-            text = ""
-            for line in process.stdout:
-                text += line
-                if text.rstrip().endswith("}"):
-                    break
-            if not text:
-                raise SideError("hybridlog view did not start")
-            yield json.loads(text)["url"], process.pid
-        finally:
-            process.terminate()
-
-
-def _resident_mb(pid: int) -> float:
-    from benchmarks.usage import rss, with_children
-
-    return rss(with_children([pid])) / 1e6
-
-
-GROUPS = ("commands", "sql", "many", "page")
+GROUPS = ("commands", "sql", "many")
 """In their order; `<name>_side` does each."""

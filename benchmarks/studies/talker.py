@@ -1,4 +1,4 @@
-"""A ROS 1 node that speaks at a fixed rate, whoever listens: `python -m benchmarks.live.talker`.
+"""A ROS 1 node that speaks at a fixed rate, whoever listens: `python -m benchmarks.studies.talker`.
 
 It is as roscpp is: a queue a connection, of which the oldest goes when it is full, but not
 what is half sent. One thread for all topics.

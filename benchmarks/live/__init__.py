@@ -1,1 +1,0 @@
-"""Recording a running robot under load, and when things fail."""

@@ -1,1 +1,0 @@
-"""What is asked of a backend that holds a load, in its own language."""
