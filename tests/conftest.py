@@ -6,13 +6,12 @@ import gc
 import os
 import signal
 import tempfile
-from collections import Counter
 from collections.abc import Iterator
 
 import pytest
 from hypothesis import HealthCheck, settings
 
-from tests import databases, durations, real_peers
+from tests import databases, real_peers
 from tests.calls import Calls
 from tests.limits import Limit
 
@@ -23,6 +22,19 @@ collect_ignore = [
     "test_packaging.py",
 ]
 """Tests that run when they are named, and as steps of `.ci/run`."""
+
+LONG = (
+    *("running/", "live/", "cli/", "test_faults", "test_model", "view/", "formats/test_bounds"),
+    *("test_groups", "test_healing", "test_hostile_store", "servers/", "formats/test_writing"),
+    *("test_power_cut", "remote/", "test_keep", "test_real_logs", "storage/test_mongod"),
+    *("tables/test_other_readers", "payloads/", "copying/", "scale/", "tables/test_writer"),
+    *("schema/test_wire", "test_mending", "test_repair", "contract/", "query/test_latest"),
+    *("training/", "query/test_intervals", "storage/test_segments", "query/test_differences"),
+    *("tf/test_in_frame", "across/test_sync", "test_sensor_messages", "storage/test_append_file"),
+    *("test_interrupted", "test_edits_at_once", "demo/", "simulator/"),
+)
+"""Tests that take long, the longest first: they begin first, or one processor would wait at the
+end; and the quick loop leaves them out, as it does those with MongoDB."""
 
 os.environ["HYBRIDLOG_MONGOD_LINGER_S"] = "0.2"
 for name in (
@@ -96,9 +108,6 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         help="MongoDB for the tests that need one (default: HYBRIDLOG_TESTS_MONGO), each in a "
         "database of its own that is dropped at the end; tests about ours are left out",
     )
-    parser.addoption(
-        "--measure", action="store_true", help="note how long each test takes, in durations.json"
-    )
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -109,8 +118,6 @@ def pytest_configure(config: pytest.Config) -> None:
     config.stash[DATABASES] = databases.Databases(config.getoption("--mongo-uri"))
     if not hasattr(config, "workerinput"):
         config.pluginmanager.register(real_peers.Attendance())
-        if config.getoption("--measure"):
-            config.pluginmanager.register(durations.Measuring())
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:
@@ -141,16 +148,16 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     real_peers.mark(items)
-    seconds = durations.measured()
-    slow = durations.slow_ones(seconds)
     for item in items:
-        if durations.name_of(item.nodeid) in slow or item.get_closest_marker("exhaustive"):
+        place = item.nodeid.removeprefix("tests/")
+        marks = {mark.name for mark in item.iter_markers()}
+        if place.startswith(LONG) or marks & {"exhaustive", "mongo"}:
             item.add_marker(pytest.mark.slow)
     if config.getoption("--mongo-uri") is not None:
         config.hook.pytest_deselected(items=[i for i in items if databases.is_embedded(i)])
         items[:] = [item for item in items if not databases.is_embedded(item)]
-    # The longest files begin first, or one processor would wait at the end.
-    files = Counter[str]()
-    for name, one in seconds.items():
-        files[name.split("::")[0]] += one
-    items.sort(key=lambda item: -files[durations.name_of(item.nodeid).split("::")[0]])
+    items.sort(key=lambda item: _rank(item.nodeid.removeprefix("tests/")))
+
+
+def _rank(place: str) -> int:
+    return next((n for n, name in enumerate(LONG) if place.startswith(name)), len(LONG))
