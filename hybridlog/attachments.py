@@ -16,7 +16,7 @@ from hybridlog_storage.errors import SegmentError
 if TYPE_CHECKING:
     import os
 
-    from mcap.records import AttachmentIndex, MetadataIndex
+    from mcap.records import AttachmentIndex
 
     from hybridlog.query.question import Question
     from hybridlog.session import Session
@@ -111,29 +111,40 @@ class Extras(NamedTuple):
 
 def attachments_of(session: Session, entry: RecordingEntry) -> list[StoredAttachment]:
     """The attachments of a recording, in the order of the log."""
-    if not entry.attachments:
-        return []
-    found: list[StoredAttachment] = []
-    for number, summary in _summaries(session, entry):
-        for index in summary.attachments:
-            source = partial(_open, session, entry.id, number, index)
-            found.append(
-                StoredAttachment(
-                    recording=entry.name,
-                    name=index.name,
-                    media_type=index.media_type,
-                    size=index.data_size,
-                    log_time_ns=index.log_time,
-                    create_time_ns=index.create_time,
-                    open=source,
-                )
-            )
+    return [
+        StoredAttachment(
+            entry.name,
+            one.name,
+            one.media_type,
+            one.data_size,
+            one.log_time,
+            one.create_time,
+            partial(_open, session, entry.id, number, one),
+        )
+        for number, summary in (_summaries(session, entry) if entry.attachments else ())
+        for one in summary.attachments
+    ]
+
+
+def metadata_of(
+    session: Session, entry: RecordingEntry, problems: list[str] | None = None
+) -> list[StoredMetadata]:
+    """The metadata records of a recording's log, in their order.
+
+    `problems` get the reason for each that cannot be read; without, that is an error.
+    """
+    found: list[StoredMetadata] = []
+    for number, summary in _summaries(session, entry) if entry.metadata_records else ():
+        for index in summary.metadata:
+            try:
+                record = session.segment(entry.id, number).metadata(index)
+            except SegmentError as error:
+                if problems is None:
+                    raise
+                problems.append(str(error))
+            else:
+                found.append(StoredMetadata(record.name, dict(record.metadata)))
     return found
-
-
-def metadata_of(session: Session, entry: RecordingEntry) -> list[StoredMetadata]:
-    """The metadata records of a recording's log, in their order."""
-    return [read() for read in _metadata_records(session, entry)]
 
 
 def extras_of(session: Session, question: Question) -> Extras:
@@ -148,11 +159,7 @@ def extras_of(session: Session, question: Question) -> Extras:
             for _, channel in sorted(session.definitions(entry).items())
             if channel.topic in topics and state_of(channel.message_encoding) is State.WHOLE
         )
-        for read in _metadata_records(session, entry):
-            try:
-                found.metadata.append(read())
-            except SegmentError as error:
-                found.problems.append(str(error))
+        found.metadata.extend(metadata_of(session, entry, found.problems))
         end = None if bounds is None or question.clock != "log" else bounds[1]
         for attachment in attachments_of(session, entry):
             if end is None or attachment.log_time_ns < end:
@@ -160,16 +167,6 @@ def extras_of(session: Session, question: Question) -> Extras:
             else:
                 left_out += 1
     return found._replace(left_out=left_out)
-
-
-def _metadata_records(
-    session: Session, entry: RecordingEntry
-) -> Iterator[Callable[[], StoredMetadata]]:
-    """A function for each metadata record of a recording, which reads it."""
-    if entry.metadata_records:
-        for number, summary in _summaries(session, entry):
-            for index in summary.metadata:
-                yield partial(_read, session, entry.id, number, index)
 
 
 def _summaries(
@@ -182,8 +179,3 @@ def _summaries(
 
 def _open(session: Session, recording: str, number: int, index: AttachmentIndex) -> Attachment:
     return session.segment(recording, number).attachment(index)
-
-
-def _read(session: Session, recording: str, number: int, index: MetadataIndex) -> StoredMetadata:
-    record = session.segment(recording, number).metadata(index)
-    return StoredMetadata(record.name, dict(record.metadata))

@@ -11,6 +11,7 @@ import os
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import lru_cache
+from itertools import chain
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
 from msgspec import UNSET, ValidationError, convert, structs, to_builtins
@@ -46,11 +47,7 @@ from hybridlog_storage.messages import (
     REDUCED,
     schema_hash,
 )
-from hybridlog_storage.segments.segment_file import (
-    Sealed,
-    is_rows,
-    sealed_name,
-)
+from hybridlog_storage.segments.segment_file import Sealed, is_rows
 from hybridlog_storage.segments.segment_format import group_of
 from hybridlog_storage.segments.segment_reader import GoneLog, SegmentSummary, open_log
 from hybridlog_storage.summary import RecordingSummary, TopicType, hash_of, topics_to_json
@@ -65,7 +62,7 @@ if TYPE_CHECKING:
 
 NO_MANIFEST: Final = (
     "{} has no manifest: `hybridlog verify --repair` makes it again from `manifest.old` and the "
-    "segments."
+    "segments. If the folder was renamed, give it its name again; remove it if it is a copy."
 )
 _ANOTHER: Final = "it is another file than the one listed"
 _TRIES = 10  # to read a recording while its files are replaced
@@ -74,32 +71,22 @@ _GONE: Final = {"expired": (EXPIRED_IDS, EXPIRED), "elsewhere": (2 * EXPIRED_IDS
 _SAID: Final = ("id", "name", "tags", "source", "created")
 
 
-def recording_metadata(one: RecordingEntry | Manifest) -> dict[str, object]:
+def recording_metadata(manifest: Manifest) -> dict[str, object]:
     """The metadata of a recording in each of its segments."""
-    return {name: to_builtins(getattr(one, name)) for name in _SAID}
+    return {name: to_builtins(getattr(manifest, name)) for name in _SAID}
 
 
 def segments_in(
     directory: StoreDirectory, recording: str, listing: Listing, but: Collection[int] = ()
 ) -> dict[int, SegmentSummary]:
-    """Summaries of a recording's valid segments by number, without some numbers.
-
-    `listing` is as its manifest says, or without one. A StoreError says that all are another's.
-    """
-    path, found, others = directory.recording(recording), dict[int, SegmentSummary](), set[str]()
+    """Summaries of a recording's valid segments by number, without some numbers."""
+    path, found = directory.recording(recording), dict[int, SegmentSummary]()
     for number, name in listing.sealed.items():
         if number not in but:
             with suppress(SegmentError):
                 summary = read_summary(path / name, number)
                 if is_of(summary, recording, None, {}, number):
                     found[number] = summary
-                else:
-                    others.add(str(summary.recording.get("id")))
-    if others and not (found or but):
-        raise StoreError(
-            f"{path} has files of {', '.join(sorted(others))}: give the folder this name again, "
-            "or remove it if it is a copy."
-        )
     return found
 
 
@@ -128,53 +115,29 @@ def see(
 
     Of segments with damage, the summaries are read. Without a catalog, nothing is known of
     decoding. Files come and go before or after the manifest says so: what seems to be missing is
-    looked for again if anything has changed; edits alone, however many, are waited for by nobody.
+    looked for until nothing has changed between; edits alone are waited for by nobody.
     """
-
-    def state() -> tuple[Listing, Manifest]:
-        listing, manifest = directory.listing(recording), directory.manifests.find(recording)
-        if manifest is None:
-            raise ManifestError(NO_MANIFEST.format(recording))
-        return listing, manifest
-
-    def told(listing: Listing, manifest: Manifest) -> object:
-        return listing.sizes, listing.open, manifest.files, manifest.status
-
-    before = state()
+    before: object = None
     for _ in range(_TRIES):
-        found, is_sure = _seen(directory, *before, damage, catalog)
-        if is_sure:
-            return found
-        now = state()
-        if told(*now) == told(*before):
-            return found
+        listing, known = directory.listing(recording), directory.manifests.find(recording)
+        if known is None:
+            raise ManifestError(NO_MANIFEST.format(recording))
+        manifest, new = known, listing.sealed.keys() - known.logs.keys()
+        if any(not known.has_let_go(number) for number in new):
+            manifest = unlisted(directory, recording, listing, known)(known)
+        logs, lost = _logs(directory.recording(recording), manifest, listing, damage)
+        goes_on = not manifest.is_ended or bool(listing.open)
+        is_open = goes_on and directory.is_recorded(recording)
+        now = listing.sizes, listing.open, known.files, known.status
+        if (not lost and goes_on == is_open) or now == before:
+            digests = {number: log.digest for number, log in logs.items()}
+            decoded = {} if catalog is None else catalog.decoded(recording, digests)
+            status = _status(manifest, lost, is_open=is_open, is_left=bool(listing.open))
+            has_left = not is_open and bool(goes_on or new or listing.left_over(known))
+            entry = entry_of(manifest, status, logs, lost, decoded)
+            return Seen(entry, "" if has_left else listing.look, has_left)
         before = now
     raise StoreError(f"The files of recording {recording!r} change while they are read. Ask again.")
-
-
-def _seen(
-    directory: StoreDirectory,
-    listing: Listing,
-    known: Manifest,
-    damage: Damage,
-    catalog: Catalog | None,
-) -> tuple[Seen, bool]:
-    """A recording, and whether nothing of it seems to be missing."""
-    recording, manifest = known.id, known
-    new = listing.sealed.keys() - known.logs.keys()
-    if any(not known.has_let_go(number) for number in new):
-        manifest = unlisted(directory, recording, listing, known)(known)
-    names = listing.choosing(manifest).sealed
-    logs, lost = _logs(directory.recording(recording), manifest, listing, damage)
-    goes_on = not manifest.is_ended or bool(listing.open)
-    is_open = goes_on and directory.is_recorded(recording)
-    digests = {number: log.digest for number, log in logs.items()}
-    decoded = {} if catalog is None else catalog.decoded(recording, digests)
-    entry = entry_of(manifest, logs, names, lost, decoded)
-    entry.status = _status(manifest, lost, is_open=is_open, is_left=bool(listing.open))
-    has_left = not is_open and bool(goes_on or new or listing.left_over(known))
-    look = "" if has_left else listing.look
-    return Seen(entry, look, has_left), not lost and goes_on == is_open
 
 
 def put_entry(directory: StoreDirectory, catalog: Catalog, recording: str) -> RecordingEntry:
@@ -217,43 +180,29 @@ def _logs(
 
 def entry_of(
     manifest: Manifest,
+    status: str,
     logs: Mapping[int, File],
-    names: Mapping[int, str],
     lost: Sequence[truth.Loss],
     decoded: Mapping[int, Mapping[int, ChannelStats]],
 ) -> RecordingEntry:
     """The entry of a recording by its manifest.
 
-    `logs` are those that can be read, with the names of their files and the results of decoding,
-    by number; `lost` are rows of the ledger for the others.
+    `logs` are those that can be read, with the results of decoding, by number; `lost` are rows of
+    the ledger for the others.
     """
-    rows = [file for file in manifest.files if file.kind == "rows"]
-    entry = RecordingEntry(
-        id=manifest.id,
-        name=manifest.name,
-        tags=dict(manifest.tags),
-        source=_source_of(manifest.source),
-        created=manifest.created,
-        status=manifest.status,
-        end={},
+    rows = manifest.rows
+    files = [*chain(*rows.values()), *(log for log in logs.values() if log.is_here)]
+    noted = chain(manifest.losses, *(log.losses for log in logs.values()))
+    return RecordingEntry(
+        manifest,
+        status,
+        losses=[*joined([*map(loss_values, noted)]), *map(loss_values, lost)],
         channels=_channels(manifest, logs, decoded),
-        stored_bytes=sum(file.bytes for file in (*rows, *logs.values()) if file.is_here),
+        stored_bytes=sum(file.bytes for file in files),
         segments=len(logs),
         chunks=sum(log.chunks for log in logs.values()),
         attachments=sum(log.attachments for log in logs.values()),
         metadata_records=sum(log.metadata for log in logs.values()),
-        notes=[structs.asdict(note) for note in manifest.notes],
-        marks=[_without_none(mark) for mark in manifest.marks],
-        pins=[
-            {
-                "id": pin.id,
-                "from": pin.first,
-                "to": None if pin.last is None else pin.last + 1,
-                "topics": None if pin.topics is None else [*pin.topics],
-                "reason": pin.reason,
-            }
-            for pin in manifest.pins
-        ],
         spans=[
             (number, log.first, log.last)
             for number, log in logs.items()
@@ -261,32 +210,18 @@ def entry_of(
         ],
         logs=dict(logs),
         digests={str(number): log.digest for number, log in logs.items()},
-        files={str(n): names[n] for n in logs if names[n] != sealed_name(n)},
+        files={str(number): rows[number][0].name for number in logs if not logs[number].is_here},
         is_decoded=all(number in decoded or not log.parts for number, log in logs.items()),
-        rows=[(file.name, topic_of(file, manifest), file.bytes) for file in rows],
-        copies=sorted({file.copy for file in manifest.files if file.copy}),
     )
-    noted = [loss_values(row) for log in logs.values() for row in log.losses]
-    known, unread = [*map(loss_values, manifest.losses)], [*map(loss_values, lost)]
-    if manifest.is_ended:
-        losses = [*joined([*known, *noted]), *unread] if noted or unread else known
-        entry.end = {"status": manifest.status, "losses": losses}
-    elif known or noted or unread:  # to make room
-        entry.end = {"losses": [*joined(noted), *unread, *known]}
-    return entry
 
 
 def with_marks(entry: RecordingEntry) -> RecordingEntry:
     """The entry of a recording's files, and of the marks that somebody set."""
-    if not entry.marks:
+    if not entry.manifest.marks:
         return entry
     from hybridlog.record.marks_log import beside  # loads numpy
 
     return beside(entry)
-
-
-def _without_none(part: truth.Record) -> dict[str, Any]:
-    return {name: value for name, value in structs.asdict(part).items() if value is not None}
 
 
 def _channels(
@@ -360,12 +295,12 @@ def _hash_of(topics: frozenset[TopicType]) -> str:
 
 def summary_of(entry: RecordingEntry, look: str = "") -> RecordingSummary:
     """The summary of a recording; `look` is as of `StoreDirectory.looks`."""
-    losses, gone = entry.end.get("losses", ()), expired_messages(entry)
+    gone = expired_messages(entry)
     return RecordingSummary(
         id=entry.id,
         name=entry.name,
         tags=entry.tags,
-        source=entry.source,
+        source=_source_of(entry.manifest.source),
         created=entry.created,
         status=entry.status,
         span=entry.span,
@@ -375,11 +310,11 @@ def summary_of(entry: RecordingEntry, look: str = "") -> RecordingSummary:
         messages=entry.messages,
         stored_bytes=entry.stored_bytes,
         segments=entry.segments,
-        has_losses=bool(losses),
-        has_lost_segments=any(row["cause"] == Cause.SEGMENT for row in losses),
+        has_losses=bool(entry.losses),
+        has_lost_segments=any(row["cause"] == Cause.SEGMENT for row in entry.losses),
         expired=gone.get(State.EXPIRED, 0),
         not_copied=gone.get(State.NOT_COPIED, 0),
-        notes=entry.notes,
+        notes=[*map(structs.asdict, entry.manifest.notes)],
         look=look,
     )
 
@@ -389,11 +324,6 @@ def topic_types(entry: RecordingEntry) -> frozenset[TopicType]:
     found = {TopicType(c.topic, c.message_encoding, c.schema or "", c.type) for c in entry.channels}
     lost = topics_of(entry) - {topic.topic for topic in found}
     return frozenset(found | {TopicType(topic, "", "", "") for topic in lost})
-
-
-def topic_of(rows: File, manifest: Manifest) -> str:
-    """The topic of a file of rows."""
-    return manifest.channels[next(iter(rows.parts))].topic
 
 
 _SOURCE = {"path": "", "kind": "", "profile": "", "bytes": 0}

@@ -41,9 +41,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.columns.tables import Tables, TopicTable
+    from hybridlog.opened import OpenStore
     from hybridlog.query.chunk_columns import Chunk
     from hybridlog.query.predicate.tree import Predicate
-    from hybridlog.shared import Shared
     from hybridlog.snapshot import Snapshot
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
@@ -77,7 +77,7 @@ class Session:
     was replaced, later questions see the newer state of its recording.
     """
 
-    def __init__(self, shared: Shared, recordings: Snapshot) -> None:
+    def __init__(self, shared: OpenStore, recordings: Snapshot) -> None:
         self.shared = shared
         self.directory = shared.directory
         self.catalog = shared.catalog
@@ -200,7 +200,7 @@ class Session:
             if entry is None and is_complete:
                 continue
             entry = entry or self.entry_of(summary)
-            if entry.status != "complete" or entry.end.get("losses"):
+            if entry.status != "complete" or entry.losses:
                 found.append(entry)
         return found
 
@@ -534,7 +534,9 @@ class Session:
 
         Where messages are lost there is none, since rows of these must not answer.
         """
-        if (topic == MARKS and recording.marks) or any(True for _ in lost_spans(recording)):
+        if (topic == MARKS and recording.manifest.marks) or any(
+            True for _ in lost_spans(recording)
+        ):
             return None
         if recording.status not in UNFINISHED:
             return self.tables.of(recording, topic)

@@ -78,18 +78,15 @@ def open_store(
 ) -> Store:
     """Open a store.
 
-    MongoDB is connected when a question needs it. What a crash has left answers as it is; who
-    changes the store seals it first.
-
     Args:
         path: Its directory; by default `HYBRIDLOG_STORE` or `./hybridlog-store`.
         mongo: URI of the MongoDB that holds the index, `embedded`, or `none` for no index; by
             default `HYBRIDLOG_MONGO_URI`, the store's own setting, or the embedded MongoDB.
         create: Create the store if it does not exist.
-        require_database: Connect to MongoDB now, and fail if it is unavailable.
+        require_database: Connect to MongoDB now, not when a question needs it.
         progress: Called while an index is brought up to date.
-        read_only: Never write a byte in it, as if this user could not, and use no MongoDB; so it
-            is where `HYBRIDLOG_READ_ONLY` is set.
+        read_only: Never write a byte in it, and use no MongoDB; so it is, too, where
+            `HYBRIDLOG_READ_ONLY` is set.
 
     Raises:
         StoreError: It is not a store, or has another format.
@@ -194,11 +191,9 @@ class Store:
         self._itself().invalidate()
 
     def snapshot(self) -> Store:
-        """The store at one moment: all questions to what this returns see the same recordings.
+        """The store at one moment, which all questions to it see; it needs not be closed.
 
-        Without it each question sees what running recordings have flushed by then. A running
-        recording is as it was when the first question asked about it. A snapshot cannot be
-        changed, and needs not be closed.
+        A running recording is as it was when the first question asked about it.
         """
         found = copy(self)
         vars(found).update(_source=self.session, _sql=None)
@@ -226,7 +221,7 @@ class Store:
         where: Texts = None,
         older_than: DurationLike | None = None,
     ) -> Recordings:
-        """The recordings that satisfy all conditions, oldest first; all without conditions.
+        """The recordings that satisfy all conditions, oldest first, perhaps none.
 
         Args:
             name: Name, id, the beginning of one, or a glob for names (`monday*`); one of several
@@ -234,13 +229,9 @@ class Store:
             tag: `"robot=7"`, or `"robot"` for any value, or a dictionary.
             has: Topics that they have: full or short names, globs, `re:`.
             type: Types of messages: `sensor_msgs/Imu`, `Imu`, a glob.
-            during: Range `[begin, end)` of log time that they overlap, in absolute times;
-                None leaves a side open.
+            during: Range `[begin, end)` of log time that they overlap; None leaves a side open.
             where: `"scan: ranges.min < 0.5"`: holds for at least one message of the topic.
             older_than: `"30d"`: their last message is at least this old.
-
-        Returns:
-            A sequence of `RecordingEntry`, perhaps empty, with `topic` for queries about them.
 
         Raises:
             TopicError: A name without wildcards means no recording, or several.
@@ -275,25 +266,16 @@ class Store:
         return self.session.entry(recording)
 
     def topics(self, *types: str) -> list[str]:
-        """Names of all topics, sorted; includes those whose messages are all lost.
+        """Names of all topics, sorted, also of those whose messages are all lost.
 
-        Args:
-            types: Only topics of these types: `LaserScan`, full names, globs.
-
-        Raises:
-            TopicError: No topic is of these types.
+        `types` leave those of some types: `LaserScan`, full names, globs; TopicError without any.
         """
         return self.recordings().topics(*types) if types else self.session.topics_of()
 
     def attachments(self, recording: str | RecordingEntry) -> list[StoredAttachment]:
         """The attachments of a recording's log, in their order.
 
-        Args:
-            recording: Its name or id, the beginning of one, or its entry.
-
-        Raises:
-            TopicError: It does not exist.
-            SegmentError: A segment is damaged.
+        TopicError without such a recording, SegmentError for a damaged segment.
         """
         from hybridlog.attachments import attachments_of
 
@@ -303,12 +285,7 @@ class Store:
     def metadata(self, recording: str | RecordingEntry) -> list[StoredMetadata]:
         """The metadata records of a recording's log, in their order.
 
-        Args:
-            recording: Its name or id, the beginning of one, or its entry.
-
-        Raises:
-            TopicError: It does not exist.
-            SegmentError: A segment is damaged.
+        TopicError without such a recording, SegmentError for a damaged segment.
         """
         from hybridlog.attachments import metadata_of
 
@@ -318,14 +295,9 @@ class Store:
     # Questions.
 
     def topic(self, *names: str) -> Query:
-        """Make a query about one or several topics.
+        """Make a query about topics: full names, clear short ones (`scan`), globs, `re:EXPRESSION`.
 
-        Args:
-            names: Full names, unambiguous short ones (`scan`), globs, or
-                `re:` and a regular expression.
-
-        Raises:
-            TopicError: A name matches no topic, or several; the message lists candidates.
+        TopicError if a name matches no topic, or several; the message lists candidates.
         """
         if not all(isinstance(name, str) for name in names):
             raise UsageError("Topics are names: topic('scan', 'odom').")
@@ -339,9 +311,7 @@ class Store:
     def query(self, topics: Sequence[str], recordings: Names | None = None) -> Query:
         """A question about topics by their full names, in some recordings or all.
 
-        Raises:
-            UsageError: a name instead of a list of names.
-            TopicError: no recording chosen has any of the topics.
+        TopicError if no recording chosen has any of the topics.
         """
         if isinstance(topics, str):
             raise UsageError(f"query takes a list of names; topic({topics!r}) takes a name.")
@@ -355,13 +325,11 @@ class Store:
         Args:
             recording: Its name or id; None if the store has one alone.
             of: A topic: the tree is of `tf` and `tf_static` of its innermost namespace that has
-                them, and for frames that these lack, of the root. None for the root's, or the
-                only one.
+                them, and for frames that these lack, of the root.
             topics: Topics with transforms instead.
 
         Raises:
-            TopicError: No such recording, or several; no topic has transforms, or only those of
-                several namespaces.
+            TopicError: Not one recording; no transforms, or those of several namespaces.
         """
         from hybridlog.tf.reader import Trees
 
@@ -372,26 +340,16 @@ class Store:
         return trees.tree(of if of is None else chosen.topic(of).topics[0])
 
     def check(self, recording: Texts = None) -> list[TopicCheck]:
-        """Check how regularly the topics of recordings came, the worst first; see `Query.check`.
+        """How regularly the topics of recordings, None for all, came, the worst first.
 
-        Args:
-            recording: Name, id or glob; None for all recordings.
-
-        Raises:
-            TopicError: No such recording.
+        See `Query.check`; TopicError if no recording matches.
         """
         return self.snapshot().recordings(recording).check().all_topics().check()
 
     def judge(self, contract: Contract | str | Path, recording: Texts = None) -> list[Result]:
-        """The results of the rules of a contract on recordings.
+        """The results of the rules of a contract, a file in YAML, on recordings; None for all.
 
-        Args:
-            contract: A file in YAML, or what `Contract.parse` makes of one.
-            recording: Name, id or glob; None for all recordings.
-
-        Raises:
-            UsageError: The contract cannot be read, or breaks its schema.
-            TopicError: No such recording.
+        UsageError if it breaks its schema, TopicError if no recording matches.
         """
         from hybridlog.contract import Contract
         from hybridlog.contract.judge import judge
@@ -410,20 +368,15 @@ class Store:
         between: tuple[TimeLike | None, TimeLike | None] | None = None,
         tolerance: float = 0.0,
     ) -> list[Difference]:
-        """Compare two recordings, or two choices of recordings, by topic.
-
-        Of two recordings of different length, the time that only one has is one difference,
-        and the others are those of the time that both have.
+        """Compare two recordings, or two choices of recordings, by topic; TopicError without any.
 
         Args:
             a: Name, id or glob; several recordings are compared together.
             b: The same.
             topics: Only these; empty for all.
-            between: Only messages of this range of each; None for the time that both have.
+            between: Only messages of this range of each; None for the time that both have, and
+                what only one has is one difference.
             tolerance: Numbers are equal that differ by at most this share of the greater one.
-
-        Raises:
-            TopicError: No such recording.
         """
         from hybridlog.contract.diff import diff
 
@@ -444,10 +397,9 @@ class Store:
     ) -> Aligned:
         """Make a table of topics side by side: a row for each message of one topic.
 
-        Columns are `log_time`, `recording` if there are several, and the fields of each topic
-        behind its full name without the first slash: `odom.pose.pose.position.x`. For each of
-        `others`, `scan.distance` is the time of its message minus that of the row. Where no
-        message is near enough, its columns are null.
+        Columns are `log_time`, `recording` if there are several, the fields of each topic behind
+        its name (`odom.pose.pose.position.x`), and of each other topic `scan.distance`, the time
+        of its message minus that of the row. Without a message near enough they are null.
 
         Args:
             base: The topic whose messages are the rows, by name, or a query about one.
@@ -455,12 +407,10 @@ class Store:
             how: `asof`: the last message not after the row. `nearest`: the nearest one, the
                 earlier of two. `interpolate`: between the last one and the next one.
             tolerance: Greatest distance in time; None for any.
-            fields: Paths of the fields wanted, by topic name; None for all. Queries may bring
-                their own.
+            fields: Paths of the fields wanted, by topic name; None for all, or a query's own.
             clock: The time that is compared: `log`, `publish` or `header`.
             across_recordings: Messages of `others` may be of any recording of their queries,
-                such as one of a second robot at that time; by default, of the row's. The
-                column `scan.recording` has the name of each.
+                which `scan.recording` names; by default, of the row's.
 
         Raises:
             TopicError: no such topic or field, or a topic does not have the clock.
@@ -498,10 +448,7 @@ class Store:
         progress: Callable[[str, int], None] | None = None,
         **choices: Any,
     ) -> LerobotReport:
-        """Write a training set for robot learning, in the format of LeRobot 3.0.
-
-        Frames are at regular times; each has the last value of a topic that is not later.
-        The same question gives the same bytes.
+        """Write a training set in the format of LeRobot 3.0; one question gives the same bytes.
 
         Args:
             query: The recordings and their range.
@@ -530,10 +477,7 @@ class Store:
         tolerance: DurationLike | None = None,
         clock: str = "header",
     ) -> Synced:
-        """Make sets of messages with about the same time, as `message_filters` does.
-
-        The policy is `ApproximateTime`. Only times are read; the messages of a set are read
-        when it is asked for. Sets are of one recording each.
+        """Make sets of messages of a recording with about the same time, as `ApproximateTime` does.
 
         Args:
             topics: Two or more, by names, or queries.
@@ -542,8 +486,7 @@ class Store:
 
         Raises:
             TopicError: no such topic, or one does not have the clock.
-            UsageError: fewer than two topics, an unknown clock, or a query with limit, every
-                or reverse.
+            UsageError: fewer than two topics, an unknown clock, or a limit, every or reverse.
             TimeError: the tolerance is no duration.
         """
         from hybridlog.across.sync import Synced
@@ -589,8 +532,6 @@ class Store:
             between: Range `[begin, end)` of log time, as for `Query.between`, of the messages
                 that views show, and of the beginnings of marks.
             memory: Bytes that DuckDB may use by its own count, from 64 MiB; 1 GiB by default.
-                Lists and texts while they are made, and what is read for it, are not counted:
-                `hybridlog sql` and the page limit their whole process.
             timeout: Seconds that the answer may take; None for no limit.
 
         Returns:
@@ -662,29 +603,15 @@ class Store:
 
         chosen, shared = options or LiveOptions(**choices), self._itself()
         shared.recover()
-        return LiveRecording(
-            self.directory,
-            self.shared.catalog,
-            FollowerProcess.of_short(shared, "Starting a recording", follow_interval_s(chosen)),
-            name,
-            chosen,
-            known=shared.newest,
-            on_close=shared.recorded,
-        )
+        interval_s = follow_interval_s(chosen)
+        follow = FollowerProcess.of_short(shared, "Starting a recording", interval_s)
+        return LiveRecording(shared, follow, name, chosen)
 
     @again_if_lost
     def sizes(self, recordings: Names | None = None) -> Sizes:
         """Bytes of recordings and topics in segments, tables and MongoDB.
 
-        Args:
-            recordings: The recordings; None for all.
-
-        Returns:
-            `rows`, `by_recording()`, `by_topic()` and `total`; the share of MongoDB is None if
-            that is unavailable.
-
-        Raises:
-            TopicError: A recording does not exist.
+        The share of MongoDB is None if that is unavailable; TopicError if one does not exist.
         """
         from hybridlog.maintenance.sizes import sizes_of
 
@@ -700,12 +627,10 @@ class Store:
         *,
         repair: bool = False,
     ) -> Verification:
-        """Check all checksums, and compare catalog and index with the segments.
+        """Compare every byte of recordings, None for all, with their manifests.
 
-        Args:
-            recordings: The recordings; None for all.
-            progress: Called after each chunk.
-            repair: Make all repairs that lose no data first.
+        With `repair`, all repairs that lose no data are made first; `progress` is called after
+        each chunk.
         """
         from hybridlog.maintenance.verify import verify
 
@@ -737,9 +662,6 @@ class Store:
                 `{"quota": "200GB"}`; None for that table.
             dry_run: True to say what would go, and delete nothing.
 
-        Returns:
-            What went, and why.
-
         Raises:
             UsageError: A rule is malformed, or not for a bucket.
             StoreError: Another process deletes here, too; or the store is read-only.
@@ -769,44 +691,23 @@ class Store:
         topics: Sequence[str] | None = None,
         reason: str = "",
     ) -> str:
-        """Pin a time of a recording: its payloads are never deleted to make room.
+        """Pin `[begin, end)` of a recording, which is never deleted to make room.
 
-        Args:
-            recording: Its name or id, or its entry; it may be running.
-            begin: First log time; None for the beginning.
-            end: Log time after the last one; None for the end.
-            topics: Full names of topics; None for all.
-            reason: Why it is pinned.
-
-        Returns:
-            The name of the pin.
-
-        Raises:
-            TimeError: A time is invalid, or the range is empty or outside of the recording.
+        Log times are as for `Query.between`, None for no bound; `topics` are full names, None for
+        all. Returns the name of the pin; TimeError for a range that is empty, or outside.
         """
         from hybridlog.maintenance.edit import pin
 
         return pin(self._to_change(), recording, (begin, end), topics, reason)
 
     def unpin(self, *names: str) -> None:
-        """Remove pins.
-
-        Raises:
-            UsageError: There is no pin of a name.
-        """
+        """Remove pins; UsageError if there is none of a name."""
         from hybridlog.maintenance.edit import unpin
 
         unpin(self._to_change(), names)
 
     def remove(self, recording: str) -> None:
-        """Delete a recording.
-
-        Args:
-            recording: Name or id.
-
-        Raises:
-            StoreError: it is being written.
-        """
+        """Delete a recording, by name or id; StoreError if it is being written."""
         from hybridlog.maintenance.edit import remove_if
 
         shared = self._to_change()
@@ -831,8 +732,7 @@ class Store:
             untag: Keys of tags to remove.
 
         Raises:
-            UsageError: A tag to remove does not exist; a name, note or key is empty; or
-                something is no text.
+            UsageError: A tag to remove does not exist, or something is empty or no text.
         """
         from hybridlog.maintenance.edit import edit
 
@@ -848,20 +748,17 @@ class Store:
         *,
         until: TimeLike | None = None,
     ) -> RecordingEntry:
-        """Set a mark at a time of a recording, also of one that is being written.
-
-        A mark is a line of the manifest. It answers like a message on `/hybridlog/marks`.
+        """Set a mark at a time of a recording, which answers like a message on `/hybridlog/marks`.
 
         Args:
-            recording: Name or id.
+            recording: Name or id; it may be running.
             moment: Log time, as for `Query.between`.
             note: Text of the mark.
             tags: Tags of the mark.
             until: Log time of its end, for what lasted; None for a moment.
 
         Raises:
-            TimeError: `moment` or `until` is invalid or outside the recording, or `until` is
-                before `moment`.
+            TimeError: A time is invalid or outside the recording, or `until` before `moment`.
             StoreError: It has 10,000 marks already, or the store cannot be written.
         """
         from hybridlog.maintenance.edit import mark
@@ -869,16 +766,9 @@ class Store:
         return mark(self._to_change(), recording, (moment, until), note, tags or {})
 
     def unmark(self, recording: str, note: str, moment: TimeLike | None = None) -> RecordingEntry:
-        """Remove marks that somebody set; those that a recorder noted are messages, and stay.
+        """Remove marks of a text that somebody set, at a log time, None for any.
 
-        Args:
-            recording: Name or id.
-            note: Text of the marks.
-            moment: Log time, as for `Query.between`; None for any.
-
-        Raises:
-            TimeError: `moment` is invalid.
-            UsageError: There is no such mark.
+        TimeError for an invalid time, UsageError without such a mark.
         """
         from hybridlog.maintenance.edit import unmark
 
@@ -894,8 +784,8 @@ class Store:
     ) -> CopyReport:
         """Copy recordings to another store; what is there already is not copied again.
 
-        Every byte is proved there before a recording is seen. After an interruption the
-        next call goes on where this one stopped.
+        Every byte is proved there before a recording is seen; those that are damaged or have not
+        ended are refused. After an interruption the next call goes on.
 
         Args:
             to: The other store: a directory, which is made, `ssh://user@host/path`, or a place in
@@ -904,9 +794,6 @@ class Store:
             options: What is copied of them, and how.
             progress: Called with the bytes copied of all that are to be copied.
             report: Takes the result as it grows, so that it is known after an error, too.
-
-        Returns:
-            What was copied; recordings that are damaged or have not ended are refused.
 
         Raises:
             StoreError: The place is not reached, or cannot be written.

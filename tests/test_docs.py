@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 import pytest
+from msgspec.structs import asdict
 
 import hybridlog as hl
 from benchmarks import page
@@ -780,7 +781,7 @@ def test_a_second_reader_gets_the_same_messages(recorded: hl.Store) -> None:
         assert (recording.id, recording.status) == (entry.id, entry.status)
         assert (recording.manifest.name, recording.manifest.tags) == (entry.name, entry.tags)
         for of_files in (False, True):
-            losses = bare(entry.end.get("losses", ()), of_files=of_files)
+            losses = bare(entry.losses, of_files=of_files)
             assert bare(recording.losses, of_files=of_files) == losses
         told = sorted(message for _, message in recording.messages())
         schemas = {
@@ -816,7 +817,7 @@ def older(recorded: hl.Store, tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert (before.status, after.status) == ("unfinished", "damaged")
     again = FormatReader(store).recording("robot")
     assert again.status == "damaged"
-    assert bare(again.losses, of_files=True) == bare(after.end["losses"], of_files=True) != []
+    assert bare(again.losses, of_files=True) == bare(after.losses, of_files=True) != []
     return robot / "000001.mcap"
 
 
@@ -869,12 +870,12 @@ def test_the_status_follows_from_the_page_alone(
         assert (recording.status, recording.id) == (status, entry.id)
         assert entry.status == recording.status
         lost = bare(recording.losses, of_files=True)
-        assert lost == bare(entry.end.get("losses", ()), of_files=True)
+        assert lost == bare(entry.losses, of_files=True)
         assert bool(lost) == (recording.status == "damaged")
         assert entry.segments == len(recording.segments)
         counted = sum(p.messages for s in recording.segments.values() for p in s.parts)
         assert entry.messages == counted
-        assert (recording.end or {})["status"] == entry.end["status"] == "complete"
+        assert (recording.end or {})["status"] == entry.manifest.status == "complete"
     with hl.open(tmp_path / "store") as store:
         whole = recorded.entry("robot")
         missing = sum(row["count"] for row in lost)
@@ -909,7 +910,7 @@ def test_a_damaged_chunk_is_the_same_loss_for_both(recorded: hl.Store, tmp_path:
     assert len(found.findings) == 3
     with hl.open(tmp_path / "store", require_database=True) as store:
         entry = store.entry("robot")
-        lost = bare(entry.end["losses"], of_files=True)
+        lost = bare(entry.losses, of_files=True)
     assert entry.status == "damaged"
     assert lost == bare(second.losses, of_files=True)
 
@@ -927,9 +928,9 @@ def test_what_people_wrote_is_read_from_the_manifest(recorded: hl.Store, tmp_pat
     assert (entry.name, entry.status) == ("Tuesday", recording.status)
     assert recording.manifest.name == "Tuesday"
     assert recording.manifest.tags == entry.tags == {"place": "lab"}
-    assert recording.manifest.notes == [(n["at"], n["text"]) for n in entry.notes]
+    assert recording.manifest.notes == [(n.at, n.text) for n in entry.manifest.notes]
     (mark,) = recording.manifest.marks
-    assert mark == entry.marks[0]
+    assert mark == {k: v for k, v in asdict(entry.manifest.marks[0]).items() if v is not None}
     assert (mark["text"], mark["tags"]) == ("bump", {"how": "hard"})
     seqs = sorted(m.seq for _, m in recording.messages())
     assert seqs == list(range(len(seqs)))

@@ -126,8 +126,8 @@ def test_what_was_acknowledged_while_it_was_recorded_is_there(
         store.refresh()
         entry = store.entry(recording.id)
         assert entry.tags.keys() == wanted
-        assert sorted(note["text"] for note in entry.notes) == sorted(wanted)
-        assert sorted(pin["reason"] for pin in entry.pins) == sorted(wanted)
+        assert sorted(note.text for note in entry.manifest.notes) == sorted(wanted)
+        assert sorted(pin.reason for pin in entry.manifest.pins) == sorted(wanted)
         assert entry.name in {f"name-p{who}-{edits - 1}" for who in range(editors)}
         assert (entry.status, entry.messages) == ("complete", written)
         manifest = places.manifest(path, recording.id)

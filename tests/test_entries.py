@@ -173,7 +173,7 @@ def by_topic(*segments: int) -> Counter[str]:
 def lost(entry: RecordingEntry) -> Counter[str]:
     """Messages that the ledger says were in segments, by topic."""
     found: Counter[str] = Counter()
-    for row in entry.end.get("losses", ()):
+    for row in entry.losses:
         if row["cause"] == "segment":
             found[row["topic"]] += row["count"]
     return found
@@ -192,7 +192,7 @@ def check(entry: RecordingEntry, *missing: int) -> None:
     assert entry.segments == len(there)
     assert [number for number, _, _ in entry.spans] == there
     assert entry.digests.keys() == set(map(str, there))
-    rows = [row for row in entry.end["losses"] if row["cause"] == "segment"]
+    rows = [row for row in entry.losses if row["cause"] == "segment"]
     for row in rows:
         number = int(row["file"].removesuffix(".mcap"))
         assert number in missing
@@ -283,9 +283,8 @@ def test_a_manifest_that_was_made_again_says_what_the_old_one_said(made: Made) -
     made.make_again()
     # What is missing does not come back; only the last change is lost.
     entry = made.entry()
-    assert plain(entry) == replace(
-        plain(before), notes=[], end={**before.end, "status": "unproven"}
-    )
+    manifest = changed(plain(before).manifest, notes=(), status="unproven")
+    assert plain(entry) == replace(plain(before), manifest=manifest)
     assert entry.status == "damaged"
     assert lost(entry) == by_topic(2)
 
@@ -350,12 +349,13 @@ def test_what_a_crash_took_of_a_listed_segment(made: Made) -> None:
 
 
 def unproven(entry: RecordingEntry) -> RecordingEntry:
-    return replace(plain(entry), status="unproven", end={**entry.end, "status": "unproven"})
+    manifest = changed(entry.manifest, status="unproven")
+    return plain(replace(entry, status="unproven", manifest=manifest))
 
 
 def plain(entry: RecordingEntry) -> RecordingEntry:
     """Without the lines of the manifest, which say when they were written."""
-    return replace(entry, logs={})
+    return replace(entry, logs={}, manifest=changed(entry.manifest, files=(), changes=0))
 
 
 def changed_part(part: Part, more: int) -> Part:
@@ -367,7 +367,7 @@ def test_a_lost_segment_of_which_nothing_is_known_is_a_row_all_the_same(made: Ma
     made.change(lambda now: changed(now, files=(*now.files, file)))
     entry = made.entry()
     assert entry.status == "damaged"
-    (row,) = [r for r in entry.end["losses"] if r["cause"] == "segment"]
+    (row,) = [r for r in entry.losses if r["cause"] == "segment"]
     assert (row["file"], row["count"], row["topic"]) == ("000004.mcap", 0, None)
 
 
@@ -382,7 +382,7 @@ def test_chunks_that_cannot_be_read_are_lost_by_topic(made: Made) -> None:
         catalog.put_damage(made.id, {(2, 0): "its checksum differs", (2, 99): "x", (9, 0): "y"})
         entry = put_entry(made.directory, catalog, made.id)
     assert entry.status == "damaged"
-    rows = [row for row in entry.end["losses"] if row["cause"] == "segment"]
+    rows = [row for row in entry.losses if row["cause"] == "segment"]
     assert {row["file"] for row in rows} == {"000002.mcap"}
     assert {row["reason"] for row in rows} == {"its checksum differs"}
     assert {(row["offset"], row["length"]) for row in rows} == {

@@ -118,9 +118,9 @@ def test_a_running_one_has_several_open_files(tmp_path: Path) -> None:
         with hl.open(tmp_path / "store", mongo="none") as other:
             following = other.all_topics().follow("**")
             recording.write(SMALL, payload(1000, 4), log_time=BEGIN - MS)
-            wait_for(lambda: len({*recording.progress}) == 1)
+            wait_for(lambda: recording.capture.writer.written.total() == recording.taken.total())
             written = [("/small", 1000), *write(recording)]
-            wait_for(lambda: len({*recording.progress}) == 1)
+            wait_for(lambda: recording.capture.writer.written.total() == recording.taken.total())
             assert len([*folder.glob("*.open")]) > 2
             assert read(other) == written
             shutil.copytree(tmp_path / "store", tmp_path / "killed")

@@ -131,3 +131,19 @@ def test_a_child_is_told_to_open_the_store(store: hl.Store) -> None:
     with held(*locks_of(store, {})):
         in_child(refused)
     assert query.count() == 5
+
+
+def test_a_child_leaves_the_recording_of_its_parent_alone(store: hl.Store) -> None:
+    channel = Channel("/own", "json", None)
+    with store.start("own") as recording:
+        recording.write(channel, b"{}")
+
+        def refused() -> None:
+            for use in (lambda: recording.write(channel, b"{}"), recording.close, recording.abort):
+                with pytest.raises(UsageError, match="made by the parent of this process"):
+                    use()
+            recording.__exit__()
+
+        in_child(refused)
+        recording.write(channel, b"{}")
+    assert store.topic("/own").count() == 2

@@ -405,7 +405,7 @@ def test_a_catalog_lost_while_the_store_is_open(store: Path, way: str) -> None:
         else:
             OF_CATALOG[way](store / CATALOG)
         assert (imu.count(), imu.where(WHERE).count(), sum(1 for _ in imu)) == want
-        assert two.source["fingerprint"] in opened.session.snapshot().by_fingerprint
+        assert two.manifest.source.fingerprint in opened.session.snapshot().by_fingerprint
         assert opened.edit(one.id, name=two.name).name == f"{two.name}-2"
         opened.refresh()
         assert len(opened.recordings()) == 2

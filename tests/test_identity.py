@@ -88,10 +88,8 @@ def test_a_folder_with_another_name_is_told_and_left_alone(place: Path) -> None:
     folder.rename(folder.with_name("other"))
     with hl.open(place, mongo=NOWHERE) as store:
         assert [one.status for one in store.recordings()] == ["damaged"]
-        assert "give the folder this name again" in store.shared.repairs.unreadable["other"]
-        findings = {one.recording: one.problem for one in store.verify().findings}
-        assert folder.name in findings["other"]
-        assert findings.keys() == {"one", "other"}
+        assert "give it its name again" in store.shared.repairs.unreadable["other"]
+        assert {one.recording for one in store.verify().findings} == {"one", "other"}
     folder.with_name("other").rename(folder)
     with hl.open(place, mongo=NOWHERE) as store:
         assert answers(store) == answers(store, "one") == right()
@@ -107,13 +105,12 @@ def test_a_copy_inside_a_store_is_told_and_left_alone(place: Path, mongo: str, c
             assert [r.name for r in store.recordings()] == ["one"]
             assert "if it is a copy" in store.shared.repairs.unreadable[copy]
             assert answers(store) == right()
-            (finding,) = store.verify().findings
-            assert (finding.recording, "if it is a copy" in finding.problem) == (copy, True)
+            assert [one.recording for one in store.verify().findings] == [copy]
             store.index.rebuild()
             assert answers(store) == right()
             done = store.verify(repair=True)
             assert not done.repaired
-            assert [one.recording for one in done.findings] == [copy]
+            assert {one.recording for one in done.findings} == {copy}
             with pytest.raises(TopicError):
                 store.remove(copy)
     shutil.rmtree(path)

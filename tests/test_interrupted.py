@@ -119,8 +119,8 @@ def look(path: Path) -> State:
         return {
             one.name: (
                 one.tags,
-                [mark["text"] for mark in one.marks],
-                len(one.pins),
+                [mark.text for mark in one.manifest.marks],
+                len(one.manifest.pins),
                 said(store, one.id) if one.messages else {},
             )
             for one in store.recordings()

@@ -399,7 +399,7 @@ def test_whole_groups_go_when_no_payloads_are_left(store: Path) -> None:
         assert {*range(51, 70)} <= {*arms} & {*cameras}
         assert max(len(arms), len(cameras)) < COUNT
         (entry,) = opened.recordings()
-        assert entry.messages == len(arms) + len(cameras) + len(entry.marks)
+        assert entry.messages == len(arms) + len(cameras) + len(entry.manifest.marks)
         for topic, numbers in (("/arm", arms), ("/camera", cameras)):
             query = opened.topic(topic)
             assert query.count() == query.where("n >= 0").count() == len(numbers)
@@ -455,7 +455,7 @@ def test_a_full_disk_is_relieved_and_fields_stay(
     assert {*payloads(path).values()} == {None}
     assert step.segments == tuple(n for n, log in logs_of(path).items() if not log.is_here)
     check_answers(path)
-    assert not hl.open(path, mongo="none").recordings()[0].end.get("losses")
+    assert not hl.open(path, mongo="none").recordings()[0].losses
 
 
 def test_a_log_that_goes_without_its_fields_is_counted(store: Path, calls: Calls) -> None:
@@ -466,10 +466,10 @@ def test_a_log_that_goes_without_its_fields_is_counted(store: Path, calls: Calls
         camera = opened.topic("/camera")
         lost = COUNT - camera.count()
         assert lost > 50
-        assert {(one["cause"], one["reason"]) for one in entry.end["losses"]} == {
+        assert {(one["cause"], one["reason"]) for one in entry.losses} == {
             ("segment", "deleted without its fields: the disk was full")
         }
-        assert sum(one["count"] for one in entry.end["losses"]) == lost
+        assert sum(one["count"] for one in entry.losses) == lost
         assert len([m.raw for m in camera]) == camera.where("n >= 0").count() == COUNT - lost
         assert f"{lost} messages" in str(camera.completeness())
         assert [m.fields["n"] for m in opened.topic("/arm")] == [*range(COUNT)]

@@ -779,8 +779,8 @@ def compare(entry: RecordingEntry, known: Recording) -> None:
     """Hold what the store says of a recording against the model."""
     assert entry.messages == len(known.messages)
     assert (entry.name, entry.tags) == (known.name, known.tags)
-    assert [note["text"] for note in entry.notes] == known.notes
-    assert [(mark["time"], mark["text"]) for mark in entry.marks] == known.marks
+    assert [note.text for note in entry.manifest.notes] == known.notes
+    assert [(mark.time, mark.text) for mark in entry.manifest.marks] == known.marks
     times = [m.log_time for m in known.messages]
     assert entry.span == ((min(times), max(times)) if times else None)
     stats = [c.stats for c in entry.channels]
@@ -793,7 +793,7 @@ def compare(entry: RecordingEntry, known: Recording) -> None:
     # A segment that is gone is a loss of just its messages, and no other.
     assert entry.status == ("damaged" if known.lost else known.status)
     losses: Counter[str] = Counter()
-    for row in entry.end.get("losses", ()):
+    for row in entry.losses:
         assert row["cause"] == "segment"
         losses[str(row["topic"])] += row["count"]
     losses = Counter({topic: number for topic, number in losses.items() if number})

@@ -105,7 +105,7 @@ def look(found: Path, run: Run, sync: str) -> str:
                 assert bytes(one.raw) == message(one.log_time_ns - 1000)
         store.refresh()  # what could not be read is known now
         (entry,) = entries = store.recordings()
-        lost = sum(row["count"] or 0 for row in entry.end.get("losses", ()))
+        lost = sum(row["count"] or 0 for row in entry.losses)
         count = sum(map(len, got.values()))
         assert count == entry.messages
         if entry.status == "complete":

@@ -48,7 +48,7 @@ def look(store: Path) -> tuple[str, int, int]:
         entry = opened.entry("one")  # what cannot be read is known by now
         assert set(got) <= {payload(n) for n in range(100, 100 + COUNT)}
         assert len(got) == entry.messages
-        lost = sum(row["count"] for row in entry.end.get("losses", ()))
+        lost = sum(row["count"] for row in entry.losses)
         return entry.status, entry.messages, lost
 
 
@@ -213,7 +213,7 @@ def test_a_segment_that_was_restored_is_answered_from_again(store: Path) -> None
     with hl.open(store) as opened:
         opened.index.rebuild()
         entry = opened.entry("one")
-        lost = sum(row["count"] for row in entry.end["losses"])
+        lost = sum(row["count"] for row in entry.losses)
         assert (entry.status, lost > 0) == ("damaged", True)
         with pytest.raises(SegmentError, match=r"byte \d+ of .*000001\.mcap is damaged"):
             opened.topic("/n").where("n >= 0").count()
@@ -238,7 +238,11 @@ def test_a_mark_beside_a_lost_segment_takes_nothing_of_it(store: Path) -> None:
     last.write_bytes(whole)
     with closing(hl.open(store, mongo=NOWHERE)) as opened:
         entry = opened.entry("one")
-        assert (entry.status, entry.messages, len(entry.marks)) == ("complete", COUNT + 1, 1)
+        assert (entry.status, entry.messages, len(entry.manifest.marks)) == (
+            "complete",
+            COUNT + 1,
+            1,
+        )
         seqs = [m.seq for m in opened.all_topics().in_recording("one")]
         assert len(set(seqs)) == len(seqs) == COUNT + 1
 

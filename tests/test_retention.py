@@ -56,7 +56,7 @@ def gone(number: int, age: float) -> list[File]:
     return [log, rows]
 
 
-def held(name: str, *files: File, ended: bool = True, window: int = 0, **values: Any) -> Recording:
+def held(name: str, *files: File, ended: bool = True, seen: Any = None, **values: Any) -> Recording:
     manifest = Manifest(
         f"{name}-{sum(name.encode()):016x}",
         name,
@@ -66,7 +66,7 @@ def held(name: str, *files: File, ended: bool = True, window: int = 0, **values:
         files=files,
         **values,
     )
-    return manifest, held_of(manifest, NOW, window)
+    return manifest, held_of(manifest, NOW, seen)
 
 
 def made(
@@ -123,9 +123,9 @@ def test_when_room_is_short_the_oldest_goes(used: int, free: int, steps: list[An
     assert not found.is_short
 
 
-def test_a_topic_rule_leaves_what_a_trigger_may_want() -> None:
+def test_a_topic_rule_leaves_what_triggers_have_not_seen() -> None:
     rules = {"quota": "100MB", "topic": {CAMERA: "1y"}}
-    running = held("running", *both(50, 40, 20), ended=False, window=25 * DAY)
+    running = held("running", *both(50, 40, 20), ended=False, seen={0, 1})
     assert [log.goes_last for log in running[1]] == [False, False, True, True, True, True]
     assert [one[:2] for one in told(made(rules, running, used=90 * MB))] == [("running", (0,))]
     # More is short than the others have: it goes after them, and a new recording before it.

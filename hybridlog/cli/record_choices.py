@@ -241,7 +241,7 @@ def row_of(report: RecordReport, path: object) -> dict[str, Any]:
         "attachments_left_out": report.attachments_left_out,
         "metadata_records": entry.metadata_records,
         # A live source has no size of its own.
-        "bytes_in": entry.source["bytes"] or sum(one.payload_bytes for one in stats),
+        "bytes_in": entry.manifest.source.bytes or sum(one.payload_bytes for one in stats),
         "seconds": round(report.elapsed_s, 3),
         "losses": losses_of(entry),
         "damage": [{**asdict(d), "file": str(d.file)} for d in report.damage],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import socket
@@ -81,7 +82,6 @@ def record_live(choices: RecordChoices) -> int:
 
 
 def _record(choices: RecordChoices) -> int:
-    from hybridlog.live.policy import frozen_objects
     from hybridlog.live.recorder import Recorder, make_room
 
     # Wrong options are found before a store is made.
@@ -95,7 +95,8 @@ def _record(choices: RecordChoices) -> int:
             held.enter_context(source).check()
         store = held.enter_context(choices.opened_to_record())
         make_room(store, options.reserve_bytes)
-        with _stop_flag() as stop, frozen_objects():
+        gc.freeze()  # the collector skips what was there before
+        with _stop_flag() as stop:
             full = ""
             while True:
                 recorder = Recorder(store, sources, options, _say)
@@ -144,7 +145,7 @@ def _finish(
         DIFFERENT: broken,
     }
     code = next((code for code, applies in worst.items() if applies), 0)
-    rows = [row_of(one, one.entry.source["path"]) for one in reports]
+    rows = [row_of(one, one.entry.manifest.source.path) for one in reports]
     if choices.as_json:
         about = {
             "ended": reason,
@@ -181,7 +182,7 @@ def _finish(
     errors += (f"{one} was never reached, so nothing of it is recorded." for one in unreached)
     if recorder.stopped_for_disk and (choices.as_json or output.is_quiet()):
         errors.append(reason)
-    losses = [row for one in reports for row in one.entry.end.get("losses", [])]
+    losses = [row for one in reports for row in one.entry.losses]
     if lost := [row for row in losses if row["cause"] == Cause.UNREADABLE]:
         errors.append(f"{in_words(lost)} that cannot be read; `hybridlog info --losses` lists them")
     output.notes(f"hybridlog: {line}" for line in (*errors, *map(not_indexed, failed)))

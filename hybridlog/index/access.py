@@ -31,7 +31,7 @@ from hybridlog_storage.settings import (
 if TYPE_CHECKING:
     from hybridlog.index.indexing import IndexTarget
     from hybridlog.maintenance.report import Progress
-    from hybridlog.shared import Shared
+    from hybridlog.opened import OpenStore
     from hybridlog_storage.mongo.database import Database
     from hybridlog_storage.mongo.index_documents import Owner
     from hybridlog_storage.mongo.mongod import EmbeddedMongod
@@ -90,7 +90,7 @@ class IndexAccess:
 
     def __init__(
         self,
-        shared: Shared,
+        shared: OpenStore,
         mongo: str | None,
         progress: Progress | None,
     ) -> None:

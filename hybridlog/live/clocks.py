@@ -31,7 +31,6 @@ CLOCK: Final = "/clock"
 """The topic with the time."""
 
 _MAX_TICKS: Final = 4096  # past times, for messages and losses that are told late
-_MAX_JUMPS: Final = 10  # jumps that are told
 _OVERHEAD: Final = 1024  # bytes of memory for a held message besides its payload
 _MAX_NS: Final = 1 << 63
 _ROS1 = struct.Struct("<II")
@@ -61,7 +60,6 @@ class SimulatedTime(Sink):
         self._lock = threading.Lock()
         self._latest = (0, 0)
         self._ticks: deque[tuple[int, int]] = deque(maxlen=_MAX_TICKS)
-        self._jumps = 0
         # What is done when the clock comes, and when it does not.
         self._held: deque[tuple[Callable[[int], None], Callable[[], None]]] | None = deque()
         self._held_bytes = 0
@@ -85,9 +83,7 @@ class SimulatedTime(Sink):
             is_first, before = not self._ticks, self._latest[1]
             self._latest = (received, now)
             self._ticks.append(self._latest)
-            self._jumps += now < before
-            is_reported = now < before and self._jumps <= _MAX_JUMPS
-        if is_reported:
+        if now < before:
             self._recorder.say(
                 f"{CLOCK} went back by {(before - now) / 1e9:.3f} s, to {now / 1e9:.3f} s; log "
                 "times go back with it"
@@ -274,7 +270,7 @@ class MachineClock:
         self._monotonic = monotonic
         self._offset = now() - monotonic()
         self._jumps: deque[Jump] = deque(maxlen=_MAX_KEPT_JUMPS)
-        self._untold: deque[Jump] = deque(maxlen=_MAX_KEPT_JUMPS)
+        self._told = now() - 1
         self._lock = threading.Lock()
 
     def steady(self, log_time: int) -> int:
@@ -307,8 +303,8 @@ class MachineClock:
         """The jumps since the last call."""
         self._look()
         with self._lock:
-            found = [*self._untold]
-            self._untold.clear()
+            found = [jump for jump in self._jumps if jump.at > self._told]
+            self._told = max((jump.at for jump in found), default=self._told)
         return found
 
     def _look(self) -> None:
@@ -319,5 +315,4 @@ class MachineClock:
             if abs(by) >= _MIN_JUMP_NS:
                 at = now - by - self.set_by
                 self.set_by += by
-                for each in (self._jumps, self._untold):
-                    each.append(Jump(at, by, self.set_by))
+                self._jumps.append(Jump(at, by, self.set_by))

@@ -2,33 +2,22 @@
 
 A hit of a trigger or signal is an incident: a mark and a pin of the same time in the recording's
 manifest. Hits of one name whose times touch are one incident.
-
-A ring lets groups of files go that ended longer ago than a time: that which has passed, never that
-of a clock. A group stays while a pin touches it; a file stays while it has the latched messages
-that a late subscriber would receive.
 """
 
 from __future__ import annotations
 
 import threading
 import time
-from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
-from hybridlog.maintenance.keep import let_go
-from hybridlog.maintenance.retention import is_pinned
-from hybridlog.query.latching import depth_of, publisher_of
 from hybridlog.query.times import format_duration, format_time
 from hybridlog_storage.manifest import Mark, Pin, new_random, replace, with_mark
 
 if TYPE_CHECKING:
     from hybridlog.contract import Contract
-    from hybridlog.follow.child import FollowerProcess
     from hybridlog.live.clocks import MachineClock
-    from hybridlog.live.recording import LiveRecording
-    from hybridlog_storage.disk.directory import StoreDirectory
-    from hybridlog_storage.manifest import File, Manifest
+    from hybridlog_storage.manifest import Manifest
 
 PINNED: Final = "is marked and pinned"
 _EVERY_S: Final = 0.1
@@ -45,11 +34,10 @@ class Moment(NamedTuple):
 
 
 class Incidents:
-    """Marks and pins on a thread of its own, looks for silences, lets what a ring has too long go.
+    """Marks and pins on a thread of its own, and looks for silences.
 
-    `now` returns the present as a steady time, ns. Nothing goes before the hits that came until
-    then are pinned. What fails is tried again. Without a clock, as of a simulation, log times are
-    steady.
+    `now` returns the present as a steady time, ns. What fails is tried again. Without a clock, as
+    of a simulation, log times are steady.
     """
 
     def __init__(
@@ -58,7 +46,6 @@ class Incidents:
         *,
         clock: MachineClock | None,
         first: Callable[[], int | None],
-        ring: Ring | None,
         silence: SilenceWatch,
         now: Callable[[], int],
         say: Callable[[str], None],
@@ -67,7 +54,6 @@ class Incidents:
         self._change = change
         self._clock = clock
         self._first = first
-        self._ring = ring
         self._silence = silence
         self._now = now
         self._say = say
@@ -81,7 +67,7 @@ class Incidents:
         self._lock = threading.Lock()
         self._writing = threading.Lock()
         self._over = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="hybridlog-ring", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="hybridlog-marks", daemon=True)
 
     def start(self) -> None:
         """Begin."""
@@ -172,13 +158,10 @@ class Incidents:
                 self._silence.look(self._now(), is_end=is_over)
                 now = time.monotonic()
                 self._follow_clock()
-                due = self._ring.due(now) if self._ring is not None and not is_over else set()
-                if due or is_over or self._is_urgent or now - self._written_at > _PROLONGED_S:
+                if is_over or self._is_urgent or now - self._written_at > _PROLONGED_S:
                     self.write()
-                if due and self._ring is not None:
-                    self._ring.let_go(due)
             except Exception as error:
-                self._say(f"marking, pinning or letting go failed: {error or repr(error)}")
+                self._say(f"marking or pinning failed: {error or repr(error)}")
 
     def _follow_clock(self) -> None:
         """When the clock was set, what is pinned ahead has other log times."""
@@ -186,86 +169,6 @@ class Incidents:
             self._set_by = self._clock.set_by
             with self._lock:
                 self._new.update({key: self._hits[key] for key, *_ in self._last.values()})
-
-
-GROUPS: Final = 10
-"""Groups of files in the time of a ring, about."""
-_LATE_S: Final = 1.0  # a signal may come so long after what it is about
-
-
-class Ring:
-    """Lets the oldest groups of a recording go, once triggers have seen them."""
-
-    def __init__(
-        self,
-        directory: StoreDirectory,
-        recording: LiveRecording,
-        span_s: float,
-        follower: FollowerProcess | None = None,
-    ) -> None:
-        self.messages = 0
-        self._directory = directory
-        self._recording = recording
-        self._span_s = span_s + _LATE_S
-        self._follower = follower
-        self._seen = 0
-        self._ended: dict[int, float] = {}  # when each group was first seen sealed
-        self._files: dict[int, set[int]] = {}  # their numbers, by group
-        self._kept: set[int] = set()  # must stay, as long as no other group is sealed
-
-    def due(self, now: float) -> set[int]:
-        """The groups whose time is over."""
-        sealed = self._recording.sealed
-        if sealed != self._seen:
-            logs = self._directory.manifests.read(self._recording.id).logs.values()
-            seen = time.monotonic()
-            self._ended = {log.group: self._ended.get(log.group, seen) for log in logs}
-            self._files = defaultdict(set)
-            for log in logs:
-                self._files[log.group].add(log.number)
-            self._seen, self._kept = sealed, set()
-        old = {group for group, at in self._ended.items() if now - at >= self._span_s}
-        judged = None if self._follower is None else self._follower.judged
-        if judged is not None:
-            old = {group for group in old if self._files[group].issubset(judged)}
-        return old - self._kept
-
-    def let_go(self, groups: Collection[int]) -> None:
-        """Delete the files of some groups, except those that must stay.
-
-        Raises:
-            StoreError: The manifest cannot be changed, or a file cannot be deleted.
-        """
-        changed = let_go(self._directory, self._recording.id, lambda now: self._going(now, groups))
-        self._kept.update(groups)  # what is left of them stays, until another group is sealed
-        self.messages = 0 if changed.let_go is None else changed.let_go.messages
-
-    def _going(self, now: Manifest, groups: Collection[int]) -> list[File]:
-        logs = [log for log in now.logs.values() if log.group in groups]
-        pinned = {log.group for log in logs if is_pinned(log, now)}
-        in_force = self._in_force(now)
-        return [
-            file
-            for file in now.files
-            if file.group in groups and file.group not in pinned and file.number not in in_force
-        ]
-
-    def _in_force(self, now: Manifest) -> set[int]:
-        """Numbers of the files with latched messages that no later ones have replaced."""
-        found: set[int] = set()
-        newer: Counter[Hashable] = Counter()
-        for number, log in sorted(now.logs.items(), reverse=True):
-            came: Counter[Hashable] = Counter()
-            for one, part in log.parts.items():
-                channel = self._recording.capture.writer.channels.get(one)
-                depth = 0 if channel is None else depth_of(channel)
-                if channel is not None and depth and part.messages:
-                    publisher = publisher_of(channel)
-                    came[publisher] += part.messages
-                    if newer[publisher] < depth:
-                        found.add(number)
-            newer += came
-        return found
 
 
 RULE: Final = "longest_gap"

@@ -1,4 +1,4 @@
-"""Policies of a recorder: throttles, priorities, the memory budget, the garbage collector.
+"""Policies of a recorder: throttles, priorities, the memory budget.
 
 A throttle limits a topic's rate at all times. Priorities decide which topics drop payloads
 first when the memory budget fills, because messages come faster than the disk writes.
@@ -6,13 +6,10 @@ first when the memory budget fills, because messages come faster than the disk w
 
 from __future__ import annotations
 
-import gc
 import math
 import os
 import re
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Final
 
 from msgspec import Struct
@@ -98,16 +95,6 @@ class Throttle:
         return True
 
 
-@contextmanager
-def frozen_objects() -> Iterator[None]:
-    """The collector skips all objects that existed before; for the program that records."""
-    gc.freeze()
-    try:
-        yield
-    finally:
-        gc.unfreeze()
-
-
 MIN_USER_BUDGET: Final = 1 << 20
 """Smallest budget that a user may choose, bytes."""
 _MIN_BUDGET, _MAX_BUDGET = 64 << 20, 2 << 30
@@ -121,12 +108,3 @@ def default_budget() -> int:
     """
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     return min(max(memory // _MACHINE_SHARE, _MIN_BUDGET), _MAX_BUDGET)
-
-
-def resident_bytes() -> int:
-    """Bytes of memory that this process holds; 0 where that is unknown."""
-    try:
-        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
-    except (OSError, ValueError, IndexError):
-        return 0
-    return pages * os.sysconf("SC_PAGE_SIZE")

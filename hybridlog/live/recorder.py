@@ -24,14 +24,13 @@ from hybridlog.entries import put_entry
 from hybridlog.entries import text as as_text
 from hybridlog.follow.child import FollowerProcess, Task
 from hybridlog.live.clocks import CLOCK, MachineClock, SimulatedTime
-from hybridlog.live.incidents import GROUPS, RULE, Incidents, Moment, Ring, Silence, SilenceWatch
+from hybridlog.live.incidents import RULE, Incidents, Moment, Silence, SilenceWatch
 from hybridlog.live.policy import (
     SMALL_BYTES,
     WHOLE_BELOW,
     Rule,
     Throttle,
     first_fit,
-    resident_bytes,
 )
 from hybridlog.live.recording import LiveOptions, LiveRecording, follow_interval_s
 from hybridlog.live.state import RecorderState, StateFile, Tally, TopicCounts
@@ -65,6 +64,7 @@ if TYPE_CHECKING:
     from hybridlog.store import Store
     from hybridlog_storage.catalog import RecordingEntry
 
+_GROUPS = 10  # of files in the time of a ring, about
 _MAX_REPORTS = 1000
 _MAX_CACHED = 4096  # channel objects that are found without comparing their content
 _FULL_BYTES = 4 << 20  # of a manifest; then another recording goes on
@@ -173,25 +173,14 @@ class Recorder:
             self._simulated = SimulatedTime(self, self.drop, held)
         self._sink: Sink = self._simulated or self
         self._target = LiveRecording(
-            store.directory,
-            store.shared.catalog,
-            self._begin_to_follow,
-            options.name,
-            self._of_recording(),
-            known=store.shared.newest,
-            on_close=store.shared.recorded,
+            store.shared, self._begin_to_follow, options.name, self._of_recording()
         )
         self.name = self._target.name
         self._says = StateFile(store.directory, self._target.id)
-        ring_s = options.ring_s
-        self._ring = (
-            None if ring_s is None else Ring(self._directory, self._target, ring_s, self._follower)
-        )
         self._incidents = Incidents(
             partial(self._directory.manifests.change, self._target.id),
             clock=None if options.use_sim_time else self._clock,
             first=lambda: self._target.first_time,
-            ring=self._ring,
             silence=self._silence,
             now=self._now,
             say=self.say,
@@ -201,10 +190,11 @@ class Recorder:
                 store.directory,
                 partial(remove_if, store.shared),
                 self._target.id,
-                sealed=lambda: self._target.sealed,
+                sealed=lambda: self._target.capture.writer.totals.segments,
                 reserve=options.reserve_bytes,
                 say=self.say,
-                window=round((options.before_s or ring_s or 0) * 1e9),
+                ring_s=options.ring_s,
+                pin=self._incidents.write,
                 judged=lambda: self._follower.judged,
             )
             self._target.make_room = self._retention.make_room
@@ -235,7 +225,7 @@ class Recorder:
     def _of_recording(self) -> LiveOptions:
         options, settings = self._options, self._options.settings
         if options.ring_s is not None:
-            group_s = options.ring_s / GROUPS
+            group_s = options.ring_s / _GROUPS
             span_s = min(settings.segment_span_s or group_s, group_s)
             settings = replace(settings, segment_span_s=span_s)
         by = f", by {CLOCK}" if options.use_sim_time else ""
@@ -374,12 +364,11 @@ class Recorder:
             stored_bytes,
             self._stalled_s(now),
             incidents=self._incidents.count,
-            let_go=None if self._ring is None else self._ring.messages,
+            let_go=None if self._options.ring_s is None else self._retention.keeper.let_go,
             taken=dict(self._target.taken),
             silent=self._silence.silent,
             breaches=self._silence.breaches,
             clock_set_s=self._clock.set_by / 1e9,
-            memory_bytes=resident_bytes(),
             sim_time=None if self._simulated is None else self._simulated.latest,
         )
         self._check_limits(state)
@@ -387,7 +376,7 @@ class Recorder:
         return state
 
     def _stalled_s(self, now: float) -> float:
-        taken, written = self._target.progress
+        taken, written = self._target.taken.total(), self._target.capture.writer.written.total()
         if taken <= written or written != self._written:
             self._written, self._written_at = written, now
         waited = now - self._written_at - self._options.flush_interval_s

@@ -7,6 +7,7 @@ that were taken and not written yet: when it is used up, `write` waits.
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections import Counter, deque
@@ -33,10 +34,9 @@ from hybridlog_storage.segments.segment_writer import SegmentSettings
 
 if TYPE_CHECKING:
     from hybridlog.follow.child import FollowerProcess
+    from hybridlog.opened import OpenStore
     from hybridlog.query.topics import TopicMatcher
-    from hybridlog.snapshot import Snapshot
-    from hybridlog_storage.catalog import Catalog, RecordingEntry
-    from hybridlog_storage.disk.directory import StoreDirectory
+    from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.messages import Buffer
 
 
@@ -108,28 +108,23 @@ class LiveRecording:
     even after an error: the received messages are worth storing.
 
     Args:
-        directory: The store.
-        catalog: The store's catalog.
+        shared: The open store, whose end ends the recording, too.
         follow: Starts the follower of the recording.
         name: Name of the recording.
         options: Options.
-        on_close: Called with the report at the end of the recording.
     """
 
     def __init__(
         self,
-        directory: StoreDirectory,
-        catalog: Catalog,
+        shared: OpenStore,
         follow: Callable[[RecordingEntry], FollowerProcess],
         name: str,
         options: LiveOptions,
-        *,
-        known: Callable[[], Snapshot],
-        on_close: Callable[[RecordReport], None],
     ) -> None:
+        self._process = os.getpid()
+        self._shared = shared
         self._options = options
         self._small_bound = options.budget_bytes * 5 // 4
-        self._on_close = on_close
         self._started = time.monotonic()
         self._taken: dict[Channel, _Taken] = {}
         self._channels: list[Channel] = []
@@ -156,17 +151,17 @@ class LiveRecording:
         self.make_room: Callable[[], bool] = lambda: False
         """Called when the disk is full; returns whether to try again."""
         self.capture = capture = Capture(
-            directory,
-            catalog,
+            shared.directory,
+            shared.catalog,
             follow,
-            known,
+            shared.newest,
             name=name,
             tags=options.tags,
             source={**_SOURCE, **options.source, "flush_interval_s": options.flush_interval_s},
             settings=options.settings,
             no_index=options.no_index,
             is_ring=options.is_ring,
-            make_room=self._when_full,
+            make_room=lambda: self.make_room(),  # noqa: PLW0108 - it may be set later
             on_written=self._notify,
         )
         """Its files and its follower."""
@@ -176,13 +171,16 @@ class LiveRecording:
         """Its name in the store."""
         self._thread = threading.Thread(target=self._run, name="hybridlog-record", daemon=True)
         self._thread.start()
+        shared.live.add(self)
 
     def __enter__(self) -> Self:
         """The recording itself."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close the recording, unless that was tried already."""
+        """Close the recording, unless that was tried already, or a parent process makes it."""
+        if os.getpid() != self._process:
+            return
         with self._closing:
             if not self._is_closing:
                 self.close()
@@ -234,6 +232,7 @@ class LiveRecording:
                 out of range or not an integer, or the recording was closed.
             DiskFullError: The disk is full; flushed messages stay.
         """
+        self._check_process()
         # An error that shows up later would end the whole recording.
         if type(payload) is not bytes:
             payload = _pinned(payload)
@@ -281,20 +280,10 @@ class LiveRecording:
         return min(max(self._unwritten, 0) / self._options.budget_bytes, 1.0)
 
     @property
-    def sealed(self) -> int:
-        """Number of sealed segments."""
-        return self.capture.writer.totals.segments
-
-    @property
     def stored(self) -> tuple[int, int]:
         """Messages in chunks, and the bytes of their payloads."""
         totals = self.capture.writer.totals
         return totals.messages, totals.payload_bytes
-
-    @property
-    def progress(self) -> tuple[int, int]:
-        """Messages taken, and those of them that are written to the disk."""
-        return self.taken.total(), self.capture.writer.written.total()
 
     @property
     def lag(self) -> int:
@@ -332,11 +321,12 @@ class LiveRecording:
             UsageError: Closing has failed before, or the same thread is closing already, as
                 in a signal handler.
         """
+        self._check_process()
         with self._closing:
             if self._report is None:
                 self._end()
                 self._report = self._close_once()
-                self._on_close(self._report)
+                self._shared.recorded(self._report)
             return self._report
 
     def _end(self) -> None:
@@ -391,6 +381,7 @@ class LiveRecording:
         Raises:
             UsageError: The recording was closed, or is being closed.
         """
+        self._check_process()
         with self._closing:
             self._end()
             self.capture.rollback()
@@ -405,13 +396,14 @@ class LiveRecording:
         with self._lock:
             self._room.notify()
 
-    def _when_full(self) -> bool:
-        return self.make_room()
-
     def _wake(self) -> None:
         """Wake the writing thread."""
         if self._calls.empty():
             self._calls.put(None)
+
+    def _check_process(self) -> None:
+        if os.getpid() != self._process:
+            raise UsageError(f"The recording {self.name!r} is made by the parent of this process.")
 
     def _check(self) -> None:
         if self.failure is not None:

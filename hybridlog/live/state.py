@@ -52,7 +52,6 @@ class RecorderState(Struct, frozen=True):
     silent: Sequence[str] = ()
     breaches: int = 0
     clock_set_s: float = 0.0
-    memory_bytes: int = 0
     sim_time: int | None = None
 
     @property

@@ -77,7 +77,7 @@ def time_of_mark(entry: RecordingEntry, moment: TimeLike) -> int:
     time = parse_time(moment, start=start, end=end)
     if entry.status == "open":
         end = max(end, clock.time_ns())
-    if entry.messages > len(entry.marks) and not start <= time <= end:
+    if entry.messages > len(entry.manifest.marks) and not start <= time <= end:
         ends = f"begins at {format_time(start)}" if time < start else f"ends at {format_time(end)}"
         raise TimeError(
             f"A mark cannot be at {format_time(time)}: {entry.name} {ends}; ten seconds from its "
@@ -149,7 +149,7 @@ def unpin(shared: OpenStore, names: Sequence[str]) -> None:
     def how(now: Manifest) -> Manifest:
         return replace(now, pins=tuple(one for one in now.pins if one.id not in names))
 
-    known = {one["id"]: entry for entry in shared.now().select(None) for one in entry.pins}
+    known = {one.id: entry for entry in shared.now().select(None) for one in entry.manifest.pins}
     for name in names:
         if name not in known:
             raise UsageError(f"There is no pin {name!r}; `hybridlog keep --pins` lists them.")

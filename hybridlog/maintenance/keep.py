@@ -13,13 +13,14 @@ that the next change of the store removes.
 
 from __future__ import annotations
 
+import math
 import os
 import secrets
 import shutil
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
 from functools import partial
 from types import MappingProxyType
@@ -54,7 +55,6 @@ from hybridlog_storage.manifest import (
     LetGo,
     Loss,
     Manifest,
-    digest_of,
     replace,
     with_rows,
     with_totals,
@@ -84,7 +84,7 @@ TOO_LATE: Final = "deleted without its fields: they were not written in time"
 """Another one, of a recording in progress."""
 _WAIT_S: Final = 5.0  # for rows that a follower writes
 _POLL_S: Final = 0.1
-_PIECE: Final = 1 << 20
+_LATE_S: Final = 1.0  # a signal may come so long after what it is about
 
 
 class KeepReport(Struct):
@@ -104,13 +104,10 @@ class KeepReport(Struct):
 class Keeper:
     """Applies rules of retention to a store.
 
-    Args:
-        remove: Removes a whole recording, by its id, unless a check of its manifest raises.
-        own: Id of the recording that this process makes, and so holds; None if it makes none.
-        window: The newest of it that goes last, ns: a trigger may want it.
-        judged: Returns the numbers of its segments that triggers have seen, None for all: the
-            others go last.
-        is_wanted: Returns whether to go on; asked before each deletion.
+    `remove` deletes a recording, by its id, unless a check of its manifest raises. `own` is the
+    one that this process makes; after `ring_s` its groups go, and `let_go` counts their messages.
+    `judged` returns the numbers of its segments that triggers have seen, None for all: the others
+    go last. `is_wanted` is asked before each deletion.
     """
 
     def __init__(
@@ -119,29 +116,34 @@ class Keeper:
         remove: Remove,
         own: str | None = None,
         *,
-        window: int = 0,
+        ring_s: float | None = None,
         judged: Callable[[], Collection[int] | None] = lambda: None,
         is_wanted: Callable[[], bool] = lambda: True,
     ) -> None:
+        self.let_go = 0
+        self._ring_s = math.inf if ring_s is None else ring_s + _LATE_S
+        self._sealed: dict[int, float] = {}  # when each group was first seen, by `monotonic`
         self._directory, self._remove, self._own = directory, remove, own
-        self._window, self._judged, self._is_wanted = window, judged, is_wanted
+        self._judged, self._is_wanted = judged, is_wanted
         # Segments that this pass could not change, by recording; -1 for all of it.
         self._failed: defaultdict[str, set[int]] = defaultdict(set)
 
     def plan(self, rules: Rules) -> Plan:
         """The deletions that are due now."""
-        path, now = self._directory.path, time.time_ns()
-        used, free = self._directory.listed_bytes(), None
+        directory, now, free = self._directory, time.time_ns(), None
+        used = 0 if rules.is_empty else directory.listed_bytes()
         if used is None:
-            used, free = disk_bytes(path), shutil.disk_usage(path).free
-        has_arrays = bool(self._directory.settings.arrays)
-        held = self._held(now)
+            used, free = disk_bytes(directory.path), shutil.disk_usage(directory.path).free
+        # A ring alone looks at nothing else.
+        ids = [self._own] if rules.is_empty and self._own else directory.ids()
+        has_arrays = bool(directory.settings.arrays)
+        held = self._held(ids, now)
         return plan(held, rules, used=used, free=free, now=now, has_arrays=has_arrays)
 
     def keep(self, rules: Rules) -> KeepReport:
         """Let go what has to go; HeldError while another process makes a pass."""
         with self._alone():
-            if not self._directory.is_remote:
+            if not (self._directory.is_remote or rules.is_empty):
                 _lay_spare(self._directory, rules)  # counts among what is used
             found = KeepReport(self.plan(rules))
             planned = found.plan
@@ -182,15 +184,16 @@ class Keeper:
             self._failed.clear()
             yield
 
-    def _held(self, now: int) -> Iterator[tuple[Manifest, list[Held]]]:
+    def _held(self, ids: Iterable[str], now: int) -> Iterator[tuple[Manifest, list[Held]]]:
         """Recordings and what they hold; nothing of those that others hold.
 
         Nor of those whose manifests were made again, which may lack pins.
         """
-        for manifest in self._directory.manifests.each(self._directory.ids()):
+        for manifest in self._directory.manifests.each(ids):
             failed, logs = self._failed[manifest.id], list[Held]()
             if manifest.id == self._own:
-                logs = held_of(manifest, now, self._window, self._judged(), failed)
+                over = self._over(manifest)
+                logs = held_of(manifest, now, self._judged(), failed, over)
             elif (
                 manifest.status != "unproven"
                 and _WHOLE not in failed
@@ -198,6 +201,12 @@ class Keeper:
             ):
                 logs = held_of(manifest, now, stays=failed)
             yield manifest, logs
+
+    def _over(self, manifest: Manifest) -> set[int]:
+        """The groups of its own recording whose time in the ring is over, whatever a clock says."""
+        now, groups = time.monotonic(), {log.group for log in manifest.logs.values()}
+        self._sealed = {group: self._sealed.get(group, now) for group in groups}
+        return {group for group, at in self._sealed.items() if now - at >= self._ring_s}
 
     def _do(self, step: Step, rules: Rules, found: KeepReport, copy: str = "") -> None:
         """Do a step, with the room of the spare file if there is no other; reports in `found`."""
@@ -231,9 +240,11 @@ class Keeper:
             if step.groups:
 
                 def choose(now: Manifest) -> list[File]:
-                    return [file for file in now.files if file.group in step.groups]
+                    own = [file for file in now.files if file.group in step.groups]
+                    return [file for file in own if file.number not in step.but]
 
-                let_go(directory, step.id, choose, check)
+                gone = let_go(directory, step.id, choose, check).let_go
+                self.let_go = gone.messages if is_own and gone else self.let_go
                 return step.bytes, {}
             return expire(
                 directory, step.id, step.segments, copy=copy, check=check, is_followed=is_own
@@ -248,7 +259,7 @@ def _check(step: Step, rules: Rules, manifest: Manifest) -> None:
     going = [
         log
         for number, log in manifest.logs.items()
-        if number in step.segments or log.group in step.groups
+        if number in step.segments or (log.group in step.groups and number not in step.but)
     ]
     if (is_whole and manifest.pins) or any(is_pinned(log, manifest) for log in going):
         raise ChangedError(f"{step.recording}: a pin was set meanwhile.")
@@ -290,14 +301,10 @@ def expire(
     """Delete sealed logs of a recording that this process has locked; it may record it, too.
 
     Returns the bytes of the disk that became free, what was written subtracted, and why logs could
-    not go, by number.
-
-    Logs that are gone already are left out, and those without messages. Those that have their rows
-    go first. Where there is no room for rows, a log goes without, and is lost. Damaged ones without
-    rows stay. `copy` is the address of a store with a proven copy of them. `check`, part of each
-    change of the manifest, raises if they must stay by now. After an error, logs that are listed
-    are as before. Where another process writes the rows (`is_followed`), they are waited for, and a
-    log that gets none goes without.
+    not go, by number. Those that have their rows go first; where there is no room for rows, a log
+    goes without, and is lost; damaged ones without rows stay. `copy` is the address of a store with
+    a proven copy. `check`, part of each change, raises if they must stay by now. Where another
+    process writes the rows (`is_followed`), they are waited for.
     """
     if is_followed:
         _have_rows(directory, recording, segments, check)
@@ -307,14 +314,15 @@ def expire(
     freed = sum(log.bytes for log in going)
     if manifest.is_ended:
         _remove_arrays(directory, manifest, going)
-    path, rows = directory.recording(recording), manifest.rows
-    ready = [log for log in going if _are_whole(path, rows.get(log.number, ()))]
-    _go(directory, recording, {log.number: () for log in ready}, check, copy)
+    rows, there = manifest.rows, directory.listing(recording)
+    ready = [log for log in going if log.number in rows and there.has_all(rows[log.number])]
+    gone = {"gone": "expired", "copy": copy}
+    _list(directory, recording, {log.number: () for log in ready}, check, gone)
     for log in (one for one in going if one not in ready):
         while True:
             try:
                 made = _rows_of(directory, recording, log)
-                _go(directory, recording, {log.number: made}, check, copy)
+                _list(directory, recording, {log.number: made}, check, gone)
                 freed -= sum(one.bytes for one in made)
             except DiskFullError:
                 if use_spare(directory):
@@ -345,19 +353,6 @@ def _have_rows(
         time.sleep(_POLL_S)
 
 
-def _are_whole(path: Path, rows: Collection[File]) -> bool:
-    """True if files of rows are as listed: they will be all that is left."""
-    try:
-        for line in rows:
-            with os.fdopen(files.open_file(path / line.name, os.O_RDONLY), "rb") as file:
-                digest = digest_of(iter(partial(file.read, _PIECE), b""))
-            if digest != line.digest:
-                return False
-    except OSError:
-        return False
-    return bool(rows)
-
-
 def _lines_of(number: int, manifest: Manifest) -> list[File]:
     return [file for file in manifest.files if file.number == number]
 
@@ -385,17 +380,19 @@ def _rows_of(directory: StoreDirectory, recording: str, log: File) -> tuple[File
         return write_rows(path, replace(log, gone="expired"), into, version=version)
 
 
-def _go(
-    directory: StoreDirectory,
-    recording: str,
-    made: Mapping[int, tuple[File, ...]],
-    check: Check,
-    copy: str,
-) -> None:
-    """Let the manifest say that logs are gone, then delete them."""
-    if made:
-        now = _list(directory, recording, made, check, {"gone": "expired", "copy": copy})
-        directory.drop(recording, [now.logs[number].name for number in made])
+def _change(
+    directory: StoreDirectory, recording: str, how: Callable[[Manifest], Manifest]
+) -> Manifest:
+    """Change a manifest, then delete the files that it does not list any more, or says are gone."""
+    before = set[str]()
+
+    def noted(now: Manifest) -> Manifest:
+        before.update(now.present)
+        return how(now)
+
+    changed = directory.manifests.change(recording, noted)
+    directory.drop(recording, before - changed.present.keys())
+    return changed
 
 
 def _list(
@@ -404,9 +401,8 @@ def _list(
     made: Mapping[int, tuple[File, ...]],
     check: Check = lambda _: None,
     values: Mapping[str, str] = MappingProxyType({}),
-) -> Manifest:
+) -> None:
     """List the rows of logs, where there are new ones, and change the lines of the logs."""
-    manifests = directory.manifests
 
     def how(now: Manifest) -> Manifest:
         check(now)
@@ -418,10 +414,10 @@ def _list(
         return now
 
     try:
-        return manifests.change(recording, how)
+        _change(directory, recording, how)
     finally:
         with suppress(StoreError):  # or else the next change does it
-            listed = {file.name for file in manifests.read(recording).files}
+            listed = {file.name for file in directory.manifests.read(recording).files}
             new = [file.name for rows in made.values() for file in rows]
             directory.drop(recording, [name for name in new if name not in listed])
 
@@ -439,11 +435,10 @@ def let_go(
     is changed; `check` raises if they must stay. `lost` is the reason of a row of the loss ledger,
     empty if they are counted as let go.
     """
-    gone: list[File] = []
 
     def how(now: Manifest) -> Manifest:
         check(now)
-        gone[:] = choose(now)
+        gone = choose(now)
         if not gone:
             return now
         parts = [(n, part) for f in gone if f.kind == "log" for n, part in f.parts.items()]
@@ -464,9 +459,7 @@ def let_go(
             )
         )
 
-    changed = directory.manifests.change(recording, how)
-    directory.drop(recording, [file.name for file in gone])
-    return changed
+    return _change(directory, recording, how)
 
 
 def write_rows(recording: Path, line: File, into: Path, *, version: int = 0) -> tuple[File, ...]:
@@ -501,11 +494,9 @@ def write_rows(recording: Path, line: File, into: Path, *, version: int = 0) -> 
 def without_payloads(
     path: Path, manifest: Manifest, logs: Collection[int], into: Path, copy: str
 ) -> Manifest:
-    """Write the rows of logs of a recording, which are to be copied later, and its new manifest.
+    """Write the rows of logs that are copied later, as `copy` has them, and its new manifest.
 
-    The recording's directory stays as it is; so do first logs of groups, and those without
-    messages. Names of the new files are drawn, so that no other file of the recording gets them.
-    `copy` is the address of the store that has the logs.
+    The recording's directory stays as it is; no other file of it ever gets the new names.
     """
     version = secrets.randbelow(8 * 10**8) + 10**8
     for number in sorted(logs):
@@ -533,22 +524,16 @@ LOOK_S: Final = 5.0
 """Seconds between two looks at the rules and at free space."""
 _TICK_S: Final = 0.1
 _AGES_S: Final = 60.0  # between two passes for the ages alone
+_RING_S: Final = 1.0  # and for a ring
 
 
 class RetentionThread:
-    """Makes room ahead of need, on a thread of its own.
+    """Makes room ahead of need for the recording of this process, on a thread of its own.
 
-    A pass is made when a segment was sealed, when less is free than the rules or the recorder
-    want, and once a minute. What it cannot do is told, and never stops the recorder.
-
-    Args:
-        remove: Removes a whole recording, by its id, unless a check of its manifest raises.
-        own: Id of the recording that this process makes.
-        sealed: Returns the number of its segments that are sealed.
-        reserve: Bytes that the recorder wants free at least, where rules may make room.
-        say: Shows a line to the user, each text once.
-        window: The newest of the recording that goes last, ns.
-        judged: Returns what triggers have seen of it, as for `Keeper`.
+    A pass is made when a segment was sealed (`sealed` counts them), when less is free than the
+    rules or the recorder (`reserve`, bytes) want, and once a minute; for a ring alone, once a
+    second, after `pin` has pinned what triggers want. What it cannot do is told, and never stops
+    the recorder. All else is as of `Keeper`.
     """
 
     def __init__(
@@ -560,15 +545,17 @@ class RetentionThread:
         sealed: Callable[[], int],
         reserve: int,
         say: Callable[[str], None],
-        window: int,
+        ring_s: float | None,
+        pin: Callable[[], object],
         judged: Callable[[], Collection[int] | None],
     ) -> None:
         self._directory = directory
-        self._keeper = Keeper(
+        self._pin = None if ring_s is None else pin
+        self.keeper = Keeper(
             directory,
             remove,
             own,
-            window=window,
+            ring_s=ring_s,
             judged=judged,
             is_wanted=lambda: not self._over.is_set(),
         )
@@ -611,7 +598,7 @@ class RetentionThread:
         return rules.with_free(self._wanted) if rules.makes_room else rules
 
     def _run(self) -> None:
-        looked = last_pass = -_AGES_S
+        looked = last_pass = last_ring = -_AGES_S
         sealed = 0
         while not self._over.wait(_TICK_S):
             now, count, is_asked, is_low = time.monotonic(), self._sealed(), self._is_asked, False
@@ -622,10 +609,13 @@ class RetentionThread:
                     self._rules = self._read_rules()
                     is_low = free < (self._rules.min_free or 0)
             if is_asked or is_low or count != sealed or now - last_pass >= _AGES_S:
-                last_pass, sealed = now, count
+                last_pass, last_ring, sealed = now, now, count
                 freed = self._pass()
                 sealed = -1 if freed is None else sealed
                 self._is_exhausted, self._is_asked = is_asked and freed == 0, False
+            elif self._pin is not None and now - last_ring >= _RING_S:
+                last_ring = now
+                self._pass(is_ring=True)
 
     @contextmanager
     def _saying(self) -> Iterator[None]:
@@ -634,20 +624,23 @@ class RetentionThread:
         except (HybridlogError, OSError) as error:
             self._say(f"making room failed: {error}")
 
-    def _pass(self, *, is_urgent: bool = False) -> int | None:
+    def _pass(self, *, is_urgent: bool = False, is_ring: bool = False) -> int | None:
         """Make a pass; returns the bytes that it freed, None while another process makes one."""
         with self._alone, self._saying():
             self._rules = self._read_rules()
-            if self._over.is_set() or self._rules.is_empty:
+            if self._over.is_set() or (self._rules.is_empty and self._pin is None):
                 return 0
+            if self._pin is not None:
+                self._pin()
+            rules = Rules() if is_ring else structs.replace(self._rules, is_urgent=is_urgent)
             try:
-                done = self._keeper.keep(structs.replace(self._rules, is_urgent=is_urgent))
+                done = self.keeper.keep(rules)
             except HeldError:
                 self._over.wait(_TICK_S)
                 return None
             warnings = [] if self._has_warned else done.plan.warnings
             self._has_warned = bool(done.plan.warnings)
-            reasons = (f"making room: {step.reason}" for step in done.plan.steps)
+            reasons = (f"making room: {one.reason}" for one in done.plan.steps if one.reason)
             for text in (*reasons, *done.problems, *warnings):
                 self._say(text)
             return done.freed_bytes

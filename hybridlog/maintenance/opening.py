@@ -19,7 +19,6 @@ from hybridlog.entries import (
     lost_in_crash,
     recording_metadata,
     see,
-    segments_in,
     summary_by,
     unlisted,
 )
@@ -66,7 +65,7 @@ class StoreFiles(Struct):
         }
         found |= self._read(sorted(looks.keys() - found.keys()))
         for name in directory.manifests.without():
-            report.unreadable[name] = _lost(directory, name)
+            report.unreadable[name] = NO_MANIFEST.format(name)
         topics = {one.topics: catalog.topics(one.topics) for one in found.values()}
         return before.with_changes(found.values(), topics, recordings)
 
@@ -130,18 +129,6 @@ class StoreFiles(Struct):
         for recording in gone:
             catalog.remove(recording)
         self._is_swept = True
-
-
-def _lost(directory: StoreDirectory, name: str) -> str:
-    """What to say of a folder without a manifest."""
-    try:
-        listing = directory.listing(name)
-        segments_in(directory, name, listing.choosing(None))
-    except StoreError as error:
-        return str(error)
-    if listing.sealed or listing.rows or listing.open:
-        return NO_MANIFEST.format(name)
-    return "it has neither a manifest nor a segment, but other files"
 
 
 def recover(directory: StoreDirectory, recording: str, report: RepairReport) -> None:

@@ -7,14 +7,15 @@ topics and times of their channels. Nothing is deleted here; see `keep.py`.
 from __future__ import annotations
 
 import math
-from collections import defaultdict
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from msgspec import Struct, field
 from msgspec.structs import replace
 
 from hybridlog.query.choice import Choice
+from hybridlog.query.latching import depth_of
 from hybridlog.query.times import parse_duration
 from hybridlog.query.topics import matcher
 from hybridlog.wording import listed, parse_size, size
@@ -158,7 +159,9 @@ class Held(Struct, frozen=True):
         row_bytes: Bytes of its files of rows.
         is_pinned: Whether a pin keeps messages of it.
         stays: Whether nothing of its group may go now.
-        goes_last: Whether a trigger may still want what it holds.
+        goes_last: Whether triggers have not seen it yet.
+        is_over: Whether its time in a ring is over, and triggers have seen it.
+        is_in_force: Whether it has latched messages that no later ones have replaced.
     """
 
     recording: Manifest
@@ -169,6 +172,8 @@ class Held(Struct, frozen=True):
     is_pinned: bool
     stays: bool
     goes_last: bool
+    is_over: bool
+    is_in_force: bool
 
     @property
     def key(self) -> tuple[str, int]:
@@ -187,28 +192,24 @@ class Held(Struct, frozen=True):
 
     @property
     def order(self) -> tuple[bool, int, int, tuple[str, int]]:
-        """The oldest first, and last what a trigger may want."""
+        """The oldest first, and last what triggers have not seen."""
         return self.goes_last, self.written, self.recording.created, self.key
 
 
 def held_of(
     manifest: Manifest,
     now: int,
-    window: int = 0,
     seen: Collection[int] | None = None,
     stays: Collection[int] = (),
+    over: Collection[int] = (),
 ) -> list[Held]:
     """The logs of a recording at `now`, ns.
 
-    Those that are at most `window` (ns) older than its newest sealed message go last, and those
-    that are not among the numbers that triggers have `seen`; None if there are no triggers.
-    `stays` has the numbers of those that cannot go.
+    Those go last that are not among the numbers that triggers have `seen`; None if there are no
+    triggers. `stays` has the numbers of those that cannot go, `over` groups whose time in a ring is
+    over.
     """
-    found: list[Held] = []
-    recent = math.inf
-    if window:
-        ends = [part.last or 0 for log in manifest.logs.values() for part in log.parts.values()]
-        recent = max(ends, default=0) - window
+    found, in_force = list[Held](), _in_force(manifest) if over else set[int]()
     later, rows = now, manifest.rows
     for number, log in sorted(manifest.logs.items(), reverse=True):
         parts = _parts_of(log, manifest)
@@ -224,10 +225,27 @@ def held_of(
                 frozenset(topic for topic, _ in parts),
                 is_pinned(log, manifest),
                 number in stays,
-                last >= recent or (seen is not None and number not in seen),
+                seen is not None and number not in seen,
+                log.group in over and (seen is None or number in seen),
+                number in in_force,
             )
         )
     return found[::-1]
+
+
+def _in_force(manifest: Manifest) -> set[int]:
+    """Numbers of the logs with latched messages that no later ones have replaced."""
+    found, newer = set[int](), Counter[Hashable]()
+    for number, log in sorted(manifest.logs.items(), reverse=True):
+        came = Counter[Hashable]()
+        for own, part in log.parts.items():
+            channel = manifest.channels[own]
+            publisher = channel.topic, channel.metadata.get("callerid") or own
+            came[publisher] += part.messages
+            if part.messages and newer[publisher] < depth_of(channel):
+                found.add(number)
+        newer += came
+    return found
 
 
 def _parts_of(log: File, manifest: Manifest) -> list[tuple[str, Part]]:
@@ -267,8 +285,9 @@ class Step(Struct, frozen=True):
         id: Its id.
         segments: Numbers of the segments whose payloads go.
         bytes: About the bytes that become free.
-        reason: Why it goes.
+        reason: Why it goes; empty for a ring.
         groups: Numbers of the groups of segments that go with their fields.
+        but: Numbers of segments of these that stay.
     """
 
     recording: str
@@ -277,6 +296,7 @@ class Step(Struct, frozen=True):
     bytes: int
     reason: str
     groups: tuple[int, ...] = ()
+    but: tuple[int, ...] = ()
 
 
 class Plan(Struct):
@@ -330,6 +350,7 @@ class _Planning:
             if not self._rules.is_never(manifest.tags) and not self._goes_whole(manifest, logs):
                 self._left += logs
         self._left.sort(key=lambda one: one.order)
+        self._by_ring()
         self._by_age()
         self._by_room()
         self._warn()
@@ -348,6 +369,23 @@ class _Planning:
         size = sum(one.size + one.row_bytes for one in logs)
         self._step(Step(manifest.name, manifest.id, (), size, f"fields older than {age}"))
         return True
+
+    def _by_ring(self) -> None:
+        """Let groups go whose time is over, rows too, but for latched messages in force."""
+        for (recording, group), logs in self._grouped().items():
+            going = [one for one in logs if not one.is_in_force]
+            if going and all(one.is_over and not (one.is_pinned or one.stays) for one in logs):
+                self._going |= {one.key for one in going}
+                freed = sum(one.size + one.row_bytes for one in going)
+                but = tuple(one.log.number for one in logs if one.is_in_force)
+                self._step(Step(logs[0].recording.name, recording, (), freed, "", (group,), but))
+
+    def _grouped(self) -> dict[tuple[str, int], list[Held]]:
+        """What is left by recording and group, the oldest first."""
+        groups: defaultdict[tuple[str, int], list[Held]] = defaultdict(list)
+        for one in sorted(self._left, key=lambda one: one.order):
+            groups[one.recording.id, one.log.group].append(one)
+        return groups
 
     def _by_age(self) -> None:
         age = self._rules.max_age
@@ -378,10 +416,11 @@ class _Planning:
         """
         reason = f"{self._reason(_SEGMENTS_FROM, 1.0)}, and no payloads are left to go"
         need = self._short(_TOPICS_FROM, _TOPICS_BELOW)
-        groups: defaultdict[tuple[str, int], list[Held]] = defaultdict(list)
-        for one in sorted(self._left, key=lambda one: one.order):
-            if one.recording.is_ended or self._rules.is_urgent:
-                groups[one.recording.id, one.log.group].append(one)
+        groups = {
+            key: logs
+            for key, logs in self._grouped().items()
+            if logs[0].recording.is_ended or self._rules.is_urgent
+        }
         chosen: dict[str, dict[int, int]] = {}  # what becomes free besides, by group
         for (recording, group), logs in groups.items():
             if need > 0 and not any(one.is_pinned or one.stays for one in logs):

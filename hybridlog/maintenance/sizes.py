@@ -11,9 +11,9 @@ import os
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
+from itertools import chain
 from typing import TYPE_CHECKING, TypeVar
 
-import numpy as np
 from msgspec import Struct
 
 from hybridlog.columns.layout import type_prefix
@@ -98,7 +98,7 @@ def sizes_of(
     rows, topics = list[Size](), set[str]()
     tables = table_bytes(directory.path, entries)
     for entry in entries:
-        segments, messages = _segment_bytes(directory, entry), entry.messages_by_topic()
+        segments, messages = _segment_bytes(entry), entry.messages_by_topic()
         payload = Counter[str]()
         for channel in entry.channels:
             payload[channel.topic] += channel.stats.payload_bytes
@@ -135,19 +135,18 @@ def _largest_first(rows: Iterable[Size]) -> list[Size]:
     return sorted(rows, key=lambda row: (-row.total_bytes, row.recording, row.topic))
 
 
-def _segment_bytes(directory: StoreDirectory, entry: RecordingEntry) -> Counter[str]:
+def _segment_bytes(entry: RecordingEntry) -> Counter[str]:
     """Bytes of the segments and files of rows by topic; the rest under the empty name."""
-    manifest, whole = directory.manifests.read(entry.id), Counter[str]()
-    for number, log in manifest.logs.items():
-        if log.is_here and log.parts and str(number) in entry.digests:
+    topics = {number: one.topic for number, one in entry.manifest.channels.items()}
+    whole = Counter[str]()
+    for log in entry.logs.values():
+        if log.is_here and log.parts:
             weights = Counter[str]()
-            for channel, part in log.parts.items():
-                weights[manifest.channels[channel].topic] += (
-                    part.bytes + part.messages * MESSAGE_HEAD.itemsize
-                )
+            for number, part in log.parts.items():
+                weights[topics[number]] += part.bytes + part.messages * MESSAGE_HEAD.itemsize
             whole.update(_divided(log.bytes, weights))
-    for _, topic, size in entry.rows:
-        whole[topic] += size
+    for file in chain(*entry.manifest.rows.values()):
+        whole[topics[next(iter(file.parts))]] += file.bytes
     whole[""] += max(0, entry.stored_bytes - whole.total())
     return whole
 
@@ -168,8 +167,8 @@ def table_bytes(root: Path, entries: Sequence[RecordingEntry]) -> Mapping[tuple[
 
 def _divided(size: int, weights: Mapping[_Key, int]) -> Counter[_Key]:
     """A number of bytes divided by weights, without a rest."""
-    names = list(weights)
-    ends = np.cumsum([weights[name] for name in names])
-    bounds = np.round(ends / ends[-1] * size).astype(np.int64)
-    each = np.diff(bounds, prepend=0).tolist()
-    return Counter({name: int(share) for name, share in zip(names, each, strict=True)})
+    found, left = Counter[_Key](), sum(weights.values())
+    for name, weight in weights.items():
+        found[name] = size * weight // left if weight else 0
+        size, left = size - found[name], left - weight
+    return found

@@ -11,7 +11,7 @@ from msgspec import Struct, field, structs
 
 from hybridlog.columns.recording_logs import RecordingRows
 from hybridlog.columns.rows_file import RowsFile
-from hybridlog.entries import free_name_in, made_again, put_entry, segments_in
+from hybridlog.entries import free_name_in, made_again, put_entry
 from hybridlog.follow.follower import bring, make_tables
 from hybridlog.maintenance import tables
 from hybridlog.maintenance.opening import recover, recover_segments
@@ -149,7 +149,6 @@ class _Check:
         directory.look_closely(recording)
         manifest, listing = directory.manifests.find(recording), directory.listing(recording)
         if manifest is None:
-            segments_in(directory, recording, listing.choosing(None))  # not another's
             self.found("manifest", "it is missing, so losses are unknown")
             return
         self._name = manifest.name
@@ -172,7 +171,7 @@ class _Check:
         if not self._lost.keys() <= known.keys():
             self._catalog.put_damage(recording, {**self._lost, **known})
         entry = put_entry(directory, self._catalog, recording)
-        self._result.messages += entry.messages + len(entry.marks)
+        self._result.messages += entry.messages + len(entry.manifest.marks)
         if entry.status != "open":
             for topic, problem in self._checker.damage(entry).items():
                 self.found(f"table of {topic}", problem)

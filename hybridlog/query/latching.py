@@ -21,6 +21,7 @@ from hybridlog_storage.messages import Batch
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from hybridlog_storage.manifest import Channel as ListedChannel
     from hybridlog_storage.messages import Buffer, Channel
 
 
@@ -36,7 +37,7 @@ MAX_HELD: Final = 256 << 20
 _BATCH = 2 << 20  # payload bytes
 
 
-def depth_of(channel: Channel) -> int:
+def depth_of(channel: Channel | ListedChannel) -> int:
     """Number of last messages that a late subscriber receives; 0 without latching.
 
     A ROS 1 connection latches one message. A ROS 2 channel mixes the publishers of its topic:

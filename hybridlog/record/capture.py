@@ -123,7 +123,7 @@ class Capture:
         self.follower = follow(self.entry)
         self.writer = RecordingWriter(
             folder,
-            recording_metadata(self.entry),
+            recording_metadata(self.entry.manifest),
             settings,
             no_index=self._no_index,
             is_named=lambda topic: rules.topic_rule(topic) is not None,

@@ -131,10 +131,10 @@ def lost_spans(entry: RecordingEntry) -> Iterator[tuple[int, int]]:
 
 def losses_of(entry: RecordingEntry) -> list[dict[str, Any]]:
     """The loss ledger of a recording, with a row for what a crash cut off."""
-    losses = [dict(loss) for loss in entry.end.get("losses", [])]
+    losses = [dict(loss) for loss in entry.losses]
     if entry.status == "unfinished":
         losses.append(_of_a_crash("what came after its last flushed message is lost"))
-    if "recovered" in {entry.status, entry.end.get("status")}:  # a crash ended it
+    if "recovered" in {entry.status, entry.manifest.status}:  # a crash ended it
         losses.append(_of_a_crash("what came after its last message was not stored"))
     return losses
 
@@ -160,7 +160,7 @@ def extent_of(entry: RecordingEntry) -> tuple[int, int]:
 
 
 def _lost_from_store(entry: RecordingEntry) -> Iterator[Mapping[str, Any]]:
-    return (row for row in entry.end.get("losses", ()) if row["cause"] == Cause.SEGMENT)
+    return (row for row in entry.losses if row["cause"] == Cause.SEGMENT)
 
 
 def _sum(one: int | None, other: int | None) -> int | None:

@@ -6,10 +6,10 @@ which are derived from files, never have them.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from itertools import accumulate
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from msgspec.structs import replace
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog_storage.catalog import RecordingEntry
+    from hybridlog_storage.manifest import Mark
     from hybridlog_storage.segments.chunk_table import ChunkPlace
 
 _ARRIVALS: Final = 1 << 52  # the first arrival number, behind those of all messages
@@ -40,13 +41,13 @@ class _MarksLog(SegmentReader):
     """Reads marks as chunks of messages.
 
     Args:
-        marks: The marks, as entries have them.
+        marks: The marks.
 
     Attributes:
         flushed: What the log has.
     """
 
-    def __init__(self, marks: Sequence[Mapping[str, Any]]) -> None:
+    def __init__(self, marks: Sequence[Mark]) -> None:
         self.path, self.number = Path(MARKS), MARKS_SEGMENT
         self.size = self.bytes_read = 0
         self._fd = -1
@@ -55,12 +56,12 @@ class _MarksLog(SegmentReader):
         digest = hasher()
         for row, own in enumerate(self._chunks):
             for one in own:
-                digest.update(one["id"].encode())
+                digest.update(one.id.encode())
             # Other marks have other places, so what was read before is never taken for them.
             chunks["offset"][row] = int(digest.hexdigest()[:15], 16)
             parts["payload_bytes"][row] = sum(map(len, _payloads(own)))
             for edge, choose in (("first", min), ("last", max)):
-                parts[edge][row] = chunks[edge][row] = choose(one["time"] for one in own)
+                parts[edge][row] = chunks[edge][row] = choose(one.time for one in own)
                 parts[f"{edge}_publish"][row] = chunks[edge][row]
         chunks["parts"] = 1
         parts["channel"] = MARKS_CHANNEL
@@ -78,7 +79,7 @@ class _MarksLog(SegmentReader):
         if place.offset not in offsets[place.number : place.number + 1]:
             raise SegmentError("Marks were set or removed meanwhile. Ask again.")
         own = self._chunks[place.number]
-        payloads, times = _payloads(own), np.array([one["time"] for one in own], np.int64)
+        payloads, times = _payloads(own), np.array([one.time for one in own], np.int64)
         lengths = [*map(len, payloads)]
         batch = Batch(
             b"".join(payloads),
@@ -100,13 +101,13 @@ class _MarksLog(SegmentReader):
         """Do nothing: they are in memory."""
 
 
-def _payloads(marks: Iterable[Mapping[str, Any]]) -> list[bytes]:
-    return [mark_payload(one["text"], one["tags"], one.get("end")) for one in marks]
+def _payloads(marks: Iterable[Mark]) -> list[bytes]:
+    return [mark_payload(one.text, one.tags, one.end) for one in marks]
 
 
 def beside(entry: RecordingEntry) -> RecordingEntry:
     """The entry of a recording's files, and of its marks."""
-    flushed = _MarksLog(entry.marks).flushed
+    flushed = _MarksLog(entry.manifest.marks).flushed
     channel = channel_entry(MARKS_CHANNEL, replace(mark_channel(), is_indexed=False))
     channel.stats = channel_totals(flushed.table)[MARKS_CHANNEL]
     span = int(flushed.table.parts["first"].min()), int(flushed.table.parts["last"].max())
@@ -120,5 +121,5 @@ def beside(entry: RecordingEntry) -> RecordingEntry:
 
 def without(entry: RecordingEntry, known: Collection[str]) -> RecordingEntry:
     """The entry without the marks of some ids, which have been told before."""
-    left = [one for one in entry.marks if one["id"] not in known]
+    left = [one for one in entry.manifest.marks if one.id not in known]
     return replace(entry, flushed={**entry.flushed, MARKS_SEGMENT: _MarksLog(left).flushed})

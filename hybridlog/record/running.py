@@ -115,8 +115,7 @@ class RunningRecording:
     def _with_flushed(self, sealed: RecordingEntry) -> RecordingEntry:
         """The entry with what is flushed besides."""
         channels = {channel.id: replace(channel) for channel in sealed.channels}
-        found = replace(sealed, end=dict(sealed.end), spans=list(sealed.spans))
-        found.flushed = dict(sealed.flushed)  # marks
+        found = replace(sealed, spans=list(sealed.spans), flushed=dict(sealed.flushed))
         for number, segment in self._segments.items():
             found.flushed[number] = segment.flushed
             table, attachments, metadata, _ = segment.flushed
@@ -134,9 +133,7 @@ class RunningRecording:
             found.attachments += len(attachments)
             found.metadata_records += len(metadata)
         found.channels = [channels[number] for number in sorted(channels)]
-        losses = list(_losses(sealed, self._segments, self._unreadable))
-        if losses:
-            found.end["losses"] = losses
+        found.losses = list(_losses(sealed, self._segments, self._unreadable))
         return found
 
     def _add_channels(self, channels: dict[int, ChannelEntry], segment: Walk) -> None:
@@ -151,11 +148,10 @@ def _losses(
     sealed: RecordingEntry, segments: Mapping[int, Walk], unreadable: Mapping[int, str]
 ) -> Iterator[dict[str, Any]]:
     """The loss ledger: what sealed segments and flushed records say, and what is damaged."""
-    before = sealed.end.get("losses", ())
-    rows = [row for row in before if row["cause"] != Cause.SEGMENT]
+    rows = [row for row in sealed.losses if row["cause"] != Cause.SEGMENT]
     flushed = (loss_values(row) for one in segments.values() for row in one.losses)
     yield from joined([*rows, *flushed])
-    yield from (row for row in before if row["cause"] == Cause.SEGMENT)
+    yield from (row for row in sealed.losses if row["cause"] == Cause.SEGMENT)
     for number, segment in segments.items():
         for damage in segment.damaged:
             yield _damaged(number, damage.reason, damage.offset, damage.length)

@@ -253,7 +253,7 @@ def _topics(content: StoreContent) -> Iterator[Mapping[str, Any]]:
 def _losses(content: StoreContent) -> Iterator[Mapping[str, Any]]:
     for summary in content.summaries:
         entry = content.session.entry_of(summary)
-        for loss in entry.end.get("losses", ()):
+        for loss in entry.losses:
             yield {
                 "recording": entry.name,
                 "topic": loss.get("topic"),

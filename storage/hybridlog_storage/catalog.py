@@ -21,7 +21,7 @@ from msgspec.structs import replace
 from hybridlog_storage.cache import Cache
 from hybridlog_storage.cells import Cells, Statement, drop, put
 from hybridlog_storage.errors import CatalogError, SegmentError
-from hybridlog_storage.manifest import File
+from hybridlog_storage.manifest import File, Manifest
 from hybridlog_storage.manifests import RECORDINGS
 from hybridlog_storage.messages import EXPIRED_IDS, Channel, Schema, schema_hash
 from hybridlog_storage.segments.chunk_table import ChunkTable
@@ -116,66 +116,67 @@ class ChannelEntry(Struct):
 
 
 class RecordingEntry(Struct):
-    """One recording.
+    """A recording at one moment: its manifest, and what is known of its files.
 
     Attributes:
-        id: Name of its directory, which never changes; everything refers to it.
-        name: What people call it; no other recording had this name when it got it.
-        tags: Tags given by the user.
-        source: The recorded log: path, kind, profile, bytes, fingerprint.
-        created: Time of recording, ns.
+        manifest: What it is, what users said of it, and its files.
         status: `open` (being recorded), `unfinished` (cut short by a crash, in a read-only
             store), `complete`, `recovered` (from a crash), `damaged` (the source or a part of
             the recording), or `unproven` (the manifest was lost).
-        end: The state at its end: losses, damage.
+        losses: Rows of the loss ledger, those of files that are lost included.
         channels: Its channels.
         stored_bytes: Size of its segments and of its files of rows.
         segments: Number of segments.
         chunks: Number of chunks.
         attachments: Number of attachments of its log.
         metadata_records: Number of metadata records of its log.
-        notes: Notes of users: `at` (ns) and `text`.
-        marks: Marks that somebody set: `id`, `time` (ns), `text`, `tags`; those that last, `end`
-            (ns).
-        pins: What is never deleted to make room: `id`, `from`, `to`, `topics`, `reason`.
         spans: Number, first and last log time (ns) of each segment that has messages.
         logs: The line of the manifest of each segment that is there, by number.
         digests: Their digests, by number as text.
         files: Of those that are gone, the names of their first files of rows.
         is_decoded: Whether messages were decoded. Otherwise header stamps, and messages that
-        do not fit their definition, are unknown.
-        rows: Name, topic and bytes of each file of rows.
-        copies: Addresses of stores with copies that have more payloads.
+            do not fit their definition, are unknown.
         flushed: Content of segments that are not sealed, and of marks, by number, at one moment.
     """
 
-    id: str
-    name: str
-    tags: dict[str, str]
-    source: dict[str, Any]
-    created: Int
+    manifest: Manifest
     status: str
-    end: dict[str, Any] = field(default_factory=dict)
+    losses: list[dict[str, Any]] = field(default_factory=list)
     channels: list[ChannelEntry] = field(default_factory=list)
     stored_bytes: Int = 0
     segments: Int = 0
     chunks: Int = 0
     attachments: Int = 0
     metadata_records: Int = 0
-    notes: list[dict[str, Any]] = field(default_factory=list)
-    marks: list[dict[str, Any]] = field(default_factory=list)
-    pins: list[dict[str, Any]] = field(default_factory=list)
     spans: list[tuple[Int, Int, Int]] = field(default_factory=list)
     logs: dict[int, File] = field(default_factory=dict)
     digests: dict[str, str] = field(default_factory=dict)
     files: dict[str, str] = field(default_factory=dict)
     is_decoded: bool = False
-    rows: list[tuple[str, str, Int]] = field(default_factory=list)
-    copies: list[str] = field(default_factory=list)
     flushed: dict[int, Flushed] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return f"<Recording {self.name}; {len(self.channels)} channels, {self.messages} messages>"
+
+    @property
+    def id(self) -> str:
+        """Name of its directory, which never changes; everything refers to it."""
+        return self.manifest.id
+
+    @property
+    def name(self) -> str:
+        """What people call it; no other recording had this name when it got it."""
+        return self.manifest.name
+
+    @property
+    def tags(self) -> dict[str, str]:
+        """Tags given by the user."""
+        return self.manifest.tags
+
+    @property
+    def created(self) -> int:
+        """Time of recording, ns."""
+        return self.manifest.created
 
     @property
     def key(self) -> str:

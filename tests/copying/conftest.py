@@ -71,9 +71,9 @@ def _answers(store: hl.Store, label: str) -> dict[str, Any]:
     found: dict[str, Any] = {
         "entry": (entry.id, entry.status, entry.messages, entry.span, entry.tags),
         "lost": losses_of(entry),
-        "notes": entry.notes,
-        "pins": entry.pins,
-        "marks": [(mark["time"], mark["text"]) for mark in entry.marks],
+        "notes": entry.manifest.notes,
+        "pins": entry.manifest.pins,
+        "marks": [(mark.time, mark.text) for mark in entry.manifest.marks],
         "near": of.topic("/scan").where("ranges.min < 1.5").count(),
         "rings": of.topic("/cloud").fields("width", "height").to_arrow().to_pylist(),
     }

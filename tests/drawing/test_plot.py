@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from PIL import Image
 
 from hybridlog.drawing.figure import MAX_LINES, Line, figure, lines
 from hybridlog.drawing.series import Series
 from hybridlog.query.answers.lost import lost_parts
 from hybridlog.record.losses import Cause
-from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.errors import MissingDependencyError, TopicError, UsageError
 from tests.calls import Calls
 from tests.cli.within import Answer, answer
@@ -126,15 +126,14 @@ def test_without_matplotlib(drive: Drive, tmp_path: Path, calls: Calls) -> None:
 
 def test_parts_with_losses(drive: Drive) -> None:
     (summary,) = (one for one in drive.store.session.look().summaries if one.name == "drive")
-    entry: RecordingEntry = drive.store.entry(summary.id)
+    entry = drive.store.entry(summary.id)
 
     def lost(*rows: tuple[int | None, int | None, int | None, Cause]) -> list[int]:
         losses = [
             {"from": first, "to": last, "count": count, "cause": cause}
             for first, last, count, cause in rows
         ]
-        end = {**entry.end, "losses": losses}
-        other = RecordingEntry(**{n: getattr(entry, n) for n in entry.__slots__} | {"end": end})
+        other = replace(entry, losses=losses)
         return np.flatnonzero(lost_parts(other, (BASE, BASE + 1000), 10)).tolist()
 
     cause = Cause.TRANSPORT

@@ -126,7 +126,7 @@ def test_a_clock_that_is_set_mid_recording(plain: hl.Store) -> None:
     assert [at for at, tags in marks if tags["cause"] == "contract"] == [
         eras[-1] + 8 * SECOND // 10
     ]
-    rows = [row for row in report.entry.end["losses"] if row["cause"] == "transport"]
+    rows = [row for row in report.entry.losses if row["cause"] == "transport"]
     assert rows
     assert all(row["from"] <= row["to"] for row in rows)
     assert not plain.verify().findings
@@ -139,7 +139,7 @@ def test_a_clock_that_is_set_between_recordings(plain: hl.Store) -> None:
         robot.play(text_channel(), *words(0, 3))
         robot.recorder.look()
         (report,) = robot.recorder.stop()
-        told.append((report.entry.name, len(report.entry.marks), len(robot.said)))
+        told.append((report.entry.name, len(report.entry.manifest.marks), len(robot.said)))
         assert plain.query(["/chatter"], [report.entry.id]).between("-0.1s", "end").count() == 1
     # Those whose clock is behind say so, and have a mark.
     assert told == [("drive", 0, 0), ("drive-2", 1, 1), ("drive-3", 0, 0), ("drive-4", 1, 1)]
@@ -167,7 +167,7 @@ def test_a_ring_goes_by_the_time_that_passes(plain: hl.Store, set_to: int) -> No
     (report,) = robot.recorder.stop()
     messages = {m.decode().data: m.log_time_ns for m in plain.topic("/chatter")}
     assert sorted(messages, key=int) == words(0, 27)  # in no more than a second of this test
-    (pin,) = report.entry.pins
-    assert all(pin["from"] <= messages[word] < pin["to"] for word in words(18, 25))
-    (mark,) = (one for one in report.entry.marks if "cause" not in one["tags"])
-    assert (mark["time"], mark["end"]) == (pin["from"], pin["to"] - 1)
+    (pin,) = report.entry.manifest.pins
+    assert all(pin.first <= messages[word] <= pin.last for word in words(18, 25))
+    (mark,) = (one for one in report.entry.manifest.marks if "cause" not in one.tags)
+    assert (mark.time, mark.end) == (pin.first, pin.last)

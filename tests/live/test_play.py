@@ -162,7 +162,7 @@ def check(store: hl.Store, part: str, sent: Messages, pins: list[list[int]], kil
         assert bool(missing) >= (part == "full")
         for topic in SIZES:
             gone = [at for (name, _), at in missing.items() if name == topic]
-            rows = [row for row in entry.end["losses"] if row["topic"] == topic]
+            rows = [row for row in entry.losses if row["topic"] == topic]
             assert sum(row["count"] for row in rows) == len(gone)
             assert {row["cause"] for row in rows} <= {"disk"}
             assert all(any(row["from"] <= at <= row["to"] for row in rows) for at in gone)

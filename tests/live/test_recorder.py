@@ -56,7 +56,7 @@ class Running(Recorded):
     def rows(self) -> Counter[tuple[str, str]]:
         (report,) = self.recorder.stop()
         found: Counter[tuple[str, str]] = Counter()
-        for row in report.entry.end["losses"]:
+        for row in report.entry.losses:
             found[row["topic"], row["cause"]] += row["count"]
         return found
 
@@ -98,9 +98,9 @@ def test_what_is_received_is_stored_or_in_the_ledger(store: hl.Store) -> None:
     assert rows["/tf", "unreadable"] == 3
     assert robot.speaker.stopped == 1
     # The index is disposable, and so is the catalog's ledger.
-    before = [r.end for r in store.recordings()]
+    before = [r.losses for r in store.recordings()]
     store.index.rebuild()
-    assert [r.end for r in store.recordings()] == before
+    assert [r.losses for r in store.recordings()] == before
     assert [m.decode().data for m in store.topic("/chatter")] == [str(n) for n in range(100)]
 
 
@@ -218,8 +218,8 @@ def test_a_disk_that_has_room_for_little_more(
     state = robot.recorder.look()
     assert report.failure is None
     assert report.entry.status == "complete"
-    lost = sum(row["count"] for row in report.entry.end["losses"])
-    assert {row["cause"] for row in report.entry.end["losses"]} == {"disk"}
+    lost = sum(row["count"] for row in report.entry.losses)
+    assert {row["cause"] for row in report.entry.losses} == {"disk"}
     assert state.lost == {"disk": lost}
     assert report.entry.messages + lost == state.messages
     assert report.entry.messages >= 5
@@ -300,7 +300,7 @@ def test_a_number_of_more_than_32_bits_is_kept_by_its_lower_ones(store: hl.Store
     (report,) = running.recorder.stop()
     assert report.entry.messages == 4
     assert len(report.entry.channels) == 1  # as of a publisher that connects again
-    assert not report.entry.end["losses"]
+    assert not report.entry.losses
     with places.segment(store.directory.path, report.entry.name).open("rb") as file:
         found = [m.sequence for _, _, m in make_reader(file).iter_messages()]
     assert found == [7, 8, 0xFFFFFFFF, 0]
@@ -407,7 +407,7 @@ def test_a_crash_loses_no_more_rows_than_messages(store: hl.Store, tmp_path: Pat
         assert recording.status == "recovered"
         # 0.2 s are ten messages and ten rows; the machine may be slow.
         assert recording.messages >= 40
-        assert sum(row["count"] for row in recording.end["losses"]) >= 40
+        assert sum(row["count"] for row in recording.losses) >= 40
 
 
 def test_a_mark_that_is_no_text(store: hl.Store) -> None:

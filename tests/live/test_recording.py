@@ -208,7 +208,7 @@ def test_a_full_disk(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
         again.shared.recover()
         (entry,) = again.recordings()
         assert entry.status == "recovered"
-        assert sum(row["count"] for row in entry.end["losses"]) == taken - 1
+        assert sum(row["count"] for row in entry.losses) == taken - 1
 
 
 def test_chunks_are_flushed_within_the_interval(store: hl.Store, calls: Calls) -> None:
@@ -333,6 +333,14 @@ def test_who_closes_it_while_the_same_thread_does_is_told(
         assert [m.raw for m in again.topic("/talk")] == [text(b"kept")]
         again.verify(repair=True)
         assert again.verify().findings == []
+
+
+def test_a_store_that_is_closed_ends_its_recordings(tmp_path: Path) -> None:
+    with hl.open(tmp_path / "store", create=True, mongo="none") as store:
+        store.start("talk").write(channel("/talk"), text(b"kept"))
+    with hl.open(tmp_path / "store", mongo="none") as store:
+        assert store.entry("talk").status == "complete"
+        assert [m.raw for m in store.topic("/talk")] == [text(b"kept")]
 
 
 def test_abort_leaves_nothing(store: hl.Store) -> None:

@@ -87,7 +87,7 @@ def test_documents_that_mongodb_loses_after_their_messages_expired_are_made_agai
         kill_mongod(path)
         wait_for(lambda: say(1) or recorder.look().index_failure)
         (report,) = recorder.stop()
-        assert report.entry.end["losses"] == []
+        assert report.entry.losses == []
     with hl.open(path) as store:
         assert store.topic("/camera").count() == sent
         assert len(documents_of(store, "/camera")) == sent

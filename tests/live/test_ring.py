@@ -12,8 +12,8 @@ import pytest
 import hybridlog as hl
 from hybridlog.follow import child
 from hybridlog.follow.child import Trigger
-from hybridlog.live import incidents
 from hybridlog.live.recorder import RecorderOptions
+from hybridlog.maintenance import keep
 from hybridlog.record.losses import Cause
 from hybridlog.record.marks import MARKS
 from hybridlog_storage.manifest import Loss
@@ -28,8 +28,8 @@ RING_S = 0.4
 
 @pytest.fixture(autouse=True)
 def is_prompt(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(incidents, "_LATE_S", 0.1)
-    monkeypatch.setattr(incidents, "_EVERY_S", 0.02)
+    monkeypatch.setattr(keep, "_LATE_S", 0.1)
+    monkeypatch.setattr(keep, "_TICK_S", 0.02)
 
 
 class Robot(Recorded):
@@ -108,7 +108,7 @@ def test_the_last_seconds_stay_and_nothing_else(store: hl.Store) -> None:
     assert (indexed.count(), [*indexed.completeness().sentences]) == (len(kept), [])
     assert store.topic("/scan").to_arrow().num_rows == len(kept)
     assert store.sql("select count(*) as n from scan").to_pandas()["n"][0] == len(kept)
-    assert entry.end["losses"] == []
+    assert entry.losses == []
     assert store.verify().findings == []
 
 
@@ -129,7 +129,7 @@ def test_questions_are_answered_while_files_go(plain: hl.Store) -> None:
             assert other.sql("select count(*) as n from scan").to_pandas()["n"][0] > 0
             with hl.open(plain.directory.path, mongo="none") as newer:
                 (one,) = newer.recordings()
-                assert one.end.get("losses", []) == []
+                assert one.losses == []
                 assert [*newer.topic("/scan").between("-0.3s", "end")]
                 assert not newer.verify().findings
             asked += 1
@@ -154,7 +154,7 @@ def test_what_is_pinned_stays(plain: hl.Store) -> None:
     assert mark.fields["tags"] == {"trigger": "bump"}
     during = plain.topic("/scan").during(plain.topic(MARKS).windows())
     assert during.count() == len(around)
-    plain.unpin(*(pin["id"] for pin in entry.pins))
+    plain.unpin(*(pin.id for pin in entry.manifest.pins))
 
 
 def test_nothing_goes_before_triggers_have_seen_it(

@@ -52,12 +52,12 @@ def played(
         recorder.look()
     (report,) = recorder.stop()
     marked: dict[str, list[tuple[int, int]]] = defaultdict(list)
-    if report.entry.marks:
+    if report.entry.manifest.marks:
         for mark in store.query([MARKS], [report.entry.id]):
             tags = mark.fields["tags"]
             assert (tags["cause"], tags["rule"]) == ("contract", "longest_gap")
             marked[tags["topic"]].append((mark.log_time_ns, mark.fields["end"]))
-    assert not report.entry.end["losses"]
+    assert not report.entry.losses
     return report.entry.name, said, marked
 
 

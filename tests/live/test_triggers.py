@@ -7,7 +7,7 @@ import random
 import struct
 import time
 from collections.abc import Callable
-from operator import itemgetter
+from operator import attrgetter
 
 import pytest
 from msgspec.structs import replace
@@ -50,8 +50,8 @@ def test_what_is_around_a_trigger_is_marked_and_pinned(store: hl.Store) -> None:
     (report,) = recorded.recorder.stop()
     assert report.entry.messages == 60
     begin, end = start + 15 * SECOND, start + 24 * SECOND
-    (pin,) = report.entry.pins
-    assert (pin["from"], pin["to"], pin["reason"]) == (begin, end + 1, trigger)
+    (pin,) = report.entry.manifest.pins
+    assert (pin.first, pin.last, pin.reason) == (begin, end, trigger)
     (mark,) = store.topic(MARKS)
     assert mark.log_time_ns == begin
     assert mark.fields == {"text": trigger, "tags": {"trigger": trigger}, "end": end}
@@ -72,7 +72,7 @@ def test_hits_of_one_name_that_touch_are_one(store: hl.Store) -> None:
     assert recorder.look().incidents == 4
     (report,) = recorder.stop()
     spans = [(-2, 5, "bump"), (3, 7, "fall"), (18, 22, "bump"), (38, 42, "bump")]
-    pins = [(pin["from"], pin["to"] - 1, pin["reason"]) for pin in report.entry.pins]
+    pins = [(pin.first, pin.last, pin.reason) for pin in report.entry.manifest.pins]
     marks = [(m.log_time_ns, m.fields["end"], m.fields["text"]) for m in store.topic(MARKS)]
     for found in (pins, marks):
         told = sorted(((a - now) // SECOND, (b - now) // SECOND, name) for a, b, name in found)
@@ -86,8 +86,8 @@ def test_marks_of_a_trigger_begin_no_recording_earlier(store: hl.Store) -> None:
     recorded.speaker.say(text_channel(), text("first"), now)
     recorded.recorder.fire("SIGUSR1")
     (report,) = recorded.recorder.stop()
-    assert report.entry.marks[0]["time"] == now
-    assert report.entry.pins[0]["from"] < now
+    assert report.entry.manifest.marks[0].time == now
+    assert report.entry.manifest.pins[0].first < now
 
 
 def test_what_a_person_marks_and_pins_is_stored_at_once(store: hl.Store) -> None:
@@ -196,8 +196,8 @@ def test_a_trigger_fires_on_whole_and_exact_messages(
         recorded.speaker.say(channel, spell(number, array), start + index * SECOND)
     (report,) = recorded.recorder.stop()
     found: dict[str, list[int]] = {}
-    for mark in sorted(report.entry.marks, key=itemgetter("time")):
-        found.setdefault(mark["text"], []).append((mark["time"] - start) // SECOND)
+    for mark in sorted(report.entry.manifest.marks, key=attrgetter("time")):
+        found.setdefault(mark.text, []).append((mark.time - start) // SECOND)
     assert found == {f"/wide: {where}": fires for where, fires in FIRES.items()}
 
 
@@ -214,7 +214,7 @@ def test_a_follower_that_is_killed_misses_nothing(store: hl.Store) -> None:
             follower._process.kill()
     (report,) = recorded.recorder.stop()
     assert len(pids) == 2
-    times = sorted((mark["time"] - start) // SECOND for mark in report.entry.marks)
+    times = sorted((mark.time - start) // SECOND for mark in report.entry.manifest.marks)
     assert times == [1, 3, 5]
 
 
@@ -228,7 +228,7 @@ def test_a_follower_that_cannot_work_is_given_up(
     assert recorded.said == ["triggers are evaluated no more: their process ends again and again"]
     recorded.speaker.say(scan_channel(), scan(0, 10))
     (report,) = recorded.recorder.stop()
-    assert (report.entry.messages, report.entry.marks) == (1, [])
+    assert (report.entry.messages, report.entry.manifest.marks) == (1, ())
 
 
 @pytest.mark.mongo

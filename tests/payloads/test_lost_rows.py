@@ -92,7 +92,7 @@ def test_a_log_that_has_lost_a_file_is_lost_in_every_door(
         assert entry.status == "damaged"
         said = [
             (loss["file"], loss["topic"], loss["count"], loss["from"], loss["to"])
-            for loss in entry.end["losses"]
+            for loss in entry.losses
         ]
         parts = {topic: next(iter(row.parts.values())) for topic, row in lost.items()}
         assert sorted(said) == sorted(

@@ -96,7 +96,7 @@ def test_a_mark_is_removed(store: hl.Store, tmp_path: Path) -> None:
     answer("mark", "carpet", "-r", "drive", "--until", "+70s", "--remove", store=path, code=2)
     marks = "/hybridlog/marks"
     with hl.open(path, mongo="none") as opened:
-        assert [m["text"] for m in opened.entry("drive").marks] == ["carpet", "stairs"]
+        assert [m.text for m in opened.entry("drive").manifest.marks] == ["carpet", "stairs"]
         assert times(opened.topic(marks)) == [60, 80]
         opened.unmark("drive", "carpet")
         assert times(opened.topic(marks)) == [80]
@@ -203,8 +203,8 @@ def test_marks_in_sql_and_in_the_timeline(store: hl.Store) -> None:
 def test_a_mark_ends_after_it_begins(store: hl.Store) -> None:
     with pytest.raises(TimeError, match="cannot end before it begins"):
         store.mark("drive", "+5s", "x", until="+4s")
-    (mark,) = store.entry("drive").marks
-    assert mark["end"] - mark["time"] == 4 * S
+    (mark,) = store.entry("drive").manifest.marks
+    assert mark.end - mark.time == 4 * S
     manifest = places.manifest(store.directory.path, "drive")
     wrong = [structs.replace(one, end=one.time - 1) for one in manifest.marks]
     with pytest.raises(ValueError, match="ends before it begins"):

@@ -37,7 +37,7 @@ def everything(store: hl.Store) -> dict[str, Any]:
     """Answers of all kinds."""
     return {
         "recordings": [
-            (one.id, one.name, one.status, one.tags, one.notes, one.marks, one.span, one.messages)
+            (one.id, one.status, one.tags, one.manifest.notes, one.manifest.marks, one.messages)
             for one in store.recordings()
         ],
         "topics": store.topics(),
@@ -122,8 +122,9 @@ def test_a_change_is_one_manifest(
     with hl.open(address) as store:
         assert len(proxy.requests) <= 3
         (entry,) = store.recordings(tag="place")
-        said = entry.tags.get("x"), entry.name, entry.notes, entry.pins, len(entry.marks)
-        assert said != (None, "run", [], [], 1)
+        now = entry.manifest
+        said = now.tags.get("x"), now.name, now.notes, now.pins, len(now.marks)
+        assert said != (None, "run", (), (), 1)
         assert not store.verify().findings
 
 
@@ -131,10 +132,10 @@ def test_marks_pins_and_rules(here: Path, address: str, proxy: Proxy) -> None:
     publish_all(here, address, ("run", "more"))
     with hl.open(address) as store:
         raw = [message.raw for message in store.topic("/scan").in_recording("run")]
-        kept = store.mark("run", "+2s", "seen", {"by": "lab"}, until="+3s").marks
-        assert [mark["text"] for mark in kept] == ["slipped", "seen"]
+        kept = store.mark("run", "+2s", "seen", {"by": "lab"}, until="+3s").manifest.marks
+        assert [mark.text for mark in kept] == ["slipped", "seen"]
         store.mark("run", "+4s", "wrong")
-        assert len(store.unmark("run", "wrong").marks) == 2
+        assert len(store.unmark("run", "wrong").manifest.marks) == 2
         pin = store.pin("run", "+0s", "+5s", reason="to keep")
         assert store.unpin(store.pin("more")) is None
         rule = ("keep", "--min-free", "1GB", "--save")
@@ -151,7 +152,7 @@ def test_marks_pins_and_rules(here: Path, address: str, proxy: Proxy) -> None:
         assert isinstance(directory, RemoteDirectory)
         assert directory.settings.retention == {"quota": "1MB"}
         (entry,) = store.recordings("run")
-        assert ([one["id"] for one in entry.pins], entry.marks) == ([pin], kept)
+        assert ([one.id for one in entry.manifest.pins], entry.manifest.marks) == ([pin], kept)
         assert not store.verify().findings
         for label, topic in (("run", "/scan"), ("more", "/scan"), ("run", "/arm")):
             assert store.topic(topic).in_recording(label).count() == 400

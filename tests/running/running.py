@@ -89,7 +89,7 @@ class Running:
         until = time.monotonic() + limit_s
         while True:
             entry = next((e for e in store.recordings() if e.name == LABEL), None)
-            if entry is not None and entry.messages >= len(self.sent) and entry.end.get("losses"):
+            if entry is not None and entry.messages >= len(self.sent) and entry.losses:
                 assert entry.messages == len(self.sent)
                 return
             assert time.monotonic() < until, entry

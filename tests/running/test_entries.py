@@ -85,7 +85,7 @@ def check(found: RecordingEntry) -> None:
     assert found.span == (min(times), max(times))
     numbers = [number for number, _, _ in found.spans]
     assert numbers == sorted({*map(int, found.digests), *found.flushed})
-    assert not found.end.get("losses")
+    assert not found.losses
 
 
 def test_what_is_sealed_while_it_is_listed_counts_once(
@@ -139,7 +139,7 @@ def test_what_cannot_be_read_is_a_loss(running: Running, tmp_path: Path, *, is_f
         path.unlink()
         path.mkdir()
     found = running.follow(StoreDirectory(tmp_path / "store"))
-    (loss,) = found.end["losses"]
+    (loss,) = found.losses
     assert (loss["cause"], loss["file"], loss["count"]) == (Cause.SEGMENT, path.name, None)
     assert loss["offset"] == (begin if is_file else None)
     assert running.sealed.messages <= found.messages < COUNT

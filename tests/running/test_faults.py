@@ -35,7 +35,7 @@ def copied(running: Running, tmp_path: Path) -> Path:
 
 def is_reported(store: hl.Store) -> bool:
     """Whether the store says that a part of a segment is damaged."""
-    losses = store.entry(LABEL).end.get("losses", ())
+    losses = store.entry(LABEL).losses
     return any(row["cause"] == "segment" and row["count"] is None for row in losses)
 
 

@@ -32,6 +32,7 @@ from hybridlog_storage.catalog import (
     channel_totals,
 )
 from hybridlog_storage.cells import put
+from hybridlog_storage.manifest import Manifest, Mark, Note, Source
 from hybridlog_storage.messages import Channel, Schema, schema_hash
 from hybridlog_storage.segments.chunk_table import CHUNK, PART, ChunkTable
 from hybridlog_storage.summary import RecordingSummary
@@ -114,19 +115,21 @@ class Model:
         for number in range(segments):
             self.tables[number], self.told[number] = segment(rng, chunks)
         self.entry = RecordingEntry(
-            id=self.id,
-            name=name,
-            tags={"a.b": "c", "$x": "y", "": "z"},
-            source={"path": "/x", "bytes": 2**40, "fingerprint": "f"},
-            created=2**62,
-            status="complete",
-            end={"losses": [{"cause": "queue", "count": None}]},
+            Manifest(
+                self.id,
+                name,
+                2**62,
+                tags={"a.b": "c", "$x": "y", "": "z"},
+                source=Source(path="/x", bytes=2**40, fingerprint="f"),
+                notes=(Note(5, "ö"),),
+                marks=(Mark(f"{1:016x}", 1, "m"),),
+            ),
+            "complete",
+            losses=[{"cause": "queue", "count": None}],
             channels=[channel_entry(c, channel(c)) for c in CHANNELS],
             stored_bytes=2**50,
             segments=segments,
             chunks=segments * chunks,
-            notes=[{"at": 5, "text": "ö"}],
-            marks=[{"time": 1, "text": "m", "tags": {}, "segment": 1}],
             spans=[
                 (n, int(t.chunks["first"].min()), int(t.chunks["last"].max()))
                 for n, t in self.tables.items()

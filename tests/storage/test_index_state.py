@@ -10,6 +10,7 @@ import pytest
 from msgspec.structs import replace
 
 from hybridlog_storage.catalog import ChannelStats, RecordingEntry, channel_entry
+from hybridlog_storage.manifest import Manifest
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.mongo.database import Database
 from hybridlog_storage.mongo.index_documents import IndexState, key_bound
@@ -44,12 +45,8 @@ def recording(*topics: str) -> RecordingEntry:
     ]
     channels[0].stats = ChannelStats(messages=2, first=5, last=9)
     return RecordingEntry(
-        id=ONE,
-        name="one",
-        tags={},
-        source=None,
-        created=1,
-        status="complete",
+        Manifest(ONE, "one", 1),
+        "complete",
         channels=channels,
         spans=[(0, 5, 9)],
     )

@@ -237,7 +237,7 @@ def test_what_is_lost_is_said(page: Page, demo_store: hl.Store, tmp_path: Path) 
     with hl.open(tmp_path / "store") as store:
         store.verify(repair=True)
         store.refresh()
-        (loss,) = [loss for loss in store.entry("robot").end["losses"] if loss["count"]][:1]
+        (loss,) = [loss for loss in store.entry("robot").losses if loss["count"]][:1]
         with served(store) as url:
             middle = (loss["from"] + loss["to"]) // 2 - store.entry("robot").span[0]
             page.goto(

@@ -16,7 +16,7 @@ from msgspec.structs import asdict
 from hybridlog.cli import options, output
 from hybridlog.cli.answers import check_room
 from hybridlog.cli.binder import command, option
-from hybridlog.cli.commands.keep import pin_cells
+from hybridlog.cli.commands.keep import pin_cells, pin_dict
 from hybridlog.cli.commands.ls import recording_dict, status_text
 from hybridlog.cli.options import AsJson, Choosing, Forced, InStore, names_argument, query_of
 from hybridlog.cli.render import Column, bytes_of, duration_of, print_fields, print_table
@@ -127,8 +127,8 @@ def _as_dict(store: Store, entry: RecordingEntry) -> dict[str, Any]:
         "chunks": entry.chunks,
         "coverage": coverage(entry, losses),
         "losses": losses,
-        "marks": entry.marks,
-        "pins": entry.pins,
+        "marks": [*map(asdict, entry.manifest.marks)],
+        "pins": [*map(pin_dict, entry.manifest.pins)],
         "attachments": [*map(_attachment_dict, attachments)],
         "metadata_records": [each._asdict() for each in metadata],
         "channels": [
@@ -161,11 +161,12 @@ def _fields(store: Store, entry: RecordingEntry, about: dict[str, Any]) -> list[
     from hybridlog.query.answers.lost import line_of
     from hybridlog.query.times import format_duration
 
-    status, source = status_text(summary_of(entry)), entry.source["kind"]
-    if entry.source["bytes"]:
-        source += f", {output.size(entry.source['bytes'])}"
-    if entry.source["path"]:
-        source = f"{entry.source['path']} ({source})"
+    manifest, status = entry.manifest, status_text(summary_of(entry))
+    source = manifest.source.kind
+    if manifest.source.bytes:
+        source += f", {output.size(manifest.source.bytes)}"
+    if manifest.source.path:
+        source = f"{manifest.source.path} ({source})"
     first, last = about["first_ns"], about["last_ns"]
     segments, chunks = (
         output.counted(getattr(entry, f"{what}s"), what) for what in ("segment", "chunk")
@@ -183,8 +184,11 @@ def _fields(store: Store, entry: RecordingEntry, about: dict[str, Any]) -> list[
         ("coverage", about["coverage"]),
         *(("", line_of(loss)) for loss in about["losses"]),
         *(("tag", f"{key}={value}") for key, value in sorted(entry.tags.items())),
-        *(("note", note["text"]) for note in entry.notes),
-        *(("pin", f"{pin['id']}: {', '.join(filter(None, pin_cells(pin)))}") for pin in entry.pins),
+        *(("note", note.text) for note in manifest.notes),
+        *(
+            ("pin", f"{one['id']}: {', '.join(filter(None, pin_cells(one)))}")
+            for one in about["pins"]
+        ),
         *(
             ("attachment", f"{one['name']} ({_about(one['media_type'], one['bytes'])})")
             for one in about["attachments"]

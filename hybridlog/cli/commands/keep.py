@@ -17,6 +17,7 @@ from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
     from hybridlog.store import Store
+    from hybridlog_storage.manifest import Pin
 
 _MAX_PINS = 1000
 _RULES = ("quota", "min_free", "max_age", "never_tag", "fields_age", "save", "dry_run")
@@ -88,7 +89,11 @@ def keep_command(given: _Given) -> int:
             store.unpin(*given.unpin)
         elif given.pins:
             chosen = given.recordings_in(store)
-            rows = [{"recording": entry.name, **pin} for entry in chosen for pin in entry.pins]
+            rows = [
+                {"recording": entry.name, **pin_dict(pin)}
+                for entry in chosen
+                for pin in entry.manifest.pins
+            ]
             given.show(rows, [Column("pin", "id"), Column("recording"), *_PIN])
         else:
             return _keep(store, rules, given)
@@ -163,6 +168,13 @@ _PIN = [
     Column("topics", lambda pin: "all" if pin["topics"] is None else listed(pin["topics"])),
     Column("reason"),
 ]
+
+
+def pin_dict(pin: Pin) -> dict[str, Any]:
+    """A pin for JSON; `to` is the time behind it."""
+    end = None if pin.last is None else pin.last + 1
+    about = {"topics": pin.topics, "reason": pin.reason}
+    return {"id": pin.id, "from": pin.first, "to": end, **about}
 
 
 def pin_cells(pin: dict[str, Any]) -> list[str]:

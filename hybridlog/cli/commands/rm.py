@@ -41,7 +41,7 @@ def rm_command(given: _Given) -> None:
     with given.opened() as store:
         chosen = recordings_of(store, choice).summaries
         if not given.yes:
-            pins = [pin["reason"] for one in chosen for pin in store.entry(one.id).pins]
+            pins = [pin.reason for one in chosen for pin in store.entry(one.id).manifest.pins]
             _confirm(chosen, pins)
         for one in chosen:
             store.remove(one.id)

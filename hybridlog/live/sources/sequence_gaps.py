@@ -47,19 +47,6 @@ class SequenceGapDetector:
         waiting: Gaps that are not confirmed yet.
     """
 
-    __slots__ = (
-        "_confirm_after",
-        "_confirmed",
-        "_max_gap",
-        "_messages_after",
-        "_received",
-        "_start",
-        "_trust_after",
-        "_trusted",
-        "expected",
-        "waiting",
-    )
-
     def __init__(
         self, *, trust_after: int = 8, confirm_after: int = 8, max_gap: int = 1_000_000
     ) -> None:

@@ -119,10 +119,10 @@ class Arrivals(Planner):
             if flushed is None:
                 sealed.add(segment)
                 del read[segment]
-        if entry.marks:
+        if entry.manifest.marks:
             entry = without(entry, self._marks)
             self.session.show(entry)
-            self._marks.update(mark["id"] for mark in entry.marks)
+            self._marks.update(mark.id for mark in entry.manifest.marks)
             columns = ChunkColumns(MARKS_SEGMENT, entry.flushed[MARKS_SEGMENT].table)
             yield from columns.chunks(columns.within(bounds, clock, timed=timed))
 

@@ -89,7 +89,8 @@ def coverage(entry: RecordingEntry, losses: Collection[Row]) -> str:
 
 def copies_of(entry: RecordingEntry) -> list[str]:
     """Sentences that name the copies with payloads that a recording lacks."""
-    return [f"{address} has more payloads of {entry.name}; ask there" for address in entry.copies]
+    copies = sorted({file.copy for file in entry.manifest.files if file.copy})
+    return [f"{address} has more payloads of {entry.name}; ask there" for address in copies]
 
 
 def _coverage(entry: RecordingEntry, losses: Collection[Row]) -> str:
@@ -99,7 +100,7 @@ def _coverage(entry: RecordingEntry, losses: Collection[Row]) -> str:
         if entry.status == "unproven":
             return "not known: its manifest was lost, so a segment may be missing"
         # An empty log is complete; a robot that sent nothing may not have been reached.
-        is_live = not entry.source["bytes"]
+        is_live = not entry.manifest.source.bytes
         return "nothing was received" if is_live and not entry.messages else "complete"
     lost = sum(loss["count"] or 0 for loss in losses)
     if any(loss["count"] is None for loss in losses):
@@ -122,7 +123,7 @@ def losses_in(session: Session, question: Question) -> Iterator[tuple[RecordingE
             continue
         chosen = windows_in(windows, bounds if question.clock == "log" else None)
         ledger = losses_of(entry)
-        if "unproven" in {entry.status, entry.end.get("status")}:
+        if "unproven" in {entry.status, entry.manifest.status}:
             ledger += [{"cause": MANIFEST_LOST, "count": None, "topic": None}]
         for row in ledger:
             span = _span_of(entry, row)

@@ -78,7 +78,7 @@ def recording(context: Context, params: RequestParams) -> dict[str, Any]:
         "messages": entry.messages,
         "bytes": entry.stored_bytes,
         "tags": entry.tags,
-        "notes": [note["text"] for note in entry.notes],
+        "notes": [note.text for note in entry.manifest.notes],
         "marks": [
             {"at": one.begin - start, "end": (one.end or one.begin) - start, "text": one.text}
             for one in islice(marks_in(context.store.session, [entry.id]), MAX_MARKS)

@@ -224,7 +224,7 @@ class IndexState:
         hour around its messages and losses, and in all topics unless the recording is complete.
         """
         chosen: dict[str, object] = {"_meta.rec": entry.key}
-        rows = entry.end.get("losses", ())
+        rows = entry.losses
         times = [*(entry.span or (None,)), *(row[one] for row in rows for one in ("from", "to"))]
         known = [time for time in times if time is not None]
         if len(known) == len(times):

@@ -20,6 +20,7 @@ from hybridlog.query.predicate.tree import Predicate
 from hybridlog.query.question import Part, RecordedChannel
 from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.catalog import ChannelStats, RecordingEntry
+from hybridlog_storage.manifest import Manifest
 from hybridlog_storage.messages import REDUCED, Batch, Channel, Schema, left_channel
 
 Message = dict[str, object]
@@ -426,7 +427,7 @@ def test_reduced_json_has_summaries(where: str, holds: bool) -> None:
     payload = reduced(codec_for(channel), json.dumps({"r": [*range(1000)]}).encode())
     zero = np.zeros(1, np.int64)
     batch = Batch(payload, zero, zero + len(payload), zero, zero, zero, zero)
-    entry = RecordingEntry("0", "a", {}, {}, 0, "complete")
+    entry = RecordingEntry(Manifest(f"a-{0:016x}", "a", 0), "complete")
     recorded = RecordedChannel(entry, 0, left_channel(channel, REDUCED), ChannelStats())
     part = Part(entry, "/r", (recorded,), None, "log", None, parse(where))
     found = matches(part, recorded, batch, zero)
