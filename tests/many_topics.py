@@ -1,11 +1,10 @@
-"""Logs of many topics, and what a mongod takes."""
+"""Logs of many topics."""
 
 from __future__ import annotations
 
 import struct
 from pathlib import Path
 
-import hybridlog as hl
 from hybridlog_storage.messages import Channel, Schema
 from tests.independent import write_mcap
 
@@ -29,8 +28,3 @@ def write_log(
         for at, value in enumerate(values)
     ]
     return write_mcap(path, said)
-
-
-def mongod_of(store: hl.Store) -> Path:
-    """The directory in /proc of the embedded mongod."""
-    return Path("/proc", (store.directory.mongod / "data/mongod.lock").read_text().strip())

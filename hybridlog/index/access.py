@@ -12,7 +12,6 @@ from functools import partial, wraps
 from typing import TYPE_CHECKING, NamedTuple, ParamSpec, TypeVar
 
 from hybridlog_storage.errors import (
-    ConnectionBrokenError,
     ConnectionLostError,
     DatabaseError,
     HybridlogError,
@@ -160,12 +159,12 @@ class IndexAccess:
         with self._connecting:
             if self.connected is not None and (self._is_complete or not brings):
                 return self.connected
-            was_connected = self.connected is not None
+            may_end = self.connected is not None or self._named == EMBEDDED
             try:
                 try:
                     return self._connect(brings=brings)
-                except ConnectionLostError as error:
-                    if not was_connected and not isinstance(error, ConnectionBrokenError):
+                except ConnectionLostError:
+                    if not may_end:
                         raise
                     return self._connect(brings=brings)
             except BaseException as error:

@@ -109,7 +109,7 @@ def sizes_of(
         topics.update(topic for topic, number in messages.items() if number)
     index = None
     if database is not None:
-        index = sum(database.size(collection_of(topic))[1] for topic in topics)
+        index = sum(database.size(collection_of(topic)) for topic in topics)
     return Sizes(_largest_first(rows), index)
 
 

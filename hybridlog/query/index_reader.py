@@ -133,8 +133,8 @@ def _counts(database: Database, parts: Sequence[Part], own: Filter) -> dict[Part
     """Number of documents of each part that satisfy a filter."""
     owners = [part for part in parts for _ in _queries([part], own)]
     found = dict.fromkeys(parts, 0)
-    for part, counts in zip(owners, database.count_each(_queries(parts, own)), strict=True):
-        found[part] += sum(number for _, number in counts)
+    for part, count in zip(owners, database.count_each(_queries(parts, own)), strict=True):
+        found[part] += count
     return found
 
 

@@ -94,15 +94,7 @@ class StoreError(HybridlogError):
 
 
 class HeldError(StoreError):
-    """Another process holds a recording's lock.
-
-    Attributes:
-        is_recording: Whether it records.
-    """
-
-    def __init__(self, message: str, *, is_recording: bool) -> None:
-        super().__init__(message)
-        self.is_recording = is_recording
+    """Another process holds a recording's lock."""
 
 
 class SegmentError(StoreError):
@@ -155,10 +147,6 @@ class WithoutMongoError(DatabaseError):
 
 class ConnectionLostError(DatabaseError):
     """The connection to MongoDB has ended, or there is none. A new one may work."""
-
-
-class ConnectionBrokenError(ConnectionLostError):
-    """The connection to MongoDB broke during a command; the server may still run."""
 
 
 class ResourceError(HybridlogError):

@@ -13,7 +13,7 @@ import re
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Final, TypeGuard
-from urllib.parse import SplitResult, quote
+from urllib.parse import quote
 
 from msgspec import Meta, Struct, ValidationError, convert
 from msgspec.structs import replace
@@ -29,18 +29,18 @@ EMBEDDED: Final = "embedded"
 NONE: Final = "none"
 """In place of a URI: no MongoDB."""
 
-MIN_CACHE_MB: Final = 256
-"""Smallest cache that MongoDB accepts, in MiB."""
-MAX_CACHE_MB: Final = 10_000 << 10
-"""Largest one, in MiB."""
-
 MAX_SETTINGS: Final = 1 << 20
 """Bytes of the file."""
 _HOST = r"(?:\[[^\s@/\[\]]+\]|[^\s@:/?\[\]]+)(?::\d{1,5})?"
-_HOSTS = re.compile(rf"{_HOST}(?:,{_HOST})*")
+_OPTION = r"[^\s=&;]+=[^\s&;]*"
+_URI: Final = re.compile(
+    r"(mongodb(?:\+srv)?://)(?:([^\s@:/?]*)(:[^\s@/?]*)?@)?"  # user, password
+    rf"({_HOST}(?:,{_HOST})*(?:/[^\s@/:?]*)?)"
+    rf"(?:\?(|{_OPTION}(?:&{_OPTION})*|{_OPTION}(?:;{_OPTION})*))?"
+)
 LOGIN_CURE: Final = (
-    "Give the password in HYBRIDLOG_MONGO_PASSWORD: a server that --mongo or HYBRIDLOG_MONGO_URI "
-    "names gets it."
+    "Name the user in the URI, mongodb://USER@host/NAME, and give the password in "
+    "HYBRIDLOG_MONGO_PASSWORD: a server that --mongo or HYBRIDLOG_MONGO_URI names gets it."
 )
 """The cure for a password that is missing or readable by others."""
 
@@ -138,16 +138,18 @@ def is_uri(mongo: str | None) -> TypeGuard[str]:
 
 def without_password(uri: str) -> str:
     """A connection string with the user's name, but without secrets."""
-    parts = _split(uri)
-    login, _, hosts = parts.netloc.rpartition("@")
-    user, colon, _ = login.partition(":")
-    mark = ";" if ";" in parts.query else "&"
-    options = parts.query.split(mark)
-    public = [option for option in options if not _is_secret(option)]
-    if not colon and len(public) == len(options):
+    found = _URI.fullmatch(uri)
+    if found is None or not uri.isprintable():
+        raise UsageError(
+            "The URI is not a MongoDB connection string. Write mongodb://host:port/NAME, and "
+            "percent-encode user name, password and socket path."
+        )
+    scheme, user, secret, place, options = found.groups("")
+    mark = ";" if ";" in options else "&"
+    public = mark.join(option for option in options.split(mark) if not _is_secret(option))
+    if not secret and public == options:
         return uri
-    clean = parts._replace(netloc=f"{user}@{hosts}" if user else hosts, query=mark.join(public))
-    return clean.geturl()
+    return f"{scheme}{user}{'@' if user else ''}{place}{'?' if public else ''}{public}"
 
 
 def with_password(uri: str) -> str:
@@ -155,36 +157,11 @@ def with_password(uri: str) -> str:
 
     A URI without a user, or with a password of its own, is unchanged.
     """
-    try:
-        parts = _split(uri)
-    except UsageError:
-        return uri  # connecting reports the error
-    user, _, hosts = parts.netloc.rpartition("@")
-    password = os.environ.get("HYBRIDLOG_MONGO_PASSWORD")
-    if not user or ":" in user or not password:
+    found, password = _URI.fullmatch(uri), os.environ.get("HYBRIDLOG_MONGO_PASSWORD")
+    if not password or found is None or not found[2] or found[3]:
         return uri
-    return parts._replace(netloc=f"{user}:{quote(password, safe='')}@{hosts}").geturl()
-
-
-def _split(uri: str) -> SplitResult:
-    # The library refuses several hosts of which one is an IPv6 address.
-    found = re.fullmatch(r"([^:]*)://([^/?]*)([^?]*)(?:\?(.*))?", uri)
-    scheme, place, path, query = found.groups("") if found else [""] * 4
-    parts = SplitResult(scheme, place, path, query, "")
-    is_whole = (
-        parts.scheme in {"mongodb", "mongodb+srv"}
-        and uri.isprintable()
-        and _HOSTS.fullmatch(parts.netloc.rpartition("@")[2])
-        and not set(parts.path[1:]) & set("@/:")
-        and not {"&", ";"} <= set(parts.query)
-        and all("=" in option for option in re.split("[&;]", parts.query) if option)
-    )
-    if not is_whole:
-        raise UsageError(
-            "The URI is not a MongoDB connection string. Write mongodb://host:port/NAME, and "
-            "percent-encode user name, password and socket path."
-        )
-    return parts
+    at = found.end(2)
+    return f"{uri[:at]}:{quote(password, safe='')}{uri[at:]}"
 
 
 def _is_secret(option: str) -> bool:

@@ -171,10 +171,9 @@ def test_other_users_do_not_see_the_password(server: Guarded, log: Path, tmp_pat
         ("robot@", "wrong", None, "HYBRIDLOG_MONGO_PASSWORD"),
         ("robot@", "", None, "HYBRIDLOG_MONGO_PASSWORD"),
         ("", "", None, "mongodb://USER@"),
-        ("robot@", PASSWORD, "tls=true&tlsCAFile={other}", "tlsCAFile"),
-        ("robot@", PASSWORD, "tls=true", "tlsCAFile"),
+        ("robot@", PASSWORD, "tls=true&tlsCAFile={other}", "certificate"),
         ("robot@", PASSWORD, "tls=true&tlsCAFile=/nowhere.pem", "/nowhere.pem"),
-        ("robot@", PASSWORD, "tls=false", "tls=true"),
+        ("robot@", PASSWORD, "tls=false", "does not answer"),
     ],
 )
 def test_what_is_wrong_is_said_with_its_cure(

@@ -259,11 +259,10 @@ def test_a_killed_keeper_takes_mongod_along_and_the_next_start_brings_another(
         keep(user.start())
         first = pids(directory)
         os.kill(first[1], signal.SIGKILL)
-        gone(first[1])
-        uri = user.start()  # mongod may still answer, but is dying
+        gone(*first)
+        uri = user.start()
         second = pids(directory)
         assert not set(first) & set(second)
-        gone(*first)
         assert kept(uri) == 1
 
 
@@ -330,7 +329,7 @@ def test_a_program_that_fails_at_once(directory: Path, monkeypatch: pytest.Monke
     user = EmbeddedMongod(directory, linger_s=LINGER_S)
     before = psutil.Process().num_fds()
     for _ in range(2):
-        with pytest.raises(DatabaseError, match=r"did not come up: .*with exit status 1"):
+        with pytest.raises(DatabaseError, match=r"did not come up: .*with status 1"):
             user.start()
     assert psutil.Process().num_fds() == before
     monkeypatch.delenv("HYBRIDLOG_MONGOD")
@@ -355,7 +354,7 @@ def test_a_program_that_fails_at_once(directory: Path, monkeypatch: pytest.Monke
             """echo '{"s":"I","msg":"hello"}'; """
             """echo '{"s":"F","msg":"oh","attr":{"error":"WT_PANIC"}}'; kill -6 $$""",
             DatabaseError,
-            r"up: oh .*WT_PANIC.*killed by signal 6",
+            r"up: oh .*WT_PANIC.*status -6",
         ),
     ],
 )
@@ -448,7 +447,7 @@ def test_damage_that_the_last_mongod_noticed_late(
     """A file that is opened only for a question: mongod has started well, and ends then."""
     user = used_once(directory)
     with user.log.open("a") as log:
-        log.write(f"{said}\nhybridlog: mongod ended by itself, killed by signal 6\n")
+        log.write(f"{said}\nhybridlog: mongod ended by itself, with status -6\n")
     with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
         assert (user.damage is not None) == replaced
         assert kept(user.start()) == (not replaced)
@@ -494,7 +493,7 @@ def test_a_runtime_directory_that_is_no_use(
     with pytest.raises(DatabaseError, match="HYBRIDLOG_RUNTIME_DIR to a short path"):
         EmbeddedMongod(directory).start()
     monkeypatch.setenv("HYBRIDLOG_RUNTIME_DIR", "/proc/nowhere")
-    with pytest.raises(DatabaseError, match="cannot be made"):
+    with pytest.raises(DatabaseError, match="can hold no socket"):
         EmbeddedMongod(directory).start()
 
 
@@ -528,7 +527,6 @@ def test_the_wheel_then_the_path_then_an_error_with_every_way(
 def test_linger_time_of_the_environment(monkeypatch: pytest.MonkeyPatch, directory: Path) -> None:
     monkeypatch.setenv("HYBRIDLOG_MONGOD_LINGER_S", "1.5")
     assert EmbeddedMongod(directory)._linger_s == 1.5
-    for text in ("soon", "-1", "inf", "nan"):
-        monkeypatch.setenv("HYBRIDLOG_MONGOD_LINGER_S", text)
-        with pytest.raises(UsageError):
-            EmbeddedMongod(directory)
+    monkeypatch.setenv("HYBRIDLOG_MONGOD_LINGER_S", "soon")
+    with pytest.raises(UsageError):
+        EmbeddedMongod(directory)

