@@ -75,7 +75,7 @@ class OpenStore:
         self._opening = threading.Lock()
         self.index = IndexAccess(self, mongo, progress)
         self._latest: Session | None = None
-        self._changed = 0, False  # as of the latest state, see `StoreDirectory.changed`
+        self._changed = 0  # as of the latest state, see `StoreDirectory.changed`
         self._names: list[str] = []  # ids of recordings
         self._listed_at = 0.0  # when they were compared last, by `monotonic`
         self.live: WeakSet[LiveRecording] = WeakSet()  # that were started by it
@@ -99,13 +99,7 @@ class OpenStore:
     @lazy
     def catalog(self) -> Catalog:
         """Recordings, channels, chunks and schemas."""
-        directory = self.directory
-        return Catalog(
-            directory.path,
-            directory.settings.store_id,
-            in_memory=not directory.is_writable,
-            cells=directory.cells,
-        )
+        return Catalog(self.directory.path, self.directory.cells)
 
     @lazy
     def tables(self) -> Tables:
@@ -137,7 +131,7 @@ class OpenStore:
             return False
         self._listed_at = time.monotonic()
         is_same = self.directory.ids() == self._names
-        self._changed = now if is_same else (0, False)
+        self._changed = now if is_same else 0
         return not is_same
 
     def replace_latest(self, before: Snapshot, now: Session) -> None:
@@ -214,7 +208,7 @@ class OpenStore:
         return self.directory.path / "tables/recordings.parquet"
 
     def _drop_list(self) -> None:
-        self._has_changed = self.directory.is_writable and not self.catalog.is_in_memory
+        self._has_changed = self.directory.is_writable
         if self._has_changed:
             removing = files.explained(self._list, "removing")
             with removing, suppress(FileNotFoundError):

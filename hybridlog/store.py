@@ -663,7 +663,7 @@ class Store:
             dry_run: True to say what would go, and delete nothing.
 
         Raises:
-            UsageError: A rule is malformed, or not for a bucket.
+            UsageError: A rule is malformed.
             StoreError: Another process deletes here, too; or the store is read-only.
         """
         from hybridlog.maintenance.edit import remove_if
@@ -672,12 +672,12 @@ class Store:
 
         self.shared.check_process()
         wanted = Rules.of(self.directory.settings.retention if rules is None else rules)
-        wanted.check_place(is_remote=self.directory.is_remote)
+        if self.directory.is_remote or not dry_run:
+            self.directory.check_writable()
         keeper = Keeper(self.directory, partial(remove_if, self.shared))
         if dry_run:
             return KeepReport(keeper.plan(wanted))
         self._to_change()
-        self.directory.check_changes()
         try:
             return keeper.keep(wanted)
         finally:

@@ -45,7 +45,7 @@ for name in (
     os.environ.pop(name, None)
 # What the tests agree to is nothing that whoever runs them has agreed to.
 _STATE = tempfile.TemporaryDirectory(prefix="hl-state-")
-os.environ["XDG_STATE_HOME"] = _STATE.name
+os.environ["XDG_STATE_HOME"] = os.environ["XDG_CACHE_HOME"] = _STATE.name
 # Hundreds of commands are run, which need not all be compiled anew.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import fcntl
-import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -19,8 +18,7 @@ def made_once(name: str, make: Callable[[Path], str]) -> Path | str:
     Returns:
         The directory, or why there is none.
     """
-    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    place = Path(home) / "hybridlog-tests" / name
+    place = Path.home() / ".cache/hybridlog-tests" / name
     place.parent.mkdir(parents=True, exist_ok=True)
     with place.with_name(f"{name}.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)

@@ -19,7 +19,7 @@ from rosbags.rosbag1 import Writer as BagWriter
 import hybridlog as hl
 from hybridlog.attachments import Extras, StoredAttachment, extras_of
 from hybridlog.cli.answers import write_answer
-from hybridlog_storage.catalog import CATALOG
+from hybridlog_storage.cells import CATALOG
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segments.recovery import damage_of, recover_segment

@@ -1022,7 +1022,7 @@ def check_state(second: FormatReader, database: Any, recordings: Mapping[str, Re
 def test_the_specification_names_what_there_is() -> None:
     from hybridlog.schema.document import ARRAY_LIMIT
     from hybridlog_storage import manifest
-    from hybridlog_storage.catalog import CATALOG
+    from hybridlog_storage.cells import CATALOG
     from hybridlog_storage.disk import directory
     from hybridlog_storage.mongo import index_documents
     from hybridlog_storage.segments import chunk_table, segment_format

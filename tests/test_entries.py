@@ -29,6 +29,7 @@ from hybridlog.maintenance.opening import StoreFiles
 from hybridlog.maintenance.report import RepairReport
 from hybridlog.snapshot import Snapshot
 from hybridlog_storage.catalog import WHOLE, Catalog, RecordingEntry
+from hybridlog_storage.cells import Cells
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import Listing, StoreDirectory
 from hybridlog_storage.errors import CatalogError, ManifestError, SegmentError
@@ -378,7 +379,7 @@ def test_chunks_that_cannot_be_read_are_lost_by_topic(made: Made) -> None:
     summary = read_summary(made.segments[2], 2)
     chunk, bounds = summary.table.chunks[0], summary.table.part_bounds()
     parts = summary.table.parts[bounds[0] : bounds[1]]
-    with closing(Catalog(Path("/nowhere"), "x", in_memory=True)) as catalog:
+    with closing(Catalog(Path("/nowhere"), Cells(None, "x"))) as catalog:
         catalog.put_damage(made.id, {(2, 0): "its checksum differs", (2, 99): "x", (9, 0): "y"})
         entry = put_entry(made.directory, catalog, made.id)
     assert entry.status == "damaged"
@@ -410,7 +411,7 @@ def test_nothing_says_what_recording_it_is(directory: StoreDirectory) -> None:
 
 def opened(directory: StoreDirectory) -> tuple[list[RecordingEntry], RepairReport]:
     report = RepairReport()
-    with closing(Catalog(directory.path, directory.settings.store_id)) as catalog:
+    with closing(Catalog(directory.path, directory.cells)) as catalog:
         store, nothing = StoreFiles(directory, catalog, report), Snapshot((), {})
         found = store.look(nothing, directory.ids()).summaries
         if store.recover([one.id for one in found if one.status == "unfinished"]):
@@ -434,7 +435,7 @@ def test_a_byte_that_changes_behind_the_catalog(made: Made) -> None:
 
 def test_chunks_of_another_segment_are_refused(made: Made) -> None:
     """They are read from the footer, which has to be the one that the entry says."""
-    with closing(Catalog(made.directory.path, "x", in_memory=True)) as empty:
+    with closing(Catalog(made.directory.path, Cells(None, "x"))) as empty:
         entry = made.entry()
         assert len(empty.table(entry, 0).chunks)
         changed = replace(entry, files={"0": "000001.mcap"})

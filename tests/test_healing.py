@@ -25,7 +25,7 @@ from hybridlog.columns.tables import TableRows, TopicTable
 from hybridlog.index import access
 from hybridlog.query import index_reader
 from hybridlog.query.planner import Planner
-from hybridlog_storage.catalog import CATALOG
+from hybridlog_storage.cells import CATALOG
 from hybridlog_storage.errors import (
     ConnectionLostError,
     DatabaseError,

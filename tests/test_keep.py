@@ -380,9 +380,8 @@ def test_what_may_have_lost_pins_is_left_alone(store: Path) -> None:
 
 
 def test_one_process_at_a_time(store: Path) -> None:
-    with StoreDirectory(store).retaining() as is_alone:
-        assert is_alone
-        with hl.open(store, mongo="none") as opened, pytest.raises(StoreError, match="already"):
+    with StoreDirectory(store).retaining(), hl.open(store, mongo="none") as opened:
+        with pytest.raises(StoreError, match="already"):
             opened.keep({"max-age": "0s"})
     assert payloads(store)[0] == image(0)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
-from hybridlog_storage.catalog import CATALOG
+from hybridlog_storage.cells import CATALOG
 from tests.damage import flip
 from tests.running.methods import LABEL, rows, sent
 from tests.running.running import NO_MONGODB, Running, begun

@@ -43,7 +43,8 @@ import hybridlog as hl
 from hybridlog.query.query import Query
 from hybridlog.query.topics import matcher
 from hybridlog.record.recorder import RecordOptions
-from hybridlog_storage.catalog import CATALOG, RecordingEntry
+from hybridlog_storage.catalog import RecordingEntry
+from hybridlog_storage.cells import CATALOG
 from hybridlog_storage.errors import TimeError, TopicError
 from hybridlog_storage.manifest import Manifest
 from hybridlog_storage.manifest import replace as changed

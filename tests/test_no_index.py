@@ -12,7 +12,7 @@ from mcap.reader import make_reader
 import hybridlog as hl
 from hybridlog.follow.follower import bring as bring_up_to_date
 from hybridlog.query.topics import matcher
-from hybridlog_storage.catalog import CATALOG
+from hybridlog_storage.cells import CATALOG
 from hybridlog_storage.errors import TopicError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.mongo.index_documents import collection_of

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import hybridlog as hl
-from hybridlog_storage.catalog import CATALOG
+from hybridlog_storage.cells import CATALOG
 from hybridlog_storage.manifest import Loss, encode, replace
 from hybridlog_storage.manifests import MANIFEST_OLD
 from tests import odd_values, places

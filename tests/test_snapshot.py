@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 import hybridlog as hl
 from hybridlog.maintenance.opening import StoreFiles
 from hybridlog.snapshot import Snapshot
-from hybridlog_storage.catalog import CATALOG
-from hybridlog_storage.cells import Cells
+from hybridlog_storage.cells import CATALOG, Cells
 from hybridlog_storage.errors import TopicError
 from hybridlog_storage.manifest import replace
 from hybridlog_storage.manifests import DiskManifests

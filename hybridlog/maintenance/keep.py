@@ -130,10 +130,9 @@ class Keeper:
 
     def plan(self, rules: Rules) -> Plan:
         """The deletions that are due now."""
-        directory, now, free = self._directory, time.time_ns(), None
-        used = 0 if rules.is_empty else directory.listed_bytes()
-        if used is None:
-            used, free = disk_bytes(directory.path), shutil.disk_usage(directory.path).free
+        directory, now = self._directory, time.time_ns()
+        used = 0 if rules.is_empty else disk_bytes(directory.path)
+        free = shutil.disk_usage(directory.path).free
         # A ring alone looks at nothing else.
         ids = [self._own] if rules.is_empty and self._own else directory.ids()
         has_arrays = bool(directory.settings.arrays)
@@ -143,7 +142,7 @@ class Keeper:
     def keep(self, rules: Rules) -> KeepReport:
         """Let go what has to go; HeldError while another process makes a pass."""
         with self._alone():
-            if not (self._directory.is_remote or rules.is_empty):
+            if not rules.is_empty:
                 _lay_spare(self._directory, rules)  # counts among what is used
             found = KeepReport(self.plan(rules))
             planned = found.plan
@@ -176,11 +175,7 @@ class Keeper:
 
     @contextmanager
     def _alone(self) -> Iterator[None]:
-        with self._directory.retaining() as is_alone:
-            if not is_alone:
-                raise HeldError(
-                    "Another process makes room in this store already.", is_recording=False
-                )
+        with self._directory.retaining():
             self._failed.clear()
             yield
 
@@ -375,9 +370,9 @@ def _rows_of(directory: StoreDirectory, recording: str, log: File) -> tuple[File
     """Write the rows of a log, in place of what a crash has left of such."""
     path, left = directory.recording(recording), directory.listing(recording).rows
     directory.drop(recording, [name for name in left if int(name[:6]) == log.number])
-    version = secrets.randbelow(9 * 10**8) + 1 if directory.is_remote else 0  # others do it, too
-    with directory.adding(recording) as into:
-        return write_rows(path, replace(log, gone="expired"), into, version=version)
+    made = write_rows(path, replace(log, gone="expired"), path)
+    files.sync_folder(path)
+    return made
 
 
 def _change(

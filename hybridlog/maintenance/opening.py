@@ -109,7 +109,7 @@ class StoreFiles(Struct):
         so does what needs more room than the disk has.
         """
         directory, done = self.directory, set[str]()
-        if self.catalog.is_in_memory:
+        if not directory.is_writable:
             return done
         if not self._is_swept:
             self._sweep()

@@ -88,11 +88,6 @@ class Rules(Struct, frozen=True):
         except (HybridlogError, TypeError) as error:
             raise UsageError(f"A rule of retention is malformed: {error}") from error
 
-    def check_place(self, *, is_remote: bool) -> None:
-        """Raise if a store in a bucket cannot follow them, since they ask for free space."""
-        if is_remote and self.min_free is not None:
-            raise UsageError("A bucket has no disk that fills: use --quota, not --min-free.")
-
     @property
     def is_empty(self) -> bool:
         """True if nothing ever goes."""

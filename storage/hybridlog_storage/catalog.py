@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
@@ -19,7 +19,7 @@ from msgspec.json import Decoder, encode
 from msgspec.structs import replace
 
 from hybridlog_storage.cache import Cache
-from hybridlog_storage.cells import Cells, Statement, drop, put
+from hybridlog_storage.cells import Cells, drop, put
 from hybridlog_storage.errors import CatalogError, SegmentError
 from hybridlog_storage.manifest import File, Manifest
 from hybridlog_storage.manifests import RECORDINGS
@@ -39,8 +39,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.segments.segment_reader import SegmentSummary
     from hybridlog_storage.segments.walk import Flushed
 
-CATALOG: Final = "catalog.sqlite"
-"""Name of the file in the store's directory."""
 WHOLE: Final = -1
 """Stands for all chunks of a segment whose summary cannot be read, or is another one."""
 Damage = Mapping[tuple[int, int], str]
@@ -227,23 +225,10 @@ def channel_totals(table: ChunkTable) -> dict[int, ChannelStats]:
 
 
 class Catalog:
-    """The catalog of a store; what is of another store is removed. Thread safe.
+    """The catalog of the store at a path, in some cells. Thread safe."""
 
-    `in_memory` leaves the file as it is, for a store that this user cannot write; `cells` are given
-    if they lie elsewhere.
-    """
-
-    def __init__(
-        self,
-        store: Path,
-        store_id: str,
-        *,
-        in_memory: bool = False,
-        cells: Cells | None = None,
-    ) -> None:
-        self.is_in_memory = in_memory or cells is not None
-        self._store = store
-        self._cells = cells or Cells(store / CATALOG, store_id, writes=not in_memory)
+    def __init__(self, store: Path, cells: Cells) -> None:
+        self._store, self._cells = store, cells
         self._topics: dict[str, tuple[TopicType, ...]] = {}
         self._tables = Cache(_MAX_TABLES)
 
@@ -258,37 +243,29 @@ class Catalog:
         """Insert or replace summaries of recordings, with their topics."""
         topics = {one.topics: tuple(types) for one, types in summaries}
         self._topics.update(topics)
-
-        def statements() -> Iterator[Statement]:
-            for digest, types in topics.items():
-                yield put(_TOPICS, digest, topics_to_json(types).encode())
-            for one, _ in summaries:
-                yield put(_SUMMARY, one.id, encode(one[:-1]))
-
-        self._cells.write(statements)
+        cells = [put(_TOPICS, one, topics_to_json(types).encode()) for one, types in topics.items()]
+        self._cells.write(cells + [put(_SUMMARY, one.id, encode(one[:-1])) for one, _ in summaries])
 
     def put_indexed(self, recordings: Collection[str], index: str) -> None:
         """Note that an index is complete for recordings, as long as they look the same."""
-
-        def statements() -> Iterator[Statement]:
-            for one in self.summaries(recordings):
-                if one.indexed_by != index:
-                    yield put(_INDEX, one.id, _body([index, one.look, self._index(one.id)[2]]))
-
-        self._cells.write(statements)
+        cells = [
+            put(_INDEX, one.id, _body([index, one.look, self._index(one.id)[2]]))
+            for one in self.summaries(recordings)
+            if one.indexed_by != index
+        ]
+        self._cells.write(cells)
 
     def put_damage(self, recording: str, damage: Damage) -> None:
         """Store the unreadable chunks of a recording."""
         rows = [(*place, reason) for place, reason in sorted(damage.items())]
-        self._cells.write(lambda: [put(_INDEX, recording, _body(["", "", rows]))])
+        self._cells.write([put(_INDEX, recording, _body(["", "", rows]))])
 
     def put_decoded(
         self, recording: str, number: int, digest: str, decoded: Mapping[int, ChannelStats]
     ) -> None:
         """Store the results of decoding a segment."""
         rounded = {n: replace(one, skew_sum=float(one.skew_sum)) for n, one in decoded.items()}
-        cell = put(_DECODED, recording, encode((number, digest, rounded)), number)
-        self._cells.write(lambda: [cell])
+        self._cells.write([put(_DECODED, recording, encode((number, digest, rounded)), number)])
 
     def put_schemas(self, schemas: Iterable[Schema]) -> None:
         """Store schemas."""
@@ -297,12 +274,12 @@ class Catalog:
             put(_SCHEMA, schema_hash(one), b"%b\n%b" % (head, bytes(one.data)))
             for one, head in heads
         ]
-        self._cells.write(lambda: cells)
+        self._cells.write(cells)
 
     def remove(self, recording: str) -> None:
         """Remove a recording."""
         self._tables.drop("table", recording)
-        self._cells.write(lambda: [drop(kind, recording) for kind in (_SUMMARY, _INDEX, _DECODED)])
+        self._cells.write([drop(kind, recording) for kind in (_SUMMARY, _INDEX, _DECODED)])
 
     # Answers.
 
@@ -325,7 +302,7 @@ class Catalog:
         """A set of topics and their types, by its hash, which a summary has."""
         found = self._set(digest)
         if found is None:
-            raise CatalogError(f"The catalog {self._store / CATALOG} has lost topics. Ask again.")
+            raise CatalogError(f"The catalog of {self._store} has lost topics. Ask again.")
         return found
 
     def _set(self, digest: str) -> tuple[TopicType, ...] | None:

@@ -1,19 +1,19 @@
 """Cells: small values in an SQLite file that is a cache.
 
 Nothing that happens to the file does more than cost time. A damaged file is removed and made
-again. If it is locked or on a full disk, memory takes its place from then on; so it does, with a
-copy of its content, where this process may not write. The file may come from elsewhere: each
-cell has a checksum, no symlink is followed, and no journal is read or written, so a process that
-is killed may leave a damaged file.
+again. If it is locked, on a full disk, or cannot be written, memory takes its place from then on.
+The file may come from elsewhere: each cell has a checksum, no symlink is followed, and no journal
+is read or written, so a process that is killed may leave a damaged file.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import sqlite3
 import stat
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from threading import RLock
@@ -22,7 +22,10 @@ from urllib.parse import quote
 
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import files
+from hybridlog_storage.errors import StoreError
 
+CATALOG: Final = "catalog.sqlite"
+"""Name of the file in the directory of a store."""
 Statement = tuple[str, tuple[object, ...]]
 """An SQL statement and its values."""
 _VERSION: Final = 3
@@ -35,7 +38,6 @@ _AMONG: Final = "key IN (SELECT value FROM json_each(?))"
 _ASIDE: Final = ("-journal", "-wal", "-shm")  # what SQLite would read or write, too
 _WAIT_S: Final = 0.1  # for other processes, once: then memory takes the place of the file
 _MAX_BYTES: Final = 1 << 28  # of a cell
-_MAX_COPIED: Final = 1 << 30  # bytes of a file that is read into memory
 _ERRORS: Final = (sqlite3.DatabaseError, UnicodeDecodeError, OSError)
 """Those of SQLite, of a message that has damaged text, and of the file's place."""
 _T = TypeVar("_T")
@@ -71,14 +73,12 @@ def _is_whole(kind: Any, key: Any, number: Any, body: Any, crc: Any) -> bool:
 class Cells:
     """Cells by kind, key and number; in memory without a path. Thread safe.
 
-    The file of another `owner`, a store, is made again. Without `writes` it stays as it is, and a
-    copy in memory is used.
+    The file of another `owner`, a store, is made again.
     """
 
-    def __init__(self, path: Path | None, owner: str, *, writes: bool = True) -> None:
+    def __init__(self, path: Path | None, owner: str) -> None:
         self._path = path
         self._owner = crc32(f"{_VERSION} {owner}".encode()) >> 1
-        self._writes = writes and path is not None
         self._lock = RLock()
         self._db: sqlite3.Connection | None = None
 
@@ -94,20 +94,19 @@ class Cells:
     def _use(self) -> sqlite3.Connection:
         """The database to ask: the file, or memory in its place."""
         if self._db is None:
-            self._db = self._opened() if self._writes else self._loaded()
+            self._db = self._in_memory() if self._path is None else self._opened(self._path)
         return self._db
 
-    def _opened(self) -> sqlite3.Connection:
+    def _opened(self, path: Path) -> sqlite3.Connection:
         """The file, made if it does not exist."""
-        assert self._path is not None
         for suffix in ("", *_ASIDE):
-            place = self._path.with_name(self._path.name + suffix)
+            place = path.with_name(path.name + suffix)
             with suppress(FileNotFoundError):
                 if suffix or not stat.S_ISREG(files.status(place).st_mode):
                     files.remove_tree(place)
         with suppress(FileExistsError):
-            os.close(files.open_file(self._path, os.O_RDWR | os.O_CREAT | os.O_EXCL))
-        opened = _connected(f"file:{quote(os.fsencode(self._path.absolute()))}?mode=rw")
+            os.close(files.open_file(path, os.O_RDWR | os.O_CREAT | os.O_EXCL))
+        opened = _connected(f"file:{quote(os.fsencode(path.absolute()))}?mode=rw")
         try:
             if not self._is_ours(opened):
                 with _transaction(opened):
@@ -129,17 +128,7 @@ class Cells:
         made.execute(_TABLE)
         made.execute(f"PRAGMA user_version = {self._owner}")
 
-    def _loaded(self) -> sqlite3.Connection:
-        """A database in memory with the cells of the file; empty if it is unreadable."""
-        made, content = _connected(), b""
-        with suppress(*_ERRORS):
-            if self._path is not None and not self._writes:
-                content = files.read_file(self._path, _MAX_COPIED)
-            if content:  # it takes an empty one for a lack of memory
-                made.deserialize(content)
-            if self._is_ours(made):
-                return made
-        made.close()
+    def _in_memory(self) -> sqlite3.Connection:
         made = _connected()
         self._fill(made)
         return made
@@ -152,12 +141,11 @@ class Cells:
                     return work(self._use())
                 except _ERRORS as error:
                     self.close()
-                    if not self._writes or _is_trouble(error):
+                    if self._path is None or _is_trouble(error):
                         break
-                    assert self._path is not None
                     with suppress(OSError):
                         files.remove_tree(self._path)
-            self._writes, self._path = False, None
+            self._path = None
             return work(self._use())
 
     # Cells.
@@ -185,12 +173,12 @@ class Cells:
 
         return self._run(work)
 
-    def write(self, make: Callable[[], Iterable[Statement]]) -> None:
-        """Change cells by the statements of `make`; meanwhile no other process changes any."""
+    def write(self, statements: Collection[Statement]) -> None:
+        """Change cells; meanwhile no other process changes any."""
 
         def work(opened: sqlite3.Connection) -> None:
             with _transaction(opened):
-                for statement in make():
+                for statement in statements:
                     opened.execute(*statement)
 
         self._run(work)
@@ -226,3 +214,12 @@ def _connected(address: str = ":memory:") -> sqlite3.Connection:
         made.close()
         raise
     return made
+
+
+def cells_of_user(address: str, owner: str) -> Cells:
+    """Cells in the user's cache, for a store at an address that cannot be written itself."""
+    with suppress(OSError, StoreError):  # then memory takes the place of the file
+        folder = files.user_cache()
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        return Cells(folder / f"{hashlib.sha256(address.encode()).hexdigest()[:40]}.sqlite", owner)
+    return Cells(None, owner)

@@ -396,7 +396,7 @@ def _locked(path: Path) -> Iterator[None]:
                 files.lock(fd, max(end - time.monotonic(), 0))
             except BlockingIOError:
                 message = f"Another process has held {path} for {WAIT_S:.0f} s; end it."
-                raise HeldError(message, is_recording=False) from None
+                raise HeldError(message) from None
             except OSError as error:
                 if error.errno not in _NO_LOCKS:
                     raise

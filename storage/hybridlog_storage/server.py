@@ -115,7 +115,6 @@ class Server(Place):
                         raise StoreError(f"{self.address}: {_reason(errors)}.")
                     raise HeldError(
                         f"Another process writes {recording} in {self.address} at this moment.",
-                        is_recording=False,
                     )
                 pause(_POLL_S)
             yield

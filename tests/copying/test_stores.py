@@ -149,7 +149,7 @@ def test_recordings_that_are_held_or_gone_keep_no_others_waiting(
 
     def busy(source: Any, target: Any, recording: str, how: Any) -> Any:
         if recording == held:
-            raise HeldError("another process copies it", is_recording=False)
+            raise HeldError("another process copies it")
         if recording == gone:
             source.manifests.remove(recording)
         return real(source, target, recording, how)

@@ -192,8 +192,7 @@ def _keep(store: Store, rules: dict[str, Any], given: _Given) -> int:
             "--fields-age, or write them into [retention] of hybridlog.toml, as --save does."
         )
     if given.save:
-        Rules.of(rules).check_place(is_remote=store.directory.is_remote)
-        store.directory.check_changes()
+        store.directory.check_writable()
         store.directory.change_settings(retention=rules)
     dry_run = given.dry_run
     found = store.keep(wanted, dry_run=dry_run)

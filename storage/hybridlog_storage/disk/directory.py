@@ -1,16 +1,4 @@
-"""The store's directory: its layout and its locks.
-
-```
-<store>/
-  hybridlog.toml        format version, id of the store, settings
-  manifests/<id>.json   what a recording is: name, tags, files, losses
-  recordings/<id>/      its files: segments, columns; writer.lock while it is written
-  catalog.sqlite        derived: recordings and channels
-  mongod/               derived: data of the embedded MongoDB
-```
-
-The id of a recording never changes. What people call it lies in its manifest.
-"""
+"""The store's directory: its files, as `docs/format.md` has them, and its locks."""
 
 from __future__ import annotations
 
@@ -28,7 +16,7 @@ from typing import Any, ClassVar, Final
 from msgspec import Struct, structs
 from msgspec.structs import replace
 
-from hybridlog_storage.cells import Cells
+from hybridlog_storage.cells import CATALOG, Cells, cells_of_user
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import HeldError, StoreError, TopicError, unreadable
 from hybridlog_storage.manifest import File, Manifest
@@ -54,7 +42,7 @@ from hybridlog_storage.stopping import pause
 LOCK: Final = WRITER_LOCK
 LOCK_WAIT_S: Final = 10.0
 """Seconds that a command waits for another one that holds its recording."""
-_OF_MANIFEST: Final = frozenset({MANIFEST_LOCK, MANIFEST_OLD, f".{MANIFEST_OLD}"})
+_OF_MANIFEST: Final = frozenset({MANIFEST_LOCK, MANIFEST_OLD})
 _TICK_NS: Final = 50_000_000
 _POLL_S = 0.02
 _RECORDER_WAIT_S = 0.5  # a reader's look at a lock must not pass for a recorder
@@ -136,13 +124,11 @@ class StoreDirectory:
     """A store's directory; with `read_only` it behaves as if this user could not write it.
 
     With `is_remote` it stands for a place in a bucket, see `remote.store`. People call it `place`;
-    another process opens it by its `address`. `cells` are those of its catalog, None for those in
-    its file; `when_empty` is the sentence for a store without recordings; `mongod` is the folder of
-    the embedded MongoDB.
+    another process opens it by its `address`. `when_empty` is the sentence for a
+    store without recordings; `mongod` is the folder of the embedded MongoDB.
     """
 
     is_remote: ClassVar[bool] = False
-    cells: Cells | None = None
     when_empty = "The store is empty: `hybridlog record FILE` fills it."
 
     def __init__(self, path: Path, *, read_only: bool = False) -> None:
@@ -193,6 +179,14 @@ class StoreDirectory:
         write_settings(path, settings)
 
     @property
+    def cells(self) -> Cells:
+        """Of its catalog; if this user may not write here, in the user's cache."""
+        owner = self.settings.store_id
+        if self.is_writable:
+            return Cells(self.path / CATALOG, owner)
+        return cells_of_user(self.address, owner)
+
+    @property
     def is_writable(self) -> bool:
         """True if this user may change the store."""
         if self.read_only:
@@ -230,16 +224,12 @@ class StoreDirectory:
         """Ids of all recordings that have a manifest, sorted."""
         return self.manifests.ids()
 
-    def changed(self) -> tuple[int, bool]:
-        """Time at which a manifest came, changed or went last, ns, and if that is a while ago.
-
-        Within a tick of the file system's clock another change would show the same time.
-        """
+    def changed(self) -> int:
+        """Time at which a manifest came, changed or went last, ns; others may have the same."""
         try:
-            changed = files.status(self.path / MANIFESTS).st_mtime_ns
+            return files.status(self.path / MANIFESTS).st_mtime_ns
         except OSError:
-            return 0, False
-        return changed, _is_a_tick_ago(changed)
+            return 0
 
     def looks(self, ids: Sequence[str]) -> dict[str, str]:
         """The look of each recording, by id; those without a manifest are left out.
@@ -267,19 +257,9 @@ class StoreDirectory:
         """The look of one recording; empty if there is none."""
         return self.looks([recording]).get(recording, "")
 
-    @contextmanager
-    def adding(self, recording: str) -> Iterator[Path]:
-        """A folder whose new files become those of a recording, within `writing`: its own here."""
-        yield self.recording(recording)
-        files.sync_folder(self.recording(recording))
-
     def drop(self, recording: str, names: Collection[str]) -> None:
         """Remove files of a recording, if they are there."""
         files.remove(self.recording(recording), names)
-
-    def listed_bytes(self) -> int | None:
-        """Bytes of all files, by manifests alone; None where the disk says it."""
-        return None
 
     def has(self, recording: str) -> bool:
         """True if there is a manifest or a folder of a recording."""
@@ -325,17 +305,16 @@ class StoreDirectory:
         return Listing(sealed, opened, tuple(others), sizes, look)
 
     @contextmanager
-    def retaining(self) -> Iterator[bool]:
-        """Lock out other passes of retention; yields False if another process makes one."""
+    def retaining(self) -> Iterator[None]:
+        """Lock out other passes of retention, else `HeldError`."""
         with ExitStack() as held:
             try:
                 held.enter_context(files.locked_folder(self.path, 0))
             except BlockingIOError:
-                yield False
-                return
+                raise HeldError("Another process makes room in this store already.") from None
             except OSError as error:
                 raise unreadable(error, self.path) from error
-            yield True
+            yield
 
     @contextmanager
     def writing(
@@ -373,10 +352,8 @@ class StoreDirectory:
                     is_mine = True
                 with files.explained(path, "locking"):
                     is_there = files.is_at(fd, path)
-                if not is_there and makes:
-                    continue
                 if not is_there:
-                    raise gone(name or recording)
+                    continue  # it was removed, and perhaps created again
                 if is_mine:
                     line = b"%d %d" % (os.getpid(), records)
                     with suppress(OSError):  # a full disk must not keep it from being removed
@@ -395,8 +372,7 @@ class StoreDirectory:
                 what = "being written" if holder.is_recording else "being changed"
                 raise HeldError(
                     f"Recording {name or recording!r} is {what} by {holder.name}. Wait until it "
-                    "is done, or stop it.",
-                    is_recording=holder.is_recording,
+                    "is done, or stop it."
                 )
             pause(_POLL_S)
 
@@ -454,12 +430,7 @@ def _file_look(about: os.stat_result) -> str:
 def is_stable(look: str) -> bool:
     """False if the look is so new that it would be the same after another change."""
     times = look.split()[2::4]  # of the folder, and of the manifest
-    return all(_is_a_tick_ago(int(one)) for one in times)
-
-
-def _is_a_tick_ago(changed: int) -> bool:
-    """True if another change by now would show another time than this one, ns."""
-    return abs(time.time_ns() - changed) > _TICK_NS
+    return all(abs(time.time_ns() - int(one)) > _TICK_NS for one in times)
 
 
 def _numbered(name: str) -> tuple[int, str]:

@@ -331,21 +331,15 @@ def _mounted(path: Path) -> tuple[Any, tuple[str, ...]] | None:
     return None
 
 
-def user_directory(variable: str, below_home: str, purpose: str) -> Path:
-    """The directory of hybridlog in one of the user's base directories; it need not exist.
-
-    `variable` is an environment variable with an absolute path; a relative one does not count.
-    Without it, the path `below_home` does. `purpose` is for the error.
-    """
-    named = os.environ.get(variable, "")
-    if os.path.isabs(named):  # noqa: PTH117 - a relative one does not count
-        return Path(named, "hybridlog")
+def user_cache() -> Path:
+    """The directory for what was read of buckets, and of stores that cannot be written."""
+    named = os.environ.get("XDG_CACHE_HOME", "")
     try:
-        return Path.home() / below_home / "hybridlog"
+        # A relative one does not count.
+        base = Path(named) if os.path.isabs(named) else Path.home() / ".cache"  # noqa: PTH117
     except RuntimeError as error:
-        raise StoreError(
-            f"This user has no home directory to keep {purpose} in: set {variable}."
-        ) from error
+        raise StoreError("This user has no home directory: set XDG_CACHE_HOME.") from error
+    return base / "hybridlog/buckets"
 
 
 def explain(error: OSError, path: Path, doing: str) -> HybridlogError:
@@ -388,9 +382,3 @@ def remove(folder: Path, names: Collection[str]) -> None:
                 unlink(folder / name)
         if names:
             sync_folder(folder)
-
-
-def write_new(final: Path, content: bytes) -> None:
-    """Write a small file atomically."""
-    with explained(final, "writing"):
-        write_file(final, content)

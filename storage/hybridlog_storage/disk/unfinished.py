@@ -52,16 +52,6 @@ def beside(final: Path) -> Unfinished:
     return Unfinished(final.with_name(f".{final.name[:100]}.{secrets.token_hex(6)}.partial"))
 
 
-def scratch_directory() -> Unfinished:
-    """Create a directory for temporary files that only this user may enter."""
-    import secrets
-    import tempfile
-
-    place = Unfinished(Path(tempfile.gettempdir()) / f"hybridlog-{secrets.token_hex(8)}")
-    place.path.mkdir(mode=0o700)
-    return place
-
-
 @contextmanager
 def undone(undo: Callable[[], object]) -> Iterator[None]:
     """Take something back if the block fails, or if the process is stopped in it.

@@ -116,9 +116,7 @@ class BlockCache:
     """
 
     def __init__(self, path: Path | None = None, most: int = MAX_CACHED) -> None:
-        if path is None:
-            path = files.user_directory("XDG_CACHE_HOME", ".cache", "blocks of buckets") / "buckets"
-        self.path = path
+        self.path = path or files.user_cache()
         self._most = most
         self._since_check = _CHECK_EVERY
         self._lock = threading.Lock()

@@ -13,29 +13,21 @@ that have changed since the last one.
 from __future__ import annotations
 
 import errno
-import hashlib
 import os
 import secrets
 import stat
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, ClassVar, Final, cast
+from typing import ClassVar, Final, cast
 
 from msgspec.structs import replace
 
-from hybridlog_storage.cells import Cells, drop, put
-from hybridlog_storage.checksum import crc32
-from hybridlog_storage.copy_places import (
-    Directory,
-    RefusedError,
-    Sending,
-    Source,
-)
+from hybridlog_storage.cells import Cells, cells_of_user, drop, put
+from hybridlog_storage.copy_places import RefusedError, Sending, Source
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import (
     Listing,
@@ -43,13 +35,11 @@ from hybridlog_storage.disk.directory import (
     gone,
 )
 from hybridlog_storage.errors import (
-    DiskFullError,
     ManifestError,
     ObjectChangedError,
     ObjectExistsError,
     RecordingExistsError,
     RecordingGoneError,
-    ResourceError,
     StoreError,
 )
 from hybridlog_storage.manifest import (
@@ -140,7 +130,7 @@ class BucketManifests(Manifests):
             if any(self._bucket.objects(f"{RECORDINGS}/{one}/")):
                 found.append(one)
             else:
-                self._cells.write(lambda one=one: [drop(_MANIFEST, one)])  # type: ignore[misc]
+                self._cells.write([drop(_MANIFEST, one)])
         return found
 
     def remove(
@@ -164,11 +154,6 @@ class BucketManifests(Manifests):
                 known = self._read(recording)
             self._known[recording] = known
             return known
-
-    def old(self, recording: str) -> Manifest | None:
-        """The manifest as the catalog has it."""
-        found = self._catalogued(recording)
-        return None if found is None else found[0]
 
     def _catalogued(self, recording: str) -> tuple[Manifest, str] | None:
         version, _, data = (self._cells.read(_MANIFEST, recording) or b"").partition(b"\n")
@@ -198,11 +183,7 @@ class BucketManifests(Manifests):
             self.number += recording not in self.objects
             self.objects[recording] = Object(_name_of(recording), len(data), version)
             self._known.pop(recording, None)
-            cell = put(_MANIFEST, recording, version.encode() + b"\n" + data)
-            self._cells.write(lambda: [cell])
-
-    def _drop(self, recording: str) -> None:
-        self._bucket.delete([_name_of(recording)])
+            self._cells.write([put(_MANIFEST, recording, version.encode() + b"\n" + data)])
 
     def _delete_files(self, recording: str) -> None:
         names = [one.name for one in self._bucket.objects(f"{RECORDINGS}/{recording}/")]
@@ -214,12 +195,12 @@ class BucketManifests(Manifests):
         with suppress(RecordingGoneError):
             if self._read(recording)[0].status != "removed":
                 return
-            self._drop(recording)
+            self._bucket.delete([_name_of(recording)])
         with self._lock:
             self._known.pop(recording, None)
             self.objects.pop(recording, None)
             self.number += 1
-            self._cells.write(lambda: [drop(_MANIFEST, recording)])
+            self._cells.write([drop(_MANIFEST, recording)])
 
 
 class BucketStore(Source):
@@ -233,10 +214,7 @@ class BucketStore(Source):
     def __init__(self, bucket: Bucket) -> None:
         self.bucket, self.address = bucket, bucket.address
         self.cache = BlockCache()
-        with suppress(OSError):  # then memory takes its place
-            self.cache.path.mkdir(mode=0o700, parents=True, exist_ok=True)
-        name = hashlib.sha256(self.address.encode()).hexdigest()[:40]
-        self.cells = Cells(self.cache.path / f"{name}.sqlite", self.address)
+        self.cells = cells_of_user(self.address, self.address)
         self.manifests = BucketManifests(bucket, self.cells)
         self._found: dict[str, Object] = {}
         self._tables: tuple[int, dict[str, dict[str, Object]]] = -1, {}
@@ -348,25 +326,26 @@ class RemoteDirectory(StoreDirectory):
     def __init__(self, address: str, *, read_only: bool = False) -> None:
         self.source = mount(address)
         self.place = self.address = address
-        self.cells, self.bucket = self.source.cells, self.source.bucket
+        self.bucket = self.source.bucket
         self.path, self.read_only = Path(address), read_only
         self.recordings = self.path / RECORDINGS
         self.when_empty = f"The store is empty: `hybridlog copy {address}` fills it from a disk."
-        # No server that a bucket names is asked.
-        self.settings = replace(self._read_settings()[1], mongo=NONE)
-        self.manifests: BucketManifests = self.source.manifests
-        self.manifests.look(now=True)
-
-    def _read_settings(self) -> tuple[str, StoreSettings]:
-        """The version of the object with the settings, and these."""
         try:
-            about, content = self.bucket.read_whole(SETTINGS, MAX_SETTINGS)
+            _, content = self.bucket.read_whole(SETTINGS, MAX_SETTINGS)
         except FileNotFoundError as error:
             raise StoreError(
                 f"There is no store at {self.place}. `hybridlog copy {self.place}` makes one from "
                 "a store on a disk."
             ) from error
-        return about.version, settings_of(content, self.place)
+        # No server that a bucket names is asked.
+        self.settings = replace(settings_of(content, self.place), mongo=NONE)
+        self.manifests: BucketManifests = self.source.manifests
+        self.manifests.look(now=True)
+
+    @property
+    def cells(self) -> Cells:
+        """Those of the manifests, in the user's cache."""
+        return self.source.cells
 
     @classmethod
     def create_in(cls, address: str) -> RemoteDirectory:
@@ -393,18 +372,10 @@ class RemoteDirectory(StoreDirectory):
         if self.read_only:
             raise StoreError(f"The store {self.place} was opened for reading only.")
 
-    def change_settings(self, **changes: Any) -> None:
-        """Change settings of the store."""
-        self.check_changes()
-        version, now = self._read_settings()
-        new = replace(now, **changes)
-        self.bucket.replace(SETTINGS, settings_text(new), version)
-        self.settings = replace(new, mongo=NONE)
-
-    def changed(self) -> tuple[int, bool]:
-        """A number that changes with what is seen of the store, and True."""
+    def changed(self) -> int:
+        """A number that changes with what is seen of the store."""
         self.manifests.look()
-        return self.source.number, True
+        return self.source.number
 
     def looks(self, ids: Sequence[str]) -> dict[str, str]:
         """The look of each recording, by id: the version of its manifest, and what was lost."""
@@ -412,10 +383,7 @@ class RemoteDirectory(StoreDirectory):
 
     def _look_of(self, recording: str) -> str:
         about = self.manifests.objects.get(recording)
-        if about is None:
-            return ""
-        lost = sorted(self._lost(recording))
-        return f"{about.version} {crc32(repr(lost).encode()):08x}" if lost else about.version
+        return "" if about is None else f"{about.version} {sorted(self._lost(recording))}"
 
     def _lost(self, recording: str) -> list[str]:
         """Paths of the files of a recording that were found to be missing."""
@@ -454,17 +422,6 @@ class RemoteDirectory(StoreDirectory):
         sizes = {name: one.bytes for name, one in here if name not in lost}
         return Listing(sealed, {}, (), sizes, look)
 
-    def listed_bytes(self) -> int:
-        """Bytes of all files that manifests list, and of tables."""
-        tables = sum(o.size for own in self.source.tables().values() for o in own.values())
-        manifests = self.manifests.each(self.ids())
-        return tables + sum(one.bytes for now in manifests for one in now.present.values())
-
-    @contextmanager
-    def retaining(self) -> Iterator[bool]:
-        """Always true: a step of which another process has made a part is refused."""
-        yield True
-
     @contextmanager
     def writing(
         self,
@@ -482,24 +439,6 @@ class RemoteDirectory(StoreDirectory):
         if not self.has(recording):
             raise gone(name or recording)
         yield
-
-    @contextmanager
-    def adding(self, recording: str) -> Iterator[Path]:
-        """As of a directory: one on the disk, whose files become objects."""
-        with tempfile.TemporaryDirectory(prefix="hybridlog-") as place:
-            into, here = Path(place) / RECORDINGS / recording, Directory(Path(place))
-            files.make_folders(into)
-            try:
-                yield into
-            except DiskFullError as error:  # of this disk, where nothing can be deleted
-                raise ResourceError(str(error)) from error
-            for name, size in here.sizes(recording).items():
-                digest = digest_of(here.pieces(f"{RECORDINGS}/{recording}/{name}", 0, size))
-                self.source.send(Sending(here, recording, name, size, digest))
-
-    def drop(self, recording: str, names: Collection[str]) -> None:
-        """Delete objects of a recording, if they are there."""
-        self.bucket.delete([f"{RECORDINGS}/{recording}/{name}" for name in names])
 
 
 def tables_of(bucket: Bucket, recording: str = "") -> Iterator[Object]:
