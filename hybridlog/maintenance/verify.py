@@ -28,6 +28,7 @@ from hybridlog_storage.errors import (
     UsageError,
 )
 from hybridlog_storage.manifest import encode, replace
+from hybridlog_storage.manifests import DiskManifests
 from hybridlog_storage.segments.recovery import damage_of, rebuild_summary
 from hybridlog_storage.segments.segment_reader import SegmentReader, open_log
 from hybridlog_storage.settings import EMBEDDED, is_uri, read_settings, write_settings
@@ -302,7 +303,7 @@ def _repair_one(directory: StoreDirectory, report: RepairReport, recording: str)
 
 
 def _manifest(directory: StoreDirectory, report: RepairReport, recording: str) -> list[Repaired]:
-    manifests, is_lost = directory.manifests, True
+    manifests, is_lost = DiskManifests(directory.path), True
     with suppress(ManifestError):
         is_lost = manifests.find(recording) is None
     if not is_lost:

@@ -17,7 +17,7 @@ from msgspec import Struct, field
 from hybridlog_storage.copy_places import RefusedError, Sending
 from hybridlog_storage.errors import RecordingExistsError, StoreError
 from hybridlog_storage.manifest import File, Manifest, replace
-from hybridlog_storage.manifests import MANIFEST_LOCK, RECORDINGS, WRITER_LOCK
+from hybridlog_storage.manifests import MANIFEST_LOCK, MANIFEST_OLD, RECORDINGS, WRITER_LOCK
 from hybridlog_storage.stopping import pause, safe_point
 
 if TYPE_CHECKING:
@@ -105,7 +105,6 @@ class _Copy:
         self._due = 0.0  # time from which more may be sent
         self._new: set[str] = set()  # paths of files that the manifest there did not list
         self._proved: dict[str, str] = {}  # digests by path
-        self._is_there = False  # its manifest
 
     def known(self) -> Copied | None:
         """The result if there is nothing to copy, found without a lock; None if there is."""
@@ -116,10 +115,9 @@ class _Copy:
         check_origin(here, there)
         if there is None or there.status == "unproven" or self._wanted(there):
             return None
-        if target.mends:
-            sizes = target.sizes(here.id)
-            if any(sizes.get(name) != one.bytes for name, one in there.present.items()):
-                return None
+        sizes = target.sizes(here.id)
+        if any(sizes.get(name) != one.bytes for name, one in there.present.items()):
+            return None
         return Copied(there, lacking=_lacking(here, there))
 
     def run(self) -> Copied:
@@ -154,17 +152,16 @@ class _Copy:
         return is_there and self._target.is_whole(self._sending(file), reads=reads)
 
     def _find(self, sizes: Mapping[str, int]) -> Manifest | None:
-        """The manifest there, or of one that was lost, the one before."""
-        here, manifests = self._here, self._target.manifests
-        there = manifests.find(here.id)
-        self._is_there = there is not None
-        there = there or manifests.old(here.id)
+        """The manifest there; a recording that has lost more than is known here is left alone."""
+        there, lost = self._target.manifests.find(self._here.id), ""
+        if there is None and MANIFEST_OLD in sizes:
+            lost = ": run `hybridlog verify --repair` there, then copy again"
         is_begun = WRITER_LOCK in sizes and MANIFEST_LOCK not in sizes  # by a stopped copy
         if there is None and not is_begun and (more := self._more(sizes)):
-            raise RefusedError(
-                f"{here.name} in {self._target.address} has lost its manifest, and has payloads "
-                f"that are not here, in {', '.join(more)}. It stays as it is."
-            )
+            lost = f", and has payloads that are not here, in {', '.join(more)}. It stays as it is"
+        if lost:
+            name, address = self._here.name, self._target.address
+            raise RefusedError(f"{name} in {address} has lost its manifest{lost}.")
         return there
 
     def _more(self, sizes: Mapping[str, int]) -> list[str]:
@@ -210,9 +207,8 @@ class _Copy:
 
     def _sending(self, file: File) -> Sending:
         source = self._source if file.name in self._own else self._others
-        rate = self._how.limit_rate
         about = file.name, file.bytes, file.digest
-        return Sending(source, self._here.id, *about, self._count, rate)
+        return Sending(source, self._here.id, *about, self._count)
 
     def _count(self, size: int, is_sent: bool) -> None:  # noqa: FBT001 - as of Sending
         """Note bytes that were sent, or were there; wait as long as the limit of the rate asks."""
@@ -229,7 +225,7 @@ class _Copy:
     def _publish(self, here: Manifest, there: Manifest | None, brought: set[int]) -> Manifest:
         manifests = self._target.manifests
         self._check_files()
-        if not self._is_there:
+        if there is None:
             # Another process may be faster.
             with suppress(RecordingExistsError), manifests.creating() as create:
                 made = merged(here, there, brought)

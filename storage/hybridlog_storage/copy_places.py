@@ -13,19 +13,13 @@ import stat
 from abc import ABC, abstractmethod
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Final
+from typing import TYPE_CHECKING, Final
 
 from msgspec import Struct
 
 from hybridlog_storage.disk import files
-from hybridlog_storage.disk.directory import (
-    LOCK_WAIT_S,
-    StoreDirectory,
-)
-from hybridlog_storage.errors import (
-    StoreError,
-    unreadable,
-)
+from hybridlog_storage.disk.directory import LOCK_WAIT_S, StoreDirectory
+from hybridlog_storage.errors import StoreError, unreadable
 from hybridlog_storage.manifest import digest_of, hasher
 from hybridlog_storage.manifests import MANIFESTS, RECORDINGS, DiskManifests
 
@@ -51,7 +45,6 @@ class Sending(Struct, frozen=True):
         digest: Of all its bytes, as the manifest has it.
         count: Told of bytes that were sent, or were there already; waits if that is too fast, and
             is a safe point.
-        limit_rate: Bytes a second, at most; None for no limit.
     """
 
     source: Source
@@ -60,7 +53,6 @@ class Sending(Struct, frozen=True):
     size: int
     digest: str
     count: Callable[[int, bool], None] = lambda *_: None
-    limit_rate: float | None = None
 
     @property
     def name(self) -> str:
@@ -78,12 +70,9 @@ class Sending(Struct, frozen=True):
 
     def pieces(self, at: int = 0) -> Iterator[bytes]:
         """The same, as fast as they may go; they are counted."""
-        most = _PIECE if self.limit_rate is None else max(int(self.limit_rate / 4), 1)
         for piece in self.again(at):
-            for begin in range(0, len(piece), most):
-                part = piece[begin : begin + most]
-                yield part
-                self.count(len(part), True)
+            yield piece
+            self.count(len(piece), True)
 
     def checked(self) -> Iterator[bytes]:
         """The same; the last ones only if all have the digest, else `RefusedError`."""
@@ -116,14 +105,10 @@ class Sending(Struct, frozen=True):
 
 
 class Place(ABC):
-    """A store that recordings are copied to; `address` is what people call it.
-
-    With `mends`, each copy looks for lost files: not on a server, where each look takes a while.
-    """
+    """A store that recordings are copied to; `address` is what people call it."""
 
     address: str
     manifests: Manifests
-    mends: ClassVar[bool] = True
 
     @contextmanager
     def working(self, recording: str) -> Iterator[None]:

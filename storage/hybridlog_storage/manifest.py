@@ -2,7 +2,7 @@
 
 A manifest is a line of JSON and a line with the digest of the first. It has bounds for all that
 it holds, since it may come from elsewhere: numbers, lengths, names that stay below the store.
-Where manifests lie, and how they change, is in `manifests`.
+Where manifests lie, and how they change, is in `manifests`; `docs/format.md` has each field.
 """
 
 from __future__ import annotations
@@ -54,15 +54,7 @@ _Part = TypeVar("_Part", bound=Record)
 
 
 class Source(Record, frozen=True):
-    """The origin of a recording: a file or a robot.
-
-    Attributes:
-        kind: Such as `rosbag1`.
-        profile: As MCAP files state it, such as `ros2`.
-        fingerprint: Of the content; two recordings of one file have the same.
-        parts: Fingerprints of its parts, if it is a log of several files.
-        flush_interval_s: Longest time until a message is flushed, seconds; None for a file.
-    """
+    """The origin of a recording: a file, or a robot, which has a `flush_interval_s`."""
 
     kind: Text = ""
     path: Text = ""
@@ -76,17 +68,8 @@ class Source(Record, frozen=True):
 class Channel(Record, frozen=True):
     """Messages of one topic, type and encoding.
 
-    Attributes:
-        type: Name of the message type; empty without a definition.
-        encoding: Of the messages, such as `cdr`.
-        metadata: As the source states it.
-        messages: All that the recording has had, those of files that are gone included, but not
-            those that a ring has let go.
-        bytes: The same, of payloads.
-        first: Log time of the first one, ns since the epoch, as `last`; None without messages.
-        schema: SHA-256 of name, encoding and text of the definition; empty without one.
-        has_publish_time: False if the source has no publish times.
-        is_indexed: False if its messages get no documents in MongoDB.
+    `messages`, `bytes` (of payloads), `first` and `last` are of all that the recording has had,
+    also of files that are gone, but not of what a ring has let go.
     """
 
     topic: Topic
@@ -112,18 +95,7 @@ class Part(Record, frozen=True, array_like=True):
 
 
 class Loss(Record, frozen=True):
-    """A row of the loss ledger.
-
-    Attributes:
-        cause: One word, such as `transport`.
-        topic: The topic; empty if unknown.
-        count: Messages that are missing; None if unknown.
-        first: Beginning of the loss, ns since the epoch, as its end, `last`; None if unknown.
-        reason: An explanation for people.
-        file: The damaged file; empty for messages that were never in one.
-        offset: Where in the file, bytes.
-        length: Bytes that are damaged there.
-    """
+    """A row of the loss ledger; `offset` and `length` are the damaged bytes of `file`."""
 
     cause: Text
     topic: Topic = ""
@@ -139,21 +111,8 @@ class Loss(Record, frozen=True):
 class File(Record, frozen=True):
     """A file below `recordings/<id>`, which never changes.
 
-    Attributes:
-        number: Its number; blob references name it.
-        group: Number of the group of files that was opened and sealed together.
-        kind: `log` has messages; `rows` has what is left of those of the log of its number once
-            that is gone.
-        digest: BLAKE3 of its bytes.
-        written: When it was sealed, ns since the epoch.
-        first: Log time of its first message, ns, as `last`; None without messages.
-        parts: What it has of each channel.
-        chunks: Number of its chunks.
-        attachments: Number of attachments of the source that it has.
-        metadata: The same of metadata records.
-        losses: Rows of the loss ledger that it has.
-        gone: Why the file is no longer here; absent while it is.
-        copy: Address of a store with a copy of a file that is gone.
+    A `log` has messages; `rows` are what is left of those of the log of their number, once that is
+    gone: expired, or left elsewhere, in the store at the address `copy`.
     """
 
     number: Number
@@ -224,17 +183,8 @@ class LetGo(Record, frozen=True):
 class Manifest(Record, frozen=True):
     """A recording: who it is, its channels and files, its losses, and what users said of it.
 
-    Attributes:
-        id: Never changes; the files lie in `recordings/<id>`.
-        created: When it began, ns since the epoch.
-        changes: How many there have been.
-        status: `open` while it is recorded, or after its recorder died; `unproven` if it was made
-            again after it was lost; `removed` if its files are being deleted.
-        notes: In the order of writing.
-        marks: Marks that somebody set, in this order; those of its recorder are messages.
-        channels: By number.
-        files: In the order of writing.
-        let_go: What its ring has let go; None for nothing.
+    It is `open` while it is recorded, or after its recorder died; `unproven` if it was made again
+    after it was lost; `removed` if its files are being deleted.
     """
 
     id: Id

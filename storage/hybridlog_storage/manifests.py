@@ -3,16 +3,7 @@
 A change is a function of the newest manifest. On a disk it is made under the lock of the
 recording; in a bucket, on condition that the object is still the one that was read, or else
 again. So no change overwrites another one. A change never creates a manifest, so nothing comes
-back that was removed.
-
-On a disk:
-
-    manifests/<id>.json              the manifest
-    manifests/.lock                  held while a manifest is created, or disappears
-    recordings/<id>/manifest.lock    held while a manifest is replaced
-    recordings/<id>/manifest.old     the manifest before the last change
-
-In a bucket, the first one only. All that is in `recordings/<id>` goes with a removal.
+back that was removed. `docs/format.md` has the names of the files.
 """
 
 from __future__ import annotations
@@ -105,20 +96,6 @@ class Manifests(ABC):
         """Create manifests; on a disk nobody else can create one meanwhile."""
         yield self._create
 
-    def restore(self, recording: str, make: Callable[[Manifest | None], Manifest]) -> Manifest:
-        """Make a manifest again that is lost or damaged; returns the one there if it can be read.
-
-        `make` gets the one before the last change, if there is one; nobody begins a recording
-        meanwhile.
-        """
-        with self.creating() as create:
-            with suppress(RecordingGoneError, ManifestError):
-                return self._read(recording)[0]
-            made = replace(make(self.old(recording)), status="unproven")
-            self._drop(recording)
-            create(made)
-            return made
-
     def remove(
         self, recording: str, check: Callable[[Manifest], object] = lambda _: None
     ) -> Manifest:
@@ -195,21 +172,13 @@ class Manifests(ABC):
     def _replace(self, recording: str, data: bytes, version: str) -> None:
         """Replace a manifest. Raises ObjectChangedError if it has another version by now."""
 
-    def old(self, recording: str) -> Manifest | None:
-        """The manifest before the last change; None if there is none to read."""
-        return None
-
-    @abstractmethod
-    def _drop(self, recording: str) -> None:
-        """Remove a manifest that cannot be read."""
-
-    @abstractmethod
     def _delete_files(self, recording: str) -> None:
         """Delete the files of a removed recording, but not its lock."""
+        raise NotImplementedError
 
-    @abstractmethod
     def _forget(self, recording: str, *, says_so: bool) -> None:
         """Delete the manifest of a removed recording, which says so unless the disk was full."""
+        raise NotImplementedError
 
 
 class DiskManifests(Manifests):
@@ -297,8 +266,11 @@ class DiskManifests(Manifests):
             yield
 
     def _replace(self, recording: str, data: bytes, version: str) -> None:
-        path = self.path(recording)
-        _keep_old(path, self._recordings / recording)
+        path, old = self.path(recording), self._recordings / recording / MANIFEST_OLD
+        with suppress(OSError):
+            files.unlink(old)
+        with suppress(OSError):  # where there are no links, there is no older one
+            files.link(path, old)
         with files.explained(path, "writing"):
             self._write(path, data)
 
@@ -314,12 +286,23 @@ class DiskManifests(Manifests):
             files.unlink(new)  # of a writer that died
         files.write_file(path, data, modified=modified, temporary=new)
 
-    def old(self, recording: str) -> Manifest | None:
-        """As of `Manifests`."""
-        with suppress(OSError, ValueError):
-            path = self._recordings / recording / MANIFEST_OLD
-            return decoded(recording, files.read_file(path, MAX_BYTES))
-        return None
+    def restore(self, recording: str, make: Callable[[Manifest | None], Manifest]) -> Manifest:
+        """Make a manifest again that is lost or damaged; returns the one there if it can be read.
+
+        `make` gets the one before the last change, if there is one; nobody begins a recording
+        meanwhile.
+        """
+        with self.creating() as create:
+            with suppress(RecordingGoneError, ManifestError):
+                return self._read(recording)[0]
+            old = None
+            with suppress(OSError, ValueError):
+                path = self._recordings / recording / MANIFEST_OLD
+                old = decoded(recording, files.read_file(path, MAX_BYTES))
+            made = replace(make(old), status="unproven")
+            self._drop(recording)
+            create(made)
+            return made
 
     def _drop(self, recording: str) -> None:
         with suppress(FileNotFoundError), _plainly(self.path(recording), "removing"):
@@ -352,17 +335,6 @@ def manifests_at(folder: Path) -> Manifests:
     """The manifests of the store in which the folder of a recording lies."""
     store = folder.parent.parent
     return files.mounted[store].manifests if store in files.mounted else DiskManifests(store)
-
-
-def _keep_old(path: Path, folder: Path) -> None:
-    """Keep a manifest that is about to be replaced, by a second name."""
-    new = folder / f".{MANIFEST_OLD}"
-    with suppress(OSError):
-        files.unlink(new)
-    with suppress(OSError):  # where there are no links, there is no older one
-        files.link(path, new)
-        files.rename(new, folder / MANIFEST_OLD)
-        files.unlink(new)  # a change that was killed has kept this one already
 
 
 def ids_of(names: Iterable[str]) -> list[str]:

@@ -12,7 +12,6 @@ import json
 import os
 import re
 import secrets
-import select
 import shlex
 import subprocess
 import tempfile
@@ -68,8 +67,6 @@ class Server(Place):
     `/~/path` is below the home directory. `ssh` is the ssh program, with options; None for `ssh`.
     """
 
-    mends = False
-
     def __init__(self, url: str, ssh: str | None = None) -> None:
         self.address = url
         self.manifests = _ServerManifests(self)
@@ -114,7 +111,7 @@ class Server(Place):
                     if process.returncode != 1 or _reason(errors):
                         raise StoreError(f"{self.address}: {_reason(errors)}.")
                     raise HeldError(
-                        f"Another process writes {recording} in {self.address} at this moment.",
+                        f"Another process writes {recording} in {self.address} at this moment."
                     )
                 pause(_POLL_S)
             yield
@@ -210,7 +207,9 @@ class Server(Place):
         with self._running(script) as (process, said, errors):
             assert process.stdin is not None
             with suppress(BrokenPipeError), process.stdin as stream:
-                _write(stream.fileno(), given)
+                for piece in given:
+                    safe_point()
+                    stream.write(piece)
             while process.poll() is None:
                 safe_point()
                 with suppress(subprocess.TimeoutExpired):
@@ -302,14 +301,6 @@ class _ServerManifests(Manifests):
                 f"{WAIT_S:.0f} s."
             ) from error
 
-    def _drop(self, recording: str) -> None:
-        raise StoreError(f"Recordings of {self._server.address} can only be removed there.")
-
-    _delete_files = _drop
-
-    def _forget(self, recording: str, *, says_so: bool) -> None:
-        self._drop(recording)
-
 
 _Running = tuple["subprocess.Popen[bytes]", "IO[bytes]", "IO[bytes]"]
 """A process, and files with its output and its errors: pipes would stay open with the login."""
@@ -321,17 +312,6 @@ class _ExitError(StoreError):
     def __init__(self, code: int, text: str) -> None:
         super().__init__(text)
         self.code = code
-
-
-def _write(pipe: int, given: Iterable[bytes]) -> None:
-    """Write to a process that may hang."""
-    os.set_blocking(pipe, False)
-    for piece in given:
-        view = memoryview(piece)
-        while view:
-            safe_point()
-            if select.select([], [pipe], [], _POLL_S)[1]:
-                view = view[os.write(pipe, view) :]
 
 
 def _summed(sent: Sending, at: int, *adds: Callable[[bytes], object]) -> Iterator[bytes]:

@@ -136,7 +136,7 @@ def check(place: Path, what: str) -> None:
         manifests.remove(ONE.id)
         assert manifests.ids() == []
     hidden = [name for name in names(place) if Path(name).name.startswith(".")]
-    assert set(hidden) <= {"manifests/.lock", f"recordings/{ONE.id}/.manifest.old"}
+    assert set(hidden) <= {"manifests/.lock"}
 
 
 @pytest.mark.parametrize("after", [False, True])
@@ -224,15 +224,6 @@ def test_without_hard_links_there_is_no_older_one(store: Path, calls: Calls) -> 
     calls(files.System, "link", refuse)
     manifests.change(ONE.id, tagged)
     assert manifests.read(ONE.id).tags == {"a": "b"}
-
-
-def test_after_a_killed_change_no_second_name_stays(store: Path) -> None:
-    """It had kept the older one, and had not replaced it yet: both are one file."""
-    folder = store / "recordings" / ONE.id
-    (folder / "manifest.old").unlink(missing_ok=True)
-    os.link(store / "manifests" / f"{ONE.id}.json", folder / "manifest.old")
-    DiskManifests(store).change(ONE.id, tagged)
-    assert not [name for name in names(store) if Path(name).name.startswith(".manifest")]
 
 
 def test_folders_without_a_manifest_are_told_unless_they_hold_nothing(store: Path) -> None:
