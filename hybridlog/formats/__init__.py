@@ -29,7 +29,6 @@ class LogFormat(Struct, frozen=True):
         beginnings: First bytes of a file, one of these.
         suffixes: Suffixes of file names in a directory that is searched for logs.
         profile: MCAP profile of the messages, if the format tells.
-        rosbag2: Name in messages of a file of a ROS 2 bag; empty if it cannot be one.
         needs_suffix: Files without its suffix are no logs in such a directory.
         has_end: A complete file shows at its end that it is complete.
     """
@@ -40,7 +39,6 @@ class LogFormat(Struct, frozen=True):
     beginnings: tuple[bytes, ...]
     suffixes: tuple[str, ...]
     profile: str = ""
-    rosbag2: str = ""
     needs_suffix: bool = False
     has_end: bool = False
 
@@ -67,7 +65,6 @@ LOGS: Final = (
         (b"SQLite format 3\0",),
         (".db3",),
         profile="ros2",
-        rosbag2="ROS 2 bag (sqlite3)",
         needs_suffix=True,
     ),
     LogFormat(
@@ -76,7 +73,6 @@ LOGS: Final = (
         "hybridlog.formats.mcap.reader:McapSource",
         (b"\x89MCAP",),
         (".mcap",),
-        rosbag2="ROS 2 bag (mcap)",
         has_end=True,
     ),
 )

@@ -54,11 +54,11 @@ def find_logs(top: Path) -> Found:
     found = Found()
     for folder, files in _folders(top, found):
         known = {file.path: log for file in files if (log := _log_file(file, found.problems))}
-        metadata, listed = _metadata(folder, files)
+        listed = _listed(folder, files)
         is_bag_found = False
         for parts in grouped_parts(known):
             if listed.isdisjoint(path.name for path in parts):
-                found.logs.append(LogSet.of([known[path] for path in parts], metadata))
+                found.logs.append(LogSet.of([known[path] for path in parts]))
             elif not is_bag_found:
                 found.logs.append(LogSet.at(folder))
                 is_bag_found = True
@@ -115,7 +115,7 @@ class Watch:
                 self._logs[file] = _log_file(file, problems)
         known = {file.path: file for file in files if self._logs.get(file)}
         self._done.update(file for file in files if file.size and file.path not in known)
-        metadata, listed = _metadata(folder, files)
+        listed = _listed(folder, files)
         names = {file.path.name for file in files}
         for parts in grouped_parts([*known, *(f.path for f in files if f in self._done)]):
             ready: dict[_File, LogFile] = {}
@@ -131,7 +131,7 @@ class Watch:
             if is_bag and len(ready) == len(parts):
                 yield LogSet.at(folder)
             else:
-                yield from (LogSet.of([log], metadata) for log in ready.values())
+                yield from (LogSet.of([log]) for log in ready.values())
 
     def _is_complete(
         self, file: _File, log: LogFile, now: int, names: set[str], *, is_closed: bool
@@ -193,12 +193,10 @@ def _log_file(file: _File, problems: list[SourceError]) -> LogFile | None:
     return log if is_called or not (log.format is UNKNOWN or log.format.needs_suffix) else None
 
 
-def _metadata(folder: Path, files: Sequence[_File]) -> tuple[BagMetadata | None, set[str]]:
-    """The metadata of the ROS 2 bag in a directory, None without; and the names it lists."""
+def _listed(folder: Path, files: Sequence[_File]) -> set[str]:
+    """The names that the metadata of the ROS 2 bag in a directory lists; none without."""
     found = read_metadata(folder) if any(file.path.name == NAME for file in files) else None
-    if not isinstance(found, BagMetadata):
-        return None, set()
-    return found, {Path(name).name for name in found.files}
+    return {Path(name).name for name in found.files} if isinstance(found, BagMetadata) else set()
 
 
 def _has_end(file: _File) -> bool:

@@ -55,21 +55,19 @@ class LogFile(Struct, frozen=True):
     Attributes:
         format: Its format; `UNKNOWN` if it is empty, no log or cannot be read.
         is_packed: Whether it is compressed with zstd.
-        messages: Number of messages by the metadata of the log, None if unknown.
     """
 
     path: Path
     format: LogFormat = UNKNOWN
     is_packed: bool = False
-    messages: int | None = None
 
     @classmethod
-    def at(cls, path: Path, messages: int | None = None) -> LogFile:
+    def at(cls, path: Path) -> LogFile:
         """Look at a file; what is wrong with it is told when it is opened."""
         try:
-            return cls(path, *sniff(path), messages)
+            return cls(path, *sniff(path))
         except SourceError:
-            return cls(path, messages=messages)
+            return cls(path)
 
     def open(self, unpacked: Path | None = None) -> Source:
         """Open the file, or what it has been unpacked to."""
@@ -92,22 +90,12 @@ def kinds() -> str:
 
 def files_in(folder: Path) -> list[LogFile]:
     """The logs and the empty files directly in a folder, in natural order of their names."""
-    files: list[LogFile] = []
-    refused: SourceError | None = None
     try:
         paths = [p for p in folder.iterdir() if not p.name.startswith(".") and p.is_file()]
     except OSError as error:
         raise cannot_open(folder, error) from error
-    for path in sorted(paths, key=natural):
-        try:
-            file = LogFile(path, *sniff(path))
-            if file.format is not UNKNOWN or not size_of(path):
-                files.append(file)
-        except SourceError as error:
-            refused = error
-    if refused is not None and all(file.format is UNKNOWN for file in files):
-        raise refused
-    return files
+    files = map(LogFile.at, sorted(paths, key=natural))
+    return [file for file in files if file.format is not UNKNOWN or not size_of(file.path)]
 
 
 # Names of the parts of a split log: `name_3.db3`, `name_2024-05-06-07-08-09_3.bag`, `3.mcap`.
@@ -160,18 +148,11 @@ def is_split(files: Sequence[LogFile]) -> bool:
 def missing_parts(files: Sequence[LogFile]) -> list[Damage]:
     """The damage for parts that are missing between others, by their numbers."""
     found = {part_of(file.path)[1]: file.path for file in files}
-    damage: list[Damage] = []
-    for before, after in pairwise(sorted(found)):
-        part = _PART.fullmatch(plain(found[before]))
-        if after == before + 1 or part is None:
-            continue
-        (stem, end), _ = part_of(found[before])
-        number = str(before + 1).zfill(len(part["number"]))
-        what = "the file is" if after == before + 2 else f"parts {before + 1} to {after - 1} are"
-        reason = f"{what} missing between {found[before].name} and {found[after].name}"
-        path = found[before].with_name(stem + number + end)
-        damage.append(Damage(path, None, None, reason, None))
-    return damage
+    return [
+        Damage(found[before], None, None, f"no part between it and {found[after].name}", None)
+        for before, after in pairwise(sorted(found))
+        if after > before + 1
+    ]
 
 
 _CDR = frozenset({"cdr", ""})  # encodings of ROS 2 messages
@@ -189,13 +170,14 @@ class LogSet(Struct, frozen=True):
         path: The file, the first of several, or the directory of a ROS 2 bag or a split log.
         parts: The files in reading order.
         damage: Files that are missing, and metadata that cannot be read.
-        gaps: Files that seem to be missing; damage unless all messages of the metadata are there.
+        message_count: Number of all messages by its metadata; None if unknown.
+        gaps: Files that seem to be missing; damage unless all of these messages are there.
         problem: Why there is no log.
     """
 
     path: Path
     parts: tuple[LogFile, ...] = ()
-    metadata: BagMetadata | None = None
+    message_count: int | None = None
     damage: tuple[Damage, ...] = ()
     gaps: tuple[Damage, ...] = ()
     problem: SourceError | None = None
@@ -212,7 +194,7 @@ class LogSet(Struct, frozen=True):
             if S_ISDIR(mode) or path.name == NAME:
                 return _in_folder(path if S_ISDIR(mode) else path.parent)
             if S_ISREG(mode):
-                return cls.of([LogFile.at(path)], read_metadata(path.parent))
+                return cls.of([LogFile.at(path)])
             reason = "neither a file nor a directory; give the path of a log"
             return cls(path, problem=SourceError(f"{path}: {reason}"))
         except OSError as error:
@@ -221,14 +203,9 @@ class LogSet(Struct, frozen=True):
             return cls(path, problem=error)
 
     @classmethod
-    def of(cls, parts: Sequence[LogFile], metadata: BagMetadata | Damage | None) -> LogSet:
+    def of(cls, parts: Sequence[LogFile]) -> LogSet:
         """A file, or the parts of a split log in their order."""
-        first = parts[0]
-        if len(parts) == 1 and isinstance(metadata, BagMetadata) and first.format.rosbag2:
-            files, _ = locate(first.path.parent, metadata)
-            if first.path in files:
-                return cls(first.path, (replace(first, messages=files[first.path]),), metadata)
-        return cls(first.path, tuple(parts), gaps=tuple(missing_parts(parts)))
+        return cls(parts[0].path, tuple(parts), gaps=tuple(missing_parts(parts)))
 
     @property
     def files(self) -> list[Path]:
@@ -280,53 +257,37 @@ def _in_folder(folder: Path) -> LogSet:
     metadata = read_metadata(folder)
     bag = metadata if isinstance(metadata, BagMetadata) else None
     damage = [metadata] if isinstance(metadata, Damage) else []
-    found, missing = ({}, []) if bag is None else locate(folder, bag)
-    there = files_in(folder)
-    files = [LogFile.at(path, count) for path, count in found.items()]
+    found, missing = ([], []) if bag is None else locate(folder, bag)
+    there, files = files_in(folder), [*map(LogFile.at, found)]
     if not found:
         files = [file for file in there if file.format is not UNKNOWN]
-        _check_one(folder, files, bag)
+        _check_one(folder, files)
     first = next((file for file in files if file.format is not UNKNOWN), None)
     paths, names = {file.path for file in files}, {plain(file.path) for file in files}
     more: list[LogFile] = []
-    for file in there:
-        is_log, is_known = file.format is not UNKNOWN, file.path in paths
-        if not is_known and is_log and plain(file.path) in names:
-            damage.append(_not_read(file.path, f"it is another form of {plain(file.path)}"))
-        elif not is_known and first is not None and is_split([first, file]):
+    for file in (one for one in there if one.path not in paths):
+        is_new = plain(file.path) not in names
+        if is_new and first is not None and is_split([first, file]):
             more.append(file)
-        elif not is_known and is_log:
-            reason = (
-                f"{NAME} does not list it, and its name is not that of a part of the bag; record"
-            )
-            damage.append(_not_read(file.path, f"{reason} it by its own path"))
+        elif file.format is not UNKNOWN:  # the log lacks nothing by that
+            reason = "the file is not read: it is no part of this log; record it by its own path"
+            damage.append(Damage(file.path, None, None, reason, 0))
     if more:
         files = sorted([*files, *more], key=lambda file: natural(file.path))
-    lacking = {damaged.file for damaged in missing}
-    gaps = [gap for gap in missing_parts(files) if gap.file not in lacking]
+    gaps = [] if found and missing else missing_parts(files)
     if found:
         damage += missing
     else:  # with as many messages as listed, they are the listed files under other names
         gaps = [*missing, *gaps]
-    return LogSet(folder, tuple(files), bag, tuple(damage), tuple(gaps))
+    count = None if bag is None else bag.message_count
+    return LogSet(folder, tuple(files), count, tuple(damage), tuple(gaps))
 
 
-def _not_read(path: Path, reason: str) -> Damage:
-    """The damage for a file that is no part of the log, which lacks nothing by that."""
-    return Damage(path, None, None, f"the file is not read: {reason}", 0)
-
-
-def _check_one(folder: Path, logs: Sequence[LogFile], bag: BagMetadata | None) -> None:
+def _check_one(folder: Path, logs: Sequence[LogFile]) -> None:
     """Refuse a directory whose files are not one log."""
     if len(logs) == 1 or (logs and is_split(logs)):
         return
-    if bag is not None:
-        reason = (
-            f"none of the files that its {NAME} lists is there "
-            f"({', '.join(bag.files[:5]) or 'no file'}); put them beside it, or give the path of "
-            "the file itself"
-        )
-    elif logs:
+    if logs:
         names = listed((log.path.name for log in logs), 5)
         reason = (
             f"{len(logs)} logs that are not parts of one ({names}); give the path of one of them"
@@ -350,13 +311,7 @@ class _JoinedSource(Source):
 
     def __init__(self, log: LogSet) -> None:
         form = next(part.format for part in log.parts if part.format is not UNKNOWN)
-        is_bag = log.metadata is not None and bool(form.rosbag2)
-        super().__init__(
-            log.path,
-            kind=form.rosbag2 if is_bag else "",
-            profile="ros2" if is_bag else form.profile,
-            files=log.files,
-        )
+        super().__init__(log.path, kind="", profile=form.profile, files=log.files)
         self._log = log
         self._got = 0
         for damage in log.damage:
@@ -388,7 +343,7 @@ class _JoinedSource(Source):
                 failed += 1
                 first = first or error
                 reason = _without_path(error, part.path)
-                self.damage.append(Damage(part.path, 0, size, reason, part.messages))
+                self.damage.append(Damage(part.path, 0, size, reason, None))
             else:
                 with inner:
                     yield from self._read(part, inner, done, size)
@@ -397,7 +352,12 @@ class _JoinedSource(Source):
             self.bytes_read = done
         if first is not None and failed == len(self._log.parts):
             raise first
-        self._check_total()
+        total, lost = self._log.message_count, sum(one.messages_lost or 0 for one in self.damage)
+        if total is None or self._got + lost < total:
+            for gap in self._log.gaps:
+                self.note(gap)
+        if total is not None:
+            self.settle(total, self._got, self.path / NAME)
 
     def _open(self, part: LogFile) -> Source:
         inner = self._unspooled(part) if part.is_packed else part.open()
@@ -427,31 +387,14 @@ class _JoinedSource(Source):
         """Yield the messages of one open file, over the channels of this source."""
         numbers = np.empty(0, np.int32)
         alike: Counter[tuple[object, ...]] = Counter()
-        got = 0
-        found_before = len(self.damage)
         for batch in self._unpacked(part.path, inner):
-            got += len(batch)
+            self._got += len(batch)
             numbers = self._numbered(inner, numbers, alike)
             share = inner.bytes_read / inner.size_bytes if inner.size_bytes else 1.0
             self.bytes_read = done + int(size * min(share, 1.0))
             yield replace(batch, channel=numbers[batch.channel])
         self._numbered(inner, numbers, alike)
         self.damage.extend(replace(damage, file=part.path) for damage in inner.damage)
-        self.remarks.extend(f"{part.path}: {remark}" for remark in inner.remarks)
-        self._got += got
-        if part.messages is not None:
-            self.settle(part.messages, got, part.path, found_before)
-
-    def _check_total(self) -> None:
-        """Compare with the number of all messages in the metadata of a directory."""
-        path, metadata = self._log.path, self._log.metadata
-        total = metadata.message_count if metadata is not None and path.is_dir() else None
-        lost = sum(damage.messages_lost or 0 for damage in self.damage)
-        if total is None or self._got + lost < total:
-            for gap in self._log.gaps:
-                self.note(gap)
-        if total is not None:
-            self.settle(total, self._got, path / NAME)
 
     def _numbered(
         self, inner: Source, numbers: NDArray[np.int32], alike: Counter[tuple[object, ...]]
@@ -466,10 +409,10 @@ class _JoinedSource(Source):
             own = channel.topic, channel.message_encoding, channel.schema, metadata
             said = *own, channel.has_publish_time
             alike[said] += 1
-            number = self._numbers.setdefault((alike[said], *said), len(self.channels))
-            if number == len(self.channels):
-                self.channels.append(channel)
-            more.append(number)
+            key = alike[said], *said
+            if key not in self._numbers:
+                self._numbers[key] = self.add_channel(channel)
+            more.append(self._numbers[key])
         return np.append(numbers, np.array(more, np.int32)) if more else numbers
 
     def _unpacked(self, path: Path, inner: Source) -> Iterator[Batch]:

@@ -37,11 +37,6 @@ BATCH_MESSAGES = 16384
 MAX_PLACES = 10_000
 """Damaged places of a file that are reported one by one."""
 
-TOO_MANY_CHANNELS = f"messages of further channels; a recording can have {MAX_CHANNELS}"
-"""Reason of the damage that counts messages on further channels."""
-
-TOO_MANY_SILENT = f"channels without messages are left out; a recording can have {MAX_CHANNELS}"
-"""Reason of the damage that counts such channels, behind their number."""
 
 _TOO_MUCH = 1 << 63  # limit of BSON integers and of file sizes
 
@@ -87,7 +82,6 @@ class Source(ABC):
             every channel of a batch before that batch is yielded. After the last batch it
             holds the channels without messages, too.
         damage: Damaged places found so far. It only grows.
-        remarks: What is odd about the log, where nothing is damaged or lost. It only grows.
         extras: Metadata and attachments found so far (MCAP only). The consumer removes them
             as it stores them. Attachments can still be read when the source is closed.
         message_count: Number of messages as stated by the log, None if it states none.
@@ -104,35 +98,36 @@ class Source(ABC):
         self.size_bytes: int = sum(size_of(file) for file in self.files)
         self.channels: list[Channel] = []
         self.damage: list[Damage] = []
-        self.remarks: list[str] = []
         self.extras: list[Metadata | Attachment] = []
         self.message_count: int | None = None
         self.time_range: tuple[int, int] | None = None
         self.bytes_read: int = 0
-        self._more_places = 0
+
+    def add_channel(self, channel: Channel) -> int:
+        """Add a channel; its index in `channels`. SourceError if no recording can hold it."""
+        if len(self.channels) >= MAX_CHANNELS:
+            raise SourceError(
+                f"{self.path}: it has more than {MAX_CHANNELS} channels, the most of a recording; "
+                "split it"
+            )
+        self.channels.append(channel)
+        return len(self.channels) - 1
 
     def note(self, damage: Damage) -> None:
-        """Add a damaged place; above `MAX_PLACES`, the last row counts all further ones."""
-        if len(self.damage) < MAX_PLACES:
+        """Add a damaged place; above `MAX_PLACES`, the last row is for all further ones."""
+        if len(self.damage) <= MAX_PLACES:
             self.damage.append(damage)
             return
-        self._more_places += 1
-        lost = damage.messages_lost
-        if self._more_places == 1:
-            self.damage.append(damage)
-        else:
-            before = self.damage[-1].messages_lost
-            lost = None if lost is None or before is None else lost + before
-        reason = f"{self._more_places} more places could not be read"
-        self.damage[-1] = Damage(damage.file, None, None, reason, lost)
+        before, lost = self.damage[-1].messages_lost, damage.messages_lost
+        lost = None if before is None or lost is None else before + lost
+        self.damage[-1] = Damage(damage.file, None, None, "more places could not be read", lost)
 
-    def settle(self, listed: int, got: int, file: Path | None = None, since: int = 0) -> None:
+    def settle(self, listed: int, got: int, file: Path | None = None) -> None:
         """Tell how many messages are missing of those that a file lists; None for all files.
 
-        They are of the damaged place whose number is unknown, if it is a single one, of those from
-        the row `since` on.
+        They are of the damaged place whose number is unknown, if it is a single one.
         """
-        rows = range(since, len(self.damage))
+        rows = range(len(self.damage))
         missing = listed - got - sum(self.damage[row].messages_lost or 0 for row in rows)
         if missing < 0:
             return

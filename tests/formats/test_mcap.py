@@ -311,9 +311,8 @@ def test_messages_without_definitions_are_counted(put: Callable[[bytes], Path]) 
     )
     assert [(m.topic, m.log_time) for m in found.messages] == [("/x", 0), ("/bare", 2), ("/odd", 4)]
     assert [m.schema is None for m in found.messages] == [False, True, True]
-    assert found.lost == [0, 2]
-    assert "schema 9 of channel 3 (/odd)" in found.damage[0].reason
-    assert "2 messages on channels that are not defined (7)" in found.damage[1].reason
+    assert found.lost == [2]
+    assert "2 messages on channels that are not defined (7)" in found.damage[0].reason
 
 
 def test_times_past_int64_are_counted(put: Callable[[bytes], Path]) -> None:
@@ -323,8 +322,8 @@ def test_times_past_int64_are_counted(put: Callable[[bytes], Path]) -> None:
     found = read(put(raw(channel, message(1, 0), late, late, unpublished, message(1, 9))))
     # The log time stands for a publish time that is none.
     assert [(m.log_time, m.publish_time) for m in found.messages] == [(0, 0), (5, 5), (9, 9)]
-    assert found.lost == [2, 0]
-    assert all("2^63" in damage.reason for damage in found.damage)
+    assert found.lost == [2]
+    assert "2^63" in found.damage[0].reason
 
 
 @pytest.mark.parametrize("use_chunking", [True, False])

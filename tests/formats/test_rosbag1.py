@@ -368,8 +368,9 @@ def test_a_connection_id_that_changes_its_meaning(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("compression", ["none", "bz2", "lz4"])
-@pytest.mark.parametrize("lie", [-40, -7, 5, 999, 1 << 30])
+@pytest.mark.parametrize("lie", [5, 999, 1 << 30])
 def test_chunk_length_that_lies(compression: str, lie: int) -> None:
+    """What unpacks from there on is the chunk; a plain one needs no length."""
     rows = [message(0, time, bytes([time, time])) for time in range(20)]
     one = bytearray(chunk(connection(0) + b"".join(rows), compression))
     head = struct.unpack_from("<I", one)[0] + 4
@@ -378,8 +379,7 @@ def test_chunk_length_that_lies(compression: str, lie: int) -> None:
     two = chunk(message(0, 100, b"z"), compression)
     found, damage = read_bytes(bag(bytes(one), index(0, 20), two, index(0, 1)))
     assert values(found) == [bytes([time, time]) for time in range(20)] + [b"z"]
-    assert damage
-    assert all(each.messages_lost == 0 for each in damage)
+    assert len(damage) == (compression == "none" and lie > 5)  # then it ends behind the file
 
 
 def test_encrypted_and_old() -> None:
@@ -443,7 +443,7 @@ def with_zeros(data: bytes) -> bytes:
 
 
 @pytest.mark.parametrize("compression", ["none", "lz4"])
-def test_zeros_behind_index_records_are_a_remark(tmp_path: Path, compression: str) -> None:
+def test_zeros_behind_index_records_are_no_damage(tmp_path: Path, compression: str) -> None:
     path = tmp_path / "a.bag"
     expected = make(path, compression, chunk=2000, messages=400)
     path.write_bytes(with_zeros(path.read_bytes()))
@@ -451,8 +451,6 @@ def test_zeros_behind_index_records_are_a_remark(tmp_path: Path, compression: st
         assert source.message_count == 400
         assert contents(source) == expected
         assert source.damage == []
-        (remark,) = source.remarks
-    assert "nothing is missing" in remark
 
 
 @pytest.mark.parametrize("size", [0, 12, 40])
@@ -483,7 +481,7 @@ def test_message_length_that_lies(compression: str) -> None:
     left = range(8, 20) if compression == "none" else ()  # damage costs the rest of the chunk
     assert [time for time, _ in found[("/a", "")]] == [*range(7), *left]
     assert set(values(found)) == {bytes(30)}
-    assert [each.messages_lost for each in damage] == [13 - len(left)]
+    assert [each.messages_lost for each in damage] == [None]
 
 
 @pytest.mark.parametrize("compression", ["bz2", "lz4"])

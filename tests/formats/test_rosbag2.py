@@ -289,7 +289,7 @@ def test_everything_before_the_damage_is_read(
     assert times == [*range(1, len(times) + 1)]
     assert len(times) <= kept
     assert all(data == bytes([(time - 1000) % 256]) * 100 for _, _, time, data in found)
-    assert [each.messages_lost for each in damage] == [2000 - len(times)]
+    assert [each.messages_lost for each in damage] == [None]  # no index counts them
     assert f"rows from id {len(times) + 1} on cannot be read: SQLite says" in damage[0].reason
 
 
@@ -347,7 +347,7 @@ def test_compressed_file_cut_short(tmp_path: Path, keep: float) -> None:
     found, damage = read(folder)
     assert found <= expected
     assert 0 < found.total() < 5000
-    assert all(each.file == file for each in damage)
+    assert {each.file for each in damage} <= {file, folder / "metadata.yaml"}
     assert sum(each.messages_lost or 0 for each in damage) == 5000 - found.total()
 
 

@@ -2,7 +2,7 @@
 
 Records are read in the order of the file, without the index. Damage in a compressed chunk costs
 that chunk; elsewhere reading goes on at the next record. What was lost is counted by the chunk
-list at the end of the bag, or by the index records behind a chunk.
+list at the end of the bag.
 """
 
 from __future__ import annotations
@@ -19,8 +19,6 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from hybridlog.formats.reading import (
     BATCH_MESSAGES,
-    TOO_MANY_CHANNELS,
-    TOO_MANY_SILENT,
     Damage,
     Source,
     cannot_open,
@@ -28,7 +26,7 @@ from hybridlog.formats.reading import (
 )
 from hybridlog.wording import listed
 from hybridlog_storage.errors import SourceError
-from hybridlog_storage.messages import MAX_CHANNELS, MAX_PAYLOAD, Batch, Channel, Schema
+from hybridlog_storage.messages import MAX_PAYLOAD, Batch, Channel, Schema
 from hybridlog_storage.segments.compression import is_implausible
 
 if TYPE_CHECKING:
@@ -52,9 +50,6 @@ _UNPACKERS: Final[dict[bytes, Any]] = {
     b"bz2": bz2.BZ2Decompressor,
     b"lz4": lz4.frame.LZ4FrameDecompressor,
 }
-_UNDEFINED, _TOO_MANY = -1, -2  # in the place of a channel
-
-_NO_RECORD: Final = "bytes that are no record"
 
 _MAX_HEADER: Final = 1 << 20
 _OP: Final = b"\x04\0\0\0op="
@@ -65,6 +60,7 @@ _WINDOW = 4 << 20  # bytes of messages outside of compressed chunks that are rea
 _UNSTATED = 16 << 20  # bytes that a chunk may unpack to whatever its header says
 _STEP: Final = 256 << 10  # bytes that are searched or unpacked at once
 
+_NO_RECORD: Final = "bytes that are no record"
 _VALUES: Final = b"\x09\0\0\0conn=", b"\x0d\0\0\0time="  # fields of a message: 4 and 8 bytes
 
 _u32 = struct.Struct("<I").unpack_from
@@ -196,13 +192,9 @@ class Rosbag1Source(Source):
         self._meaning: dict[int, _Connection] = {}  # of connection ids, at present
         self._fallback: dict[int, _Connection] = {}  # by the index of the bag
         self._numbers: dict[_Connection, int] = {}
-        self._left_out: dict[int, Counter[int]] = {_UNDEFINED: Counter(), _TOO_MANY: Counter()}
-        self._index_pos = 0
-        self._cut: int | None = None  # where the rest of a file begins that was cut short
+        self._undefined: Counter[int] = Counter()
         self._got = 0
-        self._chunk_end = 0
-        self._chunk_got = self._chunk_listed = 0  # messages of a chunk, read and in its index
-        self._chunk_losses = 0  # of the chunks before
+        self._cut: tuple[str, int | None] | None = None  # why the file ends early, and what is lost
         try:
             self._file: BinaryIO = path.open("rb", buffering=1 << 16)
         except OSError as error:
@@ -242,20 +234,19 @@ class Rosbag1Source(Source):
                 f"{self.path}: the bag is encrypted ({encryptor.decode(errors='replace')}); "
                 "decrypt it with `rosbag decrypt` first"
             )
-        self._index_pos = record.number(b"index_pos")
-        if self._index_pos:
+        if record.number(b"index_pos"):
             self._read_index(record)
 
     def _read_index(self, head: _Record) -> None:
         """Read connections and chunk list; bytes lost or added before them have moved them."""
-        begin = self._index_pos
+        begin = said = head.number(b"index_pos")
         if begin > self.size_bytes or not self._is_sound(begin):
             tail = max(head.end, self.size_bytes - _MAX_INDEX)
             last = self._read(tail, _MAX_INDEX).rfind(_OP + bytes([_INDEX_DATA]))
-            begin = last if last < 0 else self._search(tail + last)
+            begin = self.size_bytes if last < 0 else self._search(tail + last)
         pos, count, chunks, connections = begin, 0, 0, 0
         times: list[int] = []
-        while 0 <= pos < self.size_bytes:
+        while pos < self.size_bytes:
             record = self._record(pos)
             if record is None or record.end > min(self.size_bytes, record.start + MAX_PAYLOAD):
                 pos = self._search(pos + 1)
@@ -275,18 +266,13 @@ class Rosbag1Source(Source):
             pos = record.end
         wanted = head.number(b"conn_count"), head.number(b"chunk_count")
         if pos != self.size_bytes or (connections, chunks) != wanted:
-            self._cut = self.size_bytes
+            reason = f"the index, which starts at {said}, is not whole: the file was cut short"
+            self._cut = reason, 0 if said <= self.size_bytes else None
             return
         if chunks or begin == head.end:  # a bag without chunks has no list of messages
             self.message_count = count
         if count:
             self.time_range = (min(times), max(times) + 1)
-        if begin != self._index_pos:
-            reason = (
-                f"the bag header says that the index starts at {self._index_pos}, it starts at "
-                f"{begin}: bytes have been lost, added or changed"
-            )
-            self._tell(None, None, reason)
 
     # Records of the file.
 
@@ -358,30 +344,37 @@ class Rosbag1Source(Source):
         except OSError as error:
             self._tell(pos, None, f"the system cannot read on: {error.strerror or error}")
         self.bytes_read = self.size_bytes
-        self._end_chunk()
-        self._report()
+        ends = ((one.offset or 0) + (one.length or 0) for one in self.damage)
+        if self._cut and self.size_bytes > max(ends, default=0):
+            self._tell(self.size_bytes, 0, *self._cut)
+        if self._got == self.message_count and {one.reason for one in self.damage} == {_NO_RECORD}:
+            self.damage.clear()  # some recorders write zeros there
+        if self.message_count is not None:
+            self.settle(self.message_count, self._got)
+        if self._undefined:
+            shown = listed(map(str, sorted(self._undefined)))
+            reason = f"messages of connections that the bag does not define (id {shown})"
+            self._tell(None, None, reason, self._undefined.total())
+        used = {connection.conn for connection in self._numbers}
+        for conn in {**self._fallback, **self._meaning}:  # without messages
+            if conn not in used:
+                self._number(conn)
 
     def _step(self, pos: int) -> Generator[Batch, None, int]:
         """Read one record, chunk or run of messages; returns the position behind it."""
         record = self._record(pos)
-        if record is None:
-            return self._skip(pos)
-        if record.op == _CHUNK:
+        if record is not None and record.op == _CHUNK:
             return (yield from self._chunk(pos, record))
-        if record.end > min(self.size_bytes, record.start + MAX_PAYLOAD):
-            return self._skip(record.start)
-        if record.op in {_MESSAGE, _CONNECTION}:
-            return (yield from self._run(pos, record.end))
-        if record.op == _INDEX_DATA:
-            self._chunk_listed += record.number(b"count")
-        return record.end
-
-    def _run(self, pos: int, end: int) -> Generator[Batch, None, int]:
-        """Read messages outside of compressed chunks, the first of which ends at `end`."""
-        most = min(_WINDOW, self._chunk_end - pos) if self._chunk_end > pos else _WINDOW
-        data = self._read(pos, max(most, end - pos))
-        used = yield from self._content(data, lambda end: self._is_sound(pos + end))
-        return pos + used
+        if record is None or record.end > min(self.size_bytes, record.start + MAX_PAYLOAD):
+            end = self._search(pos if record is None else record.start)
+            is_end = end == self.size_bytes
+            reason, lost = self._cut if self._cut and is_end else (_NO_RECORD, None)
+            self._tell(pos, end - pos, reason, lost)
+            return end
+        if record.op not in {_MESSAGE, _CONNECTION}:
+            return record.end
+        data = self._read(pos, max(_WINDOW, record.end - pos))
+        return pos + (yield from self._content(data, lambda end: self._is_sound(pos + end)))
 
     def _content(self, data: bytes, is_end: Callable[[int], bool]) -> Generator[Batch, None, int]:
         """Read messages and connections; returns where they end."""
@@ -406,67 +399,49 @@ class Rosbag1Source(Source):
                 end = record.end
         return end
 
-    def _skip(self, start: int) -> int:
-        """Go from damage to the first record behind it."""
-        end = self._search(start)
-        if end == self.size_bytes and self.message_count is None:
-            self._cut = start
-        else:
-            self._tell(start, end - start, _NO_RECORD)
-        return end
-
     def _chunk(self, pos: int, record: _Record) -> Generator[Batch, None, int]:
         """Read a compressed chunk, or the beginning of another; returns the position behind it."""
-        self._end_chunk()
-        self._chunk_end, start, size = record.end, record.start, record.number(b"size")
-        form, length = record.fields[b"compression"], record.end - start
-        if form not in _UNPACKERS:
-            if form != b"none":
-                name = form.decode(errors="replace")
-                self._tell(pos, length, f"a chunk's compression {name!r} is not known")
-            elif size != length:
-                self._tell(pos, length, f"a chunk says {size} bytes, its record {length}")
-            return start
+        size, form = record.number(b"size"), record.fields[b"compression"]
+        if form == b"none":
+            if record.end > self.size_bytes:
+                self._cut = self._cut or ("the file ends in a chunk", None)
+            return record.start
         try:
-            data, end = self._unpacked(record)
+            if form not in _UNPACKERS:
+                raise ValueError(f"its compression {form.decode(errors='replace')!r} is not known")
+            data = self._unpacked(record)
         except (OSError, EOFError, RuntimeError, ValueError) as error:
             if isinstance(error, OSError) and error.errno:  # of the system, not of the format
                 raise
-            self._tell(pos, length, f"a chunk cannot be unpacked: {error}")
-            is_whole = record.end <= self.size_bytes and self._is_sound(record.end)
-            return record.end if is_whole else self._search(start)
-        used = yield from self._content(data, lambda end: end == len(data))
-        if record.end > self.size_bytes and end == self.size_bytes:
-            return end  # the file ends in it
-        self._chunk_end = end
-        if (end - start, len(data)) != (length, size):
-            reason = f"a chunk says {size} bytes, there are {len(data)}, and"
-            self._tell(pos, length, f"{reason} {length} compressed bytes, there are {end - start}")
-        elif used < len(data):
-            self._tell(pos, length, f"bytes that are no record at byte {used} of a chunk")
-        return end
+            self._tell(pos, record.end - pos, f"a chunk cannot be unpacked: {error}")
+        else:
+            used = yield from self._content(data, lambda end: end == len(data))
+            if len(data) != size:
+                reason = f"a chunk says {size} bytes, there are {len(data)}"
+                self._tell(pos, record.end - pos, reason)
+            elif used < len(data):
+                reason = f"bytes that are no record at byte {used} of a chunk"
+                self._tell(pos, record.end - pos, reason)
+        return record.end if self._is_sound(record.end) else self._search(record.start)
 
-    def _unpacked(self, record: _Record) -> tuple[bytes, int]:
-        """The content of a chunk and its end, whatever its record says; less if the file ends."""
+    def _unpacked(self, record: _Record) -> bytes:
+        """The content of a chunk; less if the file or its compressed bytes end early."""
         size, length = record.number(b"size"), record.end - record.start
         most = min(max(size, _UNSTATED), MAX_PAYLOAD)
-        stop = min(record.end + _UNSTATED, self.size_bytes)
         self._file.seek(record.start)
-        pos, content = record.start, BytesIO()
+        left, content = length, BytesIO()
         stream = _UNPACKERS[record.fields[b"compression"]]()
         while not stream.eof:
-            data = self._file.read(min(_STEP, stop - pos)) if stream.needs_input else b""
+            data = self._file.read(min(_STEP, left)) if stream.needs_input else b""
             if stream.needs_input and not data:
-                if record.end < self.size_bytes:
-                    raise ValueError("its compressed bytes end too early")
                 break
-            pos += len(data)
+            left -= len(data)
             content.write(stream.decompress(data, _STEP))
             if content.tell() > most:
                 raise ValueError(f"its header says {size} bytes, it has more than {most}")
             if is_implausible(content.tell(), length):
                 raise ValueError(f"its {length} bytes become more than {content.tell()}")
-        return content.getvalue(), pos - len(stream.unused_data or b"")
+        return content.getvalue()
 
     def _batch(self, data: bytes, rows: list[_Row]) -> Batch:
         """The messages that have a channel."""
@@ -480,75 +455,26 @@ class Rosbag1Source(Source):
         distinct, where = np.unique(ids, return_inverse=True)
         channel = np.array([self._number(conn) for conn in distinct.tolist()], np.int32)[where]
         self._got += len(rows)
-        self._chunk_got += len(rows)
         zeros = np.zeros(len(rows), np.uint32)
         batch = Batch(data, table[:, 0], table[:, 1], channel, times, times, zeros)
         if channel.min() >= 0:
             return batch
-        for number, counts in self._left_out.items():
-            counts.update(ids[channel == number].tolist())
+        self._undefined.update(ids[channel < 0].tolist())
         return batch.take(channel >= 0)
 
     def _number(self, conn: int) -> int:
-        """Channel index of a connection with messages; equal ones share a channel."""
+        """Channel index of a connection, -1 if it is not defined; equal ones share a channel."""
         connection = self._meaning.get(conn) or self._fallback.get(conn)
         if connection is None:
-            return _UNDEFINED
-        number = self._numbers.get(connection)
-        if number is None and len(self.channels) >= MAX_CHANNELS:
-            return _TOO_MANY
-        if number is None:
-            number = self._numbers[connection] = len(self.channels)
-            self.channels.append(connection.channel())
-        return number
-
-    # Losses.
+            return -1
+        if connection not in self._numbers:
+            self._numbers[connection] = self.add_channel(connection.channel())
+        return self._numbers[connection]
 
     def _tell(
         self, offset: int | None, length: int | None, reason: str, lost: int | None = None
     ) -> None:
         self.note(Damage(self.path, offset, length, reason, lost))
-
-    def _end_chunk(self) -> None:
-        """Count what the index records of a chunk list and it lacks."""
-        self._chunk_losses += max(0, self._chunk_listed - self._chunk_got)
-        self._chunk_got = self._chunk_listed = 0
-
-    def _report(self) -> None:
-        """Report the messages that are missing, and add channels without messages."""
-        odd = [one for one in self.damage if one.reason == _NO_RECORD]
-        if self._got == self.message_count and odd == self.damage != []:
-            self.damage.clear()
-            self.remarks.append(
-                f"{sum(one.length or 0 for one in odd)} bytes are no record, the first at byte "
-                f"{odd[0].offset}; by the index of the bag nothing is missing there"
-            )
-        if self.message_count is not None:
-            self.settle(self.message_count, self._got)
-        elif self._chunk_losses or not odd:
-            self.settle(self._got + self._chunk_losses, self._got)
-        if self._cut is None and self._chunk_end > self.size_bytes:
-            self._cut = self.size_bytes
-        if self._cut is not None:
-            reason, lost = "the file ends in a chunk or record", None
-            if self._index_pos and self.message_count is None:
-                reason = f"the index, which starts at {self._index_pos}, is not whole"
-                lost = 0 if self._index_pos <= self.size_bytes else None
-            length = self.size_bytes - self._cut
-            self._tell(self._cut, length, f"{reason}: the file was cut short", lost)
-        undefined, too_many = self._left_out.values()
-        if too_many:
-            self._tell(None, None, TOO_MANY_CHANNELS, too_many.total())
-        if undefined:
-            shown = listed(map(str, sorted(undefined)))
-            reason = f"messages of connections that the bag does not define (id {shown})"
-            self._tell(None, None, reason, undefined.total())
-        used = {connection.conn for connection in self._numbers} | set(too_many)
-        silent = [
-            self._number(conn) for conn in {**self._fallback, **self._meaning} if conn not in used
-        ]
-        if left_out := silent.count(_TOO_MANY):
-            self._tell(None, None, f"{left_out} {TOO_MANY_SILENT}", 0)
 
 
 def _not_version_2(path: Path, magic: bytes) -> str:

@@ -35,12 +35,12 @@ def read_metadata(folder: Path) -> BagMetadata | Damage | None:
         return Damage(path, 0, len(data), reason, 0)
 
 
-def locate(folder: Path, metadata: BagMetadata) -> tuple[dict[Path, int | None], list[Damage]]:
-    """The listed files that exist, in order, with their listed messages; and damage for others."""
-    files: dict[Path, int | None] = {}
+def locate(folder: Path, metadata: BagMetadata) -> tuple[list[Path], list[Damage]]:
+    """The listed files that exist, in order, and damage for others."""
+    files: dict[Path, None] = {}
     missing: list[Damage] = []
     for name in metadata.files:
-        path, count = folder / name, metadata.counts.get(name)
+        path = folder / name
         # Some recorders list compressed files under their name before compression, and early
         # ones with the folder's name before it.
         choices = [
@@ -53,10 +53,10 @@ def locate(folder: Path, metadata: BagMetadata) -> tuple[dict[Path, int | None],
         except OSError as error:
             raise cannot_open(path, error) from error
         if found is not None:
-            files.setdefault(found, count)
+            files[found] = None
         else:
-            missing.append(Damage(path, None, None, f"the file is missing; {NAME} lists it", count))
-    return files, missing
+            missing.append(Damage(path, None, None, f"the file is missing; {NAME} lists it", None))
+    return [*files], missing
 
 
 def plain(path: Path) -> str:
@@ -80,18 +80,15 @@ class BagMetadata(Struct, frozen=True):
 
     Attributes:
         files: Paths of its files in order, below the bag's folder.
-        counts: Number of messages of each file, if stated.
         message_count: Total number of messages, None if unknown.
     """
 
     files: list[str] = field(default_factory=list)
-    counts: dict[str, int] = field(default_factory=dict)
     message_count: int | None = None
 
 
 class _File(Struct):
     path: str
-    message_count: _Count | None = None
 
 
 class _Bag(Struct):
@@ -112,13 +109,12 @@ def parse_metadata(text: str) -> BagMetadata:
         bag = convert(parse_yaml(text), _Document).bag
     except ValidationError as error:
         raise YamlError(f"it does not describe a bag: {error}") from error
-    listed = bag.files or []
-    counts = {_name(one.path): one.message_count for one in listed if one.message_count is not None}
-    files = [_name(one) for one in bag.relative_file_paths or [file.path for file in listed]]
+    listed = bag.relative_file_paths or [file.path for file in bag.files or []]
+    files = [*map(_name, listed)]
     if len(files) > MAX_FILES:
         raise YamlError(f"it lists more than {MAX_FILES} files")
     names = dict.fromkeys(name for name in files if name not in _NO_FILES)
-    return BagMetadata(files=[*names], counts=counts, message_count=bag.message_count)
+    return BagMetadata([*names], bag.message_count)
 
 
 def _name(path: str) -> str:

@@ -54,19 +54,15 @@ class SqliteSource(Source):
         page, pages = _read_header(path)
         self._missing = pages * page - self.size_bytes
         try:
-            self._db, log_unread = _connect_whole_pages(path, page, self.size_bytes)
+            self._db = _connect_whole_pages(path, page, self.size_bytes)
         except sqlite3.Error as error:
             raise _unreadable(path, error) from error
-        if log_unread is not None:
-            reason = "its messages are left out: SQLite cannot read this write-ahead log here"
-            self.damage.append(Damage(log_unread, 0, None, reason, None))
         try:
             self._open()
-        except (sqlite3.Error, OverflowError, ValueError) as error:
+        except BaseException as error:
             self.close()
-            raise _unreadable(path, error) from error
-        except BaseException:
-            self.close()
+            if isinstance(error, sqlite3.Error | OverflowError | ValueError):
+                raise _unreadable(path, error) from error
             raise
 
     def close(self) -> None:
@@ -90,14 +86,10 @@ class SqliteSource(Source):
         has_publish_time = "send_timestamp" in messages
         # SQLite has types for each value only, so all are cast; names come from here.
         sent = f"ifnull(CAST(send_timestamp AS INTEGER), {log_time})"
-        columns = (
-            "rowid",
-            "CAST(topic_id AS INTEGER)",
-            f"ifnull(CAST({log_time} AS INTEGER), 0)",
-            sent if has_publish_time else "0",
-            "ifnull(CAST(data AS BLOB), x'')",
+        chosen = (
+            f"rowid, CAST(topic_id AS INTEGER), ifnull(CAST({log_time} AS INTEGER), 0), "
+            f"{sent if has_publish_time else 0}, ifnull(CAST(data AS BLOB), x'')"
         )
-        chosen = ", ".join(columns)
         self._select = f"SELECT {chosen} FROM messages WHERE rowid >= ? ORDER BY rowid"  # noqa: S608
         self._db.execute(f"{self._select} LIMIT 0", (0,)).fetchall()
         self._has_publish_time = has_publish_time
@@ -146,16 +138,14 @@ class SqliteSource(Source):
                 metadata["offered_qos_profiles"] = str(qos or "")
             if type_hash:
                 metadata["topic_type_hash"] = str(type_hash)
-            self._channel_of[number] = len(self.channels)
-            self.channels.append(
-                Channel(
-                    topic=str(name),
-                    message_encoding=str(encoding or ""),
-                    schema=Schema(type_name, *(found or ("", b""))),
-                    metadata=metadata,
-                    has_publish_time=self._has_publish_time,
-                )
+            channel = Channel(
+                str(name),
+                str(encoding or ""),
+                Schema(type_name, *(found or ("", b""))),
+                metadata,
+                has_publish_time=self._has_publish_time,
             )
+            self._channel_of[number] = self.add_channel(channel)
 
     def _read_totals(self, log_time: str) -> None:
         """Read number and times of the messages; one end of an index a query."""
@@ -191,11 +181,19 @@ class SqliteSource(Source):
         yield from self._batch(rows, size)
         self.bytes_read = self.size_bytes
         if self._problem is not None:
-            self._report_unread(*self._problem)
+            first, problem = self._problem
+            reason = f"rows from id {first} on cannot be read: SQLite says {problem}"
+            lost = None
+            if self.message_count is not None:
+                lost = max(0, self.message_count - self._got)
+            self.damage.append(Damage(self.path, None, None, reason, lost))
         elif self._missing > 0:
             reason = "the file is cut short, but only behind its messages"
             self.damage.append(Damage(self.path, self.size_bytes, self._missing, reason, 0))
-        self._report_undefined()
+        if self._undefined:
+            ids = listed(sorted(map(str, self._undefined)))
+            reason = f"messages of topics that the bag does not list (topic id {ids})"
+            self.damage.append(Damage(self.path, None, None, reason, self._undefined.total()))
         if self._early:
             reason = "messages with a time before 1970, which no log can keep"
             self.damage.append(Damage(self.path, None, None, reason, self._early))
@@ -248,28 +246,6 @@ class SqliteSource(Source):
         if len(batch):
             yield batch
 
-    def _report_unread(self, first: int, problem: str) -> None:
-        """Report the rows from an id on, counted by an index, or by ids: these have no gaps."""
-        lost = None
-        if self.message_count is not None:
-            lost = max(0, self.message_count - self._got)
-        else:
-            for (last,) in self._optional("SELECT max(rowid) FROM messages"):
-                # The id may be damaged, too; no row takes less than a byte.
-                if last is not None and first <= last < first + self.size_bytes:
-                    lost = last - first + 1
-        reason = f"rows from id {first} on cannot be read: SQLite says {problem}"
-        self.damage.append(Damage(self.path, None, None, reason, lost))
-
-    def _report_undefined(self) -> None:
-        if self._undefined:
-            numbers = sorted(number for number in self._undefined if number is not None)
-            names = [*map(str, numbers), *(["NULL"] if None in self._undefined else [])]
-            ids = listed(names)
-            reason = f"messages of topics that the bag does not list (topic id {ids})"
-            lost = self._undefined.total()
-            self.damage.append(Damage(self.path, None, None, reason, lost))
-
 
 _LOG_TIMES = ("timestamp", "recv_timestamp")
 
@@ -287,9 +263,7 @@ def _read_header(path: Path) -> tuple[int, int]:
     return 1 << 16 if page == 1 else page, int.from_bytes(data[28:32], "big")
 
 
-def _connect_whole_pages(
-    path: Path, page: int, size: int
-) -> tuple[sqlite3.Connection, Path | None]:
+def _connect_whole_pages(path: Path, page: int, size: int) -> sqlite3.Connection:
     """Open a database without its truncated last page.
 
     SQLite would read zeros for the missing part of that page, and return them as payload.
@@ -303,39 +277,26 @@ def _connect_whole_pages(
         whole.unlink(missing_ok=True)
 
 
-def _connect(path: Path) -> tuple[sqlite3.Connection, Path | None]:
-    """Open an untrusted database read-only; returns its write-ahead log, too, if left unused.
+def _connect(path: Path) -> sqlite3.Connection:
+    """Open an untrusted database read-only.
 
     A database with a write-ahead log, left by a crashed recorder, is opened with it. Others are
     opened as immutable, so that no file is written beside them.
     """
-    unread: Path | None = None
-    uri = "file:" + quote(os.fsencode(path.absolute())) + "?mode=ro"
     log = path.with_name(path.name + "-wal")
-    if log.is_file() and log.stat().st_size:
-        db = sqlite3.connect(uri, uri=True, check_same_thread=False)
-        try:
-            db.execute("SELECT 1 FROM sqlite_master LIMIT 1").fetchall()
-        except sqlite3.Error:
-            db.close()
-            unread = log
-        else:
-            return _guarded(db), None
-    db = sqlite3.connect(f"{uri}&immutable=1", uri=True, check_same_thread=False)
-    return _guarded(db), unread
-
-
-def _guarded(db: sqlite3.Connection) -> sqlite3.Connection:
+    has_log = log.is_file() and log.stat().st_size
+    uri = f"file:{quote(os.fsencode(path.absolute()))}?mode=ro{'' if has_log else '&immutable=1'}"
+    db = sqlite3.connect(uri, uri=True, check_same_thread=False)
     db.text_factory = lambda data: data.decode(errors="replace")
     db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_PAYLOAD)
-    db.execute("PRAGMA trusted_schema = OFF")
-    db.execute("PRAGMA cell_size_check = ON")
-    db.execute("PRAGMA query_only = ON")
+    db.executescript(
+        "PRAGMA trusted_schema = OFF; PRAGMA cell_size_check = ON; PRAGMA query_only = ON"
+    )
     return db
 
 
 def _unreadable(path: Path, error: Exception) -> SourceError:
     return SourceError(
-        f"{path}: SQLite cannot read it ({error}); try to repair a copy with "
-        "`sqlite3 FILE .recover | sqlite3 NEW` and use that"
+        f"{path}: SQLite cannot read it ({error}); copy it, with its -wal file if there is one, to "
+        "where you may write, or repair a copy with `sqlite3 FILE .recover | sqlite3 NEW`"
     )

@@ -134,8 +134,6 @@ class ChunkContent(NamedTuple):
         definitions: Schemas and channels in order, each with the first row that it applies to.
         invalid: int64, offset in the buffer of each omitted message record: too short, or
             with a log time beyond 2^63 - 1 ns.
-        unpublished: Number of messages whose publish time is beyond 2^63 - 1 ns; their log
-            time replaces it.
         unreadable: The problem of each definition that could not be read.
         end: Byte of the buffer behind the last record.
     """
@@ -143,7 +141,6 @@ class ChunkContent(NamedTuple):
     batch: Batch
     definitions: list[Definition]
     invalid: NDArray[np.int64]
-    unpublished: int
     unreadable: list[str]
     end: int
 
@@ -162,12 +159,12 @@ def parse_content(buffer: Buffer, *, loose: bool = False, most: int = 1 << 62) -
     if not loose and walk.end != len(buffer):
         problem = f"runs over the end at {len(buffer)}" if buffer[walk.end] else "has no kind"
         raise SegmentError(f"the record at byte {walk.end} of its content {problem}")
-    batch, good, unpublished = _batch(buffer, starts)
+    batch, good = _batch(buffer, starts)
     definitions = walk.definitions
     if not good.all():  # rows count valid messages only
         before = np.concatenate(([0], np.cumsum(good)))
         definitions = [Definition(int(before[one.row]), one.record) for one in definitions]
-    return ChunkContent(batch, definitions, starts[~good], unpublished, walk.unreadable, walk.end)
+    return ChunkContent(batch, definitions, starts[~good], walk.unreadable, walk.end)
 
 
 class _Walk:
@@ -213,8 +210,11 @@ class _Walk:
             self.definitions.append(Definition(row, found))
 
 
-def _batch(buffer: Buffer, starts: NDArray[np.int64]) -> tuple[Batch, NDArray[np.bool_], int]:
-    """The messages at `starts`, a mask of the valid ones, and `unpublished`."""
+def _batch(buffer: Buffer, starts: NDArray[np.int64]) -> tuple[Batch, NDArray[np.bool_]]:
+    """The messages at `starts`, and a mask of the valid ones.
+
+    For a publish time beyond 2^63 - 1 ns stands the log time.
+    """
     # With a last record shorter than a head, the gather below would read over the end.
     good = starts + _PAYLOAD <= len(buffer)
     chosen = starts[good]
@@ -226,7 +226,7 @@ def _batch(buffer: Buffer, starts: NDArray[np.int64]) -> tuple[Batch, NDArray[np
     late = heads["publish_time"] >= _TIME_LIMIT
     if late.any():
         heads["publish_time"] = np.where(late, heads["log_time"], heads["publish_time"])
-    return batch_of(buffer, chosen, heads), good, int(late.sum())
+    return batch_of(buffer, chosen, heads), good
 
 
 def heads_at(buffer: Buffer, starts: NDArray[np.int64]) -> NDArray[np.void]:
@@ -298,23 +298,6 @@ def read_record(opcode: int, content: Buffer) -> tuple[records.McapRecord | None
 
 LAST_KNOWN = max(Opcode)
 """Largest opcode that MCAP defines."""
-_IN_SUMMARY = frozenset(
-    {
-        Opcode.SCHEMA,
-        Opcode.CHANNEL,
-        Opcode.CHUNK_INDEX,
-        Opcode.ATTACHMENT_INDEX,
-        Opcode.METADATA_INDEX,
-        Opcode.STATISTICS,
-        Opcode.SUMMARY_OFFSET,
-    }
-)
-
-
-def is_in_summary(opcode: int) -> bool:
-    """True for a kind of record that a summary may have."""
-    return opcode in _IN_SUMMARY or opcode > LAST_KNOWN
-
 
 _FOOTER = struct.Struct("<BQQQI")  # head, start of the summary and of its offsets, checksum
 TAIL = _FOOTER.size + len(MAGIC)
@@ -346,7 +329,7 @@ def parse_summary(data: Buffer, *, skipped: int = 0) -> tuple[Summary, dict[int,
             raise SegmentError("it ends in the middle of a record")
         opcode, length = RECORD_HEAD.unpack_from(view, at)
         at += RECORD_HEAD.size
-        if length > len(view) - at or not is_in_summary(opcode):
+        if length > len(view) - at:
             raise SegmentError("it ends in the middle of a record")
         body = view[at : at + length]
         at += length

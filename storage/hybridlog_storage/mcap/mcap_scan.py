@@ -89,8 +89,6 @@ class Scan:
         listed = self.summary.chunk_indexes if self.summary is not None else list[ChunkIndex]()
         self._listed = sorted(one.chunk_start_offset for one in listed)
         self._chunked = bool(self._listed)
-        self._needs_crc = False  # messages have no checksum of their own
-        self._is_damaged = False
         self._is_closed = False  # or damage tells that it is not
 
     def _read_summary(self) -> bool:
@@ -126,7 +124,6 @@ class Scan:
                 found = [Damage(at, end - at, str(error))]
                 self._is_closed |= end == size
             for item in found:
-                self._is_damaged |= isinstance(item, Damage)
                 yield at, item
             at = end
         if not self._is_closed:
@@ -146,7 +143,7 @@ class Scan:
             raise SegmentError(what if opcode else "no record starts here")
         if opcode == Opcode.MESSAGE:
             return self._loose(at, end)
-        return self._data_end(at, end) if opcode == Opcode.DATA_END else self._plain(at, end)
+        return self._data_end(end) if opcode == Opcode.DATA_END else self._plain(at, end)
 
     # Chunks
 
@@ -155,29 +152,23 @@ class Scan:
         return head if head is not None and head.codec in _CODECS else None
 
     def _chunk(self, at: int, said: int) -> _Found:
-        """A chunk, also if the length of its record is wrong."""
-        head = self._head_of(at)
-        self._chunked |= head is not None
-        ends = [said] if head is None else [at + head.end, said]
-        is_right = ends == [said, said] and said <= self._bytes.size
-        end = said if is_right else next(filter(self._goes_on, ends), None)
-        if end is None and head is not None and min(ends) > self._bytes.size:
-            return self._bytes.size, self._cut(at, head)
-        if end is None:
-            raise SegmentError(f"a chunk of {said - at} bytes is not whole")
+        """A chunk, whose own fields say where it ends, whatever the length of its record."""
+        head, size = self._head_of(at), self._bytes.size
+        if head is None:
+            raise SegmentError("the fields of a chunk are wrong")
+        self._chunked, end = True, at + head.end
+        if min(end, said) > size:
+            return size, self._cut(at, head)
         try:
-            if head is None:
-                raise SegmentError("its fields are wrong")
-            found = self._told(at, self._content(at + head.start, head, end))
+            return end, self._told(at, self._content(at + head.start, head, end))
         except SegmentError as error:
-            return end, [Damage(at, end - at, f"a chunk is damaged: {error}")]
-        if end != said:
-            found.insert(0, Damage(at, HEAD, "the length of a chunk is wrong", 0))
-        return end, found
+            why = f"a chunk is damaged: {error}"
+            if not self._goes_on(end):
+                raise SegmentError(why) from error
+            return end, [Damage(at, end - at, why)]
 
     def _content(self, start: int, head: ChunkHead, end: int) -> ChunkContent:
-        self._needs_crc |= not head.crc
-        if max(head.size, end - start) > self._limit:
+        if max(head.size, end - start) > self._limit or end > self._bytes.size:
             raise SegmentError(
                 f"it claims {head.size} bytes uncompressed, more than the limit of {self._limit}"
             )
@@ -216,7 +207,6 @@ class Scan:
         if self._chunked or not _MESSAGE_SIZE <= size <= MAX_PAYLOAD:
             where = "between chunks" if self._chunked else f"of {size} bytes"
             raise SegmentError(f"a message record {where} is none")
-        self._needs_crc = True
         self._bytes.at(at, size + HEAD, move=True)
         found = parse_content(self._bytes.rest(at)[: self._end - at], loose=True)
         return at + found.end, self._told(at, found)
@@ -244,19 +234,10 @@ class Scan:
             raise SegmentError(f"a record of {size} bytes is above the limit of {_MAX_PLAIN}")
         return read_record(opcode, self._bytes.at(start, size))
 
-    def _data_end(self, at: int, end: int) -> _Found:
+    def _data_end(self, end: int) -> _Found:
         if self._has_end and end != self._end:
             raise SegmentError("an end of data stands in the middle of the data")
         found: list[Item] = []
-        crc = int.from_bytes(self._bytes.at(at + HEAD, 4), "little")
-        # Where damage is known already, the checksum tells nothing new.
-        if crc and self._needs_crc and not self._is_damaged:
-            seen = 0
-            for start in range(0, at, _WINDOW):
-                seen = crc32(self._bytes.at(start, min(_WINDOW, at - start)), seen)
-            if seen != crc:
-                why = "the checksum of all data differs: some bytes before this one have changed"
-                found.append(Damage(0, at, why))
         size = self._bytes.size
         rest = self._bytes.at(end, TAIL + 1)
         is_whole = self.summary is not None or (len(rest) == TAIL and footer_of(rest) is not None)
