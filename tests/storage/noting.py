@@ -9,7 +9,7 @@ from typing import Any
 from hybridlog_storage.segments.chunk import OpenChunk, PackedChunk, StoredChunk
 from hybridlog_storage.segments.chunk_table import places_of
 from hybridlog_storage.segments.segment_file import SegmentFile
-from hybridlog_storage.segments.segment_writer import RecordingWriter
+from hybridlog_storage.segments.segment_writer import Key, RecordingWriter
 
 
 class NotingWriter(RecordingWriter):
@@ -32,12 +32,12 @@ class NotingWriter(RecordingWriter):
         self._held[id(packed)] = packed, chunk
         return packed
 
-    def _create(self, group: int | None) -> SegmentFile:
-        segment = super()._create(group)
+    def _create(self, key: Key, group: int | None) -> SegmentFile:
+        segment = super()._create(key, group)
 
         def noted(packed: PackedChunk) -> None:
             SegmentFile.append_chunk(segment, packed)
-            place = places_of(segment.table.build())[-1]
+            place = places_of(segment.content.table.build())[-1]
             batch, seq = self._held.pop(id(packed))[1].laid_out()
             self.chunks.append(StoredChunk(segment.number, place, batch, seq))
 

@@ -16,7 +16,6 @@ from msgspec import Struct, field
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.append_file import AppendFile
 from hybridlog_storage.errors import SegmentError, StoreError
-from hybridlog_storage.messages import Schema
 from hybridlog_storage.segments.segment_file import (
     OPEN_SUFFIX,
     Sealed,
@@ -67,12 +66,17 @@ def recover_segment(
         with SegmentReader(path, number) as reader:
             walk = _walked(reader)
             damage = [f"byte {one.offset}: {one.reason}" for one in walk.damaged]
-            if not (walk.recording or walk.chunks or walk.attachments or damage):
+            if not (walk.recording or walk.table.chunks or walk.attachments or damage):
                 files.unlink(path)
                 files.sync_folder(path.parent)
                 return Recovered(None)
             found = Recovered(final, sum(walk.table.build().counts().values()), damage)
-            segment = _reopened(path, number, walk)
+            group = number
+            if walk.recording is not None:
+                check_format(walk.recording, path)
+                group = group_of(walk.recording, number)
+            file = AppendFile.reopen(path)
+            segment = SegmentFile(path, number, file, group=group, content=walk)
             try:
                 _mend(segment, walk, recording)
                 on_sealing(segment.prepare(sync=True), found)
@@ -91,24 +95,6 @@ def _walked(reader: SegmentReader) -> Walk:
 def _damage(walk: Walk) -> dict[int, str]:
     """Reasons of damage by the byte where it starts, without what a recovery has mended."""
     return {one.offset: one.reason for one in walk.damaged if one.reason != MENDED}
-
-
-def _reopened(path: Path, number: int, walk: Walk) -> SegmentFile:
-    """The writer that goes on behind the whole part of a segment."""
-    if walk.recording is not None:
-        check_format(walk.recording, path)
-    segment = SegmentFile(path, number, AppendFile.reopen(path))
-    if walk.recording is not None:
-        segment.group = group_of(walk.recording, number)
-    for schema_id, one in walk.schemas.items():
-        segment.schemas[schema_id] = Schema(one.name, one.encoding, bytes(one.data))
-    segment.channels |= {n: (walk.schema_ids[n], one) for n, one in walk.channels.items()}
-    segment.note_extras(walk.metadata, walk.attachments)
-    segment.losses += walk.losses
-    segment.table = walk.table
-    for chunk in walk.chunks:
-        segment.note_index(chunk.offset, chunk.head, chunk.indexes)
-    return segment
 
 
 def _mend(segment: SegmentFile, walk: Walk, recording: Mapping[str, object] | None) -> None:
@@ -175,14 +161,14 @@ def damage_of(
             return [SegmentDamage(max(reader.size - 1, 0), str(error)), *found], False
         walk.channels |= summary.channels
         walk.go_on()
-    why, whole, found = _damage(walk), {chunk.offset for chunk in walk.chunks}, []
+    why, whole, found = _damage(walk), {*walk.table.build().chunks["offset"].tolist()}, []
     for place in summary.chunks:
         if place.offset not in whole:
             parts = summary.table.chunk_parts(place.number)[["channel", "messages"]].tolist()
-            lost = [f"{summary.channels[channel].topic} {count}" for channel, count in parts]
-            topics = ", ".join(lost[:5]) + (f" and {len(lost) - 5} more" if lost[5:] else "")
+            lost = ", ".join(f"{summary.channels[c].topic} {count}" for c, count in parts[:5])
+            lost += ", ..." if parts[5:] else ""
             reason = why.pop(place.offset, "it cannot be read")
-            problem = f"chunk {place.number} is lost (messages: {topics}): {reason}"
+            problem = f"chunk {place.number} is lost (messages: {lost}): {reason}"
             found.append(SegmentDamage(place.offset, problem, place.number))
     found = sorted([*found, *(SegmentDamage(*one) for one in why.items())])
     if digest and not found:

@@ -6,6 +6,7 @@ import re
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, suppress
+from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -43,7 +44,6 @@ from hybridlog_storage.segments.segment_format import (
     arrival_record,
     channel_record,
     definitions_chunk,
-    index_offsets,
     json_metadata,
     losses_in,
     metadata_record,
@@ -52,6 +52,9 @@ from hybridlog_storage.segments.segment_format import (
 )
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from hybridlog_storage.messages import Buffer, Channel, Schema
 
 OPEN_SUFFIX = ".mcap.open"
@@ -149,29 +152,140 @@ def _listed(channel: Channel) -> ListedChannel:
     )
 
 
+class Content:
+    """What a segment has so far: noted as it is written, or as its records are walked over.
+
+    Attributes:
+        schemas: By id.
+        channels: By id.
+        table: The chunk table.
+        losses: Rows of the loss ledger.
+        attachments: Their places, in file order.
+        metadata: The same of all metadata records.
+    """
+
+    def __init__(self) -> None:
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        self.table = TableBuilder()
+        self.losses: list[Loss] = []
+        self.attachments: list[AttachmentIndex] = []
+        self.metadata: list[MetadataIndex] = []
+        self._chunk_indexes = bytearray()  # as records: a long segment has many
+
+    def note_chunk(
+        self,
+        offset: int,
+        head: ChunkHead,
+        parts: NDArray[np.void],
+        indexes: Mapping[int, int],
+        trailer: int,
+    ) -> None:
+        """Note a chunk that starts at a byte; `parts` is from `parts_of`.
+
+        `indexes` is the bytes of each message index, by channel id; `trailer` those of all records
+        behind it.
+        """
+        self.table.chunk((offset, head.length, trailer), (head.first, head.last), parts)
+        starts = accumulate(indexes.values(), initial=offset + head.length)
+        self._chunk_indexes += record_bytes(
+            ChunkIndex(
+                message_start_time=head.first,
+                message_end_time=head.last,
+                chunk_start_offset=offset,
+                chunk_length=head.length,
+                message_index_offsets=dict(zip(indexes, starts, strict=False)),
+                message_index_length=sum(indexes.values()),
+                compression=head.codec,
+                compressed_size=head.end - head.start,
+                uncompressed_size=head.size,
+            )
+        )
+
+    def note_metadata(self, record: Metadata, offset: int, length: int) -> None:
+        """Note a metadata record that starts at a byte."""
+        if record.name == LOSSES_METADATA:
+            self.losses += losses_in(record)
+        self.metadata.append(MetadataIndex(offset=offset, length=length, name=record.name))
+
+    @property
+    def of_source(self) -> list[MetadataIndex]:
+        """Places of the metadata records of the source, in file order."""
+        return [one for one in self.metadata if not one.name.startswith(OUR_NAMES)]
+
+    def tail(self, at: int) -> bytes:
+        """The last records of a file with `at` bytes of data: the end of data, the summary."""
+        end = record_bytes(DataEnd(data_section_crc=0))
+        start = at = at + len(end)
+        table = self.table.build()
+        body = table.to_bytes()
+        ids = {schema: number for number, schema in self.schemas.items()}
+        groups: list[tuple[int, bytes]] = [
+            (Opcode.SCHEMA, _joined(schema_record(i, s) for i, s in self.schemas.items())),
+            (
+                Opcode.CHANNEL,
+                _joined(
+                    channel_record(i, ids[c.schema] if c.schema else 0, c)
+                    for i, c in self.channels.items()
+                ),
+            ),
+            (Opcode.STATISTICS, record_bytes(self._statistics(table))),
+            (Opcode.CHUNK_INDEX, bytes(self._chunk_indexes)),
+            (Opcode.ATTACHMENT_INDEX, _joined(self.attachments)),
+            (Opcode.METADATA_INDEX, _joined(self.metadata)),
+            (CHUNK_TABLE_OPCODE, RECORD_HEAD.pack(CHUNK_TABLE_OPCODE, len(body)) + body),
+        ]
+        offsets: list[SummaryOffset] = []
+        for opcode, records in groups:
+            if records:
+                offsets.append(
+                    SummaryOffset(group_opcode=opcode, group_start=at, group_length=len(records))
+                )
+            at += len(records)
+        summary = b"".join((*(records for _, records in groups), _joined(offsets)))
+        footer = Footer(summary_start=start, summary_offset_start=at, summary_crc=0)
+        # The footer's checksum covers the summary and the footer up to the checksum itself.
+        covered = record_bytes(footer)[:-4]
+        footer.summary_crc = crc32(covered, crc32(summary))
+        return end + summary + record_bytes(footer) + MAGIC
+
+    def _statistics(self, table: ChunkTable) -> Statistics:
+        counts = table.counts()
+        times = table.chunks[["first", "last"]]
+        return Statistics(
+            attachment_count=len(self.attachments),
+            channel_count=len(self.channels),
+            channel_message_counts=counts,
+            chunk_count=self.table.chunks,
+            message_count=sum(counts.values()),
+            message_end_time=int(times["last"].max(initial=0)),
+            message_start_time=int(times["first"].min()) if len(times) else 0,
+            metadata_count=len(self.metadata),
+            schema_count=len(self.schemas),
+        )
+
+
 class SegmentFile:
     """An open segment, `.mcap.open`: appends whole records and collects the summary.
 
-    `file` is a new one, or one whose records will be noted. `group` is the number of the first
-    segment of its group; its own by default.
+    `file` is a new one, or has some `content` already. `group` is the number of the first segment
+    of its group; its own by default.
     """
 
     def __init__(
-        self, path: Path, number: int, file: AppendFile, *, group: int | None = None
+        self,
+        path: Path,
+        number: int,
+        file: AppendFile,
+        *,
+        group: int | None = None,
+        content: Content | None = None,
     ) -> None:
         self.path = path
         self.number = number
         self.group = number if group is None else group
-        self.schemas: dict[int, Schema] = {}
-        self.channels: dict[int, tuple[int, Channel]] = {}
-        self.table = TableBuilder()
-        """The chunk table of the file."""
-        self.losses: list[Loss] = []
-        """Rows of the loss ledger in the file."""
+        self.content = content or Content()
         self._file = file
-        self._chunk_indexes = bytearray()  # as records: a long segment has many
-        self._attachment_indexes: list[AttachmentIndex] = []
-        self._metadata_indexes: list[MetadataIndex] = []
         self._sealed: Sealed | None = None  # once the file is complete
         self._finished = False  # once it is closed
 
@@ -224,13 +338,13 @@ class SegmentFile:
         records: list[McapRecord] = [
             schema_record(number, schema)
             for number, schema in schemas.items()
-            if number not in self.schemas
+            if number not in self.content.schemas
         ]
         records += [channel_record(*one) for one in defined]
         if records:
             self._append([definitions_chunk(_joined(records), self.position)])
-        self.schemas |= schemas
-        self.channels |= {number: (schema, channel) for number, schema, channel in defined}
+        self.content.schemas |= schemas
+        self.content.channels |= {number: channel for number, _, channel in defined}
 
     def add_recording(self, recording: Mapping[str, object]) -> None:
         """Append the metadata of the recording and of the segment."""
@@ -242,10 +356,7 @@ class SegmentFile:
         offset = self.position
         data = metadata_record(record, offset)
         self._append([data])
-        index = MetadataIndex(offset=offset, length=len(data), name=record.name)
-        self._metadata_indexes.append(index)
-        if record.name == LOSSES_METADATA:
-            self.losses += losses_in(record)
+        self.content.note_metadata(record, offset, len(data))
 
     def add_attachment(self, attachment: Attachment) -> None:
         """Append an attachment, piece by piece."""
@@ -257,14 +368,7 @@ class SegmentFile:
             with suppress(HybridlogError):  # later records overwrite it
                 self.cut(offset)
             raise
-        self._attachment_indexes.append(attachment.index(offset, self.position - offset))
-
-    def note_extras(
-        self, metadata: Iterable[MetadataIndex], attachments: Iterable[AttachmentIndex]
-    ) -> None:
-        """Note metadata records and attachments that are in the file already."""
-        self._metadata_indexes += metadata
-        self._attachment_indexes += attachments
+        self.content.attachments.append(attachment.index(offset, self.position - offset))
 
     def append_chunk(self, chunk: PackedChunk) -> None:
         """Append a chunk with its message indexes and arrival numbers in one write."""
@@ -274,28 +378,9 @@ class SegmentFile:
         self._append([chunk.head, chunk.data, indexes, arrivals])
         head = chunk_head_of(chunk.head)
         assert head is not None
-        place = offset, head.length, len(indexes) + len(arrivals)
-        self.table.chunk(place, (head.first, head.last), chunk.parts)
-        self.note_index(offset, head, {number: len(data) for number, data in chunk.indexes.items()})
-
-    def note_index(self, offset: int, head: ChunkHead, indexes: Mapping[int, int]) -> None:
-        """Note the chunk index of a chunk that is in the file and the table already.
-
-        `indexes` is the bytes of the message index of each channel, by channel id.
-        """
-        self._chunk_indexes += record_bytes(
-            ChunkIndex(
-                message_start_time=head.first,
-                message_end_time=head.last,
-                chunk_start_offset=offset,
-                chunk_length=head.length,
-                message_index_offsets=index_offsets(indexes, offset + head.length),
-                message_index_length=sum(indexes.values()),
-                compression=head.codec,
-                compressed_size=head.end - head.start,
-                uncompressed_size=head.size,
-            )
-        )
+        sizes = {number: len(data) for number, data in chunk.indexes.items()}
+        trailer = len(indexes) + len(arrivals)
+        self.content.note_chunk(offset, head, chunk.parts, sizes, trailer)
 
     def rewrite(self, position: int, data: Buffer) -> None:
         """Overwrite bytes damaged by a crash or the disk."""
@@ -345,19 +430,17 @@ class SegmentFile:
         """Write the summary, without renaming the file or forcing it to the disk."""
         if self._sealed is None:
             # In one write: without room the file is unchanged, and can be sealed again.
-            self._append([self._tail(self.position)])
+            content = self.content
+            self._append([content.tail(self.position)])
             with self._explained("reading"):
                 digest = self._file.digest()
             self._sealed = Sealed.of(
                 (self.number, self.group),
                 (self.position, digest),
-                self.table.build(),
-                {number: channel for number, (_, channel) in self.channels.items()},
-                extras=(
-                    len(self._attachment_indexes),
-                    sum(not one.name.startswith(OUR_NAMES) for one in self._metadata_indexes),
-                ),
-                losses=self.losses,
+                content.table.build(),
+                content.channels,
+                extras=(len(content.attachments), len(content.of_source)),
+                losses=content.losses,
             )
         return self._sealed
 
@@ -372,53 +455,6 @@ class SegmentFile:
 
     def _explained(self, doing: str) -> AbstractContextManager[None]:
         return files.explained(self.path, doing)
-
-    def _tail(self, at: int) -> bytes:
-        """The last records of a file with `at` bytes of data: the end of data, the summary."""
-        end = record_bytes(DataEnd(data_section_crc=0))
-        start = at = at + len(end)
-        table = self.table.build()
-        body = table.to_bytes()
-        groups: list[tuple[int, bytes]] = [
-            (Opcode.SCHEMA, _joined(schema_record(i, s) for i, s in self.schemas.items())),
-            (
-                Opcode.CHANNEL,
-                _joined(channel_record(i, sid, c) for i, (sid, c) in self.channels.items()),
-            ),
-            (Opcode.STATISTICS, record_bytes(self._statistics(table))),
-            (Opcode.CHUNK_INDEX, bytes(self._chunk_indexes)),
-            (Opcode.ATTACHMENT_INDEX, _joined(self._attachment_indexes)),
-            (Opcode.METADATA_INDEX, _joined(self._metadata_indexes)),
-            (CHUNK_TABLE_OPCODE, RECORD_HEAD.pack(CHUNK_TABLE_OPCODE, len(body)) + body),
-        ]
-        offsets: list[SummaryOffset] = []
-        for opcode, records in groups:
-            if records:
-                offsets.append(
-                    SummaryOffset(group_opcode=opcode, group_start=at, group_length=len(records))
-                )
-            at += len(records)
-        summary = b"".join((*(records for _, records in groups), _joined(offsets)))
-        footer = Footer(summary_start=start, summary_offset_start=at, summary_crc=0)
-        # The footer's checksum covers the summary and the footer up to the checksum itself.
-        covered = record_bytes(footer)[:-4]
-        footer.summary_crc = crc32(covered, crc32(summary))
-        return end + summary + record_bytes(footer) + MAGIC
-
-    def _statistics(self, table: ChunkTable) -> Statistics:
-        counts = table.counts()
-        times = table.chunks[["first", "last"]]
-        return Statistics(
-            attachment_count=len(self._attachment_indexes),
-            channel_count=len(self.channels),
-            channel_message_counts=counts,
-            chunk_count=self.table.chunks,
-            message_count=sum(counts.values()),
-            message_end_time=int(times["last"].max(initial=0)),
-            message_start_time=int(times["first"].min()) if len(times) else 0,
-            metadata_count=len(self._metadata_indexes),
-            schema_count=len(self.schemas),
-        )
 
 
 def _is_there(path: Path) -> bool:

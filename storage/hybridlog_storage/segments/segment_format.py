@@ -14,7 +14,6 @@ import os
 import struct
 import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from itertools import accumulate
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -116,14 +115,16 @@ def channel_record(channel_id: int, schema_id: int, channel: Channel) -> Channel
     )
 
 
-def channel_of(record: ChannelRecord, schemas: Mapping[int, SchemaRecord]) -> Channel:
+def schema_of(record: SchemaRecord) -> Schema:
+    """The schema of a record."""
+    return Schema(record.name, record.encoding, bytes(record.data))
+
+
+def channel_of(record: ChannelRecord, schemas: Mapping[int, Schema]) -> Channel:
     """The channel described by a record; `SegmentError` if its schema is not defined."""
-    schema: Schema | None = None
-    if record.schema_id:
-        found = schemas.get(record.schema_id)
-        if found is None:
-            raise SegmentError(f"channel {record.id} refers to schema {record.schema_id}: unknown")
-        schema = Schema(found.name, found.encoding, bytes(found.data))
+    schema = schemas.get(record.schema_id)
+    if schema is None and record.schema_id:
+        raise SegmentError(f"channel {record.id} refers to schema {record.schema_id}: unknown")
     metadata = dict(record.metadata)
     return Channel(
         record.topic,
@@ -255,11 +256,6 @@ def message_indexes(
         head = INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, 6 + len(data), int(channels[start]), len(data))
         records[int(channels[start])] = head + data
     return records
-
-
-def index_offsets(sizes: Mapping[int, int], start: int) -> dict[int, int]:
-    """Start of the message index of each channel, by channel id."""
-    return dict(zip(sizes, accumulate(sizes.values(), initial=start), strict=False))
 
 
 def definitions_chunk(content: bytes, offset: int) -> bytes:

@@ -52,6 +52,7 @@ from hybridlog_storage.segments.segment_format import (
     metadata_of,
     parse_attachment,
     reader_of,
+    schema_of,
     trailer_of,
 )
 from hybridlog_storage.stopping import check_wanted
@@ -79,10 +80,9 @@ class SegmentSummary(Struct, frozen=True, kw_only=True):
     Attributes:
         recording: Catalog entry of the recording at the start of the segment.
         channels: Channels by id, and those of messages without payload, see `EXPIRED_IDS`.
-        counts: Number of messages by channel id.
         losses: Rows of the loss ledger written with its messages.
         attachments: Attachments of the source, in file order.
-        metadata: Metadata records of the source, in file order.
+        records: All metadata records, in file order.
         table: The chunk table.
         start: Byte where the summary starts.
         size: Bytes of the file.
@@ -90,13 +90,17 @@ class SegmentSummary(Struct, frozen=True, kw_only=True):
 
     recording: dict[str, object]
     channels: dict[int, Channel]
-    counts: dict[int, int]
     losses: list[Loss]
     attachments: list[AttachmentIndex]
-    metadata: list[MetadataIndex]
+    records: list[MetadataIndex]
     table: ChunkTable
     start: int
     size: int
+
+    @property
+    def metadata(self) -> list[MetadataIndex]:
+        """Metadata records of the source, in file order."""
+        return [one for one in self.records if not one.name.startswith(OUR_NAMES)]
 
     @property
     def chunks(self) -> list[ChunkPlace]:
@@ -148,46 +152,14 @@ class SegmentReader:
 
     def summary(self) -> SegmentSummary:
         """Channels, chunks and metadata, from the summary at the end of the file."""
-        return self._summary(*self._records())
-
-    def _no_summary(self, why: object) -> SegmentError:
-        return SegmentError(
-            f"Segment {self.path} has no readable summary: {why}. It was sealed and has changed "
-            "since. A repair makes the summary again if all chunks are whole; else restore the "
-            "file, or see what is left with `mcap recover`."
-        )
-
-    def _records(self) -> tuple[Summary, Buffer | None, int]:
-        """The checked summary, the content of the chunk table, and where they start."""
-        end = self.size - TAIL
-        footer = footer_of(self.read(end, TAIL)) if end >= len(MAGIC) else None
-        if footer is None:
-            raise self._no_summary("its end is damaged or missing")
-        start, offsets, crc = footer
-        if not len(MAGIC) <= start <= offsets <= end or end - start > _MAX_SUMMARY:
-            raise self._no_summary("its footer is damaged")
-        data = self.read(start, self.size - start)
-        if crc32(data[: len(data) - len(MAGIC) - 4]) != crc:
-            raise self._no_summary("its checksum differs")
         try:
-            # The chunk table says more than chunk indexes, and is faster to read.
-            found, others = parse_summary(data[: len(data) - TAIL], skipped=Opcode.CHUNK_INDEX)
+            records, table, start = self._records()
         except SegmentError as error:
-            raise self._no_summary(error) from error
-        return found, others.get(CHUNK_TABLE_OPCODE), start
-
-    def _table(self, body: Buffer | None, start: int) -> ChunkTable:
-        if body is None:
-            raise self._no_summary("its chunk table is missing")
-        try:
-            table = ChunkTable.from_bytes(body)
-        except SegmentError as error:
-            raise self._no_summary(error) from error
-        if table.end > start:
-            raise self._no_summary("its chunk table is of another file")
-        return table
-
-    def _summary(self, records: Summary, body: Buffer | None, start: int) -> SegmentSummary:
+            raise SegmentError(
+                f"Segment {self.path} has no readable summary: {error}. It was sealed and has "
+                "changed since. A repair makes the summary again if all chunks are whole; else "
+                "restore the file, or see what is left with `mcap recover`."
+            ) from error
         recording: dict[str, object] | None = None
         losses: list[Loss] = []
         for index in records.metadata_indexes:
@@ -198,30 +170,43 @@ class SegmentReader:
                 losses += losses_in(self.metadata(index))
         if recording is None:
             raise SegmentError(f"{self.path} is no segment of a hybridlog store.")
-        table = self._table(body, start)
-        stated = records.statistics.channel_message_counts if records.statistics else {}
-        is_known = {*table.parts["channel"].tolist()} <= records.channels.keys()
-        if table.counts() != {c: n for c, n in stated.items() if n} or not is_known:
-            raise self._no_summary("its statistics and its chunk table differ")
         if self._added:
             table = table.with_added(self._added)
-        counts = table.counts()
-        channels = {i: channel_of(r, records.schemas) for i, r in records.channels.items()}
+        schemas = {i: schema_of(r) for i, r in records.schemas.items()}
+        channels = {i: channel_of(r, schemas) for i, r in records.channels.items()}
         return SegmentSummary(
             recording=recording,
-            channels=with_expired(channels, counts),
-            counts=counts,
+            channels=with_expired(channels, {*table.parts["channel"].tolist()}),
             losses=losses,
             attachments=records.attachment_indexes,
-            metadata=[i for i in records.metadata_indexes if not i.name.startswith(OUR_NAMES)],
+            records=records.metadata_indexes,
             table=table,
             start=start,
             size=self.size,
         )
 
-    def records(self) -> list[MetadataIndex]:
-        """Places of all metadata records, the store's own, too."""
-        return self._records()[0].metadata_indexes
+    def _records(self) -> tuple[Summary, ChunkTable, int]:
+        """The checked summary, its chunk table, and where it starts."""
+        end = self.size - TAIL
+        footer = footer_of(self.read(end, TAIL)) if end >= len(MAGIC) else None
+        if footer is None:
+            raise SegmentError("its end is damaged or missing")
+        start, offsets, crc = footer
+        if not len(MAGIC) <= start <= offsets <= end or end - start > _MAX_SUMMARY:
+            raise SegmentError("its footer is damaged")
+        data = self.read(start, self.size - start)
+        if crc32(data[: len(data) - len(MAGIC) - 4]) != crc:
+            raise SegmentError("its checksum differs")
+        # The chunk table says more than chunk indexes, and is faster to read.
+        found, others = parse_summary(data[: len(data) - TAIL], skipped=Opcode.CHUNK_INDEX)
+        table = ChunkTable.from_bytes(others.get(CHUNK_TABLE_OPCODE, b""))
+        if table.end > start:
+            raise SegmentError("its chunk table is of another file")
+        stated = found.statistics.channel_message_counts if found.statistics else {}
+        is_known = {*table.parts["channel"].tolist()} <= found.channels.keys()
+        if table.counts() != {c: n for c, n in stated.items() if n} or not is_known:
+            raise SegmentError("its statistics and its chunk table differ")
+        return found, table, start
 
     def metadata(self, index: MetadataIndex) -> Metadata:
         """A metadata record."""
@@ -367,7 +352,7 @@ def front(reader: SegmentReader, summary: SegmentSummary, log: File) -> bytes:
 
     `log` is its line of the manifest, which says that it is gone.
     """
-    stretches = {one.offset: one.length for one in reader.records()}
+    stretches = {one.offset: one.length for one in summary.records}
     stretches[summary.start] = reader.size - summary.start
     line = encode_file(log)
     body: list[Buffer] = [line]
@@ -388,37 +373,30 @@ class GoneLog(SegmentReader):
         super().__init__(path, number)
         self._rows = rows
         self._stretches: list[tuple[int, memoryview]] = []
-        size, self.size = self.size, 0
         try:
-            self.log = self._front(size)
-        except BaseException:
+            self.log = self._front()
+        except (SegmentError, ValueError, struct.error) as error:
             self.close()
-            raise
-        self.size = self.log.bytes
-        self._added = _ADDED[str(self.log.gone)]
+            raise SegmentError(
+                f"{path} is no whole file of rows of log {number}. Restore the file."
+            ) from error
+        self.size, self._added = self.log.bytes, _ADDED[str(self.log.gone)]
 
-    def _front(self, size: int) -> File:
-        problem = f"{self.path} is no whole file of rows of log {self.number}. Restore the file."
-        self.size = size
-        head = _HEAD.unpack(self.read(0, _HEAD.size)) if size >= _HEAD.size else (b"",) * 5
-        *magic, line, crc, length = head
-        if tuple(magic) != _MAGIC or length > min(size - _HEAD.size, _MAX_FRONT) or line > length:
-            raise SegmentError(problem)
+    def _front(self) -> File:
+        *magic, line, crc, length = _HEAD.unpack(self.read(0, _HEAD.size))
+        if tuple(magic) != _MAGIC or not line <= length <= _MAX_FRONT:
+            raise SegmentError("it begins with something else")
         data = self.read(_HEAD.size, length)
         if crc32(data) != crc:
-            raise SegmentError(problem)
-        try:
-            log = decode_file(bytes(data[:line]))
-        except ValueError as error:
-            raise SegmentError(problem) from error
-        at = line
-        while at + _STRETCH.size <= length:
+            raise SegmentError("its checksum differs")
+        log, at, stretches = decode_file(bytes(data[:line])), line, []
+        while at < length:
             place, own = _STRETCH.unpack_from(data, at)
-            at += _STRETCH.size
-            self._stretches.append((place, data[at : at + own]))
-            at += own
-        if log.number != self.number or log.gone not in _ADDED or at != length:
-            raise SegmentError(problem)
+            at += _STRETCH.size + own
+            stretches.append((place, data[at - own : at]))
+        if log.number != self.number or log.gone not in _ADDED:
+            raise SegmentError("it is of another log")
+        self._stretches = stretches
         return log
 
     def read(self, offset: int, length: int) -> memoryview:

@@ -58,19 +58,12 @@ _MAX_PARTS: Final = 1 << 20  # sum over a segment's chunks of their channels in 
 class Division:
     """Decides which segment of a group a chunk goes to.
 
-    Args:
-        own_payload: Mean payload bytes from which a topic has a segment of its own in the first
-            group, once it has two messages and 16 times so many bytes.
-        large_payload: The same in later groups, for those with the most bytes in the group
-            before.
-        is_named: Returns whether a rule names a topic.
+    In later groups than the first, `large_payload` takes the place of `own_payload`, for those with
+    the most bytes in the group before. `is_named` returns whether a rule names a topic.
     """
 
-    def __init__(
-        self, own_payload: int, large_payload: int, is_named: Callable[[str], bool]
-    ) -> None:
-        self._own_payload = own_payload
-        self._large_payload = large_payload
+    def __init__(self, settings: SegmentSettings, is_named: Callable[[str], bool]) -> None:
+        self._settings = settings
         self._is_named = is_named
         self._named: dict[str, bool] = {}
         self._own: set[str] = set()
@@ -88,13 +81,12 @@ class Division:
 
     def key(self, topic: str, chunk: PackedChunk) -> Key:
         """The segment for the next chunk of a topic that shares no chunks."""
-        messages = self._messages[topic] = self._messages[topic] + int(
-            chunk.parts["messages"].sum()
-        )
-        size = self._bytes[topic] = self._bytes[topic] + int(chunk.parts["payload_bytes"].sum())
+        self._messages[topic] += int(chunk.parts["messages"].sum())
+        self._bytes[topic] += int(chunk.parts["payload_bytes"].sum())
         if topic in self._own or self.is_named(topic):
             return topic
-        is_large = messages > 1 and size >= self._own_payload * max(messages, _LEAST)
+        messages, least = self._messages[topic], self._settings.own_payload
+        is_large = messages > 1 and self._bytes[topic] >= least * max(messages, _LEAST)
         if self._is_first and len(self._own) < _OTHERS and is_large:
             self._own.add(topic)
             return topic
@@ -102,66 +94,16 @@ class Division:
 
     def begin(self) -> None:
         """Begin the next group."""
+        least = self._settings.large_payload
         large = [
             topic
             for topic, size in self._bytes.most_common()
-            if size >= self._large_payload * self._messages[topic] and not self.is_named(topic)
+            if size >= least * self._messages[topic] and not self.is_named(topic)
         ]
         self._own = {*large[:_OTHERS]}
         self._is_first = False
         self._messages.clear()
         self._bytes.clear()
-
-
-class SegmentGroup:
-    """The open segments of a group, by key, in the order of their numbers.
-
-    `create` starts the next one, given the number of the group's first one, or None to start that.
-    """
-
-    def __init__(self, create: Callable[[int | None], SegmentFile]) -> None:
-        self._create = create
-        self._opened = time.monotonic()
-        self.segments: dict[Key, SegmentFile] = {FIRST: create(None)}
-
-    @property
-    def first(self) -> SegmentFile:
-        """Its first segment."""
-        return self.segments[FIRST]
-
-    @property
-    def position(self) -> int:
-        """Bytes in its segments."""
-        return sum(segment.position for segment in self.segments.values())
-
-    def segment(self, key: Key) -> SegmentFile:
-        """A segment; started if there is none."""
-        found = self.segments.get(key)
-        if found is None:
-            group = None if key == LATCHED else self.first.number
-            found = self.segments[key] = self._create(group)
-        return found
-
-    def is_full(self, size: int, span_s: float | None) -> bool:
-        """True if it has a size, has lasted for a time, or a segment has too many chunks."""
-        if span_s is not None and time.monotonic() - self._opened >= span_s:
-            return True
-        return self.position >= size or any(
-            one.table.chunks >= _MAX_CHUNKS or one.table.parts >= _MAX_PARTS
-            for one in self.segments.values()
-        )
-
-    def prepare(self, *, sync: bool) -> list[Sealed]:
-        """Complete all segments, the first one last: until then it takes records."""
-        segments = [*self.segments.values()]
-        for segment in reversed(segments):
-            segment.complete()
-        return [segment.prepare(sync=sync) for segment in segments]
-
-    def abandon(self) -> None:
-        """Close all without sealing them."""
-        for segment in self.segments.values():
-            segment.abandon()
 
 
 _PACKERS = 2
@@ -232,22 +174,20 @@ class RecordingTotals(Struct):
 class RecordingWriter:
     """Writes the batches of one recording into segments.
 
-    Args:
-        directory: The recording's directory; it exists and is empty.
-        recording: Catalog entry stored in every segment.
-        on_written: Called on a writer thread when less content is waiting. With it `append` never
-            waits for the disk, and the caller watches `stored_bytes`: when more than a few chunks
-            wait, only those that shrink to a fifth or less are compressed. Without it `append`
-            waits for a slow disk.
-        no_index: Returns whether the messages of a topic get no documents in MongoDB. The segments
-            keep that.
-        is_named: Returns whether a rule names a topic, which then has segments of its own.
-        is_latched: Returns whether the messages of a channel stay in the first segments.
-        latched_apart: Whether they have a segment of their own in each group instead.
-        on_sealing: Called when a group is complete and, unless `sync` is never, on the disk, before
-            its segments get their final names. Called on a writer thread or by `close_truncated`.
-            An exception stops the writer like a failed write.
-        make_room: Called on a writer thread when the disk is full; returns whether to try again.
+    `directory` exists and is empty; `recording` is the catalog entry, stored in every segment.
+
+    With `on_written`, which a writer thread calls when less content is waiting, `append` never
+    waits for the disk, and the caller watches `stored_bytes`: when more than a few chunks wait,
+    only those that shrink to a fifth or less are compressed. Without it, it waits for the disk.
+
+    A topic that a rule names (`is_named`) has segments of its own. Latched messages stay in the
+    first ones, or `latched_apart` in one of their own in each group. Messages of a topic with
+    `no_index` get no documents; the segments keep that.
+
+    `on_sealing` is called on a writer thread, or by `close_truncated`, when a group is complete
+    and, unless `sync` is never, on the disk, before its segments get their final names; an
+    exception stops the writer like a failed write. `make_room` is called there when the disk is
+    full, and returns whether to try again.
     """
 
     def __init__(
@@ -292,13 +232,13 @@ class RecordingWriter:
         self._is_latched = is_latched
         self._on_sealing = on_sealing
         self._make_room = make_room
-        large, own = self.settings.large_payload, self.settings.own_payload
-        self._division = Division(own, large, is_named)
+        self._division = Division(self.settings, is_named)
         self._storing: deque[Future[None]] = deque()
         self._extras: list[Metadata | Attachment] = []  # not in a segment yet
         self._broken: BaseException | None = None
         self._next_seq = 0
-        self._group: SegmentGroup | None = None
+        self._segments: dict[Key, SegmentFile] = {}  # of the open group, by number
+        self._opened = 0.0  # when it was
         self._number = 0
         self._closed: list[Path] = []
 
@@ -392,9 +332,9 @@ class RecordingWriter:
         self._shut_down()
         if not self.written.total():
             raise DiskFullError("No space left for any message. Free some, and record again.")
-        if self._group is not None and self._group.first.is_complete:
+        if self._first().is_complete:
             self._seal()
-        first = self._open_group().first
+        first = self._first()
         kept = [one for one in self._extras if isinstance(one, Metadata)]  # such as losses
         for extra in (*kept, *extras):
             first.add_metadata(extra)
@@ -413,9 +353,9 @@ class RecordingWriter:
         """Stop at once; sealed segments and flushed chunks stay."""
         self._broken = self._broken or StoreError("The recording was stopped.")
         self._shut_down()
-        if self._group is not None:
-            self._group.abandon()
-            self._group = None
+        for segment in self._segments.values():
+            segment.abandon()
+        self._segments.clear()
 
     def _shut_down(self) -> None:
         self._pool.shutdown(wait=True, cancel_futures=True)
@@ -513,25 +453,18 @@ class RecordingWriter:
             self._broken = error
             raise
 
-    def _key_of(self, chunk: PackedChunk) -> Key:
-        """The segment of a chunk in its group."""
-        number = next(iter(chunk.indexes))
-        key = self._keys[number]
-        return self._division.key(self.channels[number].topic, chunk) if key is None else key
-
     def _add(self, record: Metadata | Attachment) -> None:
-        group = self._open_group()
         if isinstance(record, Metadata):
-            self._with_room(partial(group.first.add_metadata, record))
+            self._with_room(partial(self._first().add_metadata, record))
         else:
-            group.first.add_attachment(record)
+            self._first().add_attachment(record)
         self._extras.remove(record)
-        if isinstance(record, Attachment) and group.position >= self.settings.segment_size:
+        if isinstance(record, Attachment) and self._is_full():
             self._seal()
 
     def _define_rest(self) -> None:
         """Define the channels without messages in the last group."""
-        self._define(self._open_group().first, [c for c in self.channels if not self.written[c]])
+        self._define(self._first(), [c for c in self.channels if not self.written[c]])
 
     def _define(self, segment: SegmentFile, channel_ids: Sequence[int]) -> None:
         channels = [(number, self.channels[number]) for number in channel_ids]
@@ -541,16 +474,21 @@ class RecordingWriter:
         )
 
     def _write(self, chunk: PackedChunk) -> None:
-        segment = self._with_room(partial(self._append, chunk, self._key_of(chunk)))
+        number = next(iter(chunk.indexes))
+        key = self._keys[number]
+        if key is None:
+            key = self._division.key(self.channels[number].topic, chunk)
+        segment = self._with_room(partial(self._append, chunk, key))
         self._publish(chunk)
         if self.settings.sync == "chunk":
             segment.sync()
-        if self._open_group().is_full(self.settings.segment_size, self.settings.segment_span_s):
+        if self._is_full():
             self._seal()
 
     def _append(self, chunk: PackedChunk, key: Key) -> SegmentFile:
-        segment = self._open_group().segment(key)
-        self._define(segment, [c for c in chunk.indexes if c not in segment.channels])
+        first = self._first()
+        segment = self._segments.get(key) or self._create(key, first.number)
+        self._define(segment, [c for c in chunk.indexes if c not in segment.content.channels])
         segment.append_chunk(chunk)
         return segment
 
@@ -574,28 +512,46 @@ class RecordingWriter:
         if self._on_written is not None:
             self._on_written()
 
-    def _open_group(self) -> SegmentGroup:
-        if self._group is None:
-            self._group = SegmentGroup(self._create)
-        return self._group
+    def _first(self) -> SegmentFile:
+        """The first segment of the open group, which is begun if there is none."""
+        if not self._segments:
+            self._opened = time.monotonic()
+        return self._segments.get(FIRST) or self._create(FIRST, None)
 
-    def _create(self, group: int | None) -> SegmentFile:
-        segment = SegmentFile.create(
+    def _create(self, key: Key, group: int | None) -> SegmentFile:
+        """Begin a segment of the group with a number; the first one has none yet."""
+        segment = self._segments[key] = SegmentFile.create(
             self._directory,
             self._number,
             self._recording,
-            group=group,
+            group=None if key == LATCHED else group,
             sync=self.settings.sync == "chunk",
         )
         self._number += 1
         return segment
 
+    def _is_full(self) -> bool:
+        """True if the group has its size, has lasted for its time, or has too many chunks."""
+        size, span_s = self.settings.segment_size, self.settings.segment_span_s
+        if span_s is not None and time.monotonic() - self._opened >= span_s:
+            return True
+        segments = self._segments.values()
+        return sum(segment.position for segment in segments) >= size or any(
+            one.content.table.chunks >= _MAX_CHUNKS or one.content.table.parts >= _MAX_PARTS
+            for one in segments
+        )
+
     def _seal(self) -> None:
-        group = self._open_group()
-        is_synced = self.settings.sync != "never"
-        self._on_sealing(self._with_room(lambda: group.prepare(sync=is_synced)))
-        segments = [*group.segments.values()]
+        self._first()  # an empty recording has one
+        segments = [*self._segments.values()]
+        self._on_sealing(self._with_room(partial(self._prepared, segments)))
         self._closed += [segment.publish(sync=segment is segments[-1]) for segment in segments]
         self.totals.segments += len(segments)
         self._division.begin()
-        self._group = None
+        self._segments.clear()
+
+    def _prepared(self, segments: Sequence[SegmentFile]) -> list[Sealed]:
+        """Complete segments, the first one last: until then it takes records."""
+        for segment in reversed(segments):
+            segment.complete()
+        return [segment.prepare(sync=self.settings.sync != "never") for segment in segments]

@@ -19,7 +19,6 @@ from mcap.records import Schema as SchemaRecord
 
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.errors import SegmentError
-from hybridlog_storage.manifest import Loss
 from hybridlog_storage.mcap.mcap_content import (
     HEAD,
     MAX_CHUNK_HEAD,
@@ -30,27 +29,25 @@ from hybridlog_storage.mcap.mcap_content import (
     chunk_head_of,
     parse_content,
 )
-from hybridlog_storage.segments.chunk_table import ChunkTable, TableBuilder, check_parts
-from hybridlog_storage.segments.segment_file import OPEN_SUFFIX, sealed_name
+from hybridlog_storage.segments.chunk_table import ChunkTable, check_parts
+from hybridlog_storage.segments.segment_file import OPEN_SUFFIX, Content, sealed_name
 from hybridlog_storage.segments.segment_format import (
     ARRIVAL_OPCODE,
     DAMAGED_OPCODE,
     INDEX_HEAD,
-    LOSSES_METADATA,
-    OUR_NAMES,
     RECORDING_METADATA,
     START,
     Trailer,
     channel_of,
     json_of,
-    losses_in,
     metadata_of,
+    schema_of,
     trailer_of,
 )
 from hybridlog_storage.segments.segment_reader import SegmentReader, open_chunk
 
 if TYPE_CHECKING:
-    from hybridlog_storage.messages import Buffer, Channel
+    from hybridlog_storage.messages import Buffer
 
 MENDED: Final = "it was damaged when the recording was recovered"
 """Reason of a place that readers skip."""
@@ -61,15 +58,6 @@ _SEARCHED: Final = 1 << 20  # bytes searched at once for the next record
 _MAX_RECORD: Final = 1 << 28  # bytes of what is read into memory as a whole
 _WRITING_S: Final = 0.02  # the time that a writer may take for the rest of a record
 _LOOKS: Final = 5  # at what seems damaged, before it counts as damaged
-
-
-class WalkedChunk(NamedTuple):
-    """A whole chunk: where it starts, its record before the content, bytes of message indexes."""
-
-    offset: int
-    head: ChunkHead
-    indexes: dict[int, int]
-    """By channel id."""
 
 
 class Flushed(NamedTuple):
@@ -88,7 +76,7 @@ class _TornError(SegmentError):
     """A record whose end is not in the file."""
 
 
-class Walk:
+class Walk(Content):
     """The records of a segment so far, in file order.
 
     Args:
@@ -98,10 +86,6 @@ class Walk:
     Attributes:
         reader: As above.
         recording: What it says of its recording; None without.
-        channels: Channels by id, as far as they are defined.
-        schema_ids: Id of the schema of each, by id of the channel.
-        schemas: Schemas by id, also of channels that are not defined.
-        table: The chunk table so far.
         is_complete: Whether the end of the data was reached: the writer had begun the summary.
         end: Where the last whole record ends, or damage before a later one.
     """
@@ -121,15 +105,8 @@ class Walk:
             return cls(SegmentReader(recording / sealed_name(number), number))
 
     def _begin(self) -> None:
+        super().__init__()
         self.recording: dict[str, Any] | None = None
-        self.channels: dict[int, Channel] = {}
-        self.schema_ids: dict[int, int] = {}
-        self.schemas: dict[int, SchemaRecord] = {}
-        self.chunks: list[WalkedChunk] = []
-        self.table = TableBuilder()
-        self.losses: list[Loss] = []
-        self.attachments: list[AttachmentIndex] = []
-        self.metadata: list[MetadataIndex] = []
         self._damaged: list[Damage] = []
         self._stopped: Damage | None = None  # at the end of the file, if no writer leaves that
         self._flushed: Flushed | None = None
@@ -199,11 +176,9 @@ class Walk:
             record = metadata_of(self.reader.read(at, end - at), at)
         except SegmentError as error:
             raise SegmentError(f"a metadata record is damaged: {error}") from error
-        if record.name == LOSSES_METADATA:
-            self.losses += losses_in(record)
-        elif record.name == RECORDING_METADATA:
+        if record.name == RECORDING_METADATA:
             self.recording = json_of(record)
-        self.metadata.append(MetadataIndex(offset=at, length=end - at, name=record.name))
+        self.note_metadata(record, at, end - at)
 
     # Chunks
 
@@ -214,16 +189,14 @@ class Walk:
         if not len(seq):
             self._define(at, end)
             return end + trailer.length
-        place, span = (at, head.length, trailer.length), (head.first, head.last)
-        check_parts(place, span, parts, len(seq))
+        check_parts((at, head.length, trailer.length), (head.first, head.last), parts, len(seq))
         if self._reads:
             self._content(at, end)
         lost = {*parts["channel"].tolist()} - self.channels.keys()
         if lost:
             raise SegmentError(f"the definition of its channel {min(lost)} is lost")
         sizes = {channel: INDEX_HEAD.size + rows.nbytes for channel, rows in trailer.indexes}
-        self.chunks.append(WalkedChunk(at, head, sizes))
-        self.table.chunk(place, span, parts)
+        self.note_chunk(at, head, parts, sizes, trailer.length)
         return end + trailer.length
 
     def _proven_chunk(self, at: int, end: int) -> tuple[ChunkHead, Trailer]:
@@ -258,10 +231,9 @@ class Walk:
         for definition in parse_content(self._content(at, end)).definitions:
             record = definition.record
             if isinstance(record, SchemaRecord):
-                self.schemas[record.id] = record
+                self.schemas[record.id] = schema_of(record)
             else:
                 self.channels[record.id] = channel_of(record, self.schemas)
-                self.schema_ids[record.id] = record.schema_id
 
     def _content(self, at: int, end: int) -> Buffer:
         if end - at > _MAX_RECORD:
@@ -296,10 +268,8 @@ class Walk:
     def flushed(self) -> Flushed:
         """Its content so far."""
         if self._flushed is None:
-            metadata = [one for one in self.metadata if not one.name.startswith(OUR_NAMES)]
-            self._flushed = Flushed(
-                self.table.build(), tuple(self.attachments), metadata, self.reader
-            )
+            table, attachments = self.table.build(), tuple(self.attachments)
+            self._flushed = Flushed(table, attachments, self.of_source, self.reader)
         return self._flushed
 
     def follow(self) -> bool:
