@@ -47,24 +47,11 @@ if TYPE_CHECKING:
 class Capture:
     """Records the messages of one new recording.
 
-    Args:
-        directory: The store.
-        catalog: Its catalog.
-        follow: Starts the follower of the recording.
-        known: Returns all recordings of the store as they are now.
-        name: Name of the recording.
-        tags: Tags of the recording.
-        source: Origin of its messages, for the catalog.
-        settings: Rotation, chunks and compression of segments.
-        on_written: Called on another thread when less content waits for the disk; for a caller
-            that cannot wait for it.
-        no_index: Returns whether the messages of a topic get no documents in MongoDB; None for
-            no topic.
-        is_ring: Whether files of it go while it is recorded: latched messages have files of their
-            own.
-        check: Called with all recordings before anything is written, while no other process can
-            start a recording; raises to refuse.
-        make_room: Called when the disk is full; returns whether to try again.
+    `follow` starts its follower; `known` returns all recordings of the store as they are now.
+    `on_written` and `make_room` are as of `RecordingWriter`. `no_index` tells whether the messages
+    of a topic get no documents in MongoDB. Files of a ring go while it is recorded, so latched
+    messages have files of their own. `check` is called with all recordings before anything is
+    written, while no other process can start one; it raises to refuse.
 
     Attributes:
         entry: The recording's catalog entry.

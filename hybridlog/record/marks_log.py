@@ -7,7 +7,6 @@ which are derived from files, never have them.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -20,7 +19,8 @@ from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.manifest import hasher
 from hybridlog_storage.messages import MARKS_CHANNEL, Batch
 from hybridlog_storage.segments.chunk import StoredChunk
-from hybridlog_storage.segments.chunk_table import CHUNK, PART, ChunkTable
+from hybridlog_storage.segments.chunk_table import CHUNK, PART, ChunkTable, parts_of
+from hybridlog_storage.segments.segment_format import index_order
 from hybridlog_storage.segments.segment_reader import SegmentReader
 from hybridlog_storage.segments.walk import Flushed
 
@@ -34,64 +34,37 @@ if TYPE_CHECKING:
     from hybridlog_storage.segments.chunk_table import ChunkPlace
 
 _ARRIVALS: Final = 1 << 52  # the first arrival number, behind those of all messages
-_CHUNK: Final = 1000  # marks
 
 
 class _MarksLog(SegmentReader):
-    """Reads marks as chunks of messages.
-
-    Args:
-        marks: The marks.
-
-    Attributes:
-        flushed: What the log has.
-    """
+    """Reads marks as a chunk of messages; `flushed` is what the log has."""
 
     def __init__(self, marks: Sequence[Mark]) -> None:
         self.path, self.number = Path(MARKS), MARKS_SEGMENT
         self.size = self.bytes_read = 0
         self._fd = -1
-        self._chunks = [marks[at : at + _CHUNK] for at in range(0, len(marks), _CHUNK)]
-        chunks, parts = (np.zeros(len(self._chunks), dtype) for dtype in (CHUNK, PART))
-        digest = hasher()
-        for row, own in enumerate(self._chunks):
-            for one in own:
-                digest.update(one.id.encode())
-            # Other marks have other places, so what was read before is never taken for them.
-            chunks["offset"][row] = int(digest.hexdigest()[:15], 16)
-            parts["payload_bytes"][row] = sum(map(len, _payloads(own)))
-            for edge, choose in (("first", min), ("last", max)):
-                parts[edge][row] = chunks[edge][row] = choose(one.time for one in own)
-                parts[f"{edge}_publish"][row] = chunks[edge][row]
-        chunks["parts"] = 1
-        parts["channel"] = MARKS_CHANNEL
-        parts["messages"] = [*map(len, self._chunks)]
-        table = ChunkTable(chunks, parts)
-        self.flushed = Flushed(table, (), (), self)
+        said = [mark_payload(one.text, one.tags, one.end) for one in marks]
+        time = np.array([one.time for one in marks], np.int64)
+        length = np.fromiter(map(len, said), np.int64, len(said))
+        channel = np.full(len(marks), MARKS_CHANNEL, np.int32)
+        zeros = np.zeros(len(marks), np.uint32)
+        offset = length.cumsum() - length
+        buffer = b"".join(said)
+        self._batch = batch = Batch(buffer, offset, length, channel, time, time, zeros)
+        # Other marks have another place, so what was read before is never taken for them.
+        self._place = int(hasher(buffer + time.tobytes()).hexdigest()[:15], 16)
+        chunks, parts = np.zeros(0, CHUNK), np.zeros(0, PART)
+        if marks:
+            parts, *span = parts_of(batch, index_order(channel, time))
+            chunks = np.array([(self._place, 0, 0, *span, 1)], CHUNK)
+        self.flushed = Flushed(ChunkTable(chunks, parts), (), (), self)
 
     def read_chunk(self, place: ChunkPlace) -> StoredChunk:
-        """Some marks.
-
-        Raises:
-            SegmentError: They were changed.
-        """
-        offsets = self.flushed.table.chunks["offset"].tolist()
-        if place.offset not in offsets[place.number : place.number + 1]:
+        """The marks; `SegmentError` if they were changed."""
+        if place.offset != self._place:
             raise SegmentError("Marks were set or removed meanwhile. Ask again.")
-        own = self._chunks[place.number]
-        payloads, times = _payloads(own), np.array([one.time for one in own], np.int64)
-        lengths = [*map(len, payloads)]
-        batch = Batch(
-            b"".join(payloads),
-            np.array([0, *accumulate(lengths[:-1])], np.int64),
-            np.array(lengths, np.int64),
-            np.full(len(own), MARKS_CHANNEL, np.int32),
-            times,
-            times,
-            np.zeros(len(own), np.uint32),
-        )
-        seq = _ARRIVALS + place.number * _CHUNK + np.arange(len(own))
-        return StoredChunk(MARKS_SEGMENT, place, batch, seq)
+        seq = _ARRIVALS + np.arange(len(self._batch))
+        return StoredChunk(MARKS_SEGMENT, place, replace(self._batch), seq)
 
     def read_times(self, place: ChunkPlace) -> dict[int, NDArray[np.int64]]:
         """Their log times, as of a segment."""
@@ -99,10 +72,6 @@ class _MarksLog(SegmentReader):
 
     def fetch(self, places: Iterable[ChunkPlace]) -> None:
         """Do nothing: they are in memory."""
-
-
-def _payloads(marks: Iterable[Mark]) -> list[bytes]:
-    return [mark_payload(one.text, one.tags, one.end) for one in marks]
 
 
 def beside(entry: RecordingEntry) -> RecordingEntry:
