@@ -63,10 +63,10 @@ DAMAGED = {
     "tilt_trunc60.bag": ("real/tilt_laser.bag", 2469, 1),
     "luminar_lz4_bitflip.bag": ("real/luminar_pointcloud.bag", 14, 1),
     "husky.bag.active": (None, 12303, 0),
-    "tilt_chunksize_lie.bag": ("real/tilt_laser.bag", 4093, 1),
+    "tilt_chunksize_lie.bag": ("real/tilt_laser.bag", 4093, 0),
     "auv_trunc60.mcap": ("real/auv_ros2.mcap", 11421, 1),
     "auv_no_summary.mcap": ("real/auv_ros2.mcap", 18558, 1),
-    "auv_huge_record_len.mcap": ("real/auv_ros2.mcap", 18558, 1),
+    "auv_huge_record_len.mcap": ("real/auv_ros2.mcap", 18558, 0),
     "ouster_zstd_bitflip.mcap": ("real/ouster.mcap", 100, 1),
     "lidar_trunc50.db3": (None, 217, 1),
 }

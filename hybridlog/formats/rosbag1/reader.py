@@ -193,7 +193,7 @@ class Rosbag1Source(Source):
         self._fallback: dict[int, _Connection] = {}  # by the index of the bag
         self._numbers: dict[_Connection, int] = {}
         self._undefined: Counter[int] = Counter()
-        self._got = 0
+        self._got = self._chunk_end = 0
         self._cut: tuple[str, int | None] | None = None  # why the file ends early, and what is lost
         try:
             self._file: BinaryIO = path.open("rb", buffering=1 << 16)
@@ -373,7 +373,8 @@ class Rosbag1Source(Source):
             return end
         if record.op not in {_MESSAGE, _CONNECTION}:
             return record.end
-        data = self._read(pos, max(_WINDOW, record.end - pos))
+        most = min(_WINDOW, self._chunk_end - pos) if self._chunk_end > pos else _WINDOW
+        data = self._read(pos, max(most, record.end - pos))
         return pos + (yield from self._content(data, lambda end: self._is_sound(pos + end)))
 
     def _content(self, data: bytes, is_end: Callable[[int], bool]) -> Generator[Batch, None, int]:
@@ -405,6 +406,7 @@ class Rosbag1Source(Source):
         if form == b"none":
             if record.end > self.size_bytes:
                 self._cut = self._cut or ("the file ends in a chunk", None)
+            self._chunk_end = record.end
             return record.start
         try:
             if form not in _UNPACKERS:
