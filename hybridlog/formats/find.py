@@ -69,10 +69,12 @@ class Watch:
     """Finds logs below a directory as they become complete, by looking again and again.
 
     A file that was written since the last look is not complete. An MCAP file or a bag says
-    itself when it ends; one that does not, and any other file, is complete when a later part of
-    the same log exists or `metadata.yaml` lists it. Databases and compressed files are complete,
-    too, when they have not changed for some time. Each file is a log of its own, but for ROS 2
+    itself when it ends, or `metadata.yaml` lists it; databases and compressed files are complete
+    when they have not changed for some time. Each file is a log of its own, but for ROS 2
     bags that are complete when they are met.
+
+    Attributes:
+        unfinished: Logs that were not complete at the last look.
     """
 
     def __init__(self, top: Path, settle_s: float = SETTLE_S) -> None:
@@ -80,71 +82,55 @@ class Watch:
         self._settle_ns = round(settle_s * 1e9)
         self._seen: set[_File] = set()  # at the last look
         self._done: set[_File] = set()  # taken, or no log
-        self._logs: dict[_File, LogFile | None] = {}
+        self.unfinished: list[Path] = []
 
     def look(self) -> Found:
         """The logs that have become complete since the last look.
 
-        It lists the directories, and reads the beginnings and ends of files that have changed.
+        It lists the directories, and reads the beginnings and ends of files that are not taken.
         """
         found = Found()
         seen: set[_File] = set()
-        now = time.time_ns()
+        self.unfinished.clear()
         for folder, files in _folders(self._top, found):
             seen.update(files)
             if not self._done.issuperset(files):
-                found.logs += self._complete_in(folder, files, now, found.problems)
+                found.logs += self._complete_in(folder, files, found.problems)
         self._seen = seen
         self._done &= seen
-        self._logs = {file: log for file, log in self._logs.items() if file in seen}
         return found
 
     def put_back(self, log: LogSet) -> None:
         """Find a log again at the next look."""
         self._done = {file for file in self._done if file.path not in log.files}
 
-    def unfinished(self) -> list[Path]:
-        """Logs that were not complete at the last look, by path."""
-        return sorted(file.path for file, log in self._logs.items() if log)
-
     def _complete_in(
-        self, folder: Path, files: Sequence[_File], now: int, problems: list[SourceError]
+        self, folder: Path, files: Sequence[_File], problems: list[SourceError]
     ) -> Iterator[LogSet]:
-        for file in files:
-            if file not in self._done and file not in self._logs and file.size:
-                self._logs[file] = _log_file(file, problems)
-        known = {file.path: file for file in files if self._logs.get(file)}
-        self._done.update(file for file in files if file.size and file.path not in known)
+        new = [file for file in files if file.size and file not in self._done]
         listed = _listed(folder, files)
         names = {file.path.name for file in files}
-        for parts in grouped_parts([*known, *(f.path for f in files if f in self._done)]):
-            ready: dict[_File, LogFile] = {}
-            for path in parts:
-                log = self._logs.get(known[path]) if path in known else None
-                is_closed = path is not parts[-1] or path.name in listed
-                if log and self._is_complete(known[path], log, now, names, is_closed=is_closed):
-                    ready[known[path]] = log
-            self._done.update(ready)
-            for file in ready:
-                del self._logs[file]
-            is_bag = bool(listed) and listed.issubset(file.path.name for file in ready)
-            if is_bag and len(ready) == len(parts):
-                yield LogSet.at(folder)
+        ready: dict[_File, LogFile] = {}
+        for file in new:
+            log = _log_file(file, problems)
+            if log is None:
+                self._done.add(file)
+            elif self._is_complete(file, log, names, listed):
+                ready[file] = log
             else:
-                yield from (LogSet.of([log]) for log in ready.values())
+                self.unfinished.append(file.path)
+        self._done.update(ready)
+        if listed and listed.issubset(file.path.name for file in ready):
+            yield LogSet.at(folder)
+            ready = {file: log for file, log in ready.items() if file.path.name not in listed}
+        yield from (LogSet.of([log]) for log in ready.values())
 
-    def _is_complete(
-        self, file: _File, log: LogFile, now: int, names: set[str], *, is_closed: bool
-    ) -> bool:
-        """True if nobody writes a file any more; `now` in ns.
-
-        `names` are of the files beside it. `is_closed` says that a later part exists, or that
-        metadata lists it.
-        """
-        is_unchanged = now - file.changed >= self._settle_ns
+    def _is_complete(self, file: _File, log: LogFile, names: set[str], listed: set[str]) -> bool:
+        """True if nobody writes a file any more; `names` are of the files beside it."""
+        is_unchanged = time.time_ns() - file.changed >= self._settle_ns
         if not is_unchanged and file not in self._seen:
             return False
-        if is_closed or _has_end(file):
+        if file.path.name in listed or _has_end(file):
             return True
         if log.format.has_end and not file.path.name.endswith(".zstd"):
             return False

@@ -171,7 +171,6 @@ class LogSet(Struct, frozen=True):
         parts: The files in reading order.
         damage: Files that are missing, and metadata that cannot be read.
         message_count: Number of all messages by its metadata; None if unknown.
-        gaps: Files that seem to be missing; damage unless all of these messages are there.
         problem: Why there is no log.
     """
 
@@ -179,7 +178,6 @@ class LogSet(Struct, frozen=True):
     parts: tuple[LogFile, ...] = ()
     message_count: int | None = None
     damage: tuple[Damage, ...] = ()
-    gaps: tuple[Damage, ...] = ()
     problem: SourceError | None = None
 
     @classmethod
@@ -205,7 +203,7 @@ class LogSet(Struct, frozen=True):
     @classmethod
     def of(cls, parts: Sequence[LogFile]) -> LogSet:
         """A file, or the parts of a split log in their order."""
-        return cls(parts[0].path, tuple(parts), gaps=tuple(missing_parts(parts)))
+        return cls(parts[0].path, tuple(parts), damage=tuple(missing_parts(parts)))
 
     @property
     def files(self) -> list[Path]:
@@ -259,44 +257,34 @@ def _in_folder(folder: Path) -> LogSet:
     damage = [metadata] if isinstance(metadata, Damage) else []
     found, missing = ([], []) if bag is None else locate(folder, bag)
     there, files = files_in(folder), [*map(LogFile.at, found)]
-    if not found:
+    if not found:  # the listed files may have got other names
         files = [file for file in there if file.format is not UNKNOWN]
         _check_one(folder, files)
     first = next((file for file in files if file.format is not UNKNOWN), None)
-    paths, names = {file.path for file in files}, {plain(file.path) for file in files}
+    paths = {file.path for file in files}
     more: list[LogFile] = []
     for file in (one for one in there if one.path not in paths):
-        is_new = plain(file.path) not in names
-        if is_new and first is not None and is_split([first, file]):
+        if first is not None and is_split([first, file]):
             more.append(file)
         elif file.format is not UNKNOWN:  # the log lacks nothing by that
             reason = "the file is not read: it is no part of this log; record it by its own path"
             damage.append(Damage(file.path, None, None, reason, 0))
     if more:
         files = sorted([*files, *more], key=lambda file: natural(file.path))
-    gaps = [] if found and missing else missing_parts(files)
-    if found:
-        damage += missing
-    else:  # with as many messages as listed, they are the listed files under other names
-        gaps = [*missing, *gaps]
+    damage += missing if found else missing_parts(files) if bag is None else []
     count = None if bag is None else bag.message_count
-    return LogSet(folder, tuple(files), count, tuple(damage), tuple(gaps))
+    return LogSet(folder, tuple(files), count, tuple(damage))
 
 
 def _check_one(folder: Path, logs: Sequence[LogFile]) -> None:
     """Refuse a directory whose files are not one log."""
     if len(logs) == 1 or (logs and is_split(logs)):
         return
+    reason = f"a directory without a log; hybridlog reads {kinds()}"
     if logs:
         names = listed((log.path.name for log in logs), 5)
-        reason = (
-            f"{len(logs)} logs that are not parts of one ({names}); give the path of one of them"
-        )
-    else:
-        reason = (
-            f"a directory without a log; give one that holds {kinds()}, or the path of a log itself"
-        )
-    raise SourceError(f"{folder}: {reason}")
+        reason = f"{len(logs)} logs that are not parts of one ({names})"
+    raise SourceError(f"{folder}: {reason}; give the path of a log itself")
 
 
 # Reading.
@@ -352,12 +340,8 @@ class _JoinedSource(Source):
             self.bytes_read = done
         if first is not None and failed == len(self._log.parts):
             raise first
-        total, lost = self._log.message_count, sum(one.messages_lost or 0 for one in self.damage)
-        if total is None or self._got + lost < total:
-            for gap in self._log.gaps:
-                self.note(gap)
-        if total is not None:
-            self.settle(total, self._got, self.path / NAME)
+        if self._log.message_count is not None:
+            self.settle(self._log.message_count, self._got, self.path / NAME)
 
     def _open(self, part: LogFile) -> Source:
         inner = self._unspooled(part) if part.is_packed else part.open()

@@ -70,7 +70,7 @@ def test_split_ros1_bag(tmp_path: Path) -> None:
         ("CATALOGUE.md", "not a log of a known kind"),
         ("nothing.bag", "no such file or directory; check"),
         ("CATALOGUE.md/x", "cannot be read"),
-        ("odd", "give the path of one of them"),
+        ("odd", "give the path of a log itself"),
         ("mcap-conformance", "without a log"),
     ],
 )

@@ -144,7 +144,7 @@ def test_a_log_is_taken_when_it_says_that_it_ends(tmp_path: Path) -> None:
     assert paths(watch.look(), tmp_path) == []  # they may still be written
     assert paths(watch.look(), tmp_path) == ["whole.bag", "whole.mcap"]
     assert paths(watch.look(), tmp_path) == []
-    assert [path.name for path in watch.unfinished()] == ["copied.bag", "open.bag", "torn.mcap"]
+    assert [path.name for path in watch.unfinished] == ["copied.bag", "open.bag", "torn.mcap"]
     mcap(torn, 5)
     assert paths(watch.look(), tmp_path) == []
     assert paths(watch.look(), tmp_path) == ["torn.mcap"]
@@ -154,17 +154,15 @@ def test_a_log_is_taken_when_it_says_that_it_ends(tmp_path: Path) -> None:
     assert paths(watch.look(), tmp_path) == ["whole.mcap"]
 
 
-def test_a_part_is_taken_when_a_later_one_begins(tmp_path: Path) -> None:
+def test_a_part_is_taken_when_metadata_lists_it(tmp_path: Path) -> None:
     watch = Watch(tmp_path)
     database(tmp_path / "x_0.db3")
     watch.look()
     assert paths(watch.look(), tmp_path) == []
-    database(tmp_path / "x_1.db3")
+    (tmp_path / "metadata.yaml").write_text(METADATA.format(files="x_0.db3, x_1.db3"))
     assert paths(watch.look(), tmp_path) == ["x_0.db3"]
     assert paths(watch.look(), tmp_path) == []
-    (tmp_path / "metadata.yaml").write_text(METADATA.format(files="x_0.db3, x_1.db3"))
-    assert paths(watch.look(), tmp_path) == ["x_1.db3"]
-    assert watch.unfinished() == []
+    assert watch.unfinished == []
 
 
 def test_a_file_without_an_end_is_complete_when_it_has_settled(tmp_path: Path) -> None:

@@ -95,7 +95,7 @@ def test_files_are_asked_before_the_metadata(bag: Path, files: list[str], count:
 
 @pytest.mark.parametrize(
     ("count", "damage"),
-    [(10, []), (15, [("bag_0.db3", 5)]), (None, [("bag_0.db3", None)])],
+    [(10, []), (15, [("metadata.yaml", 5)]), (None, [("bag_1.db3", None)])],
 )
 def test_part_that_nothing_lists_is_missing(
     bag: Path, count: int | None, damage: list[tuple[str, int | None]]
@@ -112,7 +112,7 @@ def test_part_that_nothing_lists_is_missing(
     ("listed", "count", "damage"),
     [
         (["x_0.db3", "x_1.db3"], 15, []),
-        (["x_0.db3"], 20, [("x_0.db3", 5)]),
+        (["x_0.db3"], 20, [("metadata.yaml", 5)]),
         ([], 15, []),
         ([], 16, [("metadata.yaml", 1)]),
     ],
