@@ -23,7 +23,6 @@ from starlette.routing import Route
 from hybridlog.query.answers.current import next_time
 from hybridlog.query.times import TIME_LIMIT
 from hybridlog.record.losses import extent_of
-from hybridlog.view.sql_process import SqlProcess
 from hybridlog_storage.errors import (
     HybridlogError,
     ResourceError,
@@ -60,27 +59,23 @@ class Context:
         store: That store; at one moment while an answer is worked out.
         turns: Held by each answer that is worked out.
         matching: Held while matches are looked for.
-        sql: Answers SQL.
     """
 
     def __init__(self, store: Store) -> None:
         self.store = store
-        self._looks = _Looks(store)
         self.turns = threading.BoundedSemaphore(MAX_WORKING)
         self.matching = threading.Lock()
-        self.sql = SqlProcess(store)
+        self._looking, self._looked = threading.Lock(), time.monotonic()
 
     def of_now(self) -> Context:
         """The same context for an answer, whose store is of the moment that begins now."""
+        with self._looking:  # for what other processes have done since
+            if time.monotonic() >= self._looked + REFRESH_S:
+                self.store.refresh()
+                self._looked = time.monotonic()
         found = copy(self)
         found.store = self.store.snapshot()
         return found
-
-    def refresh(self) -> None:
-        """See what other processes have recorded since, unless the last look was just now."""
-        self._looks.refresh()
-        if self.store is not self._looks.store:
-            self.store = self._looks.store.snapshot()
 
     def recording(self, params: RequestParams) -> RecordingEntry:
         """The recording that the parameter `recording` names by its id or name."""
@@ -98,22 +93,6 @@ class Context:
         """The recording, and a query about its topic that the parameter `topic` names."""
         recording = self.recording(params)
         return recording, self.query(recording, params.text("topic"))
-
-
-class _Looks:
-    """Looks for new recordings of a store, not too often."""
-
-    def __init__(self, store: Store) -> None:
-        self.store = store
-        self._looking = threading.Lock()
-        self._looked = time.monotonic()
-
-    def refresh(self) -> None:
-        with self._looking:
-            if time.monotonic() >= self._looked + REFRESH_S:
-                self.store.refresh()
-                self.store.shared.now()
-                self._looked = time.monotonic()
 
 
 def start_of(recording: RecordingEntry | RecordingSummary) -> int:
@@ -140,7 +119,7 @@ def route(path: str, answer: Answer, turns: threading.Semaphore | None = None) -
 
     def answered(request: Request, given_up: threading.Event) -> Response:
         context: Context = request.app.state.context
-        params = RequestParams(request.query_params, request.headers.get("if-none-match"))
+        params = RequestParams(request.query_params)
         try:
             with until_given_up(given_up), held(turns or context.turns):
                 found = answer(context.of_now(), params)
@@ -205,19 +184,6 @@ class Current(Struct, frozen=True):
     message: Message | None
     time: str | None
     until: str | None
-
-    @property
-    def tag(self) -> str:
-        """An entity tag: equal for the same message."""
-        message = self.message
-        return '"none"' if message is None else f'"{message.recording}-{message.seq}"'
-
-    @property
-    def headers(self) -> dict[str, str]:
-        """Headers of an answer about the message."""
-        times = {"Hybridlog-Time": self.time, "Hybridlog-Until": self.until}
-        known = {name: time for name, time in times.items() if time is not None}
-        return {"ETag": self.tag, "Cache-Control": "private, no-cache", **known}
 
 
 def current(context: Context, params: RequestParams) -> Current:
@@ -284,14 +250,10 @@ _INTEGER: Final = re.compile(r"-?\d{1,19}", re.ASCII)
 
 
 class RequestParams:
-    """The parameters of one request, as in the URL; wrong and missing ones are refused.
+    """The parameters of one request, as in the URL; wrong and missing ones are refused."""
 
-    The entity tag is that of the answer that the browser has already; None for none.
-    """
-
-    def __init__(self, parameters: QueryParams, tag: str | None = None) -> None:
+    def __init__(self, parameters: QueryParams) -> None:
         self._parameters = parameters
-        self.tag = tag
 
     def has(self, name: str) -> bool:
         """True if a parameter is given."""

@@ -64,11 +64,9 @@ class ViewServer:
 
 ROUTES: Final = (
     "ask",
-    "export",
     "messages",
+    "pictures",
     "recordings",
-    "spatial",
-    "timeline",
 )
 """The modules of `routes/`."""
 

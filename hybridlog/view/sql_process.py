@@ -1,113 +1,95 @@
-"""The process that answers SQL for the page: its memory is limited, and the page outlives it.
+"""A process for each question in SQL of the page: its memory is limited, and the page outlives it.
 
-It answers one question at a time. One that nobody waits for any more ends with its process, so
-a query that runs away is stopped whatever it does.
+One that nobody waits for any more ends, so a query that runs away is stopped whatever it does.
 """
 
 from __future__ import annotations
 
 import os
+import pickle
 import subprocess
 import sys
 import threading
 import traceback
-from collections.abc import Callable
-from contextlib import suppress
-from multiprocessing import Pipe
-from multiprocessing.connection import Connection
+from collections.abc import Callable, Sequence
+from contextlib import closing, suppress
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
 
 import hybridlog
-from hybridlog.sql.duck import OWN_MEMORY, limited_memory, private_bytes, shortage_of
+from hybridlog.sql.duck import limited_memory, shortage_of
 from hybridlog_storage.errors import HybridlogError, ResourceError
-from hybridlog_storage.stopping import check_wanted, held
+from hybridlog_storage.stopping import check_wanted
 
 if TYPE_CHECKING:
+    from hybridlog.sql.rows import Reading
     from hybridlog.store import Store
 
 SQL_MEMORY: Final = 512 << 20
 """Bytes that DuckDB may use."""
+SQL_ROWS: Final = 1000
+_SQL_BYTES: Final = 32 << 20
+SQL_COLUMNS: Final = 200
+_MICROSECOND: Final = 1000  # ns
 _POLL_S: Final = 0.05
 _START: Final = (
-    "import sys; sys.path[:] = {!r}; from hybridlog.view.sql_process import serve; serve({})"
+    "import sys; sys.path[:] = {!r}; from hybridlog.view.sql_process import answer; answer({})"
 )
 _T = TypeVar("_T")
 
 
-class SqlProcess:
-    """Answers by one process, which starts when it is needed, and again when it has ended.
+def in_process(store: Store, work: Callable[..., _T], *arguments: Any) -> _T:
+    """Call a function of a module in a process, with the store and further arguments.
 
-    It ends with this object, or with the process that has it, and opens the store for itself.
+    These and the answer are pickled. It is given up when the caller is.
     """
-
-    def __init__(self, store: Store) -> None:
-        self._store = store
-        self._lock = threading.Lock()
-        self._pipe: Connection[Any, Any] | None = None
-        self._child: subprocess.Popen[bytes] | None = None
-
-    def ask(self, work: Callable[..., _T], *arguments: Any) -> _T:
-        """Call a function of a module in the process, with its store and further arguments.
-
-        These and the answer are pickled. It is given up when the caller is; a process that ends
-        twice is an error.
-        """
-        with held(self._lock):
-            for _ in range(2):
-                try:
-                    is_answer, found = self._answer_of((work, arguments))
-                except (EOFError, ConnectionError):
-                    self._end()
-                except BaseException:
-                    self._end()
-                    raise
-                else:
-                    if is_answer:
-                        return cast("_T", found)
-                    raise found
-        raise ResourceError(
-            "The process that answers SQL has ended, likely for want of memory: ask for less at a "
-            "time, or ask in `hybridlog sql` with more --memory."
-        )
-
-    def _answer_of(self, call: Any) -> Any:
-        pipe = self._pipe or self._begin()
-        pipe.send(call)
-        while not pipe.poll(_POLL_S):
-            check_wanted()
-        return pipe.recv()
-
-    def _begin(self) -> Connection[Any, Any]:
-        self._pipe, theirs = Pipe()
-        places = [str(Path(place).absolute()) for place in sys.path]
-        with theirs:
-            self._child = subprocess.Popen(  # noqa: S603 - our own module
-                [sys.executable, "-c", _START.format(places, theirs.fileno())],
-                cwd="/",  # nothing in an answer says where this one runs
-                stdin=subprocess.PIPE,  # which ends with this one
-                stdout=subprocess.DEVNULL,
-                pass_fds=[theirs.fileno()],
-                start_new_session=True,  # Ctrl-C ends the page, which ends this process
-            )
-        threading.Thread(target=_waited, args=[self._child], daemon=True).start()
-        directory = self._store.directory
-        mongo = self._store.shared.index.wanted
-        self._pipe.send((directory.address, mongo, directory.read_only))
-        return self._pipe
-
-    def _end(self) -> None:
-        if self._pipe is not None and self._child is not None:
-            self._pipe.close()
-            self._child.kill()
-        self._pipe = None
+    directory = store.directory
+    place = directory.address, store.shared.index.wanted, directory.read_only
+    paths = [str(Path(path).absolute()) for path in sys.path]
+    with (
+        TemporaryFile() as found,
+        subprocess.Popen(  # noqa: S603 - our own module
+            [sys.executable, "-c", _START.format(paths, found.fileno())],
+            cwd="/",  # nothing in an answer says where this one runs
+            stdin=subprocess.PIPE,  # which ends with this one
+            stdout=subprocess.DEVNULL,
+            pass_fds=[found.fileno()],
+            start_new_session=True,  # Ctrl-C ends the page, which ends this process
+        ) as child,
+    ):
+        assert child.stdin is not None
+        try:
+            with suppress(BrokenPipeError):
+                child.stdin.write(pickle.dumps((place, work, arguments)))
+                child.stdin.flush()
+            while child.poll() is None:
+                check_wanted()
+                with suppress(subprocess.TimeoutExpired):
+                    child.wait(_POLL_S)
+        finally:
+            child.kill()
+        found.seek(0)
+        try:
+            is_answer, made = pickle.load(found)  # noqa: S301 - our own process wrote it
+        except EOFError:
+            raise ResourceError(
+                "The process that answers SQL has ended, likely for want of memory: ask for less "
+                "at a time, or ask in `hybridlog sql` with more --memory."
+            ) from None
+    if not is_answer:
+        raise made
+    return cast("_T", made)
 
 
-def _waited(child: subprocess.Popen[bytes]) -> None:
-    """Wait for the end of a process: until then its standard input is open."""
-    child.wait()
-    assert child.stdin is not None
-    child.stdin.close()
+def answer(handle: int) -> None:
+    """Answer what comes on standard input into an open file."""
+    place, work, arguments = pickle.load(sys.stdin.buffer)  # noqa: S301 - the page wrote it
+    threading.Thread(target=_until_alone, daemon=True).start()
+    found = _answer(place, work, arguments)
+    with os.fdopen(handle, "wb") as file:
+        file.write(pickle.dumps(found))
+    os._exit(0)
 
 
 def _until_alone() -> None:
@@ -116,28 +98,14 @@ def _until_alone() -> None:
     os._exit(0)
 
 
-def serve(handle: int) -> None:
-    """Answer until the other side has gone."""
-    threading.Thread(target=_until_alone, daemon=True).start()
-    with Connection(handle) as caller, suppress(EOFError, ConnectionError):
-        path, mongo, read_only = caller.recv()
-        try:
-            store = hybridlog.open(path, mongo=mongo, read_only=read_only)
-            store.sql_engine.connect(SQL_MEMORY).query("select 1").to_arrow()  # loads what it needs
-        except HybridlogError as error:
-            caller.recv()
-            caller.send((False, error))
-            return  # the next process may be able to open it
-        with limited_memory(SQL_MEMORY) as most:
-            while private_bytes() <= most - OWN_MEMORY // 2:  # else a new process has it all
-                caller.send(_answer(store, *caller.recv()))
-
-
-def _answer(store: Store, work: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[bool, Any]:
+def _answer(place: Any, work: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[bool, Any]:
     """Whether there is an answer, and that, or the error."""
+    path, mongo, read_only = place
     try:
-        store.refresh()
-        return True, work(store.snapshot(), *arguments)
+        with hybridlog.open(path, mongo=mongo, read_only=read_only) as store:
+            store.sql_engine.connect(SQL_MEMORY).query("select 1").to_arrow()  # loads what it needs
+            with limited_memory(SQL_MEMORY):
+                return True, work(store.snapshot(), *arguments)
     except HybridlogError as error:
         return False, error
     except Exception as error:
@@ -145,3 +113,55 @@ def _answer(store: Store, work: Callable[..., Any], arguments: tuple[Any, ...]) 
         if shortage is None:
             traceback.print_exc()
         return False, shortage or RuntimeError(repr(error))
+
+
+# What is asked.
+
+
+def sql_answer(store: Store, text: str, seconds: float) -> dict[str, Any]:
+    """The first rows of a query, worked out in the process for SQL."""
+    from hybridlog.frames.lines import shown
+
+    with closing(store.sql_engine.connect(SQL_MEMORY, only_reads=True)) as connection:
+        answer = connection.query(text, timeout=seconds)
+        table, is_cut = answer.first(SQL_ROWS, _SQL_BYTES)
+        body = f"    print(store.sql({text!r}).to_pandas())\n"
+        found = shown(table, SQL_COLUMNS)
+        found["at"], found["recordings"] = _moments(
+            store, found.pop("times"), found["recordings"], answer.reading
+        )
+        return found | {
+            "more": is_cut,
+            "remarks": answer.sentences(),
+            "python": program(store, body),
+        }
+
+
+def _moments(
+    store: Store, times: Sequence[int | None], names: Sequence[str | None], read: Reading
+) -> tuple[list[str | None], list[str | None]]:
+    """The time since the start of its recording, ns, as text, and the recording of each row.
+
+    Without a column `recording`, the recording is known if a single one was read. A row that
+    lies in no recording has neither.
+    """
+    if not times:
+        return [], []
+    known = [entry.name for entry in read.recordings.values()]
+    named = names or [known[0] if len(known) == 1 else None] * len(times)
+    spans = {}
+    for name in {*named} - {None}:
+        with suppress(HybridlogError):  # there is no such recording, or it is damaged
+            spans[name] = store.entry(str(name)).span
+    found: list[str | None] = []
+    for time, name in zip(times, named, strict=True):
+        first, last = spans.get(name) or (0, -1)
+        is_inside = time is not None and first <= time < last + _MICROSECOND
+        found.append(str(min(time or 0, last) - first) if is_inside else None)
+    return found, [name if at else None for name, at in zip(named, found, strict=True)]
+
+
+def program(store: Store, body: str) -> str:
+    """A program that opens a store; `body` is indented."""
+    path = store.directory.place
+    return f"import hybridlog as hl\n\nwith hl.open({path!r}) as store:\n{body}"

@@ -1,4 +1,4 @@
-"""Questions over HTTP: predicates, SQL, completion, files."""
+"""Questions over HTTP: predicates, SQL, files."""
 
 from __future__ import annotations
 
@@ -18,8 +18,9 @@ import hybridlog as hl
 from hybridlog.cli.commands import fetch
 from hybridlog.drawing.tree import MAX_SHOWN
 from hybridlog.view.guard import Admission
-from hybridlog.view.routes import ask, export
+from hybridlog.view.routes import ask
 from hybridlog.view.server import make_app
+from hybridlog.view.sql_process import SQL_ROWS
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
@@ -81,7 +82,6 @@ REFUSED: list[tuple[str, dict[str, Any], str]] = [
     ("matches", {"begin": 9, "end": 9, "pixels": 10}, "greater"),
     ("match-list", {"at": 0, "count": 201}, "count"),
     ("match-list", {"at": 0, "direction": "up"}, "direction"),
-    ("complete", {"text": "x" * 10_001, "place": 1}, "too long"),
     ("sql", {"text": "select 1; drop table x"}, "Only queries"),
     ("sql", {"text": "selec 1"}, "LINE 1"),
     ("sql", {"text": "select * from read_text('/etc/passwd')"}, "files"),
@@ -136,22 +136,9 @@ def test_what_is_refused(
     assert problem in answer.json()["error"]
 
 
-def test_completion(client: TestClient) -> None:
-    def offered(text: str) -> list[str]:
-        asked = {**NEAR, "text": text, "place": len(text)}
-        answer = client.get("complete", params=asked).json()
-        return [text[: answer["begin"]] + one for one, _, _ in answer["candidates"]]
-
-    assert offered("ranges.mi") == ["ranges.min"]
-    assert offered("ranges.min < 1 and /od") == ["ranges.min < 1 and /odom: "]
-    assert offered("/odom: twist.twist.linear.x") == ["/odom: twist.twist.linear.x"]
-    assert offered("odom: twist.twist.linear.x") == ["odom: twist.twist.linear.x"]
-    assert offered("/nothing: x") == []
-
-
 def test_sql_is_bounded(client: TestClient, limit: Limit) -> None:
     answer = sql(client, "select range from range(100000)").json()
-    assert (len(answer["rows"]), answer["more"], answer["at"]) == (ask.SQL_ROWS, True, [])
+    assert (len(answer["rows"]), answer["more"], answer["at"]) == (SQL_ROWS, True, [])
     answer = sql(client, "select count(*) as n, min(topic) as first from topics").json()
     assert answer["columns"] == [["n", True], ["first", False]]
     assert answer["rows"][0][0] in printed_by(answer["python"])
@@ -278,7 +265,7 @@ def test_a_file_is_made_while_it_is_sent(
     limit(export_piece_bytes=1)
     made: list[int] = []
     ended: list[bool] = []
-    pieces_of = export.pieces_of
+    pieces_of = ask.pieces_of
 
     def counted(query: hl.Query) -> Iterator[bytes]:
         try:
@@ -288,7 +275,7 @@ def test_a_file_is_made_while_it_is_sent(
         finally:
             ended.append(True)
 
-    monkeypatch.setattr(export, "pieces_of", counted)
+    monkeypatch.setattr(ask, "pieces_of", counted)
     app = make_app(odd, Admission(token=TOKEN, port=PORT))
     asked = {"recording": "x [1]"}
     said = asked_for(app, "export", asked, leaves_after=9.0)
@@ -332,12 +319,7 @@ def test_a_question_is_asked_and_its_matches_become_a_file(
     page.goto(f"{demo_url}#recording=robot")
     page.get_by_label("Topic of the question").select_option("/base/scan")
     page.locator("body").press("/")
-    page.keyboard.type("ranges.m")
-    page.get_by_role("option", name="ranges.min").wait_for()
-    page.keyboard.type("i")
-    page.keyboard.press("Tab")  # before the candidates are there
-    page.locator("[role=option][aria-selected=true]").wait_for(state="attached")
-    page.keyboard.type(" <")
+    page.keyboard.type("ranges.min <")
     page.keyboard.press("Enter")
     assert (
         page.locator(".ask .body .problem").inner_text().endswith("ranges.min <\n              ^")

@@ -138,7 +138,6 @@ def test_nothing_leaves_the_store(
     assert told.error
     assert "root:" not in told.error
     assert str(demo_store.directory.path) not in told.error
-    assert ask("sql", query="select 1 as n").values["rows"] == [{"n": 1}]
 
 
 def test_settings_name_no_path(demo_store: hl.Store, ask: Ask) -> None:

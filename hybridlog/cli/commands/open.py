@@ -47,23 +47,25 @@ def open_command(given: _Given) -> None:
     import asyncio
 
     try:
-        from hybridlog.view.playback.server import PlaybackOptions, PlaybackServer
+        from hybridlog.view.playback.server import PlaybackServer
     except ImportError as error:
         raise MissingDependencyError(
             "open needs websockets: pip install 'hybridlog[foxglove]'"
         ) from error
     from hybridlog.view.playback.played import PlayedLog
 
-    options = PlaybackOptions(
-        port=_PORT if given.port is None else given.port,
-        speed=given.speed,
-        origins=given.origins,
-    )
     with given.opened() as store:
         query = given.query(store)
         log = PlayedLog(query)
         name = " ".join(["hybridlog", *given.choice.name])
-        server = PlaybackServer(log, name, options, output.note)
+        server = PlaybackServer(
+            log,
+            name,
+            output.note,
+            port=_PORT if given.port is None else given.port,
+            speed=given.speed,
+            origins=given.origins,
+        )
         output.remarks([*query.completeness(is_empty=False).sentences, *unplayed(query)])
         asyncio.run(_until_signal(server))
 

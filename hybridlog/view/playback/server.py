@@ -13,27 +13,26 @@ import json
 import secrets
 import struct
 import time
-from collections.abc import AsyncIterator, Callable, Collection, Iterable, Sequence
+from collections.abc import AsyncIterator, Callable, Collection, Sequence
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
 
 import msgspec
 import numpy as np
-from msgspec import Struct
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 
 from hybridlog.live.sources.foxglove.protocol import MESSAGE_DATA, SUBPROTOCOLS
 from hybridlog.view.guard import Admission, listen
-from hybridlog.view.playback.played import PlaybackClock, PlayedChannel
-from hybridlog_storage.errors import HybridlogError
+from hybridlog.view.playback.played import PlaybackClock
+from hybridlog_storage.errors import HybridlogError, UsageError
 
 if TYPE_CHECKING:
     from websockets.http11 import Request as HttpRequest
     from websockets.http11 import Response
     from websockets.typing import Subprotocol
 
-    from hybridlog.view.playback.played import Blocks, PlayedLog
+    from hybridlog.view.playback.played import Blocks, PlayedChannel, PlayedLog
     from hybridlog_storage.messages import Batch
 
 _WITH_PLAYBACK: Final = SUBPROTOCOLS[0]
@@ -62,10 +61,6 @@ _PLAY, _PAUSE = 0, 1
 PLAYING, PAUSED, ENDED = 0, 1, 3
 """States of a playback."""
 _ERROR = 2  # severity of a status
-
-
-class RequestError(Exception):
-    """A client violates the protocol; the message is for the client."""
 
 
 _Number = Annotated[int, msgspec.Meta(ge=0, lt=1 << 32)]
@@ -103,28 +98,9 @@ _Text = Subscribe | Unsubscribe
 Request = _Text | Control
 
 
-def server_info(name: str, session: str, begin: int, end: int) -> str:
-    """The first message to a client: the server, this run of it, first and last log time."""
-    return json.dumps(
-        {
-            "op": "serverInfo",
-            "name": name,
-            "capabilities": ["playbackControl", "time"],
-            "sessionId": session,
-            "dataStartTime": {"sec": begin // 10**9, "nsec": begin % 10**9},
-            "dataEndTime": {"sec": end // 10**9, "nsec": end % 10**9},
-        }
-    )
-
-
-def advertise(channels: Iterable[PlayedChannel]) -> str:
-    """The message that offers channels. Channels without a definition have an empty one."""
-    return json.dumps({"op": "advertise", "channels": [_described(each) for each in channels]})
-
-
 def _described(each: PlayedChannel) -> dict[str, Any]:
-    channel = each.channel
-    schema = None if channel.schema is None else channel.schema
+    """A channel as it is offered; one without a definition has an empty one."""
+    channel, schema = each.channel, each.channel.schema
     found = {"id": each.id, "topic": channel.topic, "encoding": channel.message_encoding}
     if schema is None or not schema.encoding:
         return {**found, "schemaName": schema.name if schema else "", "schema": ""}
@@ -140,71 +116,68 @@ def problem(text: str) -> str:
     return json.dumps({"op": "status", "level": _ERROR, "message": text})
 
 
-def message_data(subscription: int, log_time: int, payload: memoryview) -> bytes:
-    """A message of a subscription."""
-    return b"".join((_DATA.pack(MESSAGE_DATA, subscription, log_time), payload))
-
-
 def time_now(position: int) -> bytes:
     """The time of the playback."""
     return _TIME.pack(2, position)
 
 
-def playback_state(state: int, time: int, speed: float, *, did_seek: bool, request: bytes) -> bytes:
-    """A message with the state of the playback, for the request of an id, or none.
-
-    After a seek, what clients have shown no longer holds.
-    """
-    return _STATE.pack(_PLAYBACK_STATE, state, time, speed, did_seek, len(request)) + request
-
-
 def parse(message: str | bytes) -> Request:
-    """A message of a client; one that is malformed or unknown raises RequestError."""
+    """A message of a client; one that is malformed or unknown raises UsageError."""
     if isinstance(message, str):
         try:
             request: _Text = msgspec.json.decode(message, type=_Text)
-        except (msgspec.MsgspecError, RecursionError, UnicodeError) as problem:
-            raise RequestError(f"a message is no request to a playback: {problem}") from problem
+        except (msgspec.MsgspecError, RecursionError, UnicodeError) as wrong:
+            raise UsageError(f"a message is no request to a playback: {wrong}") from wrong
         return request
     try:
         kind, command, speed, seeks, position, length = _CONTROL.unpack_from(message)
-    except struct.error as problem:
-        raise RequestError("a message is no whole request to a playback") from problem
+    except struct.error as wrong:
+        raise UsageError("a message is no whole request to a playback") from wrong
     name = message[_CONTROL.size :]
     if kind != _PLAYBACK_CONTROL or command not in {_PLAY, _PAUSE} or len(name) != length:
-        raise RequestError("a message is no request to a playback, which takes no messages")
+        raise UsageError("a message is no request to a playback, which takes no messages")
     return Control(command == _PLAY, speed, position if seeks else None, name)
 
 
 # The server.
 
 
-class PlaybackOptions(Struct, frozen=True):
-    """Options of a playback.
+class PlaybackServer:
+    """Plays a log to Foxglove viewers.
 
-    Attributes:
+    Args:
+        log: What is played.
+        name: What viewers call it.
+        say: Takes lines for the user.
         port: TCP port on the loopback interface; 0 for a free one.
         speed: Seconds of log time a second at first.
         origins: Web origins that may connect, beside those of Foxglove and of this computer.
     """
 
-    port: int = 8765
-    speed: float = 1.0
-    origins: tuple[str, ...] = ()
-
-
-class PlaybackServer:
-    """Plays a log to Foxglove viewers, under a name; `say` takes lines for the user."""
-
     def __init__(
-        self, log: PlayedLog, name: str, options: PlaybackOptions, say: Callable[[str], None]
+        self,
+        log: PlayedLog,
+        name: str,
+        say: Callable[[str], None],
+        *,
+        port: int = 8765,
+        speed: float = 1.0,
+        origins: tuple[str, ...] = (),
     ) -> None:
-        self._log = log
-        self._options = options
-        self._say = say
-        self._rules = Admission(origins=options.origins)
-        session = secrets.token_hex(8)
-        self._about = server_info(name, session, log.begin, log.end)
+        self._log, self._say = log, say
+        self._port, self._speed = port, speed
+        self._rules = Admission(origins=origins)
+        begin, end = ({"sec": time // 10**9, "nsec": time % 10**9} for time in (log.begin, log.end))
+        self._about = json.dumps(
+            {
+                "op": "serverInfo",
+                "name": name,
+                "capabilities": ["playbackControl", "time"],
+                "sessionId": secrets.token_hex(8),
+                "dataStartTime": begin,
+                "dataEndTime": end,
+            }
+        )
         self._viewers = 0
         self._refused: set[str] = set()
 
@@ -213,7 +186,7 @@ class PlaybackServer:
         protocols: Sequence[Subprotocol] = SUBPROTOCOLS  # type: ignore[assignment]
         async with serve(
             self._serve,
-            sock=listen(self._options.port),
+            sock=listen(self._port),
             subprotocols=protocols,
             process_request=self._check,
             compression=None,
@@ -244,7 +217,7 @@ class PlaybackServer:
         self._viewers += 1
         try:
             await connection.send(self._about)
-            await _Playback(connection, self._log, self._options.speed, self._say).run()
+            await _Playback(connection, self._log, self._speed, self._say).run()
         except ConnectionClosed:
             pass  # it has gone without a farewell
         finally:
@@ -304,7 +277,8 @@ class _Playback:
 
     async def run(self) -> None:
         """Play until the viewer goes."""
-        await self._connection.send(advertise(self._log.channels))
+        offered = [*map(_described, self._log.channels)]
+        await self._connection.send(json.dumps({"op": "advertise", "channels": offered}))
         await self._send_state()
         playing = asyncio.create_task(self._play())
         try:
@@ -340,18 +314,15 @@ class _Playback:
         if self._has_ended:
             state = ENDED
         position = min(self._clock.position, self._log.end) if seek is None else seek
-        await self._connection.send(
-            playback_state(
-                state, position, self._clock.speed, did_seek=seek is not None, request=request
-            )
-        )
+        about = position, self._clock.speed, seek is not None, len(request)
+        await self._connection.send(_STATE.pack(_PLAYBACK_STATE, state, *about) + request)
 
     # Requests.
 
     async def _obey(self, message: str | bytes) -> None:
         try:
             request = parse(message)
-        except RequestError as error:
+        except UsageError as error:
             await self._connection.send(problem(str(error)))
             return
         if isinstance(request, Subscribe):
@@ -478,8 +449,8 @@ class _Playback:
         rows = zip(batch.channel.tolist(), batch.log_time.tolist(), strict=True)
         for row, (channel, log_time) in enumerate(rows):
             if channel in own:
-                message = message_data(own[channel], log_time, batch.payload(row))
-                await self._connection.send(message)
+                head = _DATA.pack(MESSAGE_DATA, own[channel], log_time)
+                await self._connection.send(head + batch.payload(row))
 
     def _read(self) -> None:
         """Read the subscribed topics, behind what is sent already."""

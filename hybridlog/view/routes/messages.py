@@ -150,7 +150,6 @@ def message(context: Context, params: RequestParams) -> dict[str, Any]:
     if shown is None:
         return answer
     answer |= {
-        "tag": found.tag,
         "type": shown.type,
         "log_time": format_time(shown.log_time_ns),
         "publish_time": _time(shown.publish_time_ns),

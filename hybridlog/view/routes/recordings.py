@@ -7,9 +7,6 @@ from collections.abc import Callable, Mapping, Sequence
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
-
-from hybridlog.query.answers.lost import lost_parts
 from hybridlog.query.answers.marks import marks_in
 from hybridlog.query.choice import Choice
 from hybridlog.record.losses import losses_of
@@ -25,8 +22,6 @@ if TYPE_CHECKING:
 
 _MAX_ROWS: Final = 200
 _MAX_CONDITIONS: Final = 16
-_MAX_PARTS: Final = 64
-"""Parts of a coverage bar that are told apart."""
 
 
 _KEYS: Final[Mapping[str, Callable[[RecordingSummary], Any]]] = {
@@ -42,7 +37,6 @@ _KEYS: Final[Mapping[str, Callable[[RecordingSummary], Any]]] = {
 
 def recordings(context: Context, params: RequestParams) -> dict[str, Any]:
     """A part of the recordings that satisfy some conditions, in some order."""
-    context.refresh()
     first = params.integer("first", 0, 1 << 31, 0)
     count = params.integer("count", 1, _MAX_ROWS, _MAX_ROWS)
     key = _KEYS[params.word("order", _KEYS, "start")]
@@ -58,7 +52,7 @@ def recordings(context: Context, params: RequestParams) -> dict[str, Any]:
         "messages": sum(one.messages for one in ordered),
         "bytes": sum(one.stored_bytes for one in ordered),
         "first": first,
-        "rows": [_row(context, one) for one in shown],
+        "rows": [*map(_row, shown)],
     }
 
 
@@ -106,9 +100,8 @@ def _globs(text: str) -> Sequence[str]:
     return [word if set(word) & set("*?") else f"*{word.replace('[', '[[]')}*" for word in words]
 
 
-def _row(context: Context, summary: RecordingSummary) -> dict[str, Any]:
+def _row(summary: RecordingSummary) -> dict[str, Any]:
     begin, end = summary.extent
-    losses = context.store.entry(summary.id) if summary.has_losses else None
     return {
         "id": summary.id,
         "name": summary.name,
@@ -119,16 +112,8 @@ def _row(context: Context, summary: RecordingSummary) -> dict[str, Any]:
         "topics": summary.topic_count,
         "messages": summary.messages,
         "bytes": summary.stored_bytes,
-        "lost": [] if losses is None else _lost_parts(losses, begin, end),
         "incomplete": summary.has_losses or summary.has_lost_segments,
     }
-
-
-def _lost_parts(entry: RecordingEntry, begin: int, end: int) -> list[tuple[float, float]]:
-    """Parts of a recording in which messages were lost, as fractions of its time."""
-    is_lost = lost_parts(entry, (begin, end), _MAX_PARTS)
-    edges = np.flatnonzero(np.diff(is_lost, prepend=False, append=False)) / _MAX_PARTS
-    return [(low, high) for low, high in edges.reshape(-1, 2).tolist()]
 
 
 def _loss(loss: Mapping[str, Any], start: int) -> dict[str, Any]:

@@ -1,9 +1,9 @@
 /** The bar that takes questions, and below it their answers. */
 
 import { ApiError, Question, isAborted } from "./api.js";
-import { completed, questionHistory } from "./completion.js";
 import { element, fill, notice } from "./dom.js";
 import { exportForm } from "./export.js";
+import { questionHistory } from "./history.js";
 import { matchList } from "./match_list.js";
 import { drawMatches, predicate } from "./matches.js";
 import { sqlTable } from "./sql_table.js";
@@ -22,9 +22,7 @@ export function mountAsk(main, recording) {
   const text = element("input", {
     class: "question",
     type: "text",
-    role: "combobox",
     "aria-label": "Question",
-    "aria-autocomplete": "list",
     autocomplete: "off",
     autocapitalize: "off",
     spellcheck: "false",
@@ -39,9 +37,6 @@ export function mountAsk(main, recording) {
     size: 10,
     maxlength: 64,
   });
-  const candidates = completed(text, () =>
-    kind.value === "sql" ? null : { recording: recording.info.id, topic: topic.value },
-  );
   const history = questionHistory();
   const list = matchList(recording);
   const files = exportForm(recording);
@@ -60,7 +55,7 @@ export function mountAsk(main, recording) {
     { class: "bar", role: "search", "aria-label": "Ask", onsubmit: submit },
     kind,
     topic,
-    element("div", { class: "input" }, text, candidates.list),
+    text,
     within,
     element("button", {}, "Ask"),
     button("Export", "Export this range or the matches", files.toggle),
@@ -114,7 +109,6 @@ export function mountAsk(main, recording) {
 
   function submit(event) {
     event.preventDefault();
-    candidates.close();
     const question = written();
     if (!question.text) {
       state.set({ ask: null }, { isStep: true });
@@ -213,10 +207,9 @@ export function mountAsk(main, recording) {
   function pressed(event) {
     if (event.key === "Escape") {
       event.stopPropagation();
-      if (!candidates.close()) text.blur();
+      text.blur();
     } else if (event.key === "ArrowUp" || event.key === "ArrowDown") {
       event.preventDefault();
-      candidates.close();
       const found = history.step(event.key === "ArrowUp" ? -1 : 1, written());
       if (found) write(found);
     }

@@ -14,7 +14,6 @@ const COLUMNS = [
   { key: "name", title: "Recording" },
   { key: "start", title: "Start (UTC)" },
   { key: "duration", title: "Duration", isNumber: true },
-  { key: null, title: "Coverage" },
   { key: "topics", title: "Topics", isNumber: true },
   { key: "messages", title: "Messages", isNumber: true },
   { key: "size", title: "Stored", isNumber: true },
@@ -173,17 +172,17 @@ function row(one) {
   };
   const link = element("a", { href: state.link({ recording: one.name }), onclick: open }, one.name);
   const status = STATUS[one.status];
-  const badge = status ? element("span", { class: "badge" }, status) : null;
+  const lost = one.incomplete && "messages lost";
+  const badges = [status, lost].filter(Boolean).map((text) => element("span", { class: "badge" }, text));
   const tags = Object.entries(one.tags).map(([key, value]) =>
     element("span", { class: "tag" }, value ? `${key}=${value}` : key),
   );
   return element(
     "tr",
     {},
-    element("th", { scope: "row" }, link, name, badge),
+    element("th", { scope: "row" }, link, ...badges),
     element("td", { class: "time" }, moment(BigInt(one.start), 0)),
     element("td", { class: "number" }, duration(one.duration)),
-    element("td", {}, coverage(one)),
     element("td", { class: "number" }, count(one.topics)),
     element("td", { class: "number" }, count(one.messages)),
     element("td", { class: "number" }, size(one.bytes)),
@@ -199,23 +198,3 @@ const STATUS = {
   unproven: "manifest lost",
 };
 
-/** A bar over the time of a recording; parts with losses are striped. */
-function coverage(one) {
-  const said = one.incomplete ? "Messages are lost in the striped parts." : "Complete.";
-  const bar = element("meter", { class: "sr-only", min: 0, max: 1, value: 1 }, said);
-  const picture = document.createElementNS("http://www.w3.org/2000/svg", "svg");
-  picture.setAttribute("class", one.incomplete && !one.lost.length ? "coverage unknown" : "coverage");
-  picture.setAttribute("viewBox", "0 0 64 8");
-  picture.setAttribute("preserveAspectRatio", "none");
-  picture.setAttribute("aria-hidden", "true");
-  picture.append(part("whole", 0, 64), ...one.lost.map(([a, b]) => part("lost", a * 64, (b - a) * 64)));
-  return element("span", { title: said }, bar, picture);
-}
-
-function part(kind, x, width) {
-  const made = document.createElementNS("http://www.w3.org/2000/svg", "rect");
-  for (const [name, value] of Object.entries({ class: kind, x, y: 0, width, height: 8 })) {
-    made.setAttribute(name, value);
-  }
-  return made;
-}

@@ -17,7 +17,7 @@ const HELP = [
   ["Home, End", "first and last message; a running recording is followed from its end"],
   ["< >", "play slower, faster"],
   ["Drag", "move the visible range; with Shift, zoom to the part that is dragged over"],
-  ["/", "ask; Enter asks, Tab completes, ↑ ↓ give earlier questions, Esc leaves"],
+  ["/", "ask; Enter asks, ↑ ↓ give earlier questions, Esc leaves"],
   ["n p", "next, previous match"],
   ["?", "this list"],
 ];

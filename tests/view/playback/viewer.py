@@ -15,7 +15,7 @@ from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin, Subprotocol
 
 from hybridlog.view.playback.played import PlayedLog
-from hybridlog.view.playback.server import PlaybackOptions, PlaybackServer
+from hybridlog.view.playback.server import PlaybackServer
 
 SDK = "foxglove.sdk.v1"
 WEBSOCKET = "foxglove.websocket.v1"
@@ -174,8 +174,8 @@ class Viewer:
 @contextmanager
 def served(log: PlayedLog, said: list[str] | None = None, **options: Any) -> Iterator[str]:
     """The address of a server in a thread of its own."""
-    with_defaults = PlaybackOptions(**{"port": 0, "speed": 100.0, **options})
-    server = PlaybackServer(log, "test", with_defaults, (said if said is not None else []).append)
+    say = (said if said is not None else []).append
+    server = PlaybackServer(log, "test", say, **{"port": 0, "speed": 100.0, **options})
     ports: list[int] = []
     ready = threading.Event()
     stopping: list[tuple[asyncio.AbstractEventLoop, asyncio.Event]] = []

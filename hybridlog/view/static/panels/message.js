@@ -68,7 +68,7 @@ function mount(body, panel) {
         begin,
         count: number,
       });
-      return of === answer && found.tag === of.tag ? found.tree : null;
+      return of === answer && found.seq === of.seq ? found.tree : null;
     },
     isOpen(names) {
       const isUsual = names.length < OPEN_LEVELS;
