@@ -39,7 +39,7 @@ ALLOWED = {
     "click": ("hybridlog.cli",),
     "duckdb": ("hybridlog.sql.source",),
     "google": ("hybridlog.schema.protobuf_codec",),
-    "isal": ("hybridlog.drawing.pixels", "hybridlog_storage.checksum"),
+    "isal": ("hybridlog.drawing.images", "hybridlog_storage.checksum"),
     "lz4": ("hybridlog.formats.rosbag1.reader", "hybridlog_storage.segments.compression"),
     "matplotlib": ("hybridlog.drawing.figure",),
     "mcap": ("hybridlog.formats", "hybridlog_storage.mcap", "hybridlog_storage.segments"),

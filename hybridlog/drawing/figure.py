@@ -29,10 +29,7 @@ if TYPE_CHECKING:
 
 
 DPI: Final = 100
-MAX_MARKED_POINTS: Final = 100
-"""Messages of a line that are marked, each of them."""
 _UNITS = ((300, 1, "seconds"), (3 * 3600, 60, "minutes"), (3 * 86_400, 3600, "hours"))
-_EXACT_COLOURS = 10  # of matplotlib's own
 
 
 @contextmanager
@@ -79,16 +76,14 @@ def draw(axes: Axes, found: Sequence[Line]) -> None:
     length = max(ends, default=0) / 1e9
     step, unit = next(((s, u) for most, s, u in _UNITS if length <= most), (86_400, "days"))
     names = _names(found)
-    colours = _colours(len(found))
     drawn = []
-    for line, colour in zip(found, colours, strict=True):
+    for number, line in enumerate(found):
         times, values = line.series.polyline()
         at = (times - line.start) / (1e9 * step)
-        (curve,) = axes.plot(at, drawable(values), color=colour, linewidth=1.2)
-        shown = line.series
-        is_marked = shown.alone() if len(shown.times) > MAX_MARKED_POINTS else slice(None)
-        marks = (shown.times[is_marked] - line.start) / (1e9 * step)
-        axes.plot(marks, drawable(shown.least[is_marked]), ".", color=colour, markersize=4)
+        (curve,) = axes.plot(at, drawable(values), color=f"C{number}", linewidth=1.2)
+        shown, alone = line.series, line.series.alone()
+        marks = (shown.times[alone] - line.start) / (1e9 * step)
+        axes.plot(marks, drawable(shown.least[alone]), ".", color=f"C{number}", markersize=4)
         drawn.append(curve)
     recordings = {(line.recording, line.start) for line in found}
     since = "the beginning of each recording"
@@ -131,14 +126,6 @@ def _names(found: Sequence[Line]) -> list[str]:
         )
         for line in found
     ]
-
-
-def _colours(count: int) -> list[object]:
-    from matplotlib import colormaps
-
-    if count <= _EXACT_COLOURS:
-        return [f"C{number}" for number in range(count)]
-    return [*colormaps["turbo"](np.linspace(0.05, 0.95, count))]
 
 
 def _label(text: Text, words: str) -> None:

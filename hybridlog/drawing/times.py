@@ -65,13 +65,6 @@ class Lane(Struct, frozen=True, eq=False):
         return found
 
 
-def evenly(span: tuple[int, int], pixels: int) -> NDArray[np.int64]:
-    """Edges of parts of a span, ns; the lengths of parts differ by one nanosecond at most."""
-    whole, rest = divmod(span[1] - span[0], pixels)
-    numbers = np.arange(pixels + 1, dtype=np.int64)
-    return np.int64(span[0]) + numbers * whole + numbers * rest // pixels
-
-
 def aligned(span: tuple[int, int], pixels: int) -> NDArray[np.int64]:
     """Edges of bins of a power of two of nanoseconds from the epoch: a moved picture has the same.
 

@@ -72,35 +72,19 @@ Track: TypeAlias = "dict[str, Any]"
 """
 
 
-class Position(Struct, frozen=True):
-    """Place of the position in the messages of a topic.
+def position_of(known: Mapping[str, str] | None) -> tuple[tuple[str, str], bool] | None:
+    """Paths of both values, and whether they are latitude and longitude; None without any.
 
-    Attributes:
-        prefix: Path in front of both values: `""`, `pose.pose.position.`.
-        is_geographic: True for `latitude` and `longitude`, False for `x` and `y`.
+    The types of the fields are known, or no definition fixes them.
     """
-
-    prefix: str
-    is_geographic: bool
-
-    @property
-    def paths(self) -> tuple[str, str]:
-        """Paths of both values."""
-        names = ("latitude", "longitude") if self.is_geographic else ("x", "y")
-        return f"{self.prefix}{names[0]}", f"{self.prefix}{names[1]}"
-
-
-def position_of(known: Mapping[str, str] | None) -> Position | None:
-    """The place of the position in messages with these types of fields; None if they have none."""
     if known is None:
-        return Position("", is_geographic=True)
-    for end, is_geographic in (("latitude", True), ("position.x", False)):
+        return ("latitude", "longitude"), True
+    for first, second in (("latitude", "longitude"), ("position.x", "position.y")):
         for path in known:
-            if path != end and not path.endswith(f".{end}"):
-                continue
-            found = Position(path[: len(path) - (8 if is_geographic else 1)], is_geographic)
-            if "[]" not in path and found.paths[1] in known:
-                return found
+            other = path.removesuffix(first) + second
+            is_it = path == first or path.endswith(f".{first}")
+            if is_it and "[]" not in path and other in known:
+                return (path, other), first == "latitude"
     return None
 
 
@@ -115,11 +99,11 @@ def track(query: Query, *, pixels: int, span: Span | None = None) -> Track:
     if pixels < 1:
         raise UsageError("A track has at least one pixel.")
     known = field_types(query)
-    position = position_of(known)
-    if position is None:
+    found = position_of(known)
+    if found is None:
         raise UsageError("These messages have no latitude and longitude, and no pose.")
-    paths = list(position.paths)
-    if position.is_geographic and (known is None or _STATUS in known):
+    paths, is_geographic = [*found[0]], found[1]
+    if is_geographic and (known is None or _STATUS in known):
         paths.append(_STATUS)
     narrowed, (begin, end) = over_time(query, paths, span)
     rows = ShownRows((begin, end), pixels, most=_POSITIONS_PER_PIXEL * pixels)
@@ -128,7 +112,7 @@ def track(query: Query, *, pixels: int, span: Span | None = None) -> Track:
     with query.counters.timed():
         for table in tables_of(narrowed) if begin < end else ():
             first, second, *status = (_numbers(table, path) for path in paths)
-            if position.is_geographic:
+            if is_geographic:
                 has_fix = _is_position(first, second)
             else:
                 has_fix = np.isfinite(first) & np.isfinite(second)
@@ -137,7 +121,7 @@ def track(query: Query, *, pixels: int, span: Span | None = None) -> Track:
             messages += len(has_fix)
             fixes += int(np.count_nonzero(has_fix))
             xy = np.where(has_fix, (first, second), np.nan)
-            if position.is_geographic and fixes:
+            if is_geographic and fixes:
                 at = int(np.argmax(has_fix))
                 grid = grid or Grid.at(float(first[at]), float(second[at]))
                 xy = grid.metres(*xy).T
@@ -151,7 +135,7 @@ def track(query: Query, *, pixels: int, span: Span | None = None) -> Track:
         "times": np.insert(rows.times, gaps, middles),
         "xy": np.insert(places, gaps, np.nan, axis=0),
         "grid": grid,
-        "is_geographic": position.is_geographic,
+        "is_geographic": is_geographic,
         "messages": messages,
         "fixes": fixes,
         "exact": rows.exact,

@@ -27,7 +27,6 @@ MAX_TEXT: Final = 1000
 
 _SHOWN: Final = {True: 64, False: 16}
 """Elements that are shown unasked, of an array of plain values and of any other."""
-_MAX_CHARACTERS: Final = 1 << 18
 _LONGEST_INTEGER: Final = 1 << 256
 
 Node: TypeAlias = "dict[str, Any]"
@@ -61,11 +60,10 @@ def tree(
 
 
 class _Walk:
-    """Makes the nodes of one answer; `nodes` and `characters` say how many may still be made."""
+    """Makes the nodes of one answer; `nodes` says how many may still be made."""
 
     def __init__(self) -> None:
         self.nodes = MAX_NODES
-        self.characters = _MAX_CHARACTERS
 
     def node(self, value: Any, depth: int, begin: int = 0, count: int | None = None) -> Node:
         """The node of a value."""
@@ -79,7 +77,7 @@ class _Walk:
             count = MAX_SHOWN if is_object else _SHOWN[part.is_plain]
         places = range(begin, min(begin + count, size))
         if part.is_plain:
-            found["texts"] = [self._cut(_plain(part.items[place]).text) for place in places]
+            found["texts"] = [_cut(_plain(part.items[place]).text) for place in places]
             return found
         if depth <= 0 or self.nodes < min(count, size):
             return found
@@ -88,22 +86,21 @@ class _Walk:
         for place in places:
             self.nodes += 1  # it was set aside, so that no level below can take it
             node = self.node(part.items[place], depth - 1)
-            named = {} if part.names is None else {"name": self._cut(part.names[place])}
+            named = {} if part.names is None else {"name": _cut(part.names[place])}
             found["items"].append({**named, **node})
         return found
 
     def _plain(self, part: _Plain, begin: int) -> Node:
-        shown = self._cut(part.text[begin : begin + MAX_TEXT])
+        shown = _cut(part.text[begin : begin + MAX_TEXT])
         found: Node = {"type": part.type, "text": shown}
         if len(shown) < len(part.text):
             found |= {"n": len(part.text), "begin": min(begin, len(part.text))}
         return found
 
-    def _cut(self, text: str) -> str:
-        cut = text[: min(MAX_TEXT, max(self.characters, 1))]
-        self.characters -= len(cut)
-        # A lone surrogate, which JSON may have, is no text of a web page.
-        return cut.encode("utf-8", "replace").decode()
+
+def _cut(text: str) -> str:
+    # A lone surrogate, which JSON may have, is no text of a web page.
+    return text[:MAX_TEXT].encode("utf-8", "replace").decode()
 
 
 class _Plain(NamedTuple):

@@ -11,7 +11,7 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.cli.signals import Stopped
-from hybridlog.drawing.times import evenly, lane_of
+from hybridlog.drawing.times import aligned, lane_of
 from hybridlog.schema.states import CAUSES, State, without_payload
 from hybridlog_storage import stopping
 from hybridlog_storage.errors import PayloadError
@@ -125,7 +125,7 @@ def _told(path: Path) -> Counter[State]:
         assert one.span is not None
         span = one.span[0], one.span[1] + 1
         lane = lane_of(store.session, store.entry(one.id), "/cloud")
-        assert lane.counts(evenly(span, 8)).sum() == found.total()
+        assert lane.counts(aligned(span, 8)).sum() == found.total()
         (listed,) = answer("ls", "--json", store=path).json
         assert (listed["expired"], listed["not_copied"]) == (one.expired, one.not_copied)
     raw = answer("fetch", "cloud", "-o", path.with_suffix(".mcap"), "--force", store=path).err

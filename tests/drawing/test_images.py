@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image as Pillow
 
 from hybridlog.arrays.message_arrays import IMAGES, VIDEOS, to_numpy
-from hybridlog.drawing.images import Picture, picture
-from hybridlog.drawing.pixels import pixels
+from hybridlog.drawing.images import Picture, picture, pixels
 from hybridlog_storage.errors import MissingDependencyError, PayloadError, UsageError
 from tests.calls import Calls
 from tests.cli.within import Answer, answer

@@ -1,4 +1,4 @@
-"""`hybridlog plot`, and small bars of text."""
+"""`hybridlog plot`."""
 
 from __future__ import annotations
 
@@ -6,13 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from msgspec.structs import replace
 from PIL import Image
 
 from hybridlog.drawing.figure import MAX_LINES, Line, figure, lines
 from hybridlog.drawing.series import Series
-from hybridlog.query.answers.lost import lost_parts
-from hybridlog.record.losses import Cause
 from hybridlog_storage.errors import MissingDependencyError, TopicError, UsageError
 from tests.calls import Calls
 from tests.cli.within import Answer, answer
@@ -122,24 +119,3 @@ def test_without_matplotlib(drive: Drive, tmp_path: Path, calls: Calls) -> None:
         figure([], size=(500, 300), form="png")
     plot(drive, *ask, "-o", tmp_path / "y.png", code=MissingDependencyError.exit_code)
     assert [*tmp_path.iterdir()] == []
-
-
-def test_parts_with_losses(drive: Drive) -> None:
-    (summary,) = (one for one in drive.store.session.look().summaries if one.name == "drive")
-    entry = drive.store.entry(summary.id)
-
-    def lost(*rows: tuple[int | None, int | None, int | None, Cause]) -> list[int]:
-        losses = [
-            {"from": first, "to": last, "count": count, "cause": cause}
-            for first, last, count, cause in rows
-        ]
-        other = replace(entry, losses=losses)
-        return np.flatnonzero(lost_parts(other, (BASE, BASE + 1000), 10)).tolist()
-
-    cause = Cause.TRANSPORT
-    assert lost((BASE + 100, BASE + 299, 5, cause)) == [1, 2]
-    assert lost((BASE + 100, BASE + 300, None, cause)) == [1, 2, 3]
-    assert lost((BASE - 50, BASE, 1, cause), (BASE + 999, BASE + 5000, 1, cause)) == [0, 9]
-    assert lost((BASE - 50, BASE - 1, 1, cause), (BASE + 1000, BASE + 5000, 1, cause)) == []
-    assert lost((None, None, 5, cause), (BASE, BASE, 0, cause)) == []
-    assert lost((BASE, BASE, 5, Cause.THROTTLE)) == []

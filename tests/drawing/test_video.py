@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import json
 import random
-import re
 import struct
 import sys
 from collections.abc import Callable, Iterable, Iterator
@@ -230,7 +229,7 @@ def test_a_recorded_slice_begins_with_the_key_frame(form: str, tmp_path: Path) -
         "record", tmp_path / "log.mcap", "--between", begin, BASE + 9 * STEP, "--mongo", "none",
         store=tmp_path / "other",
     )  # fmt: skip
-    assert re.search(r"(?m)^from before +8$", answered.out)
+    assert ", 8 from before, " in answered.out
 
 
 def refusal(store: hl.Store, topic: str, n: int) -> str:
