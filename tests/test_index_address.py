@@ -11,7 +11,6 @@ import pytest
 from pymongo import MongoClient
 
 import hybridlog as hl
-from hybridlog.index.of_store import contents
 from tests import logs
 from tests.cli.running import run
 from tests.limits import Limit
@@ -36,7 +35,6 @@ def test_a_server_stays_while_a_client_is_connected(path: Path, limit: Limit) ->
     limit(clients_wait_s=5.0)
     with hl.open(path) as store:
         address = store.index.address()
-        assert contents(store.shared) == [(f"/{n}", n, 20) for n in ("number", "stamped", "text")]
     server = mongod(path)
     with MongoClient[dict[str, object]](address.uri) as client:
         time.sleep(7)
@@ -49,16 +47,9 @@ def test_a_server_stays_while_a_client_is_connected(path: Path, limit: Limit) ->
 
 def test_as_a_command(path: Path) -> None:
     told = run("index", "address", "--json", store=path).json
-    assert told["recordings"] == 1
-    assert [(one["topic"], one["documents"]) for one in told["topics"]] == [
-        ("/number", 20),
-        ("/stamped", 20),
-        ("/text", 20),
-    ]
     assert run("index", "address", "-q", store=path).lines == [told["uri"]]
     out = run("index", "address", store=path).out
-    assert out.startswith(told["uri"] + "\n")
-    assert out.endswith("database hybridlog, 1 recording\n")
+    assert out == f"{told['uri']}\ndatabase hybridlog\n"
     mongod(path).terminate()
 
 

@@ -18,8 +18,7 @@ import click
 from hybridlog.cli import output
 from hybridlog.cli.binder import PATH, option
 from hybridlog.cli.options import AsJson, Forced, Topics
-from hybridlog.cli.output import Bar
-from hybridlog.cli.render import ROWS_AT_ONCE, Column, print_table
+from hybridlog.cli.output import ROWS_AT_ONCE, Bar, Column, print_table
 from hybridlog.formats import OUTPUTS, formats_of, is_directory, suffixes_of
 from hybridlog_storage.errors import PayloadError, UsageError
 from hybridlog_storage.stopping import anywhere
@@ -214,16 +213,9 @@ def write_answer(
     size = payload_bytes(query) if isinstance(target, Path) and output.has_bars() else 0
     about: Any = {"settings": settings, "counters": counters, "size": size}
     written = _write(answer, form, target, completeness, **about)
-    notes = []
     if left_out := len(answer.unreadable):
         many = output.counted(left_out, "message")
-        notes.append(f"{many} left out; the first: {answer.unreadable[0]}.")
-    if answer.schema is not None:
-        from hybridlog.frames.answer import json_columns
-
-        text = "has values of several types: it is written as JSON text."
-        notes += [f"{name} {text}" for name in json_columns(answer.schema)]
-    output.notes(notes)
+        output.note(f"{many} left out; the first: {answer.unreadable[0]}.")
     if OUTPUTS[form].content in {"lines", "table"} and not in_frame:
         counters.messages = written + counters.reduced
 

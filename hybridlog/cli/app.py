@@ -13,7 +13,6 @@ import click
 
 from hybridlog import __version__
 from hybridlog.cli.output import Bar, counted, notes
-from hybridlog.wording import listed
 from hybridlog_storage.errors import (
     NO_SPACE,
     DiskFullError,
@@ -113,9 +112,6 @@ def app() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
-_MAX_LISTED = 3  # names of recordings
-
-
 @contextmanager
 def opened_store(
     path: Path | None,
@@ -170,15 +166,9 @@ def _repairs(store: Store, doing: str, *, verifies: bool) -> list[str]:
         found.append(f"The store {store.directory.path} is read-only; its segments answer.")
     if repairs.damage:
         found.append("The data files of the embedded MongoDB were damaged, and were replaced.")
-    if indexed := {r: n for r, n in repairs.indexed.items() if n and r not in repairs.recovered}:
-        added = counted(sum(indexed.values()), "chunk")
-        found.append(f"{listed(indexed, _MAX_LISTED)}: {added} added to the index.")
-    if repairs.removed:
-        found.append(f"{listed(repairs.removed)}: no files any more, so out of the index.")
     reason = store.shared.index.unavailable
     is_wanted = reason is not None and not isinstance(reason, WithoutMongoError)
     if doing and is_wanted and store.directory.is_writable:
         found.append(f"MongoDB is unavailable, {doing}: {reason}")
-    for done in (repairs.damage, repairs.indexed, repairs.removed):
-        done.clear()
+    repairs.damage.clear()
     return found

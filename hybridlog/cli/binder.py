@@ -71,9 +71,7 @@ SOME_SECONDS: Final = Amount(parse_seconds, "1ns")
 _FIRST: Final = ("topic", "between", "where", "fields", "output", "form")
 _SECTIONS: Final[dict[str, tuple[str, ...]]] = {
     "Live recording": (),
-    "With lerobot": (
-        "features", "propose_map", "fps", "episodes_by", "task", "task_topic", "vcodec", "on_gap",
-    ),
+    "With lerobot": (),
     "Choosing recordings": (
         "recording", "tag", "has", "types", "during", "last", "older_than", "conditions",
     ),

@@ -83,9 +83,9 @@ def _run() -> int:
 
 def _complain(text: str, code: int = HybridlogError.exit_code) -> int:
     """Print an error; gives the exit code."""
-    from hybridlog.cli.output import folded
+    from hybridlog.cli.output import printable
 
-    lines = "\n".join(map(folded, f"hybridlog: {text}".split("\n")))
+    lines = "\n".join(map(printable, f"hybridlog: {text}".split("\n")))
     try:
         print(lines, file=sys.stderr, flush=True)  # noqa: T201
     except OSError:

@@ -13,7 +13,7 @@ import click
 
 from hybridlog.cli import output
 from hybridlog.cli.binder import argument, option
-from hybridlog.cli.render import Column, print_table
+from hybridlog.cli.output import Column, print_table
 from hybridlog.query.choice import Choice
 from hybridlog_storage.errors import UsageError
 

@@ -1,4 +1,4 @@
-"""Prints JSON, notes and progress; writes sizes and times for people."""
+"""Prints rows, JSON, notes and progress; writes sizes and times for people."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ import sys
 import textwrap
 import threading
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from typing import Final, Self, TextIO
+from dataclasses import dataclass
+from itertools import chain, islice, zip_longest
+from typing import Any, Final, Literal, Self
 
 from msgspec import Struct
 from msgspec.structs import asdict
@@ -48,22 +50,11 @@ def screen_width() -> int:
     return shutil.get_terminal_size().columns
 
 
-def wrapped(text: str, width: int) -> list[str]:
-    """Lines of at most so many characters, without broken words."""
-    return textwrap.wrap(text, width, break_long_words=False, break_on_hyphens=False)
-
-
 def printable(text: str) -> str:
     """Text without control characters: names in logs are untrusted."""
     if text.isprintable():
         return text
-    return "".join(c if c.isprintable() else _escaped(ord(c)) for c in text)
-
-
-def _escaped(code: int) -> str:
-    if code < 0x100:
-        return f"\\x{code:02x}"
-    return f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def cut(line: str, most: int = _MAX_LINE) -> str:
@@ -75,12 +66,6 @@ def quoted(text: str) -> str:
     """Typed text in quotes; bytes that are not UTF-8 are shown as escapes."""
     raw = text.encode("utf-8", "surrogateescape")
     return f"'{printable(raw.decode('utf-8', 'backslashreplace'))}'"
-
-
-def folded(text: str, stream: TextIO | None = None) -> str:
-    """A line for standard error or another stream: a terminal shows it without broken words."""
-    text = printable(text)
-    return "\n".join(wrapped(text, screen_width())) if (stream or sys.stderr).isatty() else text
 
 
 def say(text: str = "") -> None:
@@ -95,7 +80,7 @@ def tell(value: object, lines: Iterable[str], *, at_once: bool = False) -> None:
     elif not is_quiet():
         for line in lines:
             clear()
-            print(folded(line, sys.stdout))  # noqa: T201
+            print(printable(line))  # noqa: T201
 
 
 def print_json(value: object, *, at_once: bool = False) -> None:
@@ -114,7 +99,7 @@ def note(text: str) -> None:
     """A line for the person, on standard error; who reads it may go, and the work goes on."""
     with suppress(BrokenPipeError), _drawing:
         clear()
-        print(folded(text), file=sys.stderr)  # noqa: T201
+        print(printable(text), file=sys.stderr)  # noqa: T201
 
 
 def clear() -> None:
@@ -148,14 +133,10 @@ def short_time(ns: int | None) -> str:
 
 
 def short_duration(ns: int) -> str:
-    """A length of time to four digits; from a second on to the ms, from a day on to the hour."""
+    """A length of time, to the ms from a second on, else to the µs."""
     from hybridlog.query.times import format_duration
 
-    step = 10**6
-    if abs(ns) < 10**9:
-        step = 10 ** max(0, len(str(abs(ns))) - 4)
-    elif abs(ns) >= 86_400 * 10**9:
-        step = 3_600 * 10**9
+    step = 10**6 if abs(ns) >= 10**9 else 1000
     return format_duration(round(ns / step) * step)
 
 
@@ -204,7 +185,7 @@ _shown: list[Drawn] = []
 
 
 class Bar:
-    """A line with bar, rate and remaining time; a context manager that removes it.
+    """A line with share and rate; a context manager that removes it.
 
     It appears at the first progress, on a terminal. Elsewhere there is nothing. The total is in
     bytes, about; None if it is unknown, or each part tells its own.
@@ -231,16 +212,9 @@ class Bar:
         if self._line is None or now < self._next:
             return
         self._begin, self._next = self._begin or now, now + _REDRAW_S
-        rate = done / (now - self._begin or 1)
-        texts = [_short(self._label), f"{size(rate)}/s", _short(note)]
-        if total:
-            share = min(done / total, 1)
-            minutes, seconds = divmod(int((total - done) / rate) if 0 < done < total else 0, 60)
-            texts[1:1] = ["", f"{share:.0%}"]
-            texts.insert(-1, f"ETA {minutes:02}:{seconds:02}")
-            room = max(screen_width() - len(" ".join(texts)) - 1, 0)
-            texts[1] = f"{'━' * int(share * room):<{room}}"
-        self._line.draw([" ".join(texts)])
+        share = f" {min(done / total, 1):.0%}" if total else ""
+        rate = size(done / (now - self._begin or 1))
+        self._line.draw([printable(f"{self._label}{share}  {rate}/s  {note}")])
 
     def part(self, recording: str, done: int, total: int) -> None:
         """Report `done` of `total` bytes of a recording, until it is complete; a safe point."""
@@ -250,5 +224,174 @@ class Bar:
             self.__exit__()
 
 
-def _short(text: str) -> str:
-    return cut(printable(text), 22)
+# Rows for people: a table that fits the terminal, else a block for each row.
+
+ROWS_AT_ONCE = 10_000
+"""Rows of a table that are laid out together."""
+_MIN_ROOM = 20  # characters of a folded value
+
+Get = str | int | Callable[[Any], object]
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """A column of a table.
+
+    Attributes:
+        get: Key or function that gives the value of a row; empty for the name as the key.
+        side: Numbers stand on the right.
+        shown: Writes a value; None is not written.
+        cut: Cells may be cut off to so many characters; 0 for no.
+        order: Columns are left out in this order where there is no room; 0 for never.
+        varies: It is left out where it is the same in all rows.
+    """
+
+    name: str
+    get: Get = ""
+    side: Literal["left", "right"] = "left"
+    shown: Callable[[Any], str] | None = None
+    cut: int = 0
+    order: int = 0
+    varies: bool = False
+
+    def cell(self, row: Any) -> str:
+        """The text for a row."""
+        get = self.get
+        value = get(row) if callable(get) else row[self.name if get == "" else get]
+        if value is None:
+            return ""
+        if self.shown is not None:
+            return self.shown(value)
+        return printable(f"{value:.6g}" if isinstance(value, float) else str(value))
+
+
+def numbers(*names: str, **how: Any) -> list[Column]:
+    """Columns of numbers whose headings are the keys."""
+    return [Column(name, side="right", **how) for name in names]
+
+
+def bytes_of(name: str, key: str, order: int = 0) -> Column:
+    """A column of sizes; `-` for one that is not known."""
+
+    def shown(row: Mapping[str, Any]) -> str:
+        return "-" if row[key] is None else size(row[key])
+
+    return Column(name, shown, "right", order=order)
+
+
+def rate_of(name: str, get: Get, order: int = 0) -> Column:
+    """A column of rates, in hertz."""
+    return Column(name, get, "right", "{:.2f}".format, order=order)
+
+
+def duration_of(name: str, get: Get, order: int = 0) -> Column:
+    """A column of lengths of time, of ns."""
+    return Column(name, get, "right", lambda ns: short_duration(round(ns)), order=order)
+
+
+def time_of(name: str, key: str, order: int = 0) -> Column:
+    """A column of times in UTC, of ns."""
+    return Column(name, lambda row: time_text(row[key]), order=order)
+
+
+class _Table:
+    """Some columns, as wide as their cells, or narrower where these may be cut."""
+
+    def __init__(self, columns: Sequence[Column]) -> None:
+        self.columns = columns
+        self.widths = [len(one.name) for one in columns]
+        self._is_narrow = False
+
+    def cells(self, rows: Iterable[Any]) -> list[list[str]]:
+        """The cells of rows; columns become as wide as they are."""
+        found = [[one.cell(row) for one in self.columns] for row in rows]
+        if found and not self._is_narrow:
+            wide = (max(map(len, cells)) for cells in zip(*found, strict=True))
+            self.widths = [*map(max, self.widths, wide)]
+        return found
+
+    def fits(self, width: int) -> bool:
+        """True if it is no wider than that; cells that may be cut are, the last column first."""
+        over = sum(self.widths) + 2 * (len(self.widths) - 1) - width
+        for place, one in reversed([*enumerate(self.columns)]):
+            spare = self.widths[place] - max(len(one.name), one.cut)
+            if one.cut and over > 0 and spare > 0:
+                self.widths[place] -= min(spare, over)
+                over -= spare
+                self._is_narrow = True
+        return over <= 0
+
+    def lines(self, rows: Iterable[Sequence[str]]) -> Iterable[str]:
+        """Rows of cells as text."""
+        for row in rows:
+            aligned = (
+                f"{cut(cell, width):{'>' if one.side == 'right' else '<'}{width}}"
+                for cell, one, width in zip(row, self.columns, self.widths, strict=True)
+            )
+            yield "  ".join(aligned).rstrip()
+
+    @property
+    def heading(self) -> list[str]:
+        return [one.name for one in self.columns]
+
+
+def _fitting(columns: Sequence[Column], block: Sequence[Any], width: int | None) -> _Table | None:
+    """The table with most columns that fits a screen of that width (None: any); None without."""
+    left = [*columns]
+    for gone in (None, *sorted((one for one in columns if one.order), key=lambda one: one.order)):
+        left = [one for one in left if one is not gone]
+        table = _Table(left)
+        table.cells(block)
+        if width is None or table.fits(width):
+            return table
+    return None
+
+
+def table_lines(columns: Sequence[Column], rows: Sequence[Any], width: int) -> list[str]:
+    """The lines of a table, headings first; they are cut where no table fits the width."""
+    table = _fitting(columns, rows, width) or _Table(columns)
+    cells = table.cells(rows)
+    return [cut(line, width) for line in table.lines([table.heading, *cells])]
+
+
+def print_table(columns: Sequence[Column], rows: Iterable[Any]) -> bool:
+    """Print rows under headings; on a terminal that has no room for them, a block for each row.
+
+    Prints nothing without rows, and returns False.
+
+    A long table is printed some rows at a time: memory does not grow with it. Columns become wider
+    where later rows need it.
+    """
+    source = iter(rows)
+    block = [*islice(source, ROWS_AT_ONCE)]
+    if len(block) < ROWS_AT_ONCE:
+        columns = [one for one in columns if not one.varies or len({*map(one.cell, block)}) > 1]
+    if not block:
+        return False
+    table = _fitting(columns, block, screen_width() if sys.stdout.isatty() else None)
+    if table is None:
+        for number, row in enumerate(chain(block, source)):
+            (_, title), *fields = ((one.name, one.cell(row)) for one in columns)
+            if number:
+                say()
+            say(title)
+            print_fields([pair for pair in fields if pair[1]], indent=2)
+        return True
+    cells = [table.heading, *table.cells(block)]
+    while cells:
+        for line in table.lines(cells):
+            print(line)  # noqa: T201
+        cells = table.cells(islice(source, ROWS_AT_ONCE))
+    return True
+
+
+def print_fields(fields: Sequence[tuple[str, object]], indent: int = 0) -> None:
+    """Print a line for each name and value, folded on a terminal."""
+    width = max((len(name) for name, _ in fields), default=0)
+    room = max(screen_width() - width - 2 - indent, _MIN_ROOM)
+    for name, value in fields:
+        lines = [printable(str(value))]
+        if sys.stdout.isatty():
+            lines = textwrap.wrap(lines[0], room, break_on_hyphens=False)
+        for heading, line in zip_longest([printable(name)], lines, fillvalue=""):
+            say(f"{' ' * indent}{heading:<{width}}  {line}".rstrip())

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, cast
 
@@ -251,26 +250,20 @@ def row_of(report: RecordReport, path: object) -> dict[str, Any]:
     }
 
 
-def fields_of(row: Mapping[str, Any]) -> list[tuple[str, object]]:
-    """The lines of one recorded log: name and value, without some counts of zero."""
-    some = {
+def line_of(row: Mapping[str, Any]) -> str:
+    """A recorded log in a line, without counts of zero."""
+    more = {
         "left out": row["messages_skipped"],
         "from before": row["messages_latched"],
         "attachments": row["attachments"],
     }
-    return [
-        ("recording", row["name"]),
-        ("source", f"{row['path']} ({row['source']['kind']})"),
-        ("topics", row["topics"]),
-        ("messages", row["messages"]),
-        *(pair for pair in some.items() if pair[1]),
-        ("bytes in", output.size(row["bytes_in"])),
-        ("stored", output.size(row["stored_bytes"])),
-        ("ratio", f"{row['bytes_in'] / (row['stored_bytes'] or inf):.2f}"),
-        ("indexed", row["messages_indexed"]),
-        ("time", f"{row['seconds']:.2f} s"),
-        ("messages/s", f"{row['messages'] / (row['seconds'] or inf):,.0f}"),
+    told = [
+        output.counted(row["messages"], "message"),
+        output.size(row["stored_bytes"]),
+        *(f"{number} {what}" for what, number in more.items() if number),
+        f"from {row['path']}",
     ]
+    return f"{row['name']}: {', '.join(told)}"
 
 
 def remarks_on(report: RecordReport) -> Iterator[str]:

@@ -20,12 +20,11 @@ from hybridlog.cli.commands.top import draw, summary
 from hybridlog.cli.options import parse_tags
 from hybridlog.cli.record_choices import (
     RecordChoices,
-    fields_of,
+    line_of,
     not_indexed,
     remarks_on,
     row_of,
 )
-from hybridlog.cli.render import print_fields
 from hybridlog.cli.signals import handled, write_note
 from hybridlog.query.answers.lost import coverage, in_words
 from hybridlog.record.losses import Cause, losses_of
@@ -163,13 +162,11 @@ def _finish(
         output.print_json({"report": about}, at_once=True)
     elif not rows:
         output.remarks(["Nothing was stored."])
-    elif not output.is_quiet():
+    else:
         entry = reports[-1].entry
-        let_go = f"{state.let_go}, by the ring" if state.let_go else ""
-        words = coverage(entry, losses_of(entry))
-        more = [("coverage", words), ("let go", let_go), ("ended", reason)]
-        received = ("received", state.messages)
-        print_fields([*fields_of(rows[-1]), received, *(one for one in more if one[1])])
+        let_go = [f"{state.let_go} let go by the ring"] if state.let_go else []
+        told = [f"{state.messages} received", coverage(entry, losses_of(entry)), *let_go, reason]
+        output.tell(None, [*map(line_of, rows), "; ".join(told)])
     silent, unfitting = recorder.silent(), recorder.unfitting()
     output.remarks(f"{topic}: has a publisher that sent nothing" for topic in silent)
     output.remarks(f"no topic fits {text}" for text in unfitting)

@@ -114,11 +114,6 @@ def schema_of(planner: Planner) -> pa.Schema | None:
     return common_schema(stream(planner))
 
 
-def json_columns(schema: pa.Schema | None) -> list[str]:
-    """Columns that are JSON text, since they have no common exact type."""
-    return [] if schema is None else [field.name for field in schema if field.type == pa.json_()]
-
-
 def _is_open(channel: RecordedChannel) -> bool:
     """True if the columns of a channel depend on the content of its messages."""
     return channel.encoding not in FIXED

@@ -215,12 +215,3 @@ def _keys(fields: Sequence[str]) -> list[tuple[str, int]]:
         raise UsageError(f"An index takes up to {_MAX_FIELDS} fields, without duplicates.")
     # Documents have no brackets: an index on an element is one on the array.
     return [(field.replace("[]", ""), 1) for field in fields]
-
-
-@again_if_lost
-def contents(shared: OpenStore) -> list[tuple[str, str, int]]:
-    """Each topic with the MongoDB collection of its documents, and their number there."""
-    database = shared.index.database_for("The contents of the index")
-    there = {*database.list_collections()}
-    topics = ((topic, collection_of(topic)) for topic in shared.now().topics_of())
-    return [(topic, name, database.count(name)) for topic, name in topics if name in there]

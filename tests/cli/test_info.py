@@ -109,7 +109,7 @@ def test_control_characters_are_shown_not_obeyed(store: Path) -> None:
         assert "\x1b" not in done.out + done.err
         assert "\x07" not in done.out + done.err
         shown += done.out
-    assert "/\\x1b[31mred\\x07\\x0a/x" in shown
+    assert "/\\x1b[31mred\\x07\\n/x" in shown
     assert "\\x1b[2Jboo" in shown
     found = run("info", "odd", "--json", store=store)
     assert HOSTILE_NAME in {c["topic"] for c in found.json[0]["channels"]}

@@ -80,17 +80,17 @@ def plain(text: str) -> str:
 
 
 @pytest.mark.mongo
-def test_a_bar_with_rate_and_remaining_time_and_then_the_table(logs: Path, tmp_path: Path) -> None:
+def test_a_bar_with_share_and_rate_and_then_the_line(logs: Path, tmp_path: Path) -> None:
     code, shown = on_terminal(
         "record", logs / "robot.bag", "--level", "15", "--store", tmp_path / "s", width=120
     )
     assert code == 0
     bars = plain(shown).split("\r")
-    assert any(re.search(r"robot\.bag ━.* \d+% .*B/s ETA \d\d:\d\d \d+ messages", b) for b in bars)
-    # The bar goes away; the table stays.
+    assert any(re.search(r"record \d+%  .*B/s  robot\.bag: \d+ messages", b) for b in bars)
+    # The bar goes away; the line stays.
     last = plain(shown[shown.rindex("\x1b[J") :])
-    assert "━" not in last
-    assert re.search(r"indexed\s+\d+", last)
+    assert "B/s" not in last
+    assert re.search(r"robot: \d+ messages, ", last)
 
 
 def test_no_bar_elsewhere_or_when_quiet(logs: Path, tmp_path: Path) -> None:

@@ -428,7 +428,7 @@ def test_what_only_one_has_comes_first(tmp_path: Path) -> None:
     asked = ("diff", "all", "later", "-t", "scan", "-t", "new", "-n", "1")
     done = process(*asked, store=path, code=12)
     assert len(done.lines) == 2
-    assert f"only a: {only[2]}" in done.lines[1]
+    assert only[2] in done.lines[1]
     assert done.err == f"The first 1 of {2 + len(others)} differences.\n"
     assert process("diff", "all", "begin", "--between", "+1s", "+1.5s", store=path).out == ""
 

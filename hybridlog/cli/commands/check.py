@@ -17,7 +17,7 @@ from hybridlog.cli.options import (
     Strict,
     Topics,
 )
-from hybridlog.cli.render import Column, duration_of, rate_of
+from hybridlog.cli.output import Column, duration_of, rate_of
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:

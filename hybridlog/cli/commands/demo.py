@@ -86,9 +86,7 @@ def run(directory: Path) -> int:
         code = subprocess.run(program(typed), cwd=directory, check=False).returncode  # noqa: S603
         if code:
             _print(f"The tour stops here; its files remain in {directory}\n")
-            sys.stderr.write(f"error: `{typed}` failed with exit code {code}\n")
-            # A child that was killed by a signal has a negative code, which shells cannot return.
-            return code if code > 0 else 128 - code
+            return abs(code)
     place = shlex.quote(str(directory / STORE))
     _print(f"\nAll files remain in {directory}; look at them: hybridlog view --store {place}\n")
     return 0

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from msgspec.structs import asdict
 
@@ -13,7 +11,7 @@ from hybridlog.cli.answers import Listing
 from hybridlog.cli.app import DIFFERENT
 from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.options import Between, InStore, Quiet, one_recording, topics
-from hybridlog.cli.render import Column
+from hybridlog.cli.output import Column
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,20 +43,10 @@ def diff_command(given: _Given) -> int:
             between=given.between,
             tolerance=share,
         )
-    columns = [Column("topic"), Column("what"), Column("a", _side("a")), Column("b", _side("b"))]
+    columns = [*map(Column, ("topic", "what", "a", "b"))]
     given.show(map(asdict, found), columns)
     if not given.as_json:
         total = f"{output.counted(len(found), 'difference')}." if found else "No difference."
         is_cut = given.limit is not None and given.limit < len(found)
         output.remarks([f"The first {given.limit} of {total}" if is_cut else total])
     return DIFFERENT if found else 0
-
-
-def _side(name: str) -> Callable[[Mapping[str, Any]], str]:
-    """A function for the cells of one recording; they say so if only it has the topic or times."""
-
-    def told(row: Mapping[str, Any]) -> str:
-        is_alone = row[name] and row["what"] in {"times", "topic"}
-        return f"only {name}: {row[name]}" if is_alone else str(row[name])
-
-    return told

@@ -47,7 +47,8 @@ _LEROBOT: Final = "lerobot"
 
 
 def _option(help: str, metavar: str | None = None, **settings: Any) -> Any:  # noqa: A002
-    return option(help, metavar, needs=(f"form={_LEROBOT}",), **settings)
+    needs = (f"form={_LEROBOT}",)
+    return option(help, metavar, needs=needs, section="With lerobot", **settings)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,8 +13,7 @@ from msgspec.structs import asdict
 from hybridlog.cli import output
 from hybridlog.cli.binder import SOME_SECONDS, argument, command, option
 from hybridlog.cli.options import AsJson, Choosing, InStore, Quiet
-from hybridlog.cli.output import Bar
-from hybridlog.cli.render import Column, bytes_of, numbers, print_table
+from hybridlog.cli.output import Bar, Column, bytes_of, numbers
 from hybridlog.cli.signals import watch
 from hybridlog.wording import listed
 from hybridlog_storage.errors import StoreError, UsageError
@@ -84,26 +83,16 @@ def _show(found: list[FieldIndex], given: _Shared, without: str = "") -> None:
 def address(given: _Shared) -> None:
     """Print where other programs find the index.
 
-    Also its collections, and how many documents they have. The index is brought up to date
-    first. The embedded MongoDB keeps its address, waits ten minutes for the first client, and
-    runs as long as one is connected.
+    The index is brought up to date first. The embedded MongoDB keeps its address, waits ten
+    minutes for the first client, and runs as long as one is connected.
     """
     with given.opened(require_database=True) as store:
         found = store.index.address()
-        from hybridlog.index.of_store import contents
-
-        places = [] if given.quiet and not given.as_json else contents(store.shared)
-        recordings = len(store.session.snapshot())
-    names = ("topic", "collection", "documents")
-    topics = [dict(zip(names, place, strict=True)) for place in places]
     if given.as_json:
-        about = {"uri": found.uri, "database": found.database, "recordings": recordings}
-        output.print_json({**about, "topics": topics})
+        output.print_json({"uri": found.uri, "database": found.database})
         return
     output.say(found.uri)
-    if not given.quiet:
-        print_table([Column("topic"), Column("collection"), *numbers("documents")], topics)
-        output.say(f"database {found.database}, {output.counted(recordings, 'recording')}")
+    output.tell(None, [f"database {found.database}"])
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,7 +19,7 @@ from hybridlog.cli.binder import command, option
 from hybridlog.cli.commands.keep import pin_cells, pin_dict
 from hybridlog.cli.commands.ls import recording_dict, status_text
 from hybridlog.cli.options import AsJson, Choosing, Forced, InStore, names_argument, query_of
-from hybridlog.cli.render import Column, bytes_of, duration_of, print_fields, print_table
+from hybridlog.cli.output import Column, bytes_of, duration_of, print_fields, print_table
 from hybridlog.query.topics import resolve
 from hybridlog.wording import listed
 from hybridlog_storage.errors import SegmentError, TopicError, UsageError
@@ -189,20 +189,8 @@ def _fields(store: Store, entry: RecordingEntry, about: dict[str, Any]) -> list[
             ("pin", f"{one['id']}: {', '.join(filter(None, pin_cells(one)))}")
             for one in about["pins"]
         ),
-        *(
-            ("attachment", f"{one['name']} ({_about(one['media_type'], one['bytes'])})")
-            for one in about["attachments"]
-        ),
-        *(
-            ("metadata", f"{one['name']} ({', '.join(one['values'])})")
-            for one in about["metadata_records"]
-        ),
         ("index", store.shared.index.place),
     ]
-
-
-def _about(media_type: str, size: int) -> str:
-    return ", ".join(filter(None, (media_type, output.size(size))))
 
 
 def _kind(channel: Mapping[str, Any]) -> str:

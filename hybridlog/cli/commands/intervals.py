@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
@@ -12,7 +11,7 @@ from hybridlog.cli import output
 from hybridlog.cli.answers import Listing, answering
 from hybridlog.cli.binder import command, option
 from hybridlog.cli.options import Filtered, parse_fields
-from hybridlog.cli.render import Column, time_of
+from hybridlog.cli.output import Column, duration_of, time_of
 
 if TYPE_CHECKING:
     from hybridlog.query.intervals import Intervals
@@ -98,16 +97,10 @@ def _intervals(given: _Given, query: Query) -> Intervals:
     return found if given.at_least is None else found.at_least(given.at_least)
 
 
-def _duration(row: Mapping[str, int]) -> str:
-    from hybridlog.query.times import format_duration
-
-    return format_duration(row["end_ns"] - row["begin_ns"])
-
-
 _COLUMNS = [
     Column("recording"),
     time_of("begin", "begin_ns"),
     time_of("end", "end_ns", order=1),
-    Column("duration", _duration, "right"),
+    duration_of("duration", lambda row: row["end_ns"] - row["begin_ns"]),
     Column("messages", side="right"),
 ]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from hybridlog.cli import output
 from hybridlog.cli.binder import command
 from hybridlog.cli.options import AsJson, Choosing, InStore
-from hybridlog.cli.render import Column
+from hybridlog.cli.output import Column
 
 if TYPE_CHECKING:
     from hybridlog_storage.summary import RecordingSummary

@@ -15,13 +15,12 @@ from hybridlog.cli.binder import command
 from hybridlog.cli.options import parse_tags
 from hybridlog.cli.record_choices import (
     RecordChoices,
-    fields_of,
+    line_of,
     not_indexed,
     remarks_on,
     row_of,
     stored,
 )
-from hybridlog.cli.render import print_fields
 from hybridlog.cli.signals import watch
 from hybridlog.wording import listed
 from hybridlog_storage.errors import (
@@ -68,23 +67,20 @@ def record_command(choices: RecordChoices) -> int:
 def _record_logs(choices: RecordChoices) -> int:
     """Record each path, and each log below a directory; an error does not stop the others."""
     logs, problems, is_search = _find(choices)
-    is_one = len(logs) == 1
-    if choices.name is not None and not is_one:
+    if choices.name is not None and len(logs) != 1:
         raise UsageError(f"--name names one recording; there are {len(logs)} logs.")
     # Wrong options are found before a store is made.
-    recorder = LogRecorder(choices, is_search=is_search, is_one=is_one)
+    recorder = LogRecorder(choices, is_search=is_search)
     total, before = sum(log.size for log in logs), 0
 
     def show(name: str, read: int, messages: int) -> None:
-        # A single one needs no name beside the bar.
-        many = output.counted(messages, "message")
-        bar(before + read, many if is_one else f"{name}: {many}")
+        bar(before + read, f"{name}: {output.counted(messages, 'message')}")
 
-    recorder.check_new_store(logs)
-    label = logs[0].path.name if is_one else f"{len(logs)} logs"
-    with choices.opened_to_record() as store, at_safe_points(), output.Bar(label, total) as bar:
+    if not recorder.may_begin(logs):
+        return recorder.exit_code
+    with choices.opened_to_record() as store, at_safe_points(), output.Bar("record", total) as bar:
         for problem in problems:
-            recorder.fail(None, problem)
+            recorder.fail(problem)
         for log in logs:
             safe_point()
             recorder.record(store, log, partial(show, log.path.name))
@@ -98,17 +94,12 @@ def _record_watched(choices: RecordChoices) -> int:
     from hybridlog.formats.find import Watch
 
     recorder = LogRecorder(choices, is_search=True)
-    recorder.check_new_store(())
+    recorder.may_begin(())
     watches = [Watch(path, choices.settle) for path in choices.paths]
     with choices.opened_to_record() as store:
         places = ", ".join(map(str, choices.paths))
-        watch(
-            places,
-            partial(_look, recorder, store, watches),
-            report=partial(recorder.fail, None),
-        )
-        left = [path for one in watches for path in one.unfinished()]
-        if left:
+        watch(places, partial(_look, recorder, store, watches), report=recorder.fail)
+        if left := [path for one in watches for path in one.unfinished]:
             paths = listed(map(str, left))
             output.note(f"Not complete: {paths}. `hybridlog record PATH` records what is there.")
     recorder.sum_up()
@@ -157,46 +148,45 @@ def _find(choices: RecordChoices) -> tuple[list[LogSet], list[SourceError], bool
 class LogRecorder:
     """Records logs with the options of the command, and tells at once what came of each."""
 
-    def __init__(self, choices: RecordChoices, *, is_search: bool, is_one: bool = False) -> None:
+    def __init__(self, choices: RecordChoices, *, is_search: bool) -> None:
         self._choices = choices
         self._settings = choices.segment_settings()
         self._tags = parse_tags(choices.set_tag)
         choices.matchers()
-        self._is_search, self._is_one = is_search, is_one
+        self._is_search = is_search
         self._counts: Counter[str] = Counter()  # of what came of logs
         self.exit_code = 0
 
-    def check_new_store(self, logs: Sequence[LogSet]) -> None:
-        """Fail before a store is made: no log can be read, or its server does not answer."""
+    def may_begin(self, logs: Sequence[LogSet]) -> bool:
+        """False, which is told, if none of some logs can be read, so that no store is made."""
         from hybridlog.store import store_path
         from hybridlog_storage.settings import NAME, is_uri, with_password
 
-        choices, problems = self._choices, list[SourceError]()
-        settings = store_path(choices.store) / NAME
-        if os.path.lexists(settings):
-            return
+        choices, problems = self._choices, list[tuple[SourceError, Path]]()
+        if os.path.lexists(store_path(choices.store) / NAME):
+            return True
         for log in logs:
             try:
                 log.open().close()
                 break
             except SourceError as error:
-                problems.append(error)
+                problems.append((error, log.path))
         if logs and len(problems) == len(logs):
-            if self._is_one:
-                self.fail(logs[0].path, problems[0])
-            raise problems[0]
+            for problem in problems:
+                self.fail(*problem)
+            return False
         if is_uri(choices.mongo):
             # The new store stores the URI, so it has to be right.
             from hybridlog_storage.mongo.database import Database
             from hybridlog_storage.mongo.index_documents import IndexState, other_store
 
             with Database.connect(with_password(choices.mongo)) as database:
-                owner = IndexState(database).owner()
-                if owner is not None and not os.path.lexists(settings):  # nobody made it meanwhile
+                if IndexState(database).owner() is not None:
                     raise other_store(database)
+        return True
 
     def record(self, store: Store, log: LogSet, progress: Callable[[int, int], None]) -> None:
-        """Record a log, or the parts that the store lacks; raises if the only log cannot be."""
+        """Record a log, or the parts that the store lacks."""
         for piece in self._pieces(store, log):
             try:
                 report = self._record_one(store, piece, progress)
@@ -204,30 +194,24 @@ class LogRecorder:
                 if self._is_search and isinstance(error, AlreadyRecordedError):
                     self._tell("known", {"path": str(piece.path), "known": str(error)})
                 else:
-                    self.fail(piece.path, error)
+                    self.fail(error, piece.path)
                 continue
             self.exit_code = self.exit_code or _told(piece.path, report)
             row = row_of(report, piece.path)
-            about = (
-                f"{output.counted(row['messages'], 'message')}, {output.size(row['stored_bytes'])}"
-            )
-            self._tell("recorded", row, [f"{row['name']}: {about}, from {piece.path}"])
+            self._tell("recorded", row, [line_of(row)])
 
-    def _pieces(self, store: Store, log: LogSet) -> Iterator[LogSet]:
-        """The log; in a search, the missing parts of it if others were recorded on their own."""
+    def _pieces(self, store: Store, log: LogSet) -> list[LogSet]:
+        """The log; in a search, each file of it if some were recorded on their own."""
         from hybridlog.formats.log_set import LogSet
         from hybridlog.formats.reading import fingerprint
 
-        missing: list[Path] = []
         if self._is_search and not self._choices.again and len(log.files) > 1:
             find = store.session.snapshot().by_fingerprint.get
             with suppress(SourceError):  # which is told when it is recorded
                 prints = fingerprint(log.files)
-                if find(prints.whole) is None:
-                    of_files = zip(log.files, prints.parts, strict=True)
-                    missing = [file for file, part in of_files if find(part) is None]
-        is_whole = not missing or len(missing) == len(log.files)
-        yield from [log] if is_whole else map(LogSet.at, missing)
+                if find(prints.whole) is None and any(map(find, prints.parts)):
+                    return [*map(LogSet.at, log.files)]
+        return [log]
 
     def _record_one(
         self, store: Store, log: LogSet, progress: Callable[[int, int], None]
@@ -261,23 +245,16 @@ class LogRecorder:
             output.note(f"{log.path}: no topic fits {output.quoted(pattern)}.")
         return report
 
-    def fail(self, path: Path | None, error: HybridlogError) -> None:
-        """Tell an error; that of the only log is raised."""
+    def fail(self, error: HybridlogError, path: Path | None = None) -> None:
+        """Tell an error."""
         about = {} if path is None else {"path": str(path)}
         self._tell("error", {**about, "error": str(error), "exit_code": error.exit_code})
-        if self._is_one and not self._is_search:
-            raise error
         output.note(f"hybridlog: {error}")
         self.exit_code = self.exit_code or error.exit_code
 
     def _tell(self, what: str, row: dict[str, Any], lines: Sequence[str] = ()) -> None:
-        """Print what came of a log: a line, or all about the only one."""
         self._counts[what] += 1
-        if self._is_one and lines and not (self._choices.as_json or output.is_quiet()):
-            output.clear()
-            print_fields(fields_of(row))
-        else:
-            output.tell(row, lines, at_once=True)
+        output.tell(row, lines, at_once=True)
 
     def sum_up(self) -> None:
         """Say of a search what became of its logs."""

@@ -10,7 +10,7 @@ from msgspec.structs import asdict
 from hybridlog.cli.answers import Listing, answering
 from hybridlog.cli.binder import command, option
 from hybridlog.cli.options import Filtered, parse_fields
-from hybridlog.cli.render import Column
+from hybridlog.cli.output import Column
 
 _NAMES = ("count", "nan", "infinite", "min", "max", "mean", "std")
 
