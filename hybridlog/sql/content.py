@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
+from itertools import islice
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import pyarrow as pa
 from msgspec.structs import replace
 
+from hybridlog.columns.fields import records_of
 from hybridlog.columns.layout import POINTS
 from hybridlog.columns.recordings_file import (
     TAGS,
@@ -18,21 +20,26 @@ from hybridlog.columns.recordings_file import (
     recordings_table,
     times,
 )
+from hybridlog.columns.rows import is_cloud
+from hybridlog.frames.answer import FIXED
+from hybridlog.index.indexing import rows_by_channel
 from hybridlog.query.answers.marks import marks_in
+from hybridlog.query.chunk_scan import ChunkScan
+from hybridlog.query.planner import Planner
+from hybridlog.query.question import Question
 from hybridlog.query.ranges import RangeResolver
-from hybridlog.snapshot import UNFINISHED
+from hybridlog.schema.arrow_types import has_empty
 from hybridlog.sql.columns import OWN, merged, points_column, view_columns
 from hybridlog.sql.names import ViewNames
-from hybridlog.sql.rows import Plan, TopicOfRecording
+from hybridlog.sql.rows import Limits, ViewRows, columns_in
 from hybridlog_storage.catalog import ChannelStats
 from hybridlog_storage.times import BEGIN, END
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from hybridlog.query.question import Question, Span
+    from hybridlog.query.question import Part, RecordedChannel
+    from hybridlog.query.ranges import Resolved
     from hybridlog.session import Session
-    from hybridlog.sql.rows import Bounds, Filter, Reading
+    from hybridlog.sql.rows import Reading
     from hybridlog_storage.summary import RecordingSummary
 
 
@@ -46,6 +53,7 @@ class StoreContent:
         scope: The recordings and times of this question alone, whatever its topics.
         snapshot: All recordings of the store.
         summaries: Those of the scope, oldest first.
+        resolved: Those that may have rows, with their times, by id, oldest first.
         names: Names of the views.
     """
 
@@ -53,42 +61,21 @@ class StoreContent:
         self.session = session
         self.scope = scope
         self.snapshot = session.look()
-        self._places = np.arange(len(self.snapshot))
+        places = np.arange(len(self.snapshot))
         if scope.recordings is not None:
-            self._places = session.chosen(scope)
-        self.summaries = [self.snapshot.summaries[place] for place in self._places.tolist()]
-        topics = self.snapshot.topics_at(self._places)
-        self._windows: dict[str, Span] | None = None
-        if scope.bounds is not None:
-            found = RangeResolver(session, replace(scope, topics=tuple(topics))).resolve()
-            self._windows = {one.summary.id: one.bounds for one in found if one.bounds}
+            places = session.chosen(scope)
+        self.summaries = [self.snapshot.summaries[place] for place in places.tolist()]
+        topics = self.snapshot.topics_at(places)
+        found = RangeResolver(session, replace(scope, topics=tuple(topics))).resolve()
+        self.resolved = {one.summary.id: one for one in found}
+        self.names = ViewNames(topics)
         self._views: dict[str, TopicView] = {}
         self._lock = threading.RLock()
-        for summary in self.summaries:
-            if summary.status in UNFINISHED:
-                entry = session.entry_of(summary)
-                session.hold(entry, map(int, entry.digests))
-        self.names = ViewNames(topics)
 
     def summaries_of(self, topic: str) -> list[RecordingSummary]:
         """Recordings that have a topic, oldest first."""
-        return [self.snapshot.summaries[place] for place in self._having(topic).tolist()]
-
-    def _having(self, topic: str) -> NDArray[np.intp]:
-        return np.intersect1d(self.snapshot.having([topic]), self._places)
-
-    def having(self, topics: Iterable[str]) -> list[str]:
-        """Ids of the recordings that may have rows of some topics."""
-        found = {one.id for topic in topics for one in self.summaries_of(topic)}
-        return [one for one in found if self._windows is None or one in self._windows]
-
-    def window(self, recording: str) -> Span | None:
-        """The log time `[begin, end)` of a recording in the scope, ns; None for all times."""
-        return None if self._windows is None else self._windows.get(recording, (0, 0))
-
-    def topic_of(self, summary: RecordingSummary, topic: str) -> TopicOfRecording:
-        """A topic in a recording."""
-        return TopicOfRecording(self.session, self.session.entry_of(summary), topic)
+        places = self.snapshot.having([topic], self.scope.recordings)
+        return [self.snapshot.summaries[place] for place in places.tolist()]
 
     def view(self, topic: str) -> TopicView:
         """The view of a topic."""
@@ -97,82 +84,103 @@ class StoreContent:
                 self._views[topic] = TopicView(self, topic)
             return self._views[topic]
 
-    def differing(self, topic: str) -> list[RecordingSummary]:
-        """One of the recordings that have a topic, for each set of topics and types."""
-        return self.snapshot.differing(self._having(topic))
-
 
 class TopicView:
     """The view of a topic: its columns, and rows for a query; `size` is nearly their number."""
 
     def __init__(self, content: StoreContent, topic: str) -> None:
         self.topic = topic
-        self._content = content
-        self._known: dict[str, TopicOfRecording] = {}
-        having = {*content.having([topic])}
-        known = content.summaries_of(topic)
-        self._summaries = [one for one in known if one.id in having]
-        kinds = self._kinds(known)
+        self._session = content.session
+        summaries = content.summaries_of(topic)
+        ids = tuple(one.id for one in summaries)
+        self._planner = Planner(self._session, Question((topic,), ids))
+        self._reason = next(filter(None, (c.codec.reason for c in self._planner.examples)), None)
+        kinds = self._kinds()
         columns = view_columns(merged(kinds) if kinds else pa.struct([]))
         self._columns = {column.name: column for column in columns}
-        points = self._points()
-        if points is not None and POINTS not in self._columns:
-            self._columns[POINTS] = points_column(points)
+        if POINTS not in self._columns and (points := self._points()):
+            self._columns[POINTS] = points_column(merged(points))
         fields = [pa.field(column.name, column.type) for column in self._columns.values()]
         self.schema = pa.schema([*OWN, *fields])
-        some = [self._of(one) for one in self._summaries[:_SAMPLED]]
-        self.size = sum(one.messages for one in some) * len(self._summaries) // max(len(some), 1)
+        self._parts: dict[str, Part | None] = {}
+        self._chosen = [content.resolved[one] for one in ids if one in content.resolved]
+        some = self._chosen[:_SAMPLED]
+        messages = sum(part.messages for part in map(self._part, some) if part is not None)
+        self.size = messages * len(self._chosen) // max(len(some), 1)
 
-    def _of(self, summary: RecordingSummary) -> TopicOfRecording:
-        if summary.id not in self._known:
-            self._known[summary.id] = self._content.topic_of(summary, self.topic)
-        return self._known[summary.id]
+    def _part(self, one: Resolved) -> Part | None:
+        """The topic in a recording, as asked; None without messages."""
+        if one.summary.id not in self._parts:
+            self._parts[one.summary.id] = next(self._planner.parts_in(*one), None)
+        return self._parts[one.summary.id]
 
-    def _kinds(self, known: Sequence[RecordingSummary]) -> list[Any]:
+    def _kinds(self) -> list[Any]:
         """Types of the messages; recordings with equal definitions have equal ones."""
-        some = [self._of(one) for one in self._content.differing(self.topic)]
-        if not all(one.is_fixed for one in some):
-            some = [self._of(one) for one in known]
-        return [kind for one in some for kind in one.kinds]
+        channels = self._planner.examples
+        if all(map(_is_fixed, channels)):
+            return [channel.arrow_type() for channel in channels if channel.codec.indexed]
+        found = []
+        for part in self._planner.split():
+            table = self._planner.tabled(part)
+            found += [] if table is None else table.table.whole_types()
+            rest = part if table is None else table.rest
+            found += [] if rest is None else (records_of(one).type for one in self._read(rest))
+        return found
 
-    def _points(self) -> Any:
-        """Type of the points of clouds of a topic whose tables have them; None without."""
-        if self.topic not in self._content.session.directory.settings.arrays:
-            return None
-        clouds = (self._of(one).points() for one in self._summaries)
-        kinds = [kind for kind in clouds if kind is not None]
-        return merged(kinds) if kinds else None
+    def _points(self) -> list[Any]:
+        """Types of the points of clouds, of a topic whose tables have them."""
+        if self.topic not in self._session.directory.settings.arrays:
+            return []
+        found = []
+        for part in self._planner.split():
+            table = self._planner.tabled(part)
+            if table is not None and table.table.points is not None:
+                found.append(table.table.points)
+            elif any(is_cloud(channel.channel) for channel in part.channels):
+                clouds = (one.type for one in self._read(part, has_points=True))
+                found += islice(
+                    (one.field(POINTS).type for one in clouds if POINTS in one.names), 1
+                )
+        return found
 
-    def rows(
-        self, columns: Sequence[str], where: Filter, reading: Reading
-    ) -> Iterator[pa.RecordBatch]:
-        """Rows for a query: those columns, where a filter holds."""
-        plan = Plan(self.schema, self._columns, columns, where, reading)
-        # The end of a recording is one more than its last time: for messages at the end of time.
-        spans = ((one.name, one.extent) for one in self._summaries)
-        bounds = _bounds((name, span if span[0] < span[1] else None) for name, span in spans)
-        for number in np.flatnonzero(where.may_hold(bounds)).tolist():
-            summary = self._summaries[number]
-            recording, window = self._of(summary), self._content.window(summary.id)
-            reading.add(recording)
-            bounds = _bounds((summary.name, source.span) for source in recording.sources)
-            chosen, (first, last) = where.may_hold(bounds), bounds["t"]
-            if window is not None:
-                chosen &= (first < window[1]) & (last >= window[0])
-            for place in np.flatnonzero(chosen).tolist():
-                yield from plan.read(recording, recording.sources[place], window)
+    def _read(self, part: Part, *, has_points: bool = False) -> Iterator[Any]:
+        """The fields of messages in chunks, as `columns_in` has them."""
+        for run in ChunkScan(self._planner.chunk_plan([part]), self._session).runs():
+            for number, rows in rows_by_channel(run.batch.channel):
+                codec = run.channels[number].codec
+                if codec.indexed:
+                    decoded = codec.columns_of(run.batch.take(rows), None)
+                    yield columns_in(decoded, has_points=has_points)
+
+    def rows(self, schema: pa.Schema, limits: Limits, reading: Reading) -> Iterator[pa.RecordBatch]:
+        """Rows for a query, with those columns."""
+        if self._reason is not None:
+            reading.undefined[self.topic] = self._reason
+        read = ViewRows(self._session, schema, self._columns, reading)
+        low, high = limits.span
+        for one in self._chosen:
+            summary, (begin, end) = one.summary, one.summary.extent
+            is_beside = begin < end and (begin >= high or end <= low)
+            names = limits.recordings
+            if is_beside or (names is not None and summary.name not in names):
+                continue
+            reading.recordings[summary.id] = self._session.entry_of(summary)
+            reading.topics.add(self.topic)
+            part = self._part(one)
+            if part is not None:
+                span = Limits(part.bounds or (BEGIN, END)).common(limits).span
+                bounds = None if span == (BEGIN, END) else span
+                yield from read.read(replace(part, bounds=bounds))
 
 
-def _bounds(parts: Iterable[tuple[str, Span | None]]) -> Bounds:
-    """The bounds of parts, by their recordings and log times, ns, None where these are unknown."""
-    names, spans = [], []
-    for name, span in parts:
-        names.append(name)
-        spans.append(span or (BEGIN, END))
-    recording = np.array(names, object)
-    first, last = np.array(spans, np.int64).reshape(-1, 2).T
-    micros = first // 1000, last // 1000
-    return {"t": (first, last), "log_time": micros, "recording": (recording, recording)}
+def _is_fixed(channel: RecordedChannel) -> bool:
+    """True if a definition fixes the fields of all messages."""
+    return (
+        channel.codec.reason is not None
+        or channel.encoding in FIXED
+        # The keys of a map of protobuf are fields, which no definition knows.
+        or (channel.encoding == "protobuf" and not has_empty(channel.arrow_type()))
+    )
 
 
 _TOPICS: Final = pa.schema(
@@ -226,8 +234,8 @@ def store_table(name: str, content: StoreContent) -> pa.Table:
 def _topics(content: StoreContent) -> Iterator[Mapping[str, Any]]:
     for topic, view in content.names.views.items():
         for summary in content.summaries_of(topic):
-            found = content.topic_of(summary, topic)
-            channels = list(found.channels.values())
+            entry = content.session.entry_of(summary)
+            channels = content.session.channels_of(entry, [topic])
             total = ChannelStats()
             for channel in channels:
                 total.add(channel.stats)
@@ -245,7 +253,7 @@ def _topics(content: StoreContent) -> Iterator[Mapping[str, Any]]:
                 "bytes": total.payload_bytes,
                 **times(total.first, total.last),
                 "mean_skew": total.mean_skew,
-                "unset_stamps": total.unset if found.entry.is_decoded else None,
+                "unset_stamps": total.unset if entry.is_decoded else None,
                 "problem": "; ".join(problems) or None,
             }
 
@@ -268,8 +276,9 @@ def _losses(content: StoreContent) -> Iterator[Mapping[str, Any]]:
 def _marks(content: StoreContent) -> Iterator[Mapping[str, Any]]:
     names = {one.id: one.name for one in content.summaries}
     for mark in marks_in(content.session, [*names]):
-        window = content.window(mark.recording)
-        if window is not None and not window[0] <= mark.begin < window[1]:
+        one = content.resolved.get(mark.recording)
+        begin, end = (0, 0) if one is None else one.bounds or (BEGIN, END)
+        if content.scope.bounds is not None and not begin <= mark.begin < end:
             continue
         yield {
             "log_time": mark.begin // 1000,

@@ -6,7 +6,7 @@ import re
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
@@ -79,12 +79,6 @@ class SqlEngine:
 
     def content(self, scope: Question = EVERYWHERE) -> StoreContent:
         """Recordings and views of a scope as they are now."""
-        for _ in range(_MAX_TRIES):
-            with suppress(ChangedError):
-                return self._read(scope)
-        return self._read(scope)
-
-    def _read(self, scope: Question) -> StoreContent:
         with self._lock:
             known, session = self._content, self._source.now()
             if known is None or known.scope != scope or known.snapshot is not session.look():
@@ -155,9 +149,8 @@ class SqlConnection:
             raise UsageError("The query is empty.")
         if self._only_reads and any(_kind(statement) != "SELECT" for statement in statements):
             raise UsageError("Only queries are possible here, such as select and show.")
-        content = self.content
-        self._names.update(content.names.named(text))
-        self.register(content)
+        self._names.update(self.content.names.named(text))
+        self.register()
         answers = [
             self._prepared(statement, params if statement is statements[-1] else None, timeout)
             for statement in statements
@@ -174,10 +167,11 @@ class SqlConnection:
             answer.run()
         return answer
 
-    def register(self, content: StoreContent) -> None:
-        """Register the views that were named so far."""
+    def register(self) -> None:
+        """Register the views that were named so far, as they are now."""
         from hybridlog.sql.source import TopicDataset
 
+        content = self.content
         for name in self._names:
             topic = content.names.topic(name)
             if topic is not None:
@@ -281,19 +275,13 @@ class SqlAnswer:
         No further row is taken after so many bytes.
         """
         taken: list[pa.RecordBatch] = []
-        room, bytes_taken = rows, 0
         # Few rows at a time: each may be an image.
         for batch in self._batches(_FIRST_ROWS, rows + 1):
-            if bytes_taken > size:
-                break
-            taken.append(batch.slice(0, room))
-            if batch.num_rows > room:
-                break
-            room -= batch.num_rows
-            bytes_taken += batch.nbytes
-        else:
-            return pa.Table.from_batches(taken), False
-        return pa.Table.from_batches(taken), True
+            if sum(one.nbytes for one in taken) > size:
+                return pa.Table.from_batches(taken), True
+            taken.append(batch)
+        table = pa.Table.from_batches(taken)
+        return table.slice(0, rows), table.num_rows > rows
 
     def to_batches(self) -> Iterator[pa.RecordBatch]:
         """The answer in record batches of bounded size, at least one.
@@ -331,7 +319,7 @@ class SqlAnswer:
                 if not tries:
                     raise
                 self._connection.engine.forget()
-                self._connection.register(self._connection.content)
+                self._connection.register()
                 self._prepare()
         raise AssertionError
 

@@ -1,35 +1,26 @@
-"""Topics as sources of DuckDB: columns and filters of a query reach `TopicView.rows`."""
+"""Topics as sources of DuckDB: columns and limits of a query reach `TopicView.rows`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial, reduce
+from collections.abc import Callable, Iterator, Sequence
+from functools import reduce
 from typing import Any, Final
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.dataset as ds
-from duckdb._sources.nodes import Binary, Col, In, Lit, Node, Postfix, Unary, Untranslatable
+from duckdb._sources.nodes import Binary, Col, In, Lit, Node
 from duckdb._sources.pyarrow import PyArrowDatasetSource
-from duckdb._sources.to_arrow import to_arrow
-from numpy.typing import NDArray
 
 from hybridlog.sql.content import TopicView
-from hybridlog.sql.rows import Bounds, Filter, Reading
+from hybridlog.sql.rows import Limits, Reading
+from hybridlog_storage.times import BEGIN, END
 
-_COMPARED: Final[Mapping[str, Callable[..., NDArray[np.bool_]]]] = {
-    "=": lambda low, high, value: (low <= value) & (value <= high),
-    "!=": lambda low, high, value: (low != value) | (high != value),
-    "<": lambda low, _, value: low < value,
-    "<=": lambda low, _, value: low <= value,
-    ">": lambda _, high, value: high > value,
-    ">=": lambda _, high, value: high >= value,
-}
-"""By operator, a test if a comparison may hold for values between a low and a high bound."""
+_UNITS: Final = {"t": 1, "log_time": 1000}
+"""Columns of log time, and the nanoseconds that a number in each stands for."""
 
 
 class TopicDataset(ds.Dataset, PyArrowDatasetSource):  # type: ignore[misc] # without types
-    """A topic as DuckDB reads it. DuckDB relies on the source for the filters that it hands over.
+    """A topic as DuckDB reads it. It relies on the source for the filters that are accepted.
 
     DuckDB takes the number of rows, and asks which filters are applied, by a class that is no
     part of its documented interface; so the version of its package is bounded.
@@ -50,57 +41,37 @@ class TopicDataset(ds.Dataset, PyArrowDatasetSource):  # type: ignore[misc] # wi
         return self.view.size
 
     def accepts(self, predicate: Any) -> bool:
-        """True for a filter that pyarrow evaluates as DuckDB does.
-
-        No rows are left out by statistics of floats, so NaN does not matter.
-        """
-        try:
-            to_arrow(predicate, self.schema)
-        except Untranslatable:
-            return False
-        return True
+        """True for a filter that limits times or recordings alone; DuckDB applies the others."""
+        return _limits(predicate) is not None
 
     def stream(self, columns: Sequence[int] | None, filters: Sequence[Node]) -> tuple[object, bool]:
         """The rows for which the filters hold, as a stream of record batches."""
         schema, reading = self.schema, self._reading()
         if columns is not None:
             schema = pa.schema([schema.field(place) for place in columns])
-        whole = reduce(partial(Binary, "AND"), filters) if filters else Node()
-        expression = to_arrow(whole, self.schema) if filters else None
-        where = Filter(expression, {*_paths(whole)}, partial(_may_hold, whole))
-        rows = self.view.rows(schema.names, where, reading)
-        reader = pa.RecordBatchReader.from_batches(schema, _told(rows, reading))
+        limits = reduce(Limits.common, filter(None, map(_limits, filters)), Limits())
+        rows = _told(self.view.rows(schema, limits, reading), reading)
+        reader = pa.RecordBatchReader.from_batches(schema, rows)
         return reader.__arrow_c_stream__(), columns is not None
 
 
-def _may_hold(node: Node, bounds: Bounds) -> NDArray[np.bool_]:
-    """Mask of the parts that may have rows for which a filter holds."""
+def _limits(node: Node) -> Limits | None:
+    """The rows for which a filter holds; None of one about anything but times and recordings."""
     match node:
         case Binary(op="AND", left=left, right=right):
-            return _may_hold(left, bounds) & _may_hold(right, bounds)
-        case Binary(op="OR", left=left, right=right):
-            return _may_hold(left, bounds) | _may_hold(right, bounds)
-        case Binary(op=op, left=Col(parts=(name,)), right=Lit(value=value)) if (
-            op in _COMPARED and name in bounds
-        ):
-            return _COMPARED[op](*bounds[name], value)
-        case In(operand=Col() as column, values=values):
-            each = (_may_hold(Binary("=", column, one), bounds) for one in values)
-            return reduce(np.logical_or, each)
-    return np.ones(len(bounds["t"][0]), np.bool_)
-
-
-def _paths(node: Node) -> Iterator[tuple[str, ...]]:
-    """The paths that a filter tests."""
-    pending = [node]
-    while pending:
-        match pending.pop():
-            case Col(parts=parts):
-                yield parts
-            case Binary(left=left, right=right):
-                pending += [left, right]
-            case Unary(operand=operand) | Postfix(operand=operand) | In(operand=operand):
-                pending.append(operand)
+            one, other = _limits(left), _limits(right)
+            return None if one is None or other is None else one.common(other)
+        case Binary(op=op, left=Col(parts=(name,)), right=Lit(value=int(value))) if name in _UNITS:
+            begin, end = (number * _UNITS[name] for number in (value, value + 1))
+            if begin > BEGIN and end < END:
+                spans = {"<": (BEGIN, begin), "<=": (BEGIN, end), "=": (begin, end)}
+                spans |= {">=": (begin, END), ">": (end, END)}
+                return Limits(spans[op]) if op in spans else None
+        case Binary(op="=", left=Col(parts=("recording",)), right=Lit(value=str(value))):
+            return Limits(recordings=[value])
+        case In(operand=Col(parts=("recording",)), values=values):
+            return Limits(recordings=[str(one.value) for one in values if isinstance(one, Lit)])
+    return None
 
 
 def _told(batches: Iterator[pa.RecordBatch], reading: Reading) -> Iterator[pa.RecordBatch]:
