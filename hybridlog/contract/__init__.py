@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import difflib
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
-from msgspec import Struct, field
+from msgspec import Meta, Struct, ValidationError, convert, field
 
 from hybridlog.formats.yaml_values import YamlError, parse_yaml, read_yaml
 from hybridlog.query.periods import GAP_PERIODS
@@ -81,7 +80,7 @@ class Contract(Struct, frozen=True):
         """Read a contract from a file.
 
         Raises:
-            UsageError: It cannot be read, or breaks the schema; names line and cure.
+            UsageError: It cannot be read, or breaks the schema; names topic, rule and cure.
         """
         return cls.parse(read_yaml(path, "contract"), str(path))
 
@@ -90,112 +89,56 @@ class Contract(Struct, frozen=True):
         """Parse a contract.
 
         Raises:
-            UsageError: It breaks the schema; names line and cure.
+            UsageError: It breaks the schema; names topic, rule and cure.
         """
-        lines: dict[tuple[int, object], int] = {}
         try:
-            root = parse_yaml(text, lines=lines)
-        except YamlError as error:
-            raise UsageError(f"{name} is no YAML: {error}.") from error
-        return _Reader(name, lines).contract(root)
+            given = convert(parse_yaml(text), _Given)
+            topics = {topic: _rules(topic, rules or {}) for topic, rules in given.topics.items()}
+            if sum(len(one.offset) + len(one.share) for one in topics.values()) > MAX_RULES:
+                raise UsageError(f"there are more than {MAX_RULES} offsets and shares")
+        except (YamlError, ValidationError, UsageError) as error:
+            raise UsageError(f"{name} is no contract: {str(error).removesuffix('.')}.") from error
+        return cls(topics, given.lost)
 
 
-class _Reader:
-    """Checks the values of a contract."""
-
-    def __init__(self, name: str, lines: Mapping[tuple[int, object], int]) -> None:
-        self._name = name
-        self._lines = lines
-        self._left = MAX_RULES
-
-    def contract(self, root: object) -> Contract:
-        if not isinstance(root, dict):
-            raise UsageError(f"{self._name} is no contract: it begins with `topics:`.")
-        self._check_keys(root, ("topics", "lost"))
-        topics = self._mapping(root, "topics")
-        found = {str(topic): self._rules(topics, topic) for topic in topics}
-        return Contract(found, self._value(root, "lost", _count) if "lost" in root else None)
-
-    def _rules(self, topics: Mapping[object, object], topic: object) -> TopicRules:
-        if topics[topic] is None:
-            return TopicRules()
-        rules = self._mapping(topics, topic)
-        self._check_keys(rules, [*TopicRules.__struct_fields__])
-        values: dict[str, Any] = {}
-        for key in map(str, rules):
-            if key in {"offset", "share"}:
-                inner = self._mapping(rules, key)
-                self._left -= len(inner)
-                if self._left < 0:
-                    why = f"there are more than {MAX_RULES} offsets and shares"
-                    raise self._error(rules, key, why)
-                values[key] = {str(one): self._value(inner, one, _KINDS[key]) for one in inner}
-                for one in inner if key == "share" else ():
-                    self._value(inner, one, partial(_check_predicate, one))
+def _rules(topic: str, given: Mapping[str, Any]) -> TopicRules:
+    values: dict[str, Any] = {}
+    for key, value in given.items():
+        if key not in _KINDS:
+            raise UsageError(f"{topic}: there is no rule `{key}`; there are {listed(_KINDS, 20)}")
+        try:
+            if key in _BY_NAME:
+                values[key] = {one: _KINDS[key](own) for one, own in convert(value, _Named).items()}
+                for predicate in values[key] if key == "share" else ():
+                    _check_predicate(predicate)
             else:
-                values[key] = self._value(rules, key, _KINDS[key])
-        return TopicRules(**values)
-
-    def _value(self, holder: Mapping[Any, object], key: object, read: Callable[[Any], Any]) -> Any:
-        try:
-            return read(holder[key])
-        except (HybridlogError, ValueError) as error:
-            raise self._error(holder, key, str(error)) from error
-
-    def _mapping(self, holder: Mapping[Any, object], key: object) -> Mapping[object, object]:
-        value = holder.get(key)
-        if not isinstance(value, dict):
-            raise self._error(
-                holder, key, f"`{key}:` has names with values, each on a line of its own"
-            )
-        return value
-
-    def _check_keys(self, holder: Mapping[object, object], known: Sequence[str]) -> None:
-        for key in holder:
-            if key not in known:
-                near = difflib.get_close_matches(str(key), known, 1)
-                cure = f"did you mean `{near[0]}`?" if near else f"there are {listed(known, 20)}"
-                raise self._error(holder, key, f"there is no rule `{key}`; {cure}")
-
-    def _error(self, holder: Mapping[Any, object], key: object, why: str) -> UsageError:
-        line = self._lines.get((id(holder), key))
-        place = f", line {line}" if line else ""
-        return UsageError(f"{self._name}{place}: {why.removesuffix('.')}.")
+                values[key] = _KINDS[key](value)
+        except (HybridlogError, ValueError, ValidationError) as error:
+            raise UsageError(f"{topic}: {key}: {error}") from error
+    return TopicRules(**values)
 
 
-def _checked(value: Any, fits: bool, why: str) -> Any:  # noqa: FBT001
-    if not fits:
-        raise ValueError(f"{value!r} {why}")
-    return value
+class _Given(Struct, forbid_unknown_fields=True):
+    """A contract as it is written."""
 
-
-def _count(value: Any) -> Any:
-    fits = type(value) is int and value >= 0
-    return _checked(value, fits, "is no number of messages: write 0 or more")
-
-
-def _number(value: object) -> float:
-    try:
-        found = float(value) if isinstance(value, int | str) and not isinstance(value, bool) else -1
-    except ValueError:
-        found = -1.0
-    _checked(value, 0 <= found < math.inf, "is no number of at least 0")
-    return found
-
-
-def _share(value: object) -> float:
-    text = str(value).strip()
-    found = _number(text.removesuffix("%").strip()) / (100 if text.endswith("%") else 1)
-    _checked(value, found <= 1, "is no share: write 95% or 0.95")
-    return found
+    topics: dict[str, dict[str, Any] | None]
+    lost: Annotated[int, Meta(ge=0)] | None = None
 
 
 def parse_share(text: str) -> float:
     """A share from `5%` or `0.05`; UsageError if it is none, or more than 1."""
+    number = text.strip().removesuffix("%")
     try:
-        return _share(text)
-    except ValueError as error:
-        raise UsageError(f"{error}.") from error
+        found = float(number) / (1 if number == text.strip() else 100)
+    except ValueError:
+        found = math.nan
+    if not 0 <= found <= 1:
+        raise UsageError(f"{text!r} is no share: write 95% or 0.95.")
+    return found
+
+
+def _duration(value: object) -> int:
+    return parse_duration(value if isinstance(value, int) else str(value))
 
 
 def _age(value: object) -> int:
@@ -203,30 +146,27 @@ def _age(value: object) -> int:
     return -parse_duration(text[1:]) if text.startswith("-") else parse_duration(text)
 
 
-def _duration(value: object) -> int:
-    return parse_duration(value if isinstance(value, int) else str(value))
+def _check_predicate(text: str) -> None:
+    predicate = parse(text)
+    if predicate.is_across:
+        raise UsageError("it is of two topics: leave the other topic out")
+    if not predicate.asks_fields:
+        raise UsageError("it is not about fields of the message")
 
 
-def _flag(value: Any) -> Any:
-    return _checked(value, isinstance(value, bool), "is neither true nor false")
-
-
-def _check_predicate(given: object, _: object) -> None:
-    text = _KINDS["type"](given)
-    _checked(text, not parse(text).is_across, "is of two topics: leave the other topic out")
-    _checked(text, parse(text).asks_fields, "is not about fields of the message")
-
-
+_Named = dict[str, int | str]
+_BY_NAME: Final = ("offset", "share")
+"""Rules with a value for each topic, or each predicate."""
 _KINDS: Final[Mapping[str, Callable[[Any], Any]]] = {
-    "type": lambda one: _checked(one, isinstance(one, str), "is no name: write it in quotes"),
-    "rate": lambda one: _checked(_number(one), _number(one) > 0, "is no rate: leave out the topic"),
-    "tolerance": _share,
-    "lost": _count,
+    "type": partial(convert, type=str),
+    "rate": partial(convert, type=Annotated[float, Meta(gt=0, le=1e9)], strict=False),
+    "tolerance": lambda value: parse_share(str(value)),
+    "lost": partial(convert, type=Annotated[int, Meta(ge=0)]),
     "least_age": _age,
     "greatest_age": _age,
-    "stamps_in_order": _flag,
-    "optional": _flag,
-    "share": _share,
+    "stamps_in_order": partial(convert, type=bool),
+    "optional": partial(convert, type=bool),
+    "share": lambda value: parse_share(str(value)),
     **dict.fromkeys(("longest_gap", "jitter", "late_start", "early_stop", "offset"), _duration),
 }
 

@@ -38,11 +38,10 @@ def read_yaml(path: str | Path, what: str) -> bytes:
     return text
 
 
-def parse_yaml(text: str | bytes, *, lines: dict[tuple[int, object], int] | None = None) -> object:
+def parse_yaml(text: str | bytes) -> object:
     """Parse the first document of a text; fractions are strings.
 
-    `lines` gets the line of each key, by the `id` of its mapping and the key. A key that is not a
-    single word or is repeated raises YamlError, as too much text does.
+    A key that is not a single word or is repeated raises YamlError, as too much text does.
     """
     import yaml
 
@@ -58,19 +57,14 @@ def parse_yaml(text: str | bytes, *, lines: dict[tuple[int, object], int] | None
         take()
         if isinstance(take(), yaml.StreamEndEvent):
             return None
-        return _value(take(), take, {}, {} if lines is None else lines)
+        return _value(take(), take, {})
     except (yaml.YAMLError, UnicodeEncodeError) as error:
         raise YamlError(" ".join(str(error).split())[:200]) from error
     except RecursionError:
         raise YamlError("its nesting depth is too great") from None
 
 
-def _value(
-    event: Any,
-    take: Callable[[], Any],
-    anchors: dict[str | None, object],
-    lines: dict[tuple[int, object], int],
-) -> Any:
+def _value(event: Any, take: Callable[[], Any], anchors: dict[str | None, object]) -> Any:
     """The value that this event begins, and the following ones complete."""
     import yaml
 
@@ -84,16 +78,15 @@ def _value(
     anchors[event.anchor] = found
     while not isinstance(item := take(), yaml.CollectionEndEvent):
         if is_list:
-            found.append(_value(item, take, anchors, lines))
+            found.append(_value(item, take, anchors))
             continue
         is_word = isinstance(item, yaml.ScalarEvent | yaml.AliasEvent)
-        key = _value(item, take, anchors, lines) if is_word else found
+        key = _value(item, take, anchors) if is_word else found
         if isinstance(key, dict | list):
             raise YamlError("a key is a list or a mapping")
         if key in found:
             raise YamlError(f"the key {key!r} is repeated")
-        lines[id(found), key] = item.start_mark.line + 1
-        found[key] = _value(take(), take, anchors, lines)
+        found[key] = _value(take(), take, anchors)
     return found
 
 
