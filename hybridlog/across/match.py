@@ -41,13 +41,10 @@ _types = pa.types
 
 
 class Matched(NamedTuple):
-    """The messages that belong to some times.
+    """The messages that belong to n times, int64[n] each: their rows, -1 where none is near enough.
 
-    Attributes:
-        before: int64[n], row of the message; -1 where none is near enough.
-        after: int64[n], row of the other one; equal to `before` if that decides alone.
-        distance: int64[n], time of the message minus the time, ns; of the farther one of two. 0
-            where there is none.
+    `after` equals `before` if that decides alone; `distance` is the time of the message, of two the
+    farther one, minus the time, ns.
     """
 
     before: NDArray[np.int64]

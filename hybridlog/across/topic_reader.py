@@ -60,12 +60,9 @@ _SKIPPED_BYTES = 1 << 20  # messages between needed ones that are read along
 
 
 class Moments(NamedTuple):
-    """Times of the messages of a topic.
+    """Log times of n messages, and times on the clock of the k that have one, ns, ascending.
 
-    Attributes:
-        log_time: int64[n], ns, ascending.
-        time: int64[k], times on the clock of the messages that have one, ns, ascending.
-        place: intp[k], which of the n messages each of these is.
+    `place` is intp[k], which of the n each of these is.
     """
 
     log_time: NDArray[np.int64]
@@ -251,10 +248,7 @@ class TopicReader:
 class Beside(TopicReader):
     """A topic beside rows: finds the messages that belong to their times.
 
-    Times are whole, values come for a piece of the rows.
-
-    Attributes:
-        most: Number of rows that may get messages together.
+    Times are whole, values come for a piece of the rows: at most `most` of them together.
     """
 
     def __init__(

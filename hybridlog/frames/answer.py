@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -109,14 +109,8 @@ def schema_of(planner: Planner) -> pa.Schema | None:
 
     Messages whose fields no definition fixes are read for this.
     """
-    if not any(_is_open(channel) for channel in planner.examples):
-        return None
-    return common_schema(stream(planner))
-
-
-def _is_open(channel: RecordedChannel) -> bool:
-    """True if the columns of a channel depend on the content of its messages."""
-    return channel.encoding not in FIXED
+    is_fixed = all(channel.encoding in FIXED for channel in planner.examples)
+    return None if is_fixed else common_schema(stream(planner))
 
 
 def _table(blocks: list[Block], question: Question) -> pa.Table:
@@ -171,7 +165,13 @@ class Decoder:
 
     def decoded(self, channel: RecordedChannel, batch: Batch) -> Decoded:
         """The fields of messages of one channel; those that cannot be read are counted."""
-        fields = _to_decode(self._chosen, channel, self.own)
+        fields = None
+        if self._chosen is not None:
+            # Arrays of which summaries are asked for, too.
+            known = {path.path: path.type for path in channel.codec.paths()}
+            arrays = (path.rpartition(".")[0] for path in summaries_in(self._chosen, known))
+            stamp = [STAMP] if "stamp" in self.own else []
+            fields = frozenset([*self._chosen, *arrays, *stamp])
         found = channel.codec.columns_of(batch, fields)
         self._counters.unreadable += len(batch) - len(found.rows)
         if isinstance(found.records, LeftFields):
@@ -185,9 +185,7 @@ class Decoder:
     ) -> Block:
         """The readable messages of one channel."""
         records, good = decoded.arrow(), decoded.rows
-        stamps = None
-        if "stamp" in self.own:
-            stamps = stamp_array(records)
+        stamps = stamp_array(records) if "stamp" in self.own else None
         if len(good) < len(batch):
             batch, seq = batch.take(good), seq[good]
         own = self.own_columns(channel, batch, seq, stamps)
@@ -211,7 +209,18 @@ class Decoder:
         stamps: pa.Array[Any] | None = None,
     ) -> dict[str, pa.Array[Any]]:
         """Built-in columns of messages of one channel, without the log time."""
-        return {name: _own_column(name, channel, batch, seq, stamps) for name in self.own}
+        rows, is_known = len(batch), channel.channel.has_publish_time
+        made: dict[str, Callable[[], pa.Array[Any]]] = {
+            "topic": lambda: text_column(channel.channel.topic, rows),
+            "recording": lambda: text_column(channel.recording.name, rows),
+            "seq": lambda: numbers(seq),
+            "sequence": lambda: numbers(batch.sequence),
+            "publish_time": lambda: (
+                numbers(batch.publish_time, "time") if is_known else pa.nulls(rows, TIME)
+            ),
+            "stamp": lambda: pa.nulls(rows, TIME) if stamps is None else stamps,
+        }
+        return {name: made[name]() for name in self.own}
 
 
 def _own(planner: Planner) -> list[str]:
@@ -227,43 +236,10 @@ def _own(planner: Planner) -> list[str]:
     return [name for name in dict.fromkeys([*added, *requested]) if name != "log_time"]
 
 
-def _own_column(
-    name: str,
-    channel: RecordedChannel,
-    batch: Batch,
-    seq: NDArray[np.int64],
-    stamps: pa.Array[Any] | None,
-) -> pa.Array[Any]:
-    rows = len(batch)
-    if name == "topic":
-        return text_column(channel.channel.topic, rows)
-    if name == "recording":
-        return text_column(channel.recording.name, rows)
-    if name == "seq":
-        return numbers(seq)
-    if name == "sequence":
-        return numbers(batch.sequence)
-    if name == "publish_time":
-        known = channel.channel.has_publish_time
-        return numbers(batch.publish_time, "time") if known else pa.nulls(rows, TIME)
-    return pa.nulls(rows, TIME) if stamps is None else stamps
-
-
 def text_column(text: str, rows: int) -> pa.Array[Any]:
     """A column of the same text."""
     text = text.encode("utf-8", "replace").decode()
     return pa.repeat(pa.scalar(text, pa.string()), rows)
-
-
-def _to_decode(
-    fields: Sequence[str] | None, channel: RecordedChannel, own: Sequence[str]
-) -> frozenset[str] | None:
-    """Paths that are decoded: those asked for, arrays whose summaries are, the stamp."""
-    if fields is None:
-        return None
-    known = {path.path: path.type for path in channel.codec.paths()}
-    wanted = {*fields, *(path.rpartition(".")[0] for path in summaries_in(fields, known))}
-    return frozenset(wanted | {STAMP} if "stamp" in own else wanted)
 
 
 def check_definitions(channels: Sequence[RecordedChannel]) -> None:
@@ -277,15 +253,9 @@ def check_definitions(channels: Sequence[RecordedChannel]) -> None:
 
 
 class Block(NamedTuple):
-    """Decoded messages of one topic.
+    """Decoded messages of one topic: log times, ns, order of equal ones, columns of n rows each.
 
-    Attributes:
-        log_time: int64[n], ns.
-        order: int64[n], order of messages with the same log time.
-        own: Built-in columns without the log time, n rows each.
-        records: n rows.
-        size: Bytes of their payloads.
-        summaries: Requested summaries of arrays that are not there, by path.
+    `size` is the bytes of their payloads; `summaries` are of arrays that are not there, by path.
     """
 
     topic: str

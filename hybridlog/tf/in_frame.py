@@ -35,42 +35,7 @@ if TYPE_CHECKING:
 _STAMPS: Final = ("header.stamp", "timestamp")
 _FRAMES: Final = ("header.frame_id", "frame_id", "parent_frame_id")
 _XYZ: Final = ("x", "y", "z")
-
-
-class _Pose(NamedTuple):
-    """Columns of a pose.
-
-    Attributes:
-        position: Path above x, y and z; of a vector the same.
-        rotation: Path above x, y, z and w; empty for a point or a vector.
-        covariance: Path of the 36 numbers of its covariance; empty without.
-        is_vector: It is only turned.
-    """
-
-    position: str
-    rotation: str
-    covariance: str
-    is_vector: bool
-
-
-class _Places(NamedTuple):
-    """Columns of a topic's messages that are in the frame of their header.
-
-    Attributes:
-        stamp: Path of the time.
-        frame: Path of the frame.
-    """
-
-    poses: Sequence[_Pose]
-    stamp: str
-    frame: str
-
-    def columns(self) -> Iterator[str]:
-        yield from (self.stamp, self.frame)
-        for pose in self.poses:
-            yield from (f"{pose.position}.{axis}" for axis in "xyz")
-            yield from (f"{pose.rotation}.{axis}" for axis in ("xyzw" if pose.rotation else ""))
-
+_TIME: Final = pa.timestamp("ns", "UTC")
 
 Known: TypeAlias = "dict[str, Trees | TopicError]"
 """The trees of recordings, or why the frame that is asked for is not there."""
@@ -89,6 +54,18 @@ class Points(NamedTuple):
     points: NDArray[Any]
 
 
+class _Pose(NamedTuple):
+    """Paths above x, y, z (and w) of a pose, and of its covariance; empty for what is not there.
+
+    A vector is only turned.
+    """
+
+    position: str
+    rotation: str = ""
+    covariance: str = ""
+    is_vector: bool = False
+
+
 def stream(planner: Planner, known: Known | None = None) -> Iterator[pa.Table]:
     """The tables of an answer, see `frames.answer.stream`; in the frame of the question, if any.
 
@@ -97,9 +74,8 @@ def stream(planner: Planner, known: Known | None = None) -> Iterator[pa.Table]:
     """
     if planner.question.frame is None:
         return answer.stream(planner)
-    if has_points(planner):
-        return _tables_of_points(planner, known)
-    return _tables_of_poses(planner, known)
+    looked = _Looked(planner.session, planner.question, planner.counters, known)
+    return (_tables_of_points if has_points(planner) else _tables_of_poses)(planner, looked)
 
 
 def has_points(planner: Planner) -> bool:
@@ -115,15 +91,17 @@ def has_places(planner: Planner) -> bool:
     return has_points(planner) or _places_in(planner) is not None
 
 
-def points_of(
-    session: Session, question: Question, counters: Counters, known: Known | None = None
-) -> Iterator[Points]:
+def points_of(session: Session, question: Question, counters: Counters) -> Iterator[Points]:
     """The points of messages in the frame of the question, in order.
 
     Messages that cannot be arrays are left out; `counters.unreadable` counts them.
     """
-    looked = _Looked(session, question, counters, known)
-    for run in Planner(session, replace(question, frame=None), counters).runs():
+    return _points_of(_Looked(session, question, counters, None))
+
+
+def _points_of(looked: _Looked) -> Iterator[Points]:
+    counters = looked.counters
+    for run in Planner(looked.session, replace(looked.question, frame=None), counters).runs():
         found: list[tuple[Points, dict[str, object]]] = []
         for message in messages_in(run):
             if message.is_reduced:
@@ -156,32 +134,30 @@ class _Looked:
     def __init__(
         self, session: Session, question: Question, counters: Counters, known: Known | None
     ) -> None:
-        self._session = session
-        self._counters = counters
-        self.target = str(question.frame)
-        self._question = question
-        self._topic = question.topics[0]
+        self.session = session
+        self.question = question
+        self.counters = counters
+        self._target, self._topic = str(question.frame), question.topics[0]
         self._trees: Known = {} if known is None else known
 
     def _of(self, recording: str) -> Trees | TopicError:
         """The trees of a recording, or why the frame asked for is not there."""
         if recording not in self._trees:
-            snapshot = self._session.look([recording])
+            snapshot = self.session.look([recording])
             summary = snapshot.summaries[snapshot.by_id[recording]]
-            trees = Trees(self._session, [summary], self._question.tf_topics)
+            trees = Trees(self.session, [summary], self.question.tf_topics)
             try:
-                trees.check(self._topic, self.target)
+                trees.check(self._topic, self._target)
                 self._trees[recording] = trees
-                self._counters.of_frames += tuple(trees.tree(self._topic).remarks)
+                self.counters.of_frames += tuple(trees.tree(self._topic).remarks)
             except TopicError as error:
                 self._trees[recording] = error
         return self._trees[recording]
 
     def _refuse(self, error: TopicError) -> None:
         """Refuse a frame that no recording has."""
-        summaries = self._session.look(self._question.recordings).summaries
-        ids = [summaries[n].id for n in self._session.chosen(self._question).tolist()]
-        if all(isinstance(self._of(recording), TopicError) for recording in ids):
+        chosen = self.session.summaries_of(self.question)
+        if all(isinstance(self._of(one.id), TopicError) for one in chosen):
             raise error
 
     def transforms(
@@ -204,88 +180,86 @@ class _Looked:
                 missing["no such frame in the recording"] += len(rows)
                 continue
             try:
-                found = trees.lookup(self._topic, self.target, frame, times[rows], log_time[rows])
+                found = trees.lookup(self._topic, self._target, frame, times[rows], log_time[rows])
             except TopicError:
                 missing[f"no frame {frame!r} among the transforms"] += len(rows)
                 continue
             made.translation[rows], made.rotation[rows] = found.translation, found.rotation
             missing.update(found.missing)
-        self._counters.no_transform += tuple(
-            (f"to {self.target}: {why}", count) for why, count in missing.items()
+        self.counters.no_transform += tuple(
+            (f"to {self._target}: {why}", count) for why, count in missing.items()
         )
         return made
 
 
-def _tables_of_points(planner: Planner, known: Known | None) -> Iterator[pa.Table]:
+def _tables_of_points(planner: Planner, looked: _Looked) -> Iterator[pa.Table]:
     question = planner.question
     if question.fields is not None:
         raise UsageError("Points in a frame have the fields of their points: leave out fields.")
     several = question.names_recording or len(planner.session.chosen(question)) > 1
-    summaries = planner.session.snapshot().summaries
-    names = {one.id: one.name for one in summaries}
-    stamp = pa.timestamp("ns", "UTC")
+    names = {one.id: one.name for one in planner.session.snapshot().summaries}
     given = False
-    for message, time, points in points_of(planner.session, question, planner.counters, known):
+    for message, time, points in _points_of(looked):
         own = {
-            "log_time": pa.array([message.log_time_ns], stamp),
+            "log_time": pa.array([message.log_time_ns], _TIME),
             **({"recording": pa.array([names[message.recording]])} if several else {}),
-            "header.stamp": pa.array([time], stamp),
+            "header.stamp": pa.array([time], _TIME),
             "header.frame_id": pa.array([question.frame]),
         }
-        columns = point_columns(points)
         own |= {
             name: pa.ListArray.from_arrays(np.array([0, len(values)], np.int32), values)
-            for name, values in columns.items()
+            for name, values in point_columns(points).items()
             if name not in own
         }
         yield pa.table(own)
         given = True
     if not given:
-        yield pa.table({"log_time": pa.array([], stamp)})
+        yield pa.table({"log_time": pa.array([], _TIME)})
 
 
-def _places_in(planner: Planner) -> _Places | None:
-    """The poses of a topic; None without any, or without a time or a frame of theirs."""
+def _places_in(planner: Planner) -> tuple[Sequence[_Pose], str, str] | None:
+    """The poses of a topic, and the paths of their time and frame; None if one is missing."""
     question = planner.question
     known = planner.session.field_types(question.topics, question.recordings) or {}
     poses = [*_poses_among(known)]
     stamp = next((name for name in _STAMPS if name in known), None)
     frame = next((name for name in _FRAMES if name in known), None)
-    if not poses or stamp is None or frame is None:
-        return None
-    return _Places(poses, stamp, frame)
+    return None if not poses or stamp is None or frame is None else (poses, stamp, frame)
 
 
-def _tables_of_poses(planner: Planner, known: Known | None) -> Iterator[pa.Table]:
-    session, question = planner.session, planner.question
-    looked = _Looked(session, question, planner.counters, known)
-    found = _places_in(planner)
-    if found is None:
+def _tables_of_poses(planner: Planner, looked: _Looked) -> Iterator[pa.Table]:
+    session, question, places = planner.session, planner.question, _places_in(planner)
+    if places is None:
         raise UsageError(
             f"{question.topics[0]} has no points or poses with a frame and a time of their own, "
             "so it cannot be in another frame."
         )
-    stamp, frame = found.stamp, found.frame
+    poses, stamp, frame = places
     several = question.names_recording or len(session.chosen(question)) > 1
-    plain = replace(question, frame=None)
-    requested, hidden = question.fields, set() if several else {"recording"}
-    if requested is not None:
-        added = [one for one in found.columns() if not _is_in(one, requested)]
+    plain = replace(question, frame=None, names_recording=True)
+    hidden = set() if several else {"recording"}
+    if question.fields is not None:
+        parts = [(one.position, "xyz") for one in poses]
+        parts += [(one.rotation, "xyzw") for one in poses if one.rotation]
+        used = [stamp, frame, *(f"{path}.{axis}" for path, axes in parts for axis in axes)]
+        added = [
+            path
+            for path in used
+            if not any(path == one or path.startswith(f"{one}.") for one in question.fields)
+        ]
         hidden |= {*added}
-        plain = replace(plain, fields=(*requested, *added))
+        plain = replace(plain, fields=(*question.fields, *added))
     ids = session.snapshot().ids_called()
-    inner = Planner(session, replace(plain, names_recording=True), planner.counters)
-    for table in answer.stream(inner):
+    for table in answer.stream(Planner(session, plain, planner.counters)):
         names = table["recording"].to_pylist()
         if not ids.keys() >= {*names}:
             raise TopicError("Two of these recordings have one name: ask about one by its id.")
-        recordings = [ids[name] for name in names]
         frames = [str(name or "") for name in table[frame].to_pylist()]
         times = table[stamp].cast(pa.int64()).fill_null(0).to_numpy()
         log_time = table["log_time"].cast(pa.int64()).to_numpy()
         columns = {name: table[name].combine_chunks() for name in table.column_names}
-        moved = looked.transforms(recordings, frames, times, log_time)
-        for pose in found.poses:
+        moved = looked.transforms([ids[name] for name in names], frames, times, log_time)
+        for pose in poses:
             columns |= _pose_in_frame(columns, pose, moved)
         columns[frame] = pa.array([question.frame] * table.num_rows, pa.string())
         yield pa.table({name: column for name, column in columns.items() if name not in hidden})
@@ -332,14 +306,10 @@ def _poses_among(paths: Mapping[str, str]) -> Iterator[_Pose]:
         if word in POSITIONS and "[" not in position:
             beside = f"{above.rpartition('.')[0]}.covariance".lstrip(".")
             known = above.endswith("pose") and paths.get(beside, "").endswith("[36]")
-            yield _Pose(position, rotation, beside if known else "", is_vector=False)
+            yield _Pose(position, rotation, beside if known else "")
     for word in ("point", "vector"):
         if all(f"{word}.{axis}" in paths for axis in _XYZ):
-            yield _Pose(word, "", "", is_vector=word == "vector")
-
-
-def _is_in(path: str, requested: Sequence[str]) -> bool:
-    return any(path == one or path.startswith(f"{one}.") for one in requested)
+            yield _Pose(word, is_vector=word == "vector")
 
 
 def _moved(array: NDArray[Any], pose: Transform) -> NDArray[Any]:

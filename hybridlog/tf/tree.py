@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     Way = tuple[str, ...]  # names of frames, each the parent of the one before
 
 _S: Final = 1e9
-_BLOCK: Final = 1 << 13  # times looked up together, so that they stay in the processor's cache
 
 
 class Frame(Struct, frozen=True, eq=False):
@@ -186,7 +185,7 @@ class FrameTree(Struct, frozen=True, eq=False):
                     ahead += [(child, depth + 1) for child in reversed(below.get(name, ()))]
 
     def problems(self) -> list[str]:
-        """Sentences about loops, several trees, frames of two parents, and transforms left out."""
+        """Sentences about several trees, frames of two parents, and transforms left out."""
         found = [
             f"{counted(number, 'transform')} left out: {why}."
             for why, number in self.invalid.items()
@@ -202,15 +201,6 @@ class FrameTree(Struct, frozen=True, eq=False):
                 )
             if len(one.parents) > 1:
                 found.append(f"{one.name} has several parents: {listed(one.parents)}.")
-        loops: set[frozenset[str]] = set()
-        for name in self.frames:
-            path = [name]
-            while path[-1] in self.frames and path[-1] not in path[:-1]:
-                path.append(self.frames[path[-1]].parents[-1])
-            loop = path[path.index(path[-1]) :]
-            if len(loop) > 1 and frozenset(loop) not in loops:
-                loops.add(frozenset(loop))
-                found.append(f"These frames are a loop: {listed(loop)}.")
         if len(self.roots) > 1:
             found.append(
                 f"The frames are {len(self.roots)} trees, with the roots {listed(self.roots)}."
@@ -239,16 +229,14 @@ class FrameTree(Struct, frozen=True, eq=False):
         known = np.flatnonzero(times)
         unset = len(times) - len(known)
         missing = Counter({"a stamp of zero, which is not set": unset} if unset else {})
-        for begin in range(0, len(known), _BLOCK):
-            block = known[begin : begin + _BLOCK]
-            for rows, upwards in self._paths(given, times, block, ()):
-                for own, downwards in self._paths(wanted, times, rows, ()):
-                    used = _until_common(upwards, downwards)
-                    if used is None:
-                        missing[f"no way between {given} and {wanted}"] += len(own)
-                        continue
-                    found = self._between(used, times[own], missing)
-                    made.translation[own], made.rotation[own] = found.translation, found.rotation
+        for rows, upwards in self._paths(given, times, known, ()):
+            for own, downwards in self._paths(wanted, times, rows, ()):
+                used = _until_common(upwards, downwards)
+                if used is None:
+                    missing[f"no way between {given} and {wanted}"] += len(own)
+                    continue
+                found = self._between(used, times[own], missing)
+                made.translation[own], made.rotation[own] = found.translation, found.rotation
         return Lookup(made.translation, made.rotation, times, dict(missing))
 
     def latest(self, target: str, source: str) -> int:

@@ -39,13 +39,7 @@ MIN_FRAMES: Final = 2
 
 
 class Values(NamedTuple):
-    """Numbers of a topic over time.
-
-    Attributes:
-        times: int64[n], log times, ns, ascending.
-        numbers: float32[n, width].
-        names: Of the columns.
-    """
+    """Numbers of a topic, float32[n, width], at log times, int64[n], ns, ascending."""
 
     times: NDArray[np.int64]
     numbers: NDArray[np.float32]
