@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from hybridlog.columns.tables import Tables
-    from hybridlog.live.recording import LiveRecording
     from hybridlog.maintenance.report import Progress
     from hybridlog.query.question import RecordedChannel
     from hybridlog.record.recorder import RecordReport
@@ -78,7 +77,7 @@ class OpenStore:
         self._changed = 0  # as of the latest state, see `StoreDirectory.changed`
         self._names: list[str] = []  # ids of recordings
         self._listed_at = 0.0  # when they were compared last, by `monotonic`
-        self.live: WeakSet[LiveRecording] = WeakSet()  # that were started by it
+        self.live: WeakSet[Any] = WeakSet()  # recordings that were started by it
         self._has_changed = False  # ended recordings, so that their list is to be made again
 
     @property

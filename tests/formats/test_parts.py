@@ -95,7 +95,7 @@ def test_files_are_asked_before_the_metadata(bag: Path, files: list[str], count:
 
 @pytest.mark.parametrize(
     ("count", "damage"),
-    [(10, []), (15, [("metadata.yaml", 5)]), (None, [("bag_1.db3", None)])],
+    [(10, []), (15, [("metadata.yaml", 5)]), (None, [("bag_0.db3", None)])],
 )
 def test_part_that_nothing_lists_is_missing(
     bag: Path, count: int | None, damage: list[tuple[str, int | None]]
