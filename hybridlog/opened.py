@@ -78,7 +78,6 @@ class OpenStore:
         self._names: list[str] = []  # ids of recordings
         self._listed_at = 0.0  # when they were compared last, by `monotonic`
         self.live: WeakSet[Any] = WeakSet()  # recordings that were started by it
-        self._has_changed = False  # ended recordings, so that their list is to be made again
 
     @property
     def is_inherited(self) -> bool:
@@ -193,29 +192,10 @@ class OpenStore:
             for recording in done:
                 self._running.pop(recording, None)
             if done:
-                self._drop_list()
                 self.catch_up(*done)
-
-    def change(self) -> None:
-        """Get ready to change ended recordings: their list goes, and is made again at the end."""
-        self.recover()
-        self._drop_list()
-
-    @property
-    def _list(self) -> Path:
-        """The list of ended recordings for other readers of their tables."""
-        return self.directory.path / "tables/recordings.parquet"
-
-    def _drop_list(self) -> None:
-        self._has_changed = self.directory.is_writable
-        if self._has_changed:
-            removing = files.explained(self._list, "removing")
-            with removing, suppress(FileNotFoundError):
-                files.unlink(self._list)
 
     def recorded(self, report: RecordReport) -> None:
         """See a recording that has ended; if MongoDB is available again, index the rest."""
-        self._drop_list()
         self.catch_up(report.entry.id)
         from hybridlog.schema.codecs import unindexed  # loads numpy
 
@@ -314,12 +294,6 @@ class OpenStore:
         self._drop_files()
         self.index.disconnect()
         vars(self).pop("tables", None)
-        if self._has_changed:
-            from hybridlog.columns.recordings_file import write_recordings_file
-
-            with suppress(OSError, HybridlogError):
-                ended = [one for one in self.newest().summaries if one.status not in UNFINISHED]
-                write_recordings_file(self._list, ended)
         self.is_closed = True
         self.catalog.close()
 

@@ -167,7 +167,7 @@ class Store:
 
     def _to_change(self) -> OpenStore:
         """The open store, about to be changed: what crashes have left is finished first."""
-        self._itself().change()
+        self._itself().recover()
         return self.shared
 
     def __repr__(self) -> str:

@@ -1,24 +1,13 @@
-"""`tables/recordings.parquet`: the ended recordings of a store, beside their tables.
-
-It is made when a store that has changed recordings is closed. Who notes in the catalog that an
-ended recording has changed removes it, and it is left out if one changes while it is made.
-"""
+"""The recordings of a store as a table."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final
 
 import pyarrow as pa
-import pyarrow.parquet as pq
-
-from hybridlog.snapshot import UNFINISHED
-from hybridlog_storage.disk import files
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from hybridlog_storage.summary import RecordingSummary
 
 TIME: Final = pa.timestamp("us", "UTC")
@@ -77,22 +66,3 @@ def times(first: int | None, last: int | None) -> dict[str, Any]:
         "first_t": first,
         "last_t": last,
     }
-
-
-def write_recordings_file(path: Path, summaries: Iterable[RecordingSummary]) -> None:
-    """Write the summaries of the recordings that have ended."""
-    ended = [one for one in summaries if one.status not in UNFINISHED]
-    ended.sort(key=lambda one: (one.extent, one.id))
-    # In tables, `recording` is the id, which stays when a recording is renamed.
-    names = {"recording": "name", "id": "recording"}
-    table = recordings_table(ended)
-    sink = pa.BufferOutputStream()
-    pq.write_table(
-        table.rename_columns([names.get(name, name) for name in table.column_names]),
-        sink,
-        compression="zstd",
-        write_page_checksum=True,
-    )
-    with suppress(FileExistsError):
-        files.make_folder(path.parent)
-    files.write_file(path, sink.getvalue().to_pybytes(), sync=False)

@@ -156,7 +156,7 @@ class Copying:
             path = self._local()
             with closing(OpenStore(StoreDirectory.create(path), None, None)) as other:
                 other.directory.check_writable()
-                other.change()
+                other.recover()
                 yield Directory(path.absolute()), _naming(lambda: other.newest().summaries)
                 other.catch_up()
                 for entry in other.now().select(self._arrived):  # so that other readers find them

@@ -19,8 +19,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import hybridlog as hl
-from hybridlog_storage.messages import Channel, Schema
-from hybridlog_storage.settings import NONE
+from hybridlog_storage.messages import Schema
 from tests.cli.within import answer
 from tests.limits import Limit
 from tests.tables.logs import (
@@ -282,65 +281,3 @@ def test_a_store_in_a_folder_with_an_odd_name(many: hl.Store, tmp_path: Path) ->
     asked = ("info", "--tables", "-t", "/small", "--json")
     (item,) = json.loads(answer(*asked, store=place).out)["tables"]
     assert len(duckdb.sql(item["statement"])) == 160
-
-
-def listed(store: Path) -> dict[str, Row]:
-    """The rows of `recordings.parquet` as DuckDB reads them, by name."""
-    query = (
-        "select name, recording, tags, status, epoch_us(created), first_t, last_t, "
-        "messages, topics, segments, bytes from read_parquet(?)"
-    )
-    rows = duckdb.connect().execute(query, [str(store / "tables/recordings.parquet")]).fetchall()
-    return {row[0]: row[1:] for row in rows}
-
-
-def listed_by_command(store: Path) -> dict[str, Row]:
-    """The same of ended recordings, as `hybridlog ls --json` prints them."""
-    keys = ("id", "tags", "status", "created_ns", "first_ns", "last_ns", "messages")
-    keys += ("topics", "segments", "stored_bytes")
-    return {
-        one["name"]: tuple(one[key] // 1000 if key == "created_ns" else one[key] for key in keys)
-        for one in answer("ls", "--json", "--mongo", NONE, store=store).json
-        if one["status"] != "open"
-    }
-
-
-def test_recordings_are_listed_beside_their_tables(recorded: hl.Store, tmp_path: Path) -> None:
-    """The list is right wherever it exists, and is made again when a change has ended."""
-    place = recorded.directory.path
-    path = place / "tables/recordings.parquet"
-    recorded.close()
-    other = write_log(tmp_path / "other.mcap", [(BASE, "/a", payload(0))])
-    changes: list[Callable[[hl.Store], object]] = [
-        lambda store: store.record(other, name="other"),
-        lambda store: store.edit("log", tag={"robot": "7", "place": "hall"}),
-        lambda store: store.edit("log", name="first"),
-        lambda store: store.mark("first", BASE, "here"),
-        lambda store: store.remove("other"),
-    ]
-    for change in changes:
-        with hl.open(place, mongo=NONE) as store:
-            assert path.exists()
-            change(store)
-            assert not path.exists()
-        assert listed(place) == listed_by_command(place) != {}
-    with hl.open(place, mongo=NONE) as store, store.start("live") as live:
-        live.write(Channel("/a", "ros1", STATE), payload(0), log_time=BASE)
-        assert listed(place).keys() == listed_by_command(place).keys() == {"first"}
-    assert listed(place) == listed_by_command(place)
-    assert listed(place).keys() == {"first", "live"}
-    for work in (
-        lambda: answer("info", "--tables", "-t", "/a", store=place),
-        lambda: answer("sql", "select count(*) from a", store=place),
-    ):
-        before = path.read_bytes()
-        path.unlink()
-        work()
-        assert not path.exists()  # a question writes nothing
-        path.write_bytes(before)
-    tags = (
-        f"select distinct topic, tags['robot'] from '{place}/tables/test_State~*/*.parquet' "
-        f"join '{path}' using (recording) where recordings.name = 'first' order by topic"
-    )
-    topics = ("/large", "/small/one", "/small/two")
-    assert duckdb.sql(tags).fetchall() == [(topic, "7") for topic in topics]
