@@ -269,11 +269,6 @@ def _channel(number: int, channel: truth.Channel, gone: str = "") -> ChannelEntr
     )
 
 
-def channels_in(manifest: Manifest) -> dict[int, tuple[str, str | None]]:
-    """Topic and hash of the schema of each channel of a manifest, by id."""
-    return {n: (one.topic, one.schema or None) for n, one in manifest.channels.items()}
-
-
 def schemas_in(directory: StoreDirectory, entry: RecordingEntry) -> dict[str, Schema]:
     """Definitions of a recording by hash, from the segments that can be read."""
     found: dict[str, Schema] = {}
@@ -401,7 +396,8 @@ def _losses_of_chunks(
         summary = read_summary(path, log.number)
     except SegmentError as error:
         return str(error), []
-    if not is_of(summary, manifest.id, log, channels_in(manifest), log.number):
+    channels = {n: (one.topic, one.schema or None) for n, one in manifest.channels.items()}
+    if not is_of(summary, manifest.id, log, channels, log.number):
         return _ANOTHER, []
     table = summary.table
     chunks = {

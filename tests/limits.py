@@ -25,7 +25,6 @@ PLACES = {
     "frame_block_rows": "hybridlog.frames.answer._BLOCK_ROWS",
     "clock_wait_s": "hybridlog.live.recorder._CLOCK_WAIT_S",
     "expected_topics": "hybridlog.live.recorder._MAX_EXPECTED",
-    "settled_topics_s": "hybridlog.live.recorder._SETTLED_S",
     "full_manifest_bytes": "hybridlog.live.recorder._FULL_BYTES",
     "slow_write_s": "hybridlog.live.recorder._SLOW_WRITE_S",
     "foxglove_ping_s": "hybridlog.live.sources.foxglove.connection._PING_S",

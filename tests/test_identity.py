@@ -13,7 +13,6 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 import hybridlog as hl
@@ -21,7 +20,6 @@ from hybridlog.columns.folders import files_of
 from hybridlog.index.access import IndexAccess
 from hybridlog.maintenance.copying import Copying
 from hybridlog.maintenance.verify import become_another
-from hybridlog.query.intervals import Intervals
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import (
     HeldError,
@@ -207,15 +205,6 @@ def test_a_running_recording_is_marked_while_it_runs(tmp_path: Path) -> None:
     with hl.open(tmp_path / "killed", mongo="none") as store:
         assert store.entry("live").status == "unfinished"
         assert [m.fields["text"] for m in store.topic("/hybridlog/marks")] == ["begun"]
-
-
-def test_intervals_of_a_label_and_of_nobody(place: Path, mongo: str) -> None:
-    with hl.open(place, mongo=mongo) as store:
-        span = np.array([[110 * SECOND, 112 * SECOND, 1]])
-        for name in ("one", store.entry("one").id):
-            assert store.topic("/n").during(Intervals([(name, span)])).count() == 2
-        with pytest.raises(TopicError, match="'nobody'"):
-            store.topic("/n").during(Intervals([("nobody", span)]))
 
 
 def test_a_removal_that_was_announced_is_finished(place: Path, mongo: str) -> None:

@@ -17,13 +17,13 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from hybridlog.live.sources.base import Sink
 from hybridlog.record.losses import Cause
 from hybridlog_storage.manifest import Loss, replace
 
 if TYPE_CHECKING:
+    from hybridlog.live.sources.base import Sink
     from hybridlog_storage.messages import Channel
 
 
@@ -37,8 +37,10 @@ _ROS1 = struct.Struct("<II")
 _CDR = {0: struct.Struct(">4xiI"), 1: struct.Struct("<4xiI")}
 
 
-class SimulatedTime(Sink):
+class SimulatedTime:
     """Passes messages on to a recorder, with the time of `/clock` as their receive time.
+
+    It is a `Sink`; what is not about times is done by the recorder.
 
     Args:
         recorder: Takes them.
@@ -117,11 +119,6 @@ class SimulatedTime(Sink):
             return True
         return wanted
 
-    def expect(self, channel: Channel) -> None:
-        """See `Sink.expect`."""
-        if self._is_recorded(channel.topic):
-            self._recorder.expect(channel)
-
     def take(
         self,
         channel: Channel,
@@ -156,7 +153,7 @@ class SimulatedTime(Sink):
 
     def lost(self, loss: Loss) -> None:
         """See `Sink.lost`."""
-        if not self._is_recorded(loss.topic):
+        if loss.topic == CLOCK and not self._is_clock_recorded:
             return
 
         def report(first: int, last: int) -> None:
@@ -167,28 +164,10 @@ class SimulatedTime(Sink):
         ):
             report(self.at(loss.first or 0), self.at(loss.last or 0))
 
-    def topic_came(self, topic: str, type_name: str) -> None:
-        """See `Sink.topic_came`."""
-        if self._is_recorded(topic):
-            self._recorder.topic_came(topic, type_name)
-
-    def topic_gone(self, topic: str) -> None:
-        """See `Sink.topic_gone`."""
-        if self._is_recorded(topic):
-            self._recorder.topic_gone(topic)
-
-    def say(self, text: str) -> None:
-        """See `Sink.say`."""
-        self._recorder.say(text)
-
-    def ended(self, reason: str = "") -> None:
-        """See `Sink.ended`."""
-        self._recorder.ended(reason)
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._recorder, name)
 
     # Parts of it.
-
-    def _is_recorded(self, topic: str) -> bool:
-        return self._is_clock_recorded or topic != CLOCK
 
     def _hold(self, size: int, record: Callable[[int], None], drop: Callable[[], None]) -> bool:
         """Keep an item until the clock comes; False once everything held has been passed on."""

@@ -156,9 +156,9 @@ class Incidents:
             is_over = self._over.wait(every_s)
             try:
                 self._silence.look(self._now(), is_end=is_over)
-                now = time.monotonic()
                 self._follow_clock()
-                if is_over or self._is_urgent or now - self._written_at > _PROLONGED_S:
+                since = time.monotonic() - self._written_at
+                if is_over or self._is_urgent or since > _PROLONGED_S:
                     self.write()
             except Exception as error:
                 self._say(f"marking or pinning failed: {error or repr(error)}")

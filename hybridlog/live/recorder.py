@@ -6,7 +6,6 @@ topic the received messages are the stored ones plus those in the loss ledger.
 
 from __future__ import annotations
 
-import math
 import shutil
 import threading
 import time
@@ -15,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from operator import attrgetter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from msgspec import Struct
 from msgspec.structs import replace
@@ -72,7 +71,6 @@ _MAX_EXPECTED = 1000  # channels whose definitions are parsed before their first
 _SEQUENCES = 1 << 32
 _HELD_SHARE = 8  # of the memory budget, for messages that come before `/clock`
 _CLOCK_WAIT_S = 5.0
-_SETTLED_S = 3.0  # after the first topic, when others may have come
 _SLOW_WRITE_S = 2.0  # to pack and write a chunk, on a disk that is busy
 
 
@@ -165,13 +163,12 @@ class Recorder:
         self._written = 0
         self._newest = max(store.session.look().summaries, key=attrgetter("created"), default=None)
         self._silence = SilenceWatch(options.contract, self._note_silence)
-        self._settled_at = 0.0
         self._ended_at: int | None = None
         self._simulated: SimulatedTime | None = None
         if options.use_sim_time:
             held = options.budget_bytes // _HELD_SHARE
             self._simulated = SimulatedTime(self, self.drop, held)
-        self._sink: Sink = self._simulated or self
+        self._sink = cast("Sink", self._simulated or self)
         self._target = LiveRecording(
             store.shared, self._begin_to_follow, options.name, self._of_recording()
         )
@@ -340,7 +337,6 @@ class Recorder:
         elapsed = max(now - self._looked, 1e-3)
         self._looked = now
         self._check_clock(now)
-        self._look_for_topics(now)
         now_steady = self._now()
         lost: Counter[str] = Counter()
         with self._lock:
@@ -433,15 +429,6 @@ class Recorder:
             *((one.fits, f"the trigger '{as_text(one.text)}'") for one in options.triggers),
         ]
         return found + [text for fits, text in rules if not any(map(fits, topics))]
-
-    def _look_for_topics(self, now: float) -> None:
-        """Tell what names no topic once others may have come."""
-        if not self._settled_at and any(one.has_come for one in [*self._topics.values()]):
-            self._settled_at = now + _SETTLED_S
-        if self._settled_at and now >= self._settled_at:
-            self._settled_at = math.inf
-            for text in self.unfitting():
-                self.say(f"no topic fits {text} so far")
 
     def silent(self) -> list[str]:
         """Topics that had publishers and never sent a message."""
@@ -539,13 +526,15 @@ class Recorder:
 
     def topic_came(self, topic: str, type_name: str) -> None:
         """See `Sink.topic_came`."""
-        with self._lock:
-            self._topic(topic, type_name).is_present = True
+        if self.wants(topic, type_name):  # `/clock` may come unasked
+            with self._lock:
+                self._topic(topic, type_name).is_present = True
 
     def topic_gone(self, topic: str) -> None:
         """See `Sink.topic_gone`."""
         with self._lock:
-            self._topic(topic).is_present = False
+            if topic in self._topics:
+                self._topics[topic].is_present = False
 
     def say(self, text: str) -> None:
         """See `Sink.say`."""

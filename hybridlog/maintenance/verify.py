@@ -275,18 +275,16 @@ def _make_tables(
     wanted = tables.missing(directory, entry, checker.tables).union(damaged)
     if not wanted:
         return [], []
-    problem, name = make_tables(directory, catalog, entry, topics=damaged), entry.name
+    problem = make_tables(directory, catalog, entry, topics=damaged)
     checker.tables.look_again()
-    lacking, damaged = tables.missing(directory, entry, checker.tables), checker.damage(entry)
-    why = {topic: problem or damaged.get(topic, "") for topic in sorted(wanted)}
-    return [
-        Repaired(name, f"table of {one}", "made again")
-        for one, problem in why.items()
-        if not problem and one not in lacking
-    ], [
-        Finding(name, f"table of {one}", f"it cannot be made again: {problem}", AGAIN)
-        for one, problem in why.items()
-        if problem
+    damaged = checker.damage(entry)
+    left = tables.missing(directory, entry, checker.tables).union(damaged)
+    places = {one: f"table of {one}" for one in sorted(wanted)}
+    done = [Repaired(entry.name, places[one], "made again") for one in places if one not in left]
+    return done, [
+        Finding(entry.name, places[one], f"it cannot be made again: {why}", AGAIN)
+        for one in places
+        if (why := problem or damaged.get(one))
     ]
 
 

@@ -113,54 +113,47 @@ def reason_of(error: Exception) -> str:
     return one_line(getattr(error, "strerror", None) or str(error))
 
 
-class Network:
-    """Connects to peers. Belongs to one event loop.
+_lookups: dict[str, Future[Addresses]] = {}
+"""Look-ups of names in threads, one at a time per name, since they cannot be interrupted."""
 
-    Names are looked up in threads, one at a time per name, since a look-up cannot be
-    interrupted. One that takes too long ends with the resolver's own timeout.
-    """
 
-    def __init__(self) -> None:
-        self._lookups: dict[str, Future[Addresses]] = {}
-
-    async def connect(self, endpoint: Endpoint) -> socket.socket:
-        """A connected socket that does not block."""
-        loop = asyncio.get_running_loop()
-        failure: OSError = OSError(f"{one_line(endpoint.host)} has no address")
-        addresses = await self.addresses_of(endpoint.host)
-        for family, (host, _, *scope) in addresses[:_MAX_ADDRESSES]:
-            made = socket.socket(family, socket.SOCK_STREAM)
-            try:
-                made.setblocking(False)
-                address = (host, endpoint.port, *scope)
-                async with asyncio.timeout(PATIENCE_S):
-                    await loop.sock_connect(made, address)
-                if made.getsockname() == made.getpeername():
-                    # The socket got the wanted port itself, and is connected to itself.
-                    raise ConnectionRefusedError("connection refused")
-            except OSError as error:
-                made.close()
-                failure = error
-            except BaseException:
-                made.close()
-                raise
-            else:
-                return made
-        raise failure
-
-    async def addresses_of(self, host: str) -> Addresses:
-        """Address families and addresses (with port 0) of a host."""
+async def connect(endpoint: Endpoint) -> socket.socket:
+    """A connected socket that does not block."""
+    loop = asyncio.get_running_loop()
+    failure: OSError = OSError(f"{one_line(endpoint.host)} has no address")
+    addresses = await _addresses_of(endpoint.host)
+    for family, (host, _, *scope) in addresses[:_MAX_ADDRESSES]:
+        made = socket.socket(family, socket.SOCK_STREAM)
         try:
-            return _look_up(host, socket.AI_NUMERICHOST)
-        except OSError:
-            pass  # a name
-        lookup = self._lookups.get(host)
-        if lookup is None or lookup.done():
-            lookup = self._lookups[host] = Future()
-            lookup.set_running_or_notify_cancel()  # who stops waiting does not cancel it
-            threading.Thread(target=_settle, args=(lookup, host), daemon=True).start()
-        async with asyncio.timeout(PATIENCE_S):
-            return await asyncio.wrap_future(lookup)
+            made.setblocking(False)
+            address = (host, endpoint.port, *scope)
+            async with asyncio.timeout(PATIENCE_S):
+                await loop.sock_connect(made, address)
+            if made.getsockname() == made.getpeername():
+                # The socket got the wanted port itself, and is connected to itself.
+                raise ConnectionRefusedError("connection refused")
+        except OSError as error:
+            made.close()
+            failure = error
+        except BaseException:
+            made.close()
+            raise
+        else:
+            return made
+    raise failure
+
+
+async def _addresses_of(host: str) -> Addresses:
+    """Address families and addresses (with port 0) of a host."""
+    with suppress(OSError):  # it is a name
+        return _look_up(host, socket.AI_NUMERICHOST)
+    lookup = _lookups.get(host)
+    if lookup is None:
+        lookup = _lookups[host] = Future()
+        lookup.set_running_or_notify_cancel()  # who stops waiting does not cancel it
+        threading.Thread(target=_settle, args=(lookup, host), daemon=True).start()
+    async with asyncio.timeout(PATIENCE_S):
+        return await asyncio.wrap_future(lookup)
 
 
 def _look_up(host: str, flags: int = 0) -> Addresses:
@@ -176,3 +169,5 @@ def _settle(lookup: Future[Addresses], host: str) -> None:
         lookup.set_result(_look_up(host))
     except OSError as error:
         lookup.set_exception(error)
+    finally:
+        _lookups.pop(host)

@@ -36,7 +36,7 @@ from hybridlog.live.sources.foxglove.protocol import (
     Offer,
     parse_channel,
 )
-from hybridlog.live.sources.network import Endpoint, Network, reason_of
+from hybridlog.live.sources.network import Endpoint, connect, reason_of
 from hybridlog.live.sources.sequence_gaps import (
     SequenceGap,
     SequenceGapDetector,
@@ -125,7 +125,7 @@ class Client:
         """Connect, and agree on the protocol; PeerError names reason and remedy."""
         place = Endpoint(self._address.host, self._address.port)
         try:
-            made = await Network().connect(place)
+            made = await connect(place)
             transport, listener = await self._shake_hands(made, session)
         except WSHandshakeError as error:
             raise PeerError(_refusal(error)) from error

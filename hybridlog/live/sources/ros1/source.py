@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Final, TypeVar
 import msgspec
 
 from hybridlog.live.sources.base import PeerError, one_line
-from hybridlog.live.sources.network import Endpoint, LoopSource, Network, endpoint_of
+from hybridlog.live.sources.network import Endpoint, LoopSource, endpoint_of
 from hybridlog.live.sources.ros1.stream import Reader
 from hybridlog.live.sources.ros1.subscription import (
     ANY,
@@ -103,7 +103,7 @@ class Ros1Source(LoopSource):
         reader.start()
         try:
             async with asyncio.TaskGroup() as tasks:
-                about = Network(), self._caller, sink, reader, self._max_message_bytes
+                about = self._caller, sink, reader, self._max_message_bytes
                 context = Context(*about, tasks.create_task, graph.forget)
                 tasks.create_task(graph.watch(context))
                 await failed
@@ -179,7 +179,7 @@ class Graph:
         self, context: Context, kind: type[_Kind], method: str, *arguments: object
     ) -> _Kind:
         """What the master answers."""
-        answer = await call(context.network, self._uri, method, context.caller, *arguments)
+        answer = await call(self._uri, method, context.caller, *arguments)
         try:
             return msgspec.convert(answer, kind)
         except msgspec.ValidationError as error:

@@ -25,8 +25,8 @@ from hybridlog.live.sources.base import PeerError, one_line
 from hybridlog.live.sources.network import (
     PATIENCE_S,
     Endpoint,
-    Network,
     UnreachedError,
+    connect,
     endpoint_of,
     reason_of,
 )
@@ -49,7 +49,6 @@ class Context(Struct, frozen=True):
     an address.
     """
 
-    network: Network
     caller: str
     sink: Sink
     reader: Reader
@@ -143,7 +142,7 @@ class _Link:
         topic, failures = self._subscription.topic, 0
         while True:
             try:
-                about = context.network, context.caller, topic, self._uri
+                about = context.caller, topic, self._uri
                 connected, fields = await subscribe(*about)
             except (OSError, PeerError) as error:
                 if not self.is_listed:
@@ -272,17 +271,15 @@ _KEEPALIVE: Final = (
 )
 
 
-async def subscribe(
-    network: Network, caller: str, topic: str, uri: str
-) -> tuple[socket.socket, dict[str, str]]:
+async def subscribe(caller: str, topic: str, uri: str) -> tuple[socket.socket, dict[str, str]]:
     """Connects to a publisher of a topic, whatever its type.
 
     Returns the socket, positioned at the first message, and the fields of the publisher's header.
     """
-    protocol = await call(network, uri, "requestTopic", caller, topic, [["TCPROS"]])
+    protocol = await call(uri, "requestTopic", caller, topic, [["TCPROS"]])
     place = _place_of(protocol)
     try:
-        connected = await network.connect(place)
+        connected = await connect(place)
     except OSError as error:
         raise UnreachedError(f"{one_line(str(place))}: {reason_of(error)}") from error
     try:
@@ -346,7 +343,7 @@ _MAX_ANSWER: Final = 32 << 20
 _END: Final = b"\r\n\r\n"
 
 
-async def call(network: Network, uri: str, method: str, *arguments: Any) -> object:
+async def call(uri: str, method: str, *arguments: Any) -> object:
     """Calls a method of the master or of a node, which has 10 s, and returns its value."""
     endpoint = endpoint_of(uri)
     path = urlsplit(uri).path or "/RPC2"
@@ -357,7 +354,7 @@ async def call(network: Network, uri: str, method: str, *arguments: Any) -> obje
     )
     try:
         async with asyncio.timeout(2 * PATIENCE_S):
-            reader, writer = await asyncio.open_connection(sock=await network.connect(endpoint))
+            reader, writer = await asyncio.open_connection(sock=await connect(endpoint))
             with contextlib.closing(writer):
                 writer.write(head.encode("ascii") + body)
                 answer = await _answer(reader)
