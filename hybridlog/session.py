@@ -41,9 +41,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.columns.tables import Tables, TopicTable
-    from hybridlog.opened import OpenStore
     from hybridlog.query.chunk_columns import Chunk
     from hybridlog.query.predicate.tree import Predicate
+    from hybridlog.shared import Shared
     from hybridlog.snapshot import Snapshot
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
@@ -77,7 +77,7 @@ class Session:
     was replaced, later questions see the newer state of its recording.
     """
 
-    def __init__(self, shared: OpenStore, recordings: Snapshot) -> None:
+    def __init__(self, shared: Shared, recordings: Snapshot) -> None:
         self.shared = shared
         self.directory = shared.directory
         self.catalog = shared.catalog

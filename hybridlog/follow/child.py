@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from multiprocessing.connection import Connection
 
     from hybridlog.index.indexing import IndexTarget
-    from hybridlog.opened import OpenStore
     from hybridlog.query.predicate.tree import Predicate
+    from hybridlog.shared import Shared
     from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.messages import Channel
@@ -114,7 +114,7 @@ class FollowerProcess:
 
     @classmethod
     def of_short(
-        cls, shared: OpenStore, purpose: str, interval_s: float | None
+        cls, shared: Shared, purpose: str, interval_s: float | None
     ) -> Callable[[RecordingEntry], FollowerProcess]:
         """A function that starts the follower of a recording, which may be a short one.
 

@@ -30,7 +30,7 @@ from hybridlog_storage.settings import (
 if TYPE_CHECKING:
     from hybridlog.index.indexing import IndexTarget
     from hybridlog.maintenance.report import Progress
-    from hybridlog.opened import OpenStore
+    from hybridlog.shared import Shared
     from hybridlog_storage.mongo.database import Database
     from hybridlog_storage.mongo.index_documents import Owner
     from hybridlog_storage.mongo.mongod import EmbeddedMongod
@@ -89,7 +89,7 @@ class IndexAccess:
 
     def __init__(
         self,
-        shared: OpenStore,
+        shared: Shared,
         mongo: str | None,
         progress: Progress | None,
     ) -> None:

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     from hybridlog.columns.tables import Tables
     from hybridlog.maintenance.report import Progress, RepairReport
-    from hybridlog.opened import OpenStore
+    from hybridlog.shared import Shared
     from hybridlog.snapshot import Snapshot
     from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
@@ -186,7 +186,7 @@ def _differs(known: Tables, entry: RecordingEntry, topic: str, *, off: bool) -> 
     return (not arrays or off in arrays) and (off or not is_expired)
 
 
-def bring_tables(source: OpenStore, target: RemoteDirectory, recordings: Collection[str]) -> None:
+def bring_tables(source: Shared, target: RemoteDirectory, recordings: Collection[str]) -> None:
     """Bring the tables of recordings that were copied into a bucket; messages answer without."""
     for recording in recordings:
         entry = source.now().entry_if_there(recording)
@@ -194,7 +194,7 @@ def bring_tables(source: OpenStore, target: RemoteDirectory, recordings: Collect
             _bring_tables(source, target, entry)
 
 
-def _bring_tables(source: OpenStore, target: RemoteDirectory, entry: RecordingEntry) -> None:
+def _bring_tables(source: Shared, target: RemoteDirectory, entry: RecordingEntry) -> None:
     """Write the tables of a recording; no file of them has another recording."""
     from hybridlog_storage.copy_places import read
 
@@ -217,7 +217,7 @@ def _bring_tables(source: OpenStore, target: RemoteDirectory, entry: RecordingEn
     target.source.keep_tables(entry.id, names)
 
 
-def _tables(source: OpenStore, entry: RecordingEntry, root: Path) -> list[Path]:
+def _tables(source: Shared, entry: RecordingEntry, root: Path) -> list[Path]:
     """Files with the fields of a recording; of shared ones its rows alone, below `root`."""
     from hybridlog.columns.folders import Addition, TableFolders, files_of
 
