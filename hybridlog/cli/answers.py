@@ -7,7 +7,6 @@ import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from itertools import chain, groupby, islice
 from operator import itemgetter
 from pathlib import Path
@@ -76,7 +75,6 @@ def output_option(what: str) -> Any:
     )
 
 
-@dataclass(frozen=True, kw_only=True)
 class Tabular(Forced, AsJson):
     """Options of commands that answer with rows: `usual` is for a terminal, and for others."""
 
@@ -144,7 +142,6 @@ def form_of(path: Path, suffixes: Mapping[str, str]) -> str:
     return suffixes[path.suffix.lower()]
 
 
-@dataclass(frozen=True, kw_only=True)
 class Listing(Tabular):
     """Options of commands that answer with rows, which are text unless another form is given."""
 

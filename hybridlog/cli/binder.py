@@ -10,11 +10,11 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field, fields
+from dataclasses import Field, dataclass, field, fields
 from functools import wraps
 from itertools import chain
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, ClassVar, Final, TypeVar, dataclass_transform
 
 import click
 from click.core import ParameterSource
@@ -131,6 +131,17 @@ def _completed(context: click.Context, param: click.Parameter, incomplete: str) 
     except (HybridlogError, OSError):
         return []
     return [name for name in names if name.startswith(incomplete)]
+
+
+@dataclass_transform(kw_only_default=True, frozen_default=True)
+class Options:
+    """A base class of options: each class below it is a frozen dataclass."""
+
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+    def __init_subclass__(cls) -> None:
+        """Make a class a dataclass, whose fields are given by name."""
+        dataclass(frozen=True, kw_only=True)(cls)
 
 
 def option(

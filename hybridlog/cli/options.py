@@ -5,14 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import click
 
 from hybridlog.cli import output
-from hybridlog.cli.binder import argument, option
+from hybridlog.cli.binder import Options, argument, option
 from hybridlog.cli.output import Column, print_table
 from hybridlog.query.choice import Choice
 from hybridlog_storage.errors import UsageError
@@ -24,8 +23,7 @@ if TYPE_CHECKING:
     from hybridlog.store import Store
 
 
-@dataclass(frozen=True, kw_only=True)
-class Place:
+class Place(Options):
     """The option of all commands on a store."""
 
     store: Path | None = option(
@@ -33,7 +31,6 @@ class Place:
     )
 
 
-@dataclass(frozen=True, kw_only=True)
 class InStore(Place):
     """Options of commands that may ask MongoDB."""
 
@@ -52,8 +49,7 @@ class InStore(Place):
         return opened_store(self.store, self.mongo, **how)
 
 
-@dataclass(frozen=True, kw_only=True)
-class AsJson:
+class AsJson(Options):
     """The option of commands that print JSON."""
 
     as_json: bool = option("Print JSON, for scripts.", name="--json")
@@ -66,29 +62,25 @@ class AsJson:
             output.notes(filter(None, [without]))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Quiet:
+class Quiet(Options):
     """The option of commands that say more than their answer."""
 
     quiet: bool = option("No progress, no tables; errors only.", short="-q")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Forced:
+class Forced(Options):
     """The option of commands that write files."""
 
     force: bool = option("Overwrite existing files.", short="-f")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Strict:
+class Strict(Options):
     """The option of commands that can refuse incomplete answers."""
 
     strict: bool = option("Fail, with exit code 11, if the ledger knows of losses in this range.")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Choosing:
+class Choosing(Options):
     """Options that choose recordings; `names` may be those of an argument of the command."""
 
     names: ClassVar[tuple[str, ...]] = ()
@@ -154,8 +146,7 @@ def names_argument(what: str = "Only these recordings", without: str = "all") ->
     return argument(f"{what}, as for --recording; without, {without}.", "[RECORDING]...")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Between:
+class Between(Options):
     """The option of commands about a range of time."""
 
     between: tuple[str, str] | None = option(
@@ -173,7 +164,6 @@ def topics(
     return option(what, "TOPIC", name="--topic", short="-t")
 
 
-@dataclass(frozen=True, kw_only=True)
 class Ranged(Between, Choosing, InStore, Quiet):
     """Options of commands about a time of some recordings."""
 
@@ -183,7 +173,6 @@ class Ranged(Between, Choosing, InStore, Quiet):
         return self.between if self.last is None else (self.since, None)
 
 
-@dataclass(frozen=True, kw_only=True)
 class Topics(Ranged):
     """Options of commands about messages of some topics."""
 
@@ -224,7 +213,6 @@ class Topics(Ranged):
         return query if self.span is None else query.between(*self.span)
 
 
-@dataclass(frozen=True, kw_only=True)
 class Filtered(Strict, Topics):
     """Options of commands about messages that satisfy predicates."""
 
@@ -235,8 +223,7 @@ class Filtered(Strict, Topics):
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Served:
+class Served(Options):
     """Options of commands that serve other programs on this computer."""
 
     port: int | None = option(
@@ -247,8 +234,7 @@ class Served:
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class NoLatched:
+class NoLatched(Options):
     """The option of commands that have messages from before a range of time in front."""
 
     no_latched: bool = option(
@@ -256,7 +242,6 @@ class NoLatched:
     )
 
 
-@dataclass(frozen=True, kw_only=True)
 class Latched(NoLatched):
     """Options about messages from before a slice."""
 
@@ -285,8 +270,7 @@ def tf_topic(**rules: Any) -> Any:
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class InFrame:
+class InFrame(Options):
     """Options for points and poses in another frame."""
 
     frame: str | None = option(

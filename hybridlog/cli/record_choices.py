@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, cast
 
@@ -52,7 +51,6 @@ def _live(help: str, metavar: str | None = None, **settings: Any) -> Any:  # noq
     return option(help, metavar, **{"needs": _LIVE, "section": "Live recording", **settings})
 
 
-@dataclass(frozen=True, kw_only=True)
 class RecordChoices(Between, Latched, InStore, AsJson, Quiet):
     """The parameters as typed."""
 

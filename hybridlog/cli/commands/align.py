@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 import click
@@ -22,7 +21,6 @@ if TYPE_CHECKING:
     from hybridlog.store import Store
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Given(Filtered, InFrame, Tabular):
     needs_topic: ClassVar[bool] = True
     base: str | None = option(

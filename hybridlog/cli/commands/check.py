@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +23,6 @@ if TYPE_CHECKING:
     from hybridlog.contract.judge import Result
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Given(Strict, Topics, Listing):
     contract: Path | None = option(
         "Judge recordings by the rules in this file; exit code 12 if one is broken.",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -28,7 +28,6 @@ _RUNNING: Final = frozenset({"open", "unfinished"})
 _RATE: Final = Amount(lambda text: parse_size(text.removesuffix("/s")), "1B/s")
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Copy(Choosing, InStore, AsJson, Quiet):
     names: tuple[str, ...] = options.names_argument()  # type: ignore[misc]
     to: str | None = argument("A directory, ssh://user@host/path, or s3://bucket/path.", "[TO]")

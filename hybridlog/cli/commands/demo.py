@@ -6,12 +6,11 @@ import shlex
 import shutil
 import subprocess
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from hybridlog import demo
-from hybridlog.cli.binder import argument, command
+from hybridlog.cli.binder import Options, argument, command
 from hybridlog_storage.errors import UsageError
 
 BAG, STORE, SLICE = "robot.bag", "robot-logs", "scan.npz"
@@ -54,8 +53,7 @@ STEPS: Final = {
 """Commands by title, in order."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Given:
+class _Given(Options):
     directory: Path = argument(
         "Directory for the bag and the store of the demo.",
         "[DIRECTORY]",

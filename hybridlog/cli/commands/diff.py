@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from msgspec.structs import asdict
 
 from hybridlog.cli import output
@@ -14,7 +12,6 @@ from hybridlog.cli.options import Between, InStore, Quiet, one_recording, topics
 from hybridlog.cli.output import Column
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Given(Between, InStore, Quiet, Listing):
     a: str = one_recording("A recording, as for --recording, or a glob for several together.", "A")
     b: str = one_recording("The same.", "B")

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from hybridlog.cli import output
 from hybridlog.cli.binder import command, option
 from hybridlog.cli.options import InStore, Quiet, one_recording
 from hybridlog_storage.errors import UsageError
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Given(InStore, Quiet):
     recording: str = one_recording()
     name: str | None = option("Give it this name.", "NAME")

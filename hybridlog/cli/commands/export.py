@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
@@ -20,7 +19,7 @@ from hybridlog.cli.answers import (
     write_answer,
     write_bytes,
 )
-from hybridlog.cli.binder import argument, command, option
+from hybridlog.cli.binder import Options, argument, command, option
 from hybridlog.cli.options import Forced, Latched, Topics
 from hybridlog.cli.output import Bar
 from hybridlog.formats import OUTPUTS, formats_of, is_directory, suffixes_of
@@ -51,8 +50,7 @@ def _option(help: str, metavar: str | None = None, **settings: Any) -> Any:  # n
     return option(help, metavar, needs=needs, section="With lerobot", **settings)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Training:
+class _Training(Options):
     """Options of training sets."""
 
     features: Path | None = _option("Topics and fields, in YAML.", "FILE", name="--map")
@@ -79,7 +77,6 @@ class _Training:
     )
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Given(Topics, Latched, Forced, _Training):
     target: Path = argument(
         "File (mcap, bag) or directory (rosbag2, lerobot, mp4, tables).", "OUTPUT"

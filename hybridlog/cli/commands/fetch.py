@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -34,7 +33,6 @@ if TYPE_CHECKING:
 _FORMATS = formats_of()
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Choices(Filtered, InFrame, Tabular, NoLatched):
     needs_topic: ClassVar[bool] = True
     formats: ClassVar[Sequence[str]] = _FORMATS

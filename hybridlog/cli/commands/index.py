@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -28,12 +27,10 @@ def index_command() -> None:
     """Index fields in MongoDB, or arrays in tables."""
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Shared(InStore, AsJson, Quiet):
     pass
 
 
-@dataclass(frozen=True, kw_only=True)
 class _List(_Shared):
     topic: str | None = argument("A topic; without, all.", "[TOPIC]")
 
@@ -46,7 +43,6 @@ def list_(given: _List) -> None:
     _show(found, given, "No index on a field.")
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Fields(_Shared):
     topic: str = argument("A topic.", "TOPIC")
     field: tuple[str, ...] = argument(
@@ -95,7 +91,6 @@ def address(given: _Shared) -> None:
     output.tell(None, [f"database {found.database}"])
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Rebuild(Choosing, _Shared):
     """Which recordings are indexed again."""
 
@@ -121,7 +116,6 @@ def rebuild(given: _Rebuild) -> None:
         output.note(f"In use, and left as they are: {listed(left)}.")
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Arrays(_Shared):
     topic: tuple[str, ...] = argument("Topics.", "TOPIC...", required=True)
     off: bool = option("Make their tables without arrays again.")
@@ -152,7 +146,6 @@ def arrays(given: _Arrays) -> None:
         )
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Watch(_Shared):
     every: float = option(
         "Time between two looks at the store.", "DURATION", type=SOME_SECONDS, default="2s"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
 from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -36,7 +35,6 @@ _MAX_NAMES = 5  # recordings in a note
 _READABLE = {"ros1msg", "ros2msg", "ros2idl", "jsonschema"}
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Given(Choosing, InStore, AsJson, Forced):
     names: tuple[str, ...] = names_argument()  # type: ignore[misc]
     topic: tuple[str, ...] = options.topics(

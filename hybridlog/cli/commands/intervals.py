@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 import click
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
 _OF_A_PREDICATE = ("max_gap", "state")
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Given(Filtered, Listing):
     needs_topic: ClassVar[bool] = True
     changes: str | None = option(

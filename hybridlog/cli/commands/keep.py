@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from msgspec.structs import asdict
@@ -23,7 +22,6 @@ _MAX_PINS = 1000
 _RULES = ("quota", "min_free", "max_age", "never_tag", "fields_age", "save", "dry_run")
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Given(Choosing, InStore, AsJson, Quiet):
     quota: str | None = option("The most that the store may take, such as 200GB.", "SIZE")
     min_free: str | None = option("The least that stays free on the disk.", "SIZE")

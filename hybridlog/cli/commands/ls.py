@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.cli import output
@@ -14,7 +13,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.summary import RecordingSummary
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Given(Choosing, InStore, AsJson):
     pass
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass
 
 from hybridlog.cli import options, output
 from hybridlog.cli.binder import argument, command, option
@@ -13,7 +12,6 @@ from hybridlog.cli.options import InStore, Quiet
 from hybridlog_storage.errors import StoreError, UsageError
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Given(InStore, Quiet):
     recording: tuple[str, ...] = option(
         "Only this recorder (id or name of its recording, or the beginning of the id).",

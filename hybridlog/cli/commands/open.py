@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import click
@@ -23,7 +22,6 @@ _PORT: Final = 8765
 _MAX_SHOWN = 5  # topics
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Given(Filtered, Served):
     speed: float = option(
         "Times as fast as recorded, 0.01 to 100; viewers can change it.",

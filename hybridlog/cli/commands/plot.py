@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
@@ -13,7 +12,6 @@ from hybridlog.cli.options import Filtered, Forced, parse_fields
 _WIDTH, _HEIGHT = 1200, 400
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Given(Filtered, Forced):
     needs_topic: ClassVar[bool] = True
     fields: str | None = option(

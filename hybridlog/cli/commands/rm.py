@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import click
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.summary import RecordingSummary
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Given(Choosing, InStore, Quiet):
     names: tuple[str, ...] = names_argument(  # type: ignore[misc]
         what="These recordings", without="those that the options choose"

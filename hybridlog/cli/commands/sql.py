@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
 
 from hybridlog.cli import output
 from hybridlog.cli.answers import SCREEN, Tabular
@@ -11,7 +10,6 @@ from hybridlog.cli.binder import SECONDS, SIZE, argument, command, option
 from hybridlog.cli.options import Ranged, Strict
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Given(Strict, Ranged, Tabular):
     query: str | None = argument("A query; without, what comes on standard input.", "[QUERY]")
     memory: int | None = option(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import ClassVar
 
 from msgspec.structs import asdict
@@ -15,7 +14,6 @@ from hybridlog.cli.output import Column
 _NAMES = ("count", "nan", "infinite", "min", "max", "mean", "std")
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Given(Filtered, Listing):
     needs_topic: ClassVar[bool] = True
     fields: str | None = option(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from hybridlog.cli import options, output
 from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.options import AsJson, Choosing, InStore, Quiet, recordings_of
@@ -11,7 +9,6 @@ from hybridlog.query.choice import Choice
 from hybridlog_storage.errors import UsageError
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Given(Choosing, InStore, AsJson, Quiet):
     words: tuple[str, ...] = argument(
         "A recording, as for --recording, unless options choose; and tags to set. Without "

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 from hybridlog.cli.answers import SCREEN, Tabular
@@ -29,7 +28,6 @@ if TYPE_CHECKING:
     from hybridlog.tf.tree import FrameTree
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Given(Strict, Topics, Tabular):
     words: ClassVar[tuple[str, ...]] = ()  # type: ignore[misc]
     target: str | None = argument("The frame of the results.", "[TARGET]")

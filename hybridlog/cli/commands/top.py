@@ -6,7 +6,6 @@ import shutil
 import sys
 import textwrap
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from hybridlog.cli import output
@@ -23,7 +22,6 @@ _EVERY_S = 1.0
 _SHORT = 60  # characters of a reason
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Given(Place):
     recording: str | None = argument(
         "One of several recorders: id or name of its recording, or the beginning of the id.",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING
 
@@ -24,7 +23,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.summary import RecordingSummary
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Given(Choosing, InStore, AsJson, Quiet):
     names: tuple[str, ...] = names_argument()  # type: ignore[misc]
     repair: bool = option("Mend what can be mended without losing anything; list the rest.")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
 
 from hybridlog.cli import output
 from hybridlog.cli.binder import command
@@ -12,7 +11,6 @@ from hybridlog.cli.signals import ended_by_signal
 from hybridlog_storage.errors import MissingDependencyError
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Given(InStore, AsJson, Served):
     recording: str | None = one_recording(
         "Show this one first; without, the list of recordings.", "[RECORDING]"
