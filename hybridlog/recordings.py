@@ -93,7 +93,7 @@ class Recordings(Sequence["RecordingEntry"]):
 
     def topics(self, *types: str) -> list[str]:
         """Names of their topics, sorted, also of some types alone; as of `Store.topics`."""
-        from hybridlog.query.choosing import topics_of_types
+        from hybridlog.query.choice import topics_of_types
 
         session = self._source.now()
         return topics_of_types(session, types, self.ids) if types else session.topics_of(self.ids)

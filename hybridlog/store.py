@@ -18,7 +18,7 @@ from typing import (
 from hybridlog.index.access import again_if_lost
 from hybridlog.index.of_store import Index
 from hybridlog.opened import OpenStore
-from hybridlog.query.choice import Choice
+from hybridlog.query.choice import Choice, choose
 from hybridlog.query.query import Query, narrowed, of_now
 from hybridlog.query.question import Question
 from hybridlog.session import Asked, Session
@@ -251,10 +251,10 @@ class Store:
 
     def choose(self, choice: Choice) -> Recordings:
         """The recordings that satisfy a choice; see `recordings`."""
-        from hybridlog.query.choosing import choose
+        from hybridlog.query.planner import recordings_with_any
         from hybridlog.recordings import Recordings
 
-        chosen = choose(self.session, choice)
+        chosen = choose(self.session, choice, recordings_with_any)
         return Recordings(self._source, chosen.summaries, chosen.problem)
 
     def entry(self, recording: str) -> RecordingEntry:

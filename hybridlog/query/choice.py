@@ -1,16 +1,39 @@
-"""A choice of recordings: the conditions that they must satisfy."""
+"""Choices of recordings: the conditions that they must satisfy, and the ones that do.
+
+Only `where` asks about messages: the index or the tables of the recordings that satisfy the
+other conditions.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, TypeAlias
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from fnmatch import fnmatchcase
+from itertools import chain
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 from msgspec import Struct
+from msgspec.structs import replace
 
-from hybridlog_storage.errors import TimeError, UsageError
+from hybridlog.query.times import (
+    TIME_LIMIT,
+    format_time,
+    is_relative,
+    parse_duration,
+    parse_range,
+)
+from hybridlog.query.topics import fitting, split_topic
+from hybridlog.wording import listed, meant
+from hybridlog_storage.errors import TimeError, TopicError, UsageError
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from hybridlog.query.question import Question
     from hybridlog.query.times import DurationLike, TimeLike
+    from hybridlog.session import Session
+    from hybridlog_storage.summary import RecordingSummary
 
 Texts: TypeAlias = "str | Sequence[str] | None"
 """One text or several."""
@@ -18,6 +41,12 @@ Tags: TypeAlias = "str | Sequence[str] | Mapping[str, str | None] | None"
 """`"robot=7"`, `"robot"`, several of these, or values by key."""
 During: TypeAlias = "tuple[TimeLike | None, TimeLike | None] | None"
 """Begin and end of a range of log time; None leaves a side open."""
+_Step: TypeAlias = tuple[Iterable[int], str, str, Sequence[str]]
+"""Positions of the recordings that satisfy a condition; this in words; and, for a hint where there
+is none, the name that was wanted and those that there are."""
+Answering: TypeAlias = "Callable[[Session, Question], set[str]]"
+"""Returns the ids of the recordings that have a message in an answer."""
+_GLOB = frozenset("*?[")
 
 
 class Choice(Struct, frozen=True):
@@ -87,13 +116,181 @@ def _texts(given: Texts) -> tuple[str, ...]:
 
 
 def _tags(given: Tags) -> tuple[tuple[str, str | None], ...]:
-    pairs: list[tuple[str, str | None]]
     if isinstance(given, Mapping):
-        pairs = list(given.items())
+        pairs = tuple(given.items())
     else:
         split = (one.partition("=") for one in _texts(given))
-        pairs = [(key, value if sign else None) for key, sign, value in split]
-    for key, _ in pairs:
-        if not key:
-            raise UsageError("A tag is chosen as KEY=VALUE, or as KEY for any value.")
-    return tuple(pairs)
+        pairs = tuple((key, value if sign else None) for key, sign, value in split)
+    if not all(key for key, _ in pairs):
+        raise UsageError("A tag is chosen as KEY=VALUE, or as KEY for any value.")
+    return pairs
+
+
+class Chosen(NamedTuple):
+    """The recordings of a choice, oldest first; the `problem` is why there is none, or empty."""
+
+    summaries: list[RecordingSummary]
+    problem: str
+
+
+def choose(session: Session, choice: Choice, answering: Answering | None = None) -> Chosen:
+    """The recordings of a store that satisfy a choice; `answering` is needed for `where`."""
+    choosing = _Choosing(session, answering)
+    if not choosing.left and not choice.is_everything:
+        return Chosen([], session.when_empty)
+    conditions: list[str] = []
+    for places, condition, wanted, known in choosing.steps(choice):
+        conditions.append(condition)
+        remaining = {*places}
+        choosing.left = [place for place in choosing.left if place in remaining]
+        if not choosing.left:
+            problem = f"There is no recording {', '.join(conditions)}"
+            return Chosen([], f"{problem}; {meant(wanted, known)}" if known else f"{problem}.")
+    return Chosen(choosing.summaries, "")
+
+
+def topics_of_types(session: Session, types: Sequence[str], recordings: Sequence[str]) -> list[str]:
+    """The topics of recordings, by id, with messages of some types, as `--type` names these.
+
+    Raises:
+        TopicError: There is none.
+    """
+    snapshot = session.look(recordings)
+    places = snapshot.having(session.topics_of(recordings), recordings)
+    found = {
+        channel.topic: channel.type
+        for summary in snapshot.differing(places)
+        for channel in session.entry_of(summary).channels
+    }
+    chosen = [topic for topic, name in found.items() if any(_is_type(name, one) for one in types)]
+    if not chosen:
+        hint = meant(types[0], {*found.values()} - {""})
+        raise TopicError(f"there is no topic of type {listed(types)}; {hint}")
+    return sorted(chosen)
+
+
+def placed(session: Session, names: Iterable[str]) -> dict[int, None]:
+    """Positions of recordings by names and globs."""
+    snapshot = session.snapshot()
+    found: dict[int, None] = {}
+    for name in names:
+        if _GLOB & set(name) and not snapshot.called(name):
+            fitting = snapshot.matching(name) or snapshot.named(name)
+            found.update(dict.fromkeys(fitting))
+        else:
+            found.update(dict.fromkeys(session.named([name])))
+    return found
+
+
+class _Choosing:
+    """Narrows down the recordings of a store, one condition after the other."""
+
+    def __init__(self, session: Session, answering: Answering | None) -> None:
+        self._session = session
+        self._answering = answering
+        self._snapshot = session.snapshot()
+        self.left: list[int] = [*range(len(self._snapshot))]
+
+    @property
+    def summaries(self) -> list[RecordingSummary]:
+        """Those that are left. Positions are of the snapshot at hand: a later one sorts anew."""
+        return [self._snapshot.summaries[place] for place in self.left]
+
+    @property
+    def _places(self) -> NDArray[np.intp]:
+        import numpy as np  # the choices of a command need none
+
+        return np.array(self.left, np.intp)
+
+    @property
+    def _topics(self) -> list[str]:
+        """The topics of those that are left."""
+        return self._snapshot.topics_at(self._places)
+
+    def steps(self, choice: Choice) -> Iterator[_Step]:
+        """Each condition, to be applied before the next one is asked for."""
+        if choice.name:
+            names = [one.name for one in self._snapshot.summaries]
+            words = f"named {' or '.join(map(repr, choice.name))}"
+            yield placed(self._session, choice.name), words, choice.name[0], names
+        # See what those that go on have flushed.
+        ids = [summary.id for summary in self.summaries]
+        self._snapshot = self._session.look(ids)
+        self.left = sorted(self._snapshot.by_id[one] for one in ids)
+        tags = self._snapshot.tags
+        for key, value in choice.tag:
+            found = tags.get(key, {})
+            places = chain.from_iterable(
+                own for one, own in found.items() if value is None or one == value
+            )
+            words = key if value is None else f"{key}={value}"
+            known = [f"{name}={one}" for name, values in tags.items() for one in values]
+            yield places, f"with the tag {words}", words, known
+        for pattern in choice.has:
+            topics = fitting(pattern, self._topics)
+            having = self._snapshot.having(topics).tolist()
+            yield having, f"with the topic {pattern!r}", pattern, self._topics
+        for name in choice.type:
+            types = self._snapshot.types
+            having = self._snapshot.with_types({one for one in types if _is_type(one, name)})
+            yield having.tolist(), f"with messages of the type {name!r}", name, [*types]
+        if choice.during is not None:
+            yield self._in_time(*choice.during)
+        if choice.older_than is not None:
+            yield self._of_age(choice.older_than)
+        for condition in choice.where:
+            yield self._of_content(condition)
+
+    def _in_time(self, begin: TimeLike | None, end: TimeLike | None) -> _Step:
+        for moment in (begin, end):
+            if is_relative(moment) and str(moment).strip() not in {"start", "end"}:
+                raise TimeError(
+                    f"A time for choosing recordings is absolute, not {moment!r}: write a date "
+                    "such as 2025-06-03, seconds since the epoch, `now`, `start` or `end`."
+                )
+        low, high = parse_range(begin, end, start=0, end=TIME_LIMIT - 1)
+        places = self._snapshot.during(self._places, low, high, time.time_ns())
+        return places.tolist(), f"with messages from {begin or 'start'} to {end or 'end'}", "", ()
+
+    def _of_age(self, age: DurationLike) -> _Step:
+        latest = time.time_ns() - parse_duration(age)
+        old = [
+            place
+            for place, one in zip(self.left, self.summaries, strict=True)
+            if one.status != "open" and one.extent[0] < one.extent[1] <= latest + 1
+        ]
+        return old, f"whose last message is from {format_time(latest)} or before", "", ()
+
+    def _of_content(self, condition: str) -> _Step:
+        pattern, predicate = split_topic(condition)
+        if not pattern:
+            raise UsageError(
+                f"Write TOPIC: PREDICATE, such as 'scan: ranges.min < 0.5', not {condition!r}."
+            )
+        known = self._topics
+        topics = tuple(fitting(pattern, known))
+        there = sorted({*self._snapshot.having(topics).tolist()} & {*self.left})
+        found: list[int] = []
+        if there:
+            ids = tuple(self._snapshot.summaries[place].id for place in there)
+            from hybridlog.query.question import Question
+
+            question = Question(topics, ids)
+            if predicate:
+                checked = self._session.predicate(predicate, topics, ids)
+                if checked.is_across:
+                    raise UsageError(f"A condition for recordings is of one topic: {condition!r}.")
+                question = replace(question, predicate=checked)
+            assert self._answering is not None
+            having = self._answering(self._session, question)
+            found = [self._snapshot.by_id[one] for one in having]
+        words = f"with a message for which {condition!r} holds"
+        return found, words, pattern, () if there else known
+
+
+def _is_type(name: str, pattern: str) -> bool:
+    """True if a type is meant: `sensor_msgs/msg/Imu` by itself, `sensor_msgs/Imu` or `Imu`."""
+    short = name.replace("/msg/", "/")  # as ROS 1 spells it
+    spelled = {name, short, short.replace(".", "/").rpartition("/")[2]}
+    wanted = {pattern, pattern.replace("/msg/", "/")}
+    return any(fnmatchcase(one, want) or one == want for one in spelled for want in wanted)

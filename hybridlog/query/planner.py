@@ -118,10 +118,6 @@ class Planner(Rows):
         total = sum(-(-self.count_of(parts) // every) for parts in alike.values())
         return total if limit is None else min(total, limit)
 
-    def recordings_with_any(self) -> set[str]:
-        """Ids of the recordings that have a message in the answer."""
-        return {part.recording.id for part in self.parts() if self.count_of([part])}
-
     def runs(self) -> Iterator[MessageRun]:
         """The messages of the answer, in order."""
         question = self.question
@@ -204,6 +200,12 @@ class Planner(Rows):
             raise TopicError(
                 f"{topic} came without publish times (ROS 1 bags have none): use --clock log."
             )
+
+
+def recordings_with_any(session: Session, question: Question) -> set[str]:
+    """Ids of the recordings that have a message in an answer."""
+    planner = Planner(session, question)
+    return {part.recording.id for part in planner.parts() if planner.count_of([part])}
 
 
 def match_times(
