@@ -32,13 +32,15 @@ from hybridlog.columns.layout import OWN_COLUMNS
 from hybridlog.schema.arrow_columns import objects_array, structs
 from hybridlog.schema.arrow_types import (
     Array,
+    bounds_of,
     converted,
+    is_list,
     is_summary,
     part_of_summary,
     plain_values,
 )
 from hybridlog.schema.codec import Decoded, no_messages, no_rows, payload_alone, unreadable
-from hybridlog.schema.column import Records
+from hybridlog.schema.column import Records, offsets
 from hybridlog.schema.document import MAX_BYTES
 from hybridlog.schema.objects import Objects, plain_cells
 from hybridlog_storage.messages import Batch, Left
@@ -104,13 +106,26 @@ class LeftFields(Objects):
                 made[path] = found
         return made
 
+    def both(self) -> tuple[Array, Array]:
+        """The messages without the arrays that are gone, and with summaries of all arrays."""
+        return records_of(self.columns), records_of(self.columns, lambda _: True)
+
+    def lacks(self, fields: Iterable[str]) -> NDArray[np.bool_]:
+        """bool[n], True where of an array of some fields only the summary is left."""
+        asked = [names_of(path) for path in fields]
+        found = np.zeros(len(self), np.bool_)
+        for array, is_gone in _gone_in(self.columns):
+            if any(path[: len(array)] == array[: len(path)] for path in asked):
+                found |= is_gone
+        return found
+
     def lacking(self, but: Collection[str] = ()) -> NDArray[np.bool_]:
         """bool[n], True where a wanted array, none of `but`, has only its summary left."""
         wanted = None if self.fields is None else [names_of(path) for path in self.fields]
         found = np.zeros(len(self), np.bool_)
-        for path, summary in _summaries_in(self.columns):
+        for path, is_gone in _gone_in(self.columns, lists=False):
             if ".".join(path) not in but and (wanted is None or _asks(wanted, path)):
-                found |= summary.is_valid().to_numpy(zero_copy_only=False)
+                found |= is_gone
         return found
 
 
@@ -202,16 +217,21 @@ def messages_left(parts: Sequence[pa.StructArray]) -> tuple[Batch, NDArray[np.in
     return batch, numbers("seq", np.int64)
 
 
-def _summaries_in(
-    columns: Array, above: tuple[str, ...] = ()
-) -> Iterator[tuple[tuple[str, ...], Array]]:
-    """Columns of summaries, but for those inside lists, and the paths of their arrays."""
-    for field, column in zip(columns.type, columns.flatten(), strict=True):
+def _gone_in(
+    columns: Array, above: tuple[str, ...] = (), *, lists: bool = True
+) -> Iterator[tuple[tuple[str, ...], NDArray[np.bool_]]]:
+    """Arrays of which a summary may be left, and in which rows; those in `lists`, too."""
+    if lists and is_list(columns.type):
+        for path, is_gone in _gone_in(columns.flatten(), above):
+            before = offsets(is_gone)
+            yield path, np.diff(before[bounds_of(columns)]) > 0
+    fields = columns.flatten() if pa.types.is_struct(columns.type) else ()
+    for field, column in zip(columns.type if fields else (), fields, strict=True):
         path = (*above, original_name(field))
         if has_summaries(field):
-            yield path, column
-        elif pa.types.is_struct(field.type):
-            yield from _summaries_in(column, path)
+            yield path, column.is_valid().to_numpy(zero_copy_only=False)
+        else:
+            yield from _gone_in(column, path, lists=lists)
 
 
 def _documents(columns: Array, *, typed: bool, summaries: bool = True) -> list[dict[str, Any]]:

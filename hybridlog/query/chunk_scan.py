@@ -13,12 +13,11 @@ from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from msgspec import Struct, field
 
-from hybridlog.query.predicate.tree import is_meta
 from hybridlog.query.question import Counters
 from hybridlog_storage.errors import StoreError
 from hybridlog_storage.messages import distinct, interleave, order_of
@@ -26,11 +25,9 @@ from hybridlog_storage.stopping import check_wanted
 from hybridlog_storage.times import inside, placed, touches
 
 if TYPE_CHECKING:
-    import pyarrow as pa
     from numpy.typing import NDArray
 
     from hybridlog.query.chunk_columns import Chunk
-    from hybridlog.query.predicate.evaluate import Verdict
     from hybridlog.query.question import Clock, Part, RecordedChannel, Span
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
@@ -48,13 +45,10 @@ ChunkKey = tuple[str, int, int]
 
 
 class RecordingScan(Struct, frozen=True):
-    """The part of one recording to read.
+    """The chunks of a recording to read for some channels: their ids and places in the plan.
 
-    Attributes:
-        channels: Index of each wanted channel in the plan's channels, by channel id.
-        bounds: `[begin, end)`, ns, of the plan's clock; None for all times.
-        chunks: The chunks that may hold it, asked for with these channels.
-        windows: int64[n, 2], `[begin, end)` of log time, apart and in order; None for all times.
+    `windows` are of log time: int64[n, 2], apart and in order; `bounds` are of the plan's clock.
+    None is all times, ns.
     """
 
     recording: RecordingEntry
@@ -287,20 +281,22 @@ class ChunkScan:
         return MessageRun(own, seq[rows], self._plan.channels)
 
     def _filtered(self, run: MessageRun, undecided: Sequence[int]) -> tuple[MessageRun, int, int]:
-        """The messages that satisfy the predicate, and numbers as in `Matches`."""
+        """The messages that satisfy the predicate, and numbers as of `matches`."""
         if not undecided or not len(run.batch):
             return run, 0, 0
         holds = np.ones(len(run.batch), np.bool_)
         unreadable = expired = 0
+        from hybridlog.query.predicate.evaluate import matches
+
         for index in distinct(run.batch.channel).tolist():
             if index in undecided:
                 rows = np.flatnonzero(run.batch.channel == index)
                 channel = self._plan.channels[index]
                 part, _ = self._plan.filters[index]
-                found = matches(part, channel, run.batch.take(rows), run.seq[rows])
-                holds[rows] = found.holds
-                unreadable += found.unreadable
-                expired += found.expired
+                holds[rows], lacking, gone = matches(
+                    part, channel, run.batch.take(rows), run.seq[rows]
+                )
+                unreadable, expired = unreadable + lacking, expired + gone
         return (run if holds.all() else run.take(holds)), unreadable, expired
 
     def _inside(
@@ -381,89 +377,3 @@ def in_order(runs: list[MessageRun], plan: ScanPlan) -> MessageRun:
     if len(runs) == 1:
         return runs[0].take(order)
     return MessageRun(interleave([r.batch for r in runs], order), seq[order], plan.channels)
-
-
-# Predicates on messages that were read.
-
-
-class Matches(NamedTuple):
-    """The outcome for some messages.
-
-    Attributes:
-        holds: bool[n], true where the predicate holds.
-        unreadable: Number of messages that the predicate could not test, because they do not fit
-            their definition, or lack arrays.
-        expired: Number of those that lack arrays, since their payloads are gone.
-    """
-
-    holds: NDArray[np.bool_]
-    unreadable: int
-    expired: int = 0
-
-
-def matches(part: Part, channel: RecordedChannel, batch: Batch, seq: NDArray[np.int64]) -> Matches:
-    """Decide the predicate of a part on messages of one of its channels; `seq` as they arrived."""
-    from hybridlog.query.predicate.evaluate import on_objects
-    from hybridlog.schema.arrow_columns import structs
-
-    predicate, types = part.predicate, part.field_types
-    assert predicate is not None
-    holds = np.zeros(len(batch), np.bool_)
-    fields = {path.split(".")[0].split("[")[0] for path in predicate.fields()} - {"_meta"}
-    times = batch.log_time, seq, batch.publish_time
-    if not fields:  # what a message itself provides can be asked of any
-        return Matches(verdict_of(part, channel, structs({}, len(batch)), *times).holds, 0)
-    if not channel.codec.indexed:
-        return Matches(holds, len(batch))
-    decoded = channel.codec.columns_of(batch, fields)
-    rows, left = decoded.rows, channel.is_reduced
-    times = batch.log_time[rows], seq[rows], batch.publish_time[rows]
-    found = None if left else verdict_of(part, channel, decoded.arrow(), *times)
-    if found is None or found.open.any():
-        plain = decoded.plain()
-        if any(map(is_meta, predicate.fields())):
-            meta = meta_array(structs({}, len(rows)), channel, *times).to_pylist()
-            plain = [{**one, **own} for one, own in zip(plain, meta, strict=True)]
-        found = on_objects(predicate, types, plain, left=left)
-    holds[rows] = found.holds
-    lacking = int(found.open.sum())
-    return Matches(holds, len(batch) - len(rows) + lacking, lacking)
-
-
-def verdict_of(
-    part: Part, channel: RecordedChannel, records: pa.StructArray, *times: Any
-) -> Verdict:
-    """The outcome of a part's predicate on columns.
-
-    `times` are log times, arrival numbers and publish times, as of `meta_array`.
-    """
-    from hybridlog.query.predicate.evaluate import on_columns
-
-    assert part.predicate is not None
-    if any(map(is_meta, part.predicate.fields())):
-        records = meta_array(records, channel, *times)
-    return on_columns(part.predicate, part.field_types, records)
-
-
-def meta_array(
-    records: pa.StructArray,
-    channel: RecordedChannel,
-    log_time: NDArray[np.int64],
-    seq: NDArray[np.int64],
-    publish_time: pa.Array[Any] | NDArray[np.int64] | None,
-) -> pa.StructArray:
-    """The records with a field `_meta` of what a message itself provides; times in ns."""
-    import pyarrow as pa
-
-    rows = len(log_time)
-    columns: dict[str, Any] = {
-        "t": pa.array(log_time),
-        "rec": pa.array([channel.recording.key] * rows, pa.string()),
-        "topic": pa.array([channel.channel.topic] * rows, pa.string()),
-        "seq": pa.array(seq),
-    }
-    if channel.channel.has_publish_time and publish_time is not None:
-        columns["pub"] = pa.array(publish_time)
-    meta = pa.StructArray.from_arrays(list(columns.values()), names=list(columns))
-    names = [field.name for field in records.type]
-    return pa.StructArray.from_arrays([*records.flatten(), meta], names=[*names, "_meta"])

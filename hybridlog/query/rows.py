@@ -441,12 +441,12 @@ class Rows:
         """bool[n], true for matching messages; those that cannot be tested are counted."""
         if part.predicate is None:
             return np.ones(len(run.batch), np.bool_)
-        from hybridlog.query.chunk_scan import matches
+        from hybridlog.query.predicate.evaluate import matches
 
-        found = matches(part, channel, run.batch, run.seq)
-        self.counters.unreadable += found.unreadable
-        self.counters.without_arrays += found.expired
-        return found.holds
+        holds, unreadable, lacking = matches(part, channel, run.batch, run.seq)
+        self.counters.unreadable += unreadable
+        self.counters.without_arrays += lacking
+        return holds
 
     # Times alone.
 
@@ -512,10 +512,10 @@ def _decided(part: Part, rows: TableRows) -> NDArray[np.bool_]:
     readable = ~rows.is_unreadable()
     if part.predicate is None:
         return readable
-    from hybridlog.query.chunk_scan import verdict_of
+    from hybridlog.query.predicate.evaluate import verdict_of
 
     times = rows.t, rows.seq, rows.own.get("pub")
-    found = verdict_of(part, part.channels[0], rows.records, *times)
+    found = verdict_of(part, part.channels[0], rows.records, *times, left=True)
     if (found.open & readable).any():
         raise _UndecidedError
     return found.holds & readable
@@ -523,27 +523,14 @@ def _decided(part: Part, rows: TableRows) -> NDArray[np.bool_]:
 
 def _holds(found: Tabled, fields: Collection[str] | None) -> bool:
     """True if a table holds some fields, or all, in full: no array that is a summary there."""
+    from hybridlog.columns.fields import names_of
+
     types = found.part.field_types
-    if not fields and fields is not None:
+    if fields is not None and not fields:
         return True
     if types is None or summaries_in(fields, types):
         return False
-    held = found.table.fields(fields)
-    return all(_is_full(held, channel.arrow_type(fields)) for channel in found.part.channels)
-
-
-def _is_full(held: Any, kind: Any) -> bool:
-    """True if a type has all fields and arrays of another one."""
-    from pyarrow.types import is_struct
-
-    from hybridlog.schema.arrow_types import is_list
-
-    if is_struct(kind):
-        own = {field.name: field.type for field in held} if is_struct(held) else {}
-        return all(field.name in own and _is_full(own[field.name], field.type) for field in kind)
-    if is_list(kind):
-        return is_list(held) and _is_full(held.value_type, kind.value_type)
-    return not is_struct(held)
+    return not any(found.table.is_cut(names_of(one) if one else ()) for one in fields or [""])
 
 
 def _paths(table: TopicTable, part: Part) -> set[str]:

@@ -23,10 +23,11 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import hybridlog as hl
 from hybridlog.query.intervals import Intervals
-from hybridlog.query.predicate.evaluate import on_objects
+from hybridlog.query.predicate.evaluate import on_columns
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.query import Query, field_types
 from hybridlog.query.rows import Rows
+from hybridlog.schema.arrow_columns import objects_array
 from hybridlog_storage.errors import DatabaseError, TimeError
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segments.segment_writer import SegmentSettings
@@ -323,8 +324,12 @@ def expected(world: World, question: dict[str, Any]) -> list[Sent]:
     if question["condition"] is not None:
         types = None if question["topics"] == ("/state",) else _types(world, question)
         objects = [{**one.fields, "_meta": {"seq": one.seq}} for one in world.sent]
-        mask = on_objects(parse(question["condition"]), types, objects).holds
-        matching = {id(one) for one, holds in zip(world.sent, mask, strict=True) if holds}
+        predicate = parse(question["condition"])
+        matching = {
+            id(one)
+            for one, fields in zip(world.sent, objects, strict=True)
+            if on_columns(predicate, types, objects_array([fields], None)).holds.all()
+        }
     named = {world.ids[name] for name in question["recordings"]}
     found = []
     for sent in world.sent:

@@ -1,17 +1,16 @@
-"""Evaluates predicates on decoded messages: on their columns, or on plain objects.
+"""Evaluates predicates on columns of messages.
 
-A condition holds for a message, fails, or is open. Columns have less information than messages:
-a null is a missing field or a null, JSON text hides what it holds, and a summary replaces a
-long array. Of objects, only such summaries leave a condition open.
+Null is missing. A condition holds for a message, fails, or is open: a summary in place of a long
+array does not tell what is asked of its elements. JSON text is decoded where it is asked about.
 """
 
 from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import product
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeGuard, cast
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeGuard
 
 import numpy as np
 import pyarrow as pa
@@ -25,15 +24,16 @@ from hybridlog.query.predicate.tree import (
     Field,
     Node,
     Not,
-    Op,
     Or,
     Parts,
     Predicate,
     Slice,
     Value,
+    is_meta,
     root_of,
 )
 from hybridlog.query.predicate.types import FieldTypes, Stat
+from hybridlog.schema.arrow_columns import json_array, lists, structs, values_array
 from hybridlog.schema.arrow_types import (
     is_array,
     is_list,
@@ -41,18 +41,24 @@ from hybridlog.schema.arrow_types import (
     is_text,
     is_time,
     lengths_of,
+    plain_values,
     statistic,
 )
+from hybridlog.schema.column import offsets, ranges
 from hybridlog.schema.summary import summary_of
-from hybridlog.schema.text import nearest, repaired_text
+from hybridlog.schema.text import nearest
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+    from hybridlog.query.question import Part, RecordedChannel
+    from hybridlog_storage.messages import Batch
 
     Mask = NDArray[np.bool_]
     Rows = NDArray[np.intp]
     Types = FieldTypes | Mapping[str, str] | None
 
+_JSON: Final = pa.json_()
 LOW, HIGH = -(2**63), 2**63 - 1
 """Smallest and greatest int64."""
 _ORDERS: dict[str, np.ufunc] = {
@@ -64,9 +70,6 @@ _ORDERS: dict[str, np.ufunc] = {
 }
 _ENDS: Final = {"<": "min", "<=": "min", ">": "max", ">=": "max"}
 """The end of an array that tells whether an order holds for any of its elements."""
-_SUMMARY: Final = frozenset({"n", "min", "max", "mean"})
-_HIDDEN: Final = object()
-"""Stands for what a summary replaces."""
 
 
 class Verdict(NamedTuple):
@@ -81,30 +84,56 @@ class Verdict(NamedTuple):
         return ~(self.holds | self.fails)
 
 
-def on_columns(node: Predicate | Node, types: Types, records: pa.StructArray) -> Verdict:
-    """Evaluate a predicate on decoded messages.
+def on_columns(
+    node: Predicate | Node, types: Types, records: pa.StructArray, *, left: bool = False
+) -> Verdict:
+    """Evaluate a predicate on messages with at least its fields.
 
-    Args:
-        node: The predicate.
-        types: Types of the fields; None if each message decides.
-        records: Messages with at least the fields of the predicate. Arrays are complete, or
-            structs of `n`, `min`, `max` and `mean`.
+    Arrays may be structs of `n`, `min`, `max` and `mean`, or of `n`, if they are `left`.
     """
-    return _verdict(root_of(node), _Columns(FieldTypes.of(types), records))
+    columns = _Columns(FieldTypes.of(types), records, left=left)
+    return _verdict(root_of(node), columns.outcome, len(records))
 
 
-def on_objects(
+def on_left(
     node: Predicate | Node,
     types: Types,
-    messages: Sequence[Mapping[str, object]],
-    *,
-    left: bool = False,
+    records: pa.StructArray,
+    summaries: pa.StructArray,
+    lacks: Callable[[Sequence[str]], Mask],
 ) -> Verdict:
-    """The same of messages as dict, list, str, bytes, bool, int, float and None.
+    """The same of messages whose payloads are gone.
 
-    With `left`, arrays may be `{n, min, max, mean}`.
+    Of the arrays of some fields that a message `lacks`, the summaries are asked.
     """
-    return _verdict(root_of(node), _Objects(FieldTypes.of(types), messages, left=left))
+    known = FieldTypes.of(types)
+    whole, left = _Columns(known, records), _Columns(known, summaries, left=True)
+
+    def outcome(condition: Condition) -> Verdict:
+        fields = [one.names for one in (condition.field, condition.other) if one is not None]
+        found, gone = whole.outcome(condition), lacks(fields)
+        if not gone.any():
+            return found
+        both = zip(left.outcome(condition), found, strict=True)
+        return Verdict(*(np.where(gone, *masks) for masks in both))
+
+    return _verdict(root_of(node), outcome, len(records))
+
+
+def _verdict(node: Node, outcome: Callable[[Condition], Verdict], rows: int) -> Verdict:
+    none = np.zeros(rows, np.bool_)
+    match node:
+        case And(items):
+            inner = [_verdict(item, outcome, rows) for item in items]
+            holds = np.logical_and.reduce([~none, *(one.holds for one in inner)])
+            return Verdict(holds, np.logical_or.reduce([none, *(one.fails for one in inner)]))
+        case Or(items):
+            return _verdict(Not(And(tuple(map(Not, items)))), outcome, rows)
+        case Not(item):
+            return Verdict(*reversed(_verdict(item, outcome, rows)))
+        case Condition():
+            return outcome(node)
+    return Verdict(none, none)
 
 
 class _Values(NamedTuple):
@@ -113,367 +142,244 @@ class _Values(NamedTuple):
     Attributes:
         values: One of each of the `rows`, in an Arrow array; integers beyond 64 bits in one of
             numpy. None if there may be any.
-        is_element: True for elements of an array: a null is then null, not missing.
+        is_element: True for elements of an array.
     """
 
     values: Any
     rows: Rows
     is_element: bool = False
 
-    def split(self) -> tuple[_Values, Rows]:
-        """Those that are not null, and the rows of the others."""
-        if isinstance(self.values, np.ndarray) or not self.values.null_count:
-            return self, self.rows[:0]
-        valid = to_numpy(self.values.is_valid())
-        return self.some(valid), self.rows[~valid]
+    @property
+    def kind(self) -> pa.DataType | None:
+        """The type of an Arrow array."""
+        return getattr(self.values, "type", None)
+
+    def valid(self) -> _Values:
+        """Those that are not null."""
+        if self.kind is None or not self.values.null_count:
+            return self
+        return self.some(to_numpy(self.values.is_valid()))
 
     def some(self, chosen: Mask) -> _Values:
         """The chosen ones."""
         if chosen.all():
             return self
-        return self._replace(values=self.values.filter(pa.array(chosen)), rows=self.rows[chosen])
+        values = self.values
+        if values is not None:
+            values = values[chosen] if self.kind is None else values.filter(pa.array(chosen))
+        return self._replace(values=values, rows=self.rows[chosen])
 
 
-def _verdict(node: Node, source: _Objects | _Columns) -> Verdict:
-    none = np.zeros(len(source), np.bool_)
-    match node:
-        case And(items):
-            inner = [_verdict(item, source) for item in items]
-            holds = np.logical_and.reduce([~none, *(one.holds for one in inner)])
-            return Verdict(holds, np.logical_or.reduce([none, *(one.fails for one in inner)]))
-        case Or(items):
-            return _verdict(Not(And(tuple(map(Not, items)))), source)
-        case Not(item):
-            return Verdict(*reversed(_verdict(item, source)))
-        case Condition():
-            return _of_condition(node, source)
-    return Verdict(none, none)
+class _Columns:
+    """Messages as columns; `left` if arrays may be summaries."""
 
+    def __init__(self, types: FieldTypes, records: pa.StructArray, *, left: bool = False) -> None:
+        self._types = types
+        self._records = records
+        self._left = left
 
-def _of_condition(node: Condition, source: _Objects | _Columns) -> Verdict:
-    exists = Condition(node.field, "exists")
-    if node.op == "missing":
-        return Verdict(*reversed(_of_condition(exists, source)))
-    if node.op in NEGATED:
-        there = _of_condition(exists, source)
-        found = _of_condition(replace(node, op=NEGATED[node.op]), source)
-        return Verdict(there.holds & found.fails, there.fails | found.holds)
-    if source.types.are_singles(node.field.parts):
-        # Decimal literals as float32 holds them, like the values.
-        node = replace(node, operands=tuple(map(single, node.operands)))
-    holds, is_known = np.zeros(len(source), np.bool_), np.ones(len(source), np.bool_)
-    for rows in _holding(node, source, is_known):
-        holds[rows] = True
-    return Verdict(holds, is_known & ~holds)
+    def outcome(self, node: Condition) -> Verdict:
+        """The messages for which a condition holds, and fails."""
+        exists = Condition(node.field, "exists")
+        if node.op == "missing":
+            return Verdict(*reversed(self.outcome(exists)))
+        if node.op in NEGATED:
+            there = self.outcome(exists)
+            found = self.outcome(replace(node, op=NEGATED[node.op]))
+            return Verdict(there.holds & found.fails, there.fails | found.holds)
+        if self._types.are_singles(node.field.parts):
+            # Decimal literals as float32 holds them, like the values.
+            node = replace(node, operands=tuple(map(single, node.operands)))
+        holds, is_known = (np.full(len(self._records), one) for one in (False, True))
+        for rows in self._holding(node, is_known):
+            holds[rows] = True
+        return Verdict(holds, is_known & ~holds)
 
+    def _holding(self, node: Condition, is_known: Mask) -> Iterator[Rows]:
+        """Rows for which a condition holds; `is_known` becomes False where it may hold besides."""
+        if node.op == "exists":
+            yield from (found.rows for found in _known(self._at(node.field), is_known))
+        elif node.other is None:
+            for found in _known(self._elements(node), is_known):
+                values = _absolute(found.values) if node.field.is_absolute else found.values
+                yield found.rows[compared(values, node.op, node.operands)]
+        else:
+            both = (replace(node, field=one, other=None) for one in (node.field, node.other))
+            sides = [[*map(_numbers, _known(self._elements(one), is_known))] for one in both]
+            for (own, left), (others, right) in product(*sides):
+                rows, one, two = np.intersect1d(own, others, return_indices=True)
+                yield rows[compared_rows(left[one], node.op, right[two])]
 
-def _holding(node: Condition, source: _Objects | _Columns, is_known: Mask) -> Iterator[Rows]:
-    """Rows for which a condition holds; `is_known` becomes False where it may hold besides."""
-    if node.op == "exists":
-        yield from (found.rows for found in _known(source.there(node.field), is_known))
-    elif node.other is None:
-        for found in _known(source.elements(node), is_known):
-            try:
-                yield found.rows[_tested(node, found)]
-            except pa.ArrowInvalid:  # bytes that are no text
-                is_known[found.rows] = False
-    else:
-        both = (replace(node, field=one, other=None) for one in (node.field, node.other))
-        sides = [[*map(_numbers, _known(source.elements(one), is_known))] for one in both]
-        for (own, left), (others, right) in product(*sides):
-            rows, one, two = np.intersect1d(own, others, return_indices=True)
-            yield rows[compared_rows(left[one], node.op, right[two])]
+    def _elements(self, node: Condition) -> Iterator[_Values]:
+        """The values of a field that are no lists, and the elements of lists."""
+        for found in self._at(node.field):
+            yield from self._leaves(found, node)
+
+    def _leaves(
+        self, found: _Values, node: Condition, *, is_in_list: bool = False
+    ) -> Iterator[_Values]:
+        found = found.valid()
+        kind = found.kind
+        if kind is None:
+            yield found
+        elif is_list(kind):
+            yield from self._leaves(_flattened(found), node, is_in_list=True)
+        elif kind == _JSON:
+            for one in _apart(found):
+                yield from self._leaves(one, node, is_in_list=is_in_list)
+        elif self._left and is_summary(kind):
+            yield self._end(found, node)
+        elif is_in_list and node.op in _ENDS and pa.types.is_floating(kind):
+            yield found.some(np.isfinite(to_numpy(found.values)))
+        else:
+            yield found
+
+    def _end(self, found: _Values, node: Condition) -> _Values:
+        """The ends of arrays, if these tell what is asked of the elements."""
+        place = found.values.type.get_field_index(_ENDS.get(node.op, ""))
+        if place >= 0 and self._types.known and not (found.is_element or node.field.is_absolute):
+            values = pc.struct_field(found.values, [place])
+            if self._types.are_floats(node.field.names) or pa.types.is_integer(values.type):
+                return found._replace(values=values, is_element=True).valid()
+        return found._replace(values=None)
+
+    def _at(self, target: Field) -> Iterator[_Values]:
+        """The values at a path, whole arrays, statistics of arrays; none of them null."""
+        parts, start = target.parts, _Values(self._records, np.arange(len(self._records)))
+        stat = self._types.statistic(parts)
+        is_named = np.zeros(len(self._records), np.bool_)
+        if stat is None or not self._types.known:
+            for found in self._reach(start, parts):
+                is_named[found.rows] = True
+                yield found
+        if stat is None:
+            return
+        for array in self._reach(start, parts[:-1]):
+            for found in _statistics(array, stat):
+                yield found.some(~is_named[found.rows])
+
+    def _reach(self, found: _Values, parts: Parts) -> Iterator[_Values]:
+        """The values at a path, from some values on; through an array, from each element."""
+        found = found.valid()
+        kind = found.kind
+        if not parts or found.values is None:
+            yield found
+            return
+        name = str(parts[0])
+        if kind == _JSON:
+            for one in _apart(found, parts[0]):
+                yield from self._reach(one, parts)
+        elif kind is None:
+            return  # integers
+        elif self._left and is_summary(kind):
+            has = len(parts) == 1 and kind.num_fields > 1 and kind.get_field_index(name) >= 0
+            yield found._replace(values=pc.struct_field(found.values, name) if has else None)
+        elif isinstance(parts[0], Slice):
+            if is_list(kind):
+                yield from self._reach(_sliced(found, *parts[0]), parts[1:])
+        elif pa.types.is_struct(kind):
+            if kind.get_field_index(name) >= 0:
+                inner = found._replace(values=pc.struct_field(found.values, name))
+                yield from self._reach(inner, parts[1:])
+        elif is_list(kind) and isinstance(parts[0], int):
+            place = _sliced(found, parts[0], parts[0] + 1)
+            yield from self._reach(_flattened(place), parts[1:])
+        elif is_list(kind):
+            yield from self._reach(_flattened(found), parts)
 
 
 def _known(found: Iterator[_Values], is_known: Mask) -> Iterator[_Values]:
-    try:
-        for one in found:
-            if one.values is None:
-                is_known[one.rows] = False
-            else:
-                yield one
-    except pa.ArrowNotImplementedError:  # Arrow has no functions for lists of JSON text
-        is_known[:] = False
+    for one in found:
+        if one.values is None:
+            is_known[one.rows] = False
+        else:
+            yield one
 
 
 def _numbers(found: _Values) -> tuple[Rows, NDArray[Any]]:
     """The rows of single numbers and times, and these."""
-    values, rows = found.values, found.rows
-    if found.is_element or kind_of(values) not in {"i", "f", "O"}:
-        return rows[:0], np.empty(0)
+    if found.is_element or kind_of(found.values) not in {"i", "f", "O"}:
+        return found.rows[:0], np.empty(0)
+    return found.rows, _plain(found.values)
+
+
+def _plain(values: Any) -> NDArray[Any]:
+    """Numbers, and times in nanoseconds."""
     if isinstance(values, np.ndarray):
-        return rows, values
-    return rows, to_numpy(values.cast(pa.int64()) if is_time(values.type) else values)
+        return values
+    return to_numpy(values.cast(pa.int64()) if is_time(values.type) else values)
 
 
-def _tested(node: Condition, found: _Values) -> Mask:
-    """Mask of the values that satisfy a condition: bool[values]."""
-    values, operands = found.values, node.operands
-    if isinstance(values, pa.NullArray):
-        return np.full(len(values), None in operands)
-    if node.field.is_absolute:  # `abs(x) < 5` is `-5 < x < 5`, of the same element
-        plain = replace(node, field=replace(node.field, is_absolute=False))
-        turned = cast(Op, {"<": ">", "<=": ">=", ">": "<", ">=": "<="}.get(node.op, node.op))
-        below = tuple(-value if is_number(value) else value for value in operands)
-        join = np.logical_and if node.op in {"<", "<="} else np.logical_or
-        return join(
-            _tested(plain, found), _tested(replace(plain, op=turned, operands=below), found)
-        )
-    result = compared(values, node.op, operands)
-    if found.is_element and node.op in _ENDS and kind_of(values) == "f":
-        result &= np.isfinite(to_numpy(values).astype(np.float64))
-    return result
+def _absolute(values: Any) -> Any:
+    """Numbers without their signs; other values as they are."""
+    if kind_of(values) not in {"i", "f", "O"} or not len(values):
+        return values
+    numbers = np.abs(_plain(values))
+    if numbers.dtype.kind == "i":  # of the least integer there is none
+        numbers = numbers.view(f"u{numbers.itemsize}")
+    return numbers if numbers.dtype.kind == "O" else pa.array(numbers)
 
 
-class _Objects:
-    """Messages as plain objects."""
-
-    def __init__(
-        self, types: FieldTypes, messages: Sequence[Mapping[str, object]], *, left: bool
-    ) -> None:
-        self.types = types
-        self._messages = messages
-        self._left = left
-
-    def __len__(self) -> int:
-        return len(self._messages)
-
-    def there(self, target: Field) -> Iterator[_Values]:
-        """The messages that have a field, or may have it."""
-        rows: tuple[list[int], list[int]] = [], []
-        for row, message in enumerate(self._messages):
-            for found in self._at(message, target):
-                rows[found is _HIDDEN].append(row)
-        yield _Values((), np.array(rows[0], np.intp))
-        yield _Values(None, np.array(rows[1], np.intp))
-
-    def elements(self, node: Condition) -> Iterator[_Values]:
-        """The values of a field that are no lists, the elements of lists, and nulls."""
-        alike: dict[tuple[Any, bool], tuple[list[Any], list[int]]] = defaultdict(lambda: ([], []))
-        hidden: list[int] = []
-        for row, message in enumerate(self._messages):
-            for found in self._at(message, node.field):
-                if found is _HIDDEN or (self._left and self._is_left(found, node.field.names)):
-                    hidden.append(row)
-                    continue
-                for value in _flat(found) if isinstance(found, list) else (found,):
-                    if not isinstance(value, Mapping | bytes):  # which equal nothing
-                        # A null is one here: what is missing is not there.
-                        values, rows = alike[_type_of(value), isinstance(found, list)]
-                        values.append(repaired_text(value) if isinstance(value, str) else value)
-                        rows.append(row)
-        yield _Values(None, np.array(hidden, np.intp))
-        for (kind, is_element), (values, rows) in alike.items():
-            array = np.array(values, object) if kind is None else pa.array(values, kind)
-            yield _Values(array, np.array(rows, np.intp), is_element)
-
-    def _at(self, message: object, target: Field) -> Iterator[object]:
-        """Everything at a path: values, whole arrays, statistics of arrays."""
-        parts, types = target.parts, self.types
-        stat = types.statistic(parts)
-        if stat is None or not types.known:
-            yield from self._reached(message, parts)
-        if stat is None:
-            return
-        for array in self._reached(message, parts[:-1]):
-            if isinstance(array, list | bytes) and (types.known or _has_statistic(array, stat)):
-                yield statistic_of(array, stat)
-            elif array is _HIDDEN:
-                yield array
-            elif types.known and isinstance(array, Mapping) and stat in array:
-                yield array[stat]
-
-    def _reached(self, value: object, parts: Parts, path: str = "") -> Iterator[object]:
-        """The values at a path; through an array, those of each element. A last array is whole."""
-        if not parts:
-            yield value
-            return
-        part, rest = parts[0], parts[1:]
-        if self._left and self._is_left(value, path):
-            inside = cast("Mapping[str, object]", value)
-            yield _HIDDEN if rest else inside.get(str(part), _HIDDEN)
-        elif isinstance(part, Slice):
-            if isinstance(value, list):
-                yield from self._reached(value[part.begin : part.end], rest, path)
-        elif isinstance(value, Mapping):
-            name = str(part)
-            if name in value:
-                yield from self._reached(value[name], rest, f"{path}.{name}" if path else name)
-        elif isinstance(value, list) and isinstance(part, int):
-            yield from self._reached(value[part], rest, path) if part < len(value) else ()
-        elif isinstance(value, list):
-            for inner in _flat(value):
-                if isinstance(inner, Mapping):
-                    yield from self._reached(inner, parts, path)
-
-    def _is_left(self, value: object, path: str) -> bool:
-        """True for the summary of an array that is gone."""
-        if not isinstance(value, Mapping) or not path:
-            return False
-        return path in self.types.arrays if self.types.known else {"n"} <= value.keys() <= _SUMMARY
-
-
-def _flat(value: object) -> Iterator[object]:
-    """The elements of a list, also those of lists in it, in their order."""
-    left = [value]
-    while left:
-        value = left.pop()
-        if isinstance(value, list):
-            left += reversed(value)
-        else:
-            yield value
-
-
-def _type_of(value: object) -> pa.DataType | None:
-    """The Arrow type of a value; None of an integer that has none."""
-    if value is None:
-        return pa.null()
-    if isinstance(value, bool):
-        return pa.bool_()
-    if isinstance(value, int):
-        return pa.int64() if LOW <= value <= HIGH else None
-    return pa.string() if isinstance(value, str) else pa.float64()
-
-
-def _has_statistic(values: Sequence[object], stat: Stat) -> bool:
-    """True if an array has a statistic, and its elements have no field of that name."""
-    if stat == "n":
-        return not any(isinstance(value, Mapping) and stat in value for value in values)
-    return all(isinstance(value, int | float) for value in values)
-
-
-def statistic_of(values: Sequence[object], stat: Stat) -> float | None:
-    """A statistic of an array, equal to that in its summary in the index."""
-    if stat == "n":
-        return len(values)
-    found = summary_of(values)
-    return getattr(found, stat)[0].item() if found is not None and found.has[0] else None
-
-
-class _Columns:
-    """Messages as columns."""
-
-    def __init__(self, types: FieldTypes, records: pa.StructArray) -> None:
-        self.types = types
-        self._records = records
-
-    def __len__(self) -> int:
-        return len(self._records)
-
-    def there(self, target: Field) -> Iterator[_Values]:
-        """As of `_Objects`."""
-        for found in self._at(target):
-            if found.values is None or found.is_element:
-                yield found
-            else:
-                valid, nulls = found.split()
-                yield valid
-                yield _Values(None, nulls)  # null, or missing
-
-    def elements(self, node: Condition) -> Iterator[_Values]:
-        """As of `_Objects`; nothing else is null."""
-        for one in self._at(node.field):
-            found = one
-            while found.values is not None:
-                found, nulls = found.split()
-                if found.is_element:
-                    yield _Values(pa.nulls(len(nulls)), nulls, is_element=True)
-                elif None in node.operands:
-                    yield _Values(None, nulls)  # null, or missing
-                if not is_list(found.values.type):
-                    break
-                found = _flattened(found)
-            yield self._end(found, node) if self._may_be_left(found, node.field.names) else found
-
-    def _may_be_left(self, found: _Values, path: str) -> bool:
-        """True for summaries of arrays, and for what may be some."""
-        if found.values is None or not pa.types.is_struct(found.values.type):
-            return False
-        if self.types.known and not found.is_element:
-            return path in self.types.arrays
-        return is_summary(found.values.type)
-
-    def _end(self, found: _Values, node: Condition) -> _Values:
-        """The ends of arrays, if these tell what is asked of the elements."""
-        path, end = node.field.names, _ENDS.get(node.op, "")
-        place = found.values.type.get_field_index(end)
-        if place >= 0 and self.types.known and not (found.is_element or node.field.is_absolute):
-            values = pc.struct_field(found.values, [place])
-            if self.types.are_floats(path) or pa.types.is_integer(values.type):
-                return found._replace(values=values, is_element=True).split()[0]
-        return found._replace(values=None)
-
-    def _at(self, target: Field) -> Iterator[_Values]:
-        """The values at a path, whole arrays, statistics of arrays."""
-        parts, start = target.parts, _Values(self._records, np.arange(len(self)))
-        stat = self.types.statistic(parts)
-        if self._records.type.get_field_index(str(parts[0])) < 0:
-            yield start._replace(values=None)
-        elif stat is None:
-            yield from self._reach(start, parts)
-        elif not self.types.known:
-            yield start._replace(values=None)  # a message may have a field of that name
-        else:
-            for array in self._reach(start, parts[:-1]):
-                yield array if array.values is None else _statistic(array, stat)
-
-    def _reach(self, found: _Values, parts: Parts, path: str = "") -> Iterator[_Values]:
-        """The values at a path, from some values on; through an array, from each element."""
-        kind = None if found.values is None else found.values.type
-        if kind is None or isinstance(kind, pa.BaseExtensionType):  # JSON text
-            yield found._replace(values=None)
-        elif not parts:
-            yield found
-        elif path and self._may_be_left(found, path):
-            yield found._replace(values=None)
-        elif isinstance(parts[0], Slice):
-            if is_list(kind):
-                yield from self._reach(_sliced(found, parts[0]), parts[1:], path)
-        elif pa.types.is_struct(kind):
-            name = str(parts[0])
-            if kind.get_field_index(name) >= 0:
-                valid, _ = found.split()
-                inner = _Values(pc.struct_field(valid.values, name), valid.rows)
-                yield from self._reach(inner, parts[1:], f"{path}.{name}" if path else name)
-        elif is_list(kind) and isinstance(parts[0], int):
-            yield from self._reach(_at_place(found, parts[0]), parts[1:], path)
-        elif is_list(kind):
-            yield from self._reach(_flattened(found), parts, path)
+def _apart(found: _Values, part: str | int | Slice | None = None) -> Iterator[_Values]:
+    """Values in JSON text, apart by the types that they have; of objects a field that is wanted."""
+    wanted = [[part]] if isinstance(part, str) else None
+    alike: dict[pa.DataType, tuple[list[Any], list[int]]] = defaultdict(lambda: ([], []))
+    for row, value in zip(found.rows.tolist(), plain_values(found.values), strict=True):
+        values, rows = alike[values_array([value], wanted).type]
+        values.append(value)
+        rows.append(row)
+    for kind, (values, rows) in alike.items():
+        made = values_array(values, wanted)
+        if kind == _JSON:  # an integer beyond 64 bits, or what is nested too deeply
+            are_integers = all(isinstance(value, int) for value in values)
+            made = np.array(values, object) if are_integers else None
+        yield _Values(made, np.array(rows, np.intp), found.is_element)
 
 
 def _flattened(found: _Values) -> _Values:
-    """The elements of lists; a null list has none."""
-    values = pc.list_flatten(found.values)
-    parents = to_numpy(pc.list_parent_indices(found.values))
-    is_text = isinstance(values.type, pa.BaseExtensionType)
-    return _Values(None if is_text else values, found.rows[parents], is_element=True)
+    """The elements of lists, none of which is null."""
+    rows = np.repeat(found.rows, lengths_of(found.values))
+    return _Values(found.values.flatten(), rows, is_element=True)
 
 
-def _sliced(found: _Values, part: Slice) -> _Values:
-    """Some elements of each list; a null has none."""
-    (values, rows, _), _ = found.split()
-    made = pc.list_slice(values, part.begin, part.end, return_fixed_size_list=False)
-    return _Values(made, rows)
+def _sliced(found: _Values, begin: int, end: int | None) -> _Values:
+    """Some elements of each list, as far as it has them; none of the lists is null."""
+    lengths = lengths_of(found.values)
+    count = np.maximum((lengths if end is None else np.minimum(lengths, end)) - begin, 0)
+    places = ranges(np.cumsum(lengths) - lengths + begin, count)
+    values = found.values.flatten().take(pa.array(places))
+    return found._replace(values=lists(values, offsets(count)))
 
 
-def _at_place(found: _Values, place: int) -> _Values:
-    """The element at an index of each list that is long enough."""
-    values, rows, _ = found.some(lengths_of(found.values) > place)
-    if not len(values):
-        return _Values(pa.nulls(0, values.type.value_type), rows, is_element=True)
-    return _Values(pc.list_element(values, place), rows, is_element=True)
-
-
-def _statistic(found: _Values, stat: Stat) -> _Values:
-    """A statistic of arrays whose types are known, equal to that in the index."""
-    (values, rows, _), _ = found.split()
+def _statistics(found: _Values, stat: Stat) -> Iterator[_Values]:
+    """A statistic of arrays, equal to that in the index; nothing of what is no array."""
+    kind, values = found.kind, found.values
     made = None
-    if pa.types.is_struct(values.type):
-        has = values.type.get_field_index(stat) >= 0
-        made = pc.struct_field(values, stat) if has else None
-    elif is_array(values.type):
+    if values is None:
+        yield found
+    elif kind is None:
+        return  # integers
+    elif kind == _JSON:
+        for one in _apart(found):
+            yield from _statistics(one, stat)
+    elif is_list(kind) and kind.value_type == _JSON:
+        texts = json_array([statistic_of(one, stat) for one in plain_values(values)])
+        yield from _apart(found._replace(values=texts, is_element=True).valid())
+    elif is_array(kind):
         made = statistic(values, stat)
-    return _Values(made, rows, is_element=True)
+    elif is_summary(kind) and kind.get_field_index(stat) >= 0:
+        made = pc.struct_field(values, stat)
+    if made is not None:
+        yield found._replace(values=made, is_element=True).valid()
+
+
+def statistic_of(values: Sequence[object], stat: Stat) -> float | None:
+    """A statistic of an array of any values; None without a finite number, or with other values."""
+    if stat == "n":
+        return len(values)
+    known = [value for value in values if value is not None]
+    found = summary_of(known)
+    return getattr(found, stat)[0].item() if found is not None and found.has[0] else None
 
 
 # Exact comparisons of numbers and strings of any types.
@@ -546,9 +452,8 @@ def _compared(values: Any, order: str, value: Value) -> Any:
         return _ORDERS[order](values, value).astype(np.bool_)
     if kind in "bU":
         return to_numpy(getattr(pc, _ORDERS[order].__name__)(values, pa.scalar(value, values.type)))
-    numbers = to_numpy(values.cast(pa.int64()) if is_time(values.type) else values)
     compare = _integers_compared if kind == "i" else _floats_compared
-    return compare(numbers, order, value)  # type: ignore[arg-type]
+    return compare(_plain(values), order, value)  # type: ignore[arg-type]
 
 
 def _integers_compared(numbers: NDArray[Any], order: str, value: float) -> Any:
@@ -587,3 +492,72 @@ def _floats_compared(numbers: NDArray[Any], order: str, value: float) -> Any:
     # No double lies between both, so it is on the other side or it is not.
     order = order[0] if (order[0] == "<") == (near > value) else f"{order[0]}="
     return _ORDERS[order](wide, near)
+
+
+# Predicates of parts, on messages that were read.
+
+
+def matches(
+    part: Part, channel: RecordedChannel, batch: Batch, seq: NDArray[np.int64]
+) -> tuple[Mask, int, int]:
+    """Decide the predicate of a part on messages of one of its channels; `seq` as they arrived.
+
+    Returns bool[n], true where it holds; the number of messages that could not be tested, since
+    they do not fit their definition or lack arrays; and that of those that lack arrays.
+    """
+    from hybridlog.columns.left_rows import LeftFields
+
+    predicate = part.predicate
+    assert predicate is not None
+    holds = np.zeros(len(batch), np.bool_)
+    fields = {path.split(".")[0].split("[")[0] for path in predicate.fields()} - {"_meta"}
+    times = batch.log_time, seq, batch.publish_time
+    if not fields:  # what a message itself provides can be asked of any
+        return verdict_of(part, channel, structs({}, len(batch)), *times).holds, 0, 0
+    if not channel.codec.indexed:
+        return holds, len(batch), 0
+    decoded = channel.codec.columns_of(batch, fields)
+    rows, records = decoded.rows, decoded.records
+    times = batch.log_time[rows], seq[rows], batch.publish_time[rows]
+    if isinstance(records, LeftFields):
+        whole, left = (_with_meta(part, channel, one, *times) for one in records.both())
+        found = on_left(predicate, part.field_types, whole, left, records.lacks)
+    else:
+        found = verdict_of(part, channel, decoded.arrow(), *times)
+    holds[rows] = found.holds
+    lacking = int(found.open.sum())
+    return holds, len(batch) - len(rows) + lacking, lacking
+
+
+def verdict_of(
+    part: Part,
+    channel: RecordedChannel,
+    records: pa.StructArray,
+    *times: Any,
+    left: bool = False,
+) -> Verdict:
+    """The outcome of a part's predicate on columns; `times` are as of `_with_meta`."""
+    assert part.predicate is not None
+    records = _with_meta(part, channel, records, *times)
+    return on_columns(part.predicate, part.field_types, records, left=left)
+
+
+def _with_meta(
+    part: Part, channel: RecordedChannel, records: pa.StructArray, *times: Any
+) -> pa.StructArray:
+    """The records with what a predicate asks of a message: log, arrival and publish times."""
+    if part.predicate is None or not any(map(is_meta, part.predicate.fields())):
+        return records
+    log_time, seq, publish_time = times
+    rows = len(log_time)
+    columns: dict[str, Any] = {
+        "t": pa.array(log_time),
+        "rec": pa.array([channel.recording.key] * rows, pa.string()),
+        "topic": pa.array([channel.channel.topic] * rows, pa.string()),
+        "seq": pa.array(seq),
+    }
+    if channel.channel.has_publish_time and publish_time is not None:
+        columns["pub"] = pa.array(publish_time)
+    meta = pa.StructArray.from_arrays(list(columns.values()), names=list(columns))
+    names = [field.name for field in records.type]
+    return pa.StructArray.from_arrays([*records.flatten(), meta], names=[*names, "_meta"])

@@ -24,7 +24,6 @@ from hybridlog.query.predicate.tree import (
     Field,
     MongoFilter,
     Predicate,
-    Reach,
     is_meta,
 )
 from hybridlog.query.predicate.types import STATS, FieldTypes, check
@@ -73,16 +72,9 @@ def from_json(text: str) -> Filter:
 def mongo_filter(
     query: Mapping[str, object], types: FieldTypes | Mapping[str, str] | None
 ) -> Predicate:
-    """A filter as a predicate that MongoDB answers.
+    """A filter, as pymongo takes it, as a predicate that MongoDB answers.
 
     It is copied as BSON, so numpy's scalars are numbers and tuples are lists.
-
-    Args:
-        query: A filter as `pymongo` takes it.
-        types: Types of the fields by path; None where no definition fixes them.
-
-    Raises:
-        WhereError: a part is not allowed, with its place; or there is no such field.
     """
     if not isinstance(query, Mapping):
         raise WhereError(f"a filter is a mapping, not {type(query).__name__}")
@@ -112,7 +104,7 @@ def misjudged(node: MongoFilter, types: FieldTypes | Mapping[str, str] | None) -
     """
     known = FieldTypes.of(types)
     found: dict[str, Filter] = {}
-    for path, reach in node.paths:
+    for path, of_value in node.paths:
         if is_meta(path) or _is_id(path):
             continue
         names = [name for name in path.split(".") if not name.isdecimal()]
@@ -126,10 +118,9 @@ def misjudged(node: MongoFilter, types: FieldTypes | Mapping[str, str] | None) -
         above = {".".join(names[: end + 1]) for end in range(len(names))}
         for array in sorted(known.arrays if known.known else above):
             is_above = name.startswith(f"{array}.") and not (is_statistic and array == parent)
-            is_it = array == name and (reach != "exists" or path != name)
-            is_below = reach == "whole" and array.startswith(f"{name}.")
+            is_it = array == name and (of_value or path != name)
             width = width_of(known.types.get(array, ""))
-            if (is_above or is_it or is_below) and (width is None or width > WHOLE):
+            if (is_above or is_it) and (width is None or width > WHOLE):
                 found[
                     f"{array} of more than {WHOLE} elements is a summary in the index: write a "
                     f"predicate, such as '{array} > 0', or, if all are so long, ask for "
@@ -172,19 +163,13 @@ _CODEC: CodecOptions[Filter] = CodecOptions(type_registry=TypeRegistry(fallback_
 
 
 class _Checker:
-    """Checks a filter of plain values; `paths` says how it asks for each path."""
+    """Checks a filter of plain values; `paths` are asked for their values, or whether they are."""
 
     def __init__(self) -> None:
-        self.paths: dict[str, Reach] = {}
+        self.paths: dict[str, bool] = {}
 
     def query(self, query: object, path: _Path, above: str = "") -> None:
-        """Check a filter.
-
-        Args:
-            query: The filter, or several.
-            path: Its place, for messages.
-            above: The path of the array whose elements it is about, and a dot.
-        """
+        """Check a filter, or several; `above` is the array that it is inside of, and a dot."""
         for one in query if isinstance(query, list) else [query]:
             for key, value in one.items() if isinstance(one, dict) else ():
                 place = (*path, key)
@@ -195,10 +180,8 @@ class _Checker:
                 else:
                     self._condition(above + key, value, place)
 
-    def _ask(self, name: str, reach: Reach) -> None:
-        """Note that the filter asks for a path, and how."""
-        if self.paths.get(name, "exists") == "exists" or reach == "whole":
-            self.paths[name] = reach
+    def _ask(self, name: str, *, of_value: bool = True) -> None:
+        self.paths[name] = of_value or self.paths.get(name, False)
 
     def _condition(self, name: str, value: object, path: _Path) -> None:
         """Check what a field is compared with: a value, a pattern, or operators."""
@@ -207,13 +190,13 @@ class _Checker:
         elif _has_operators(value):
             self._operators(name, cast("Filter", value), path)
         else:
-            self._ask(name, "whole" if isinstance(value, dict | list) else "value")
+            self._ask(name)
             _literal(value, path)
 
     def _operators(self, name: str, operators: Filter, path: _Path) -> None:
         for key, value in operators.items():
             place = (*path, key)
-            self._ask(name, "exists" if key == "$exists" else "value")
+            self._ask(name, of_value=key != "$exists")
             if key == "$regex":
                 self._pattern(name, value, operators.get("$options", ""), place)
             elif key == "$elemMatch":
@@ -231,7 +214,7 @@ class _Checker:
                 raise _refused(place, "the operator is not allowed here")
 
     def _pattern(self, name: str, value: object, options: object, path: _Path) -> None:
-        self._ask(name, "value")
+        self._ask(name)
         if isinstance(value, Regex):
             if options or value.flags & ~sum(_FLAGS.values()):
                 raise _refused(path, "may have the options i, m and s only, and once")

@@ -28,7 +28,7 @@ there.
 element equals or matches the operand. `not (...)` is plain negation: it also holds where
 the field is missing. Numbers are compared by value, whatever their type. A comparison of
 different kinds (a number and a string) is false. NaN equals NaN and is neither less nor
-greater than anything. `== null` finds a stored null, not a missing field.
+greater than anything. A null is missing: `== null` is `missing`, `!= null` is `exists`.
 
 The pattern of `~` is found anywhere in the string unless anchored; its backslashes have no
 escaping of their own. It has RE2's syntax and takes linear time.
@@ -45,6 +45,7 @@ holds for any finite element.
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from collections.abc import Callable
@@ -63,6 +64,7 @@ from hybridlog.query.predicate.tree import (
     Near,
     Node,
     Not,
+    Op,
     Or,
     Order,
     Parts,
@@ -100,19 +102,9 @@ _TOKEN = re.compile(
     |(?P<operator>==|!=|<=|>=|&&|\|\||!~|=~|[<>=~!()\[\],+-])""",
     re.VERBOSE | re.DOTALL,
 )
-_HINTS = {
-    "&": "; write and",
-    "|": "; write or",
-    ":": "; a slice is x[3:8], and a space follows the name of another topic: /odom: x > 1",
-    ".": "; the field's name does not end",
-    "'": "; the string is not closed",
-    '"': "; the string is not closed",
-    "`": "; a name must not be empty, hold '.' or NUL, or begin with '$'",
-}
 _INTEGER = re.compile(r"0[xX][0-9a-fA-F]+|[0-9]+")
 _FLOAT = re.compile(r"(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
-_ESCAPE = re.compile(r"\\(?:u([0-9a-fA-F]{4})|(.))", re.DOTALL)
-_ESCAPES = dict(zip("\"'\\/ntrbf0", "\"'\\/\n\t\r\b\f\0", strict=True))
+_ESCAPE = re.compile(r"\\.|\"", re.DOTALL)
 
 Kind = Literal["path", "number", "time", "string", "operator", "topic", "end"]
 
@@ -172,7 +164,7 @@ def tokenize(text: str) -> list[Token]:
     while at < len(text):
         match = _TOKEN.match(text, at)
         if match is None:
-            raise error_at(text, at, f"{text[at]!r} has no meaning here{_HINTS.get(text[at], '')}")
+            raise error_at(text, at, f"{text[at]!r} has no meaning here")
         if match.lastgroup != "space":
             tokens.append(_token(text, cast(Kind, match.lastgroup), match[0], at))
         at = match.end()
@@ -180,22 +172,15 @@ def tokenize(text: str) -> list[Token]:
 
 
 def unescape(text: str, token: Token) -> str:
-    """The value of a string token."""
-
-    def replace(match: re.Match[str]) -> str:
-        if match[1]:
-            return chr(int(match[1], 16))
-        if match[2] in _ESCAPES:
-            return _ESCAPES[match[2]]
-        place = token.position + 1 + match.start()
-        raise error_at(text, place, f"there is no escape \\{match[2]}; write \\\\ for a backslash")
-
-    value = _ESCAPE.sub(replace, token.text)
+    """The value of a string token, with the escapes of JSON."""
+    quoted = _ESCAPE.sub(lambda m: {"\\'": "'", '"': '\\"'}.get(m[0], m[0]), token.text)
     try:
-        # Pairs of surrogates become one character.
-        return value.encode("utf-16", "surrogatepass").decode("utf-16")
-    except UnicodeDecodeError:
-        raise error_at(text, token.position, "the string has half a surrogate pair") from None
+        value = str(json.loads(f'"{quoted}"', strict=False))
+        value.encode()
+    except ValueError:
+        problem = "the string has escapes that JSON has not; write \\\\ for a backslash"
+        raise error_at(text, token.position, problem) from None
+    return value
 
 
 def _token(text: str, kind: Kind, word: str, at: int) -> Token:
@@ -274,12 +259,7 @@ Regex: TypeAlias = "re.Pattern[str]"
 
 @lru_cache(maxsize=256)
 def compile_regex(pattern: str, max_length: int = MAX_LENGTH) -> Regex:
-    """Compile a pattern in RE2's syntax.
-
-    Args:
-        pattern: The pattern as the user wrote it.
-        max_length: Maximum length of the pattern, characters.
-    """
+    """Compile a pattern in RE2's syntax, of at most so many characters."""
     if len(pattern) > max_length:
         raise RegexError(f"longer than {max_length} characters")
     if any(escape[1] == "C" for escape in _REGEX_ESCAPE.finditer(pattern)):
@@ -316,7 +296,7 @@ _ORDERS: dict[str, Order] = {
     ">=": ">=",
 }
 _TURNED: dict[Order, Order] = {"<": ">", "<=": ">=", ">": "<", ">=": "<="}
-_VALUE_WORDS: dict[str, Value] = {
+_VALUE_WORDS: dict[str, Value | None] = {
     "true": True,
     "false": False,
     "null": None,
@@ -462,9 +442,6 @@ class _Parser:
             if token.keyword == "not" and not self._take("in"):
                 raise self._fail(self._peek(), "expected 'in' after 'not' here")
             return self._member(field, token, negated=token.keyword == "not")
-        if token.keyword == "[":
-            problem = "write an element as x[3], a slice as x[3:8]; both count from 0"
-            raise self._fail(token, problem)
         raise self._fail(
             token,
             "expected an operator here: ==, !=, <, <=, >, >=, in, not in, ~, !~, exists "
@@ -481,7 +458,7 @@ class _Parser:
         if closing is None:
             raise self._fail(self._peek(), "expected a list here: [1, 2]")
         self._at += 1
-        values: list[Value] = []
+        values: list[Value | None] = []
         while not self._take(closing):
             if values and not self._take(","):
                 raise self._fail(self._peek(), f"expected ',' or '{closing}' here")
@@ -490,9 +467,13 @@ class _Parser:
             values.append(self._value())
         if not values:
             raise self._fail(token, "the list is empty")
-        return Condition(
-            field, "not in" if negated else "in", tuple(values), position=token.position
-        )
+        known = tuple(value for value in values if value is not None)
+        op: Op = "not in" if negated else "in"
+        found: Node = Condition(field, op, known, position=token.position)
+        if len(known) < len(values) and not negated:
+            missing = Condition(field, "missing")
+            found = Or((missing, found)) if known else missing
+        return found if known or not negated else Condition(field, "exists")
 
     def _match(self, field: Field, *, negated: bool) -> Node:
         token = self._peek()
@@ -525,7 +506,7 @@ class _Parser:
             raise self._fail(token, problem)
         return Field(token.path, position=token.position)
 
-    def _value(self) -> Value:
+    def _value(self) -> Value | None:
         sign = {"-": -1, "+": 1}.get(self._peek().keyword, 0)
         self._at += bool(sign)
         token = self._peek()
@@ -565,10 +546,14 @@ class _Parser:
         return error_at(self._text, token.position, message)
 
 
-def _compare(text: str, field: Field, order: Order, value: Value, position: int) -> Condition:
-    if order not in {"==", "!="}:
-        if value is None or isinstance(value, bool):
-            raise error_at(text, position, "only numbers, times and strings have an order")
-        if isinstance(value, float) and math.isnan(value):
-            raise error_at(text, position, "nothing is less or greater than nan; write == nan")
+def _compare(
+    text: str, field: Field, order: Order, value: Value | None, position: int
+) -> Condition:
+    is_order = order not in {"==", "!="}
+    if value is None and not is_order:
+        return Condition(field, "missing" if order == "==" else "exists")
+    if value is None or (is_order and isinstance(value, bool)):
+        raise error_at(text, position, "only numbers, times and strings have an order")
+    if is_order and isinstance(value, float) and math.isnan(value):
+        raise error_at(text, position, "nothing is less or greater than nan; write == nan")
     return Condition(field, order, (value,), position=position)

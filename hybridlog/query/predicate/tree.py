@@ -13,7 +13,7 @@ from msgspec import Struct
 
 from hybridlog_storage.cache import lazy
 
-Value: TypeAlias = bool | int | float | str | None
+Value: TypeAlias = bool | int | float | str
 """The operand of a comparison; times and durations are integer nanoseconds."""
 Order = Literal["==", "!=", "<", "<=", ">", ">="]
 Op: TypeAlias = Literal[Order, "in", "not in", "~", "!~", "exists", "missing"]
@@ -129,20 +129,16 @@ class Near(_Node, frozen=True, eq=False):
     item: Node
 
 
-Reach: TypeAlias = Literal["exists", "value", "whole"]
-"""How a MongoDB filter asks for a path: whether there is one, for its value, for all below it."""
-
-
 class MongoFilter(_Node, frozen=True, eq=False):
     """A MongoDB filter, at the root of a predicate or in an `And` there.
 
     Attributes:
         filter: The filter in BSON.
-        paths: The paths that it asks for, and how.
+        paths: The paths that it asks for, and whether for their values.
     """
 
     filter: bytes
-    paths: tuple[tuple[str, Reach], ...]
+    paths: tuple[tuple[str, bool], ...]
 
     def to_filter(self) -> dict[str, object]:
         """The filter as a new dictionary."""

@@ -84,12 +84,7 @@ class FieldTypes(Struct, frozen=True):
 
     @staticmethod
     def of(types: FieldTypes | Mapping[str, str] | None) -> FieldTypes:
-        """The types as listed by a codec: path to type; None if they are unknown.
-
-        Args:
-            types: Path (dotted, with or without `[]` after arrays) to type as definitions
-                write it: `float64`, `time`, `float32[]`, `uint8[9]`, `pkg/Type[]`.
-        """
+        """From types by path, as definitions write both: `a[].b`, `float32[9]`; None: unknown."""
         if isinstance(types, FieldTypes):
             return types
         return _listed(None if types is None else tuple(types.items()))
@@ -193,10 +188,6 @@ def _problems(node: Condition, types: FieldTypes, text: str) -> Iterator[str]:
         return
     if node.field.is_absolute and kind not in {"number", "other"}:
         yield f"the field is a {kind}, and abs() is of numbers"
-    if node.field.is_absolute and any(
-        isinstance(one, int | float) and one < 0 for one in node.operands
-    ):
-        yield "abs() is never negative"
     if node.other is not None:
         kinds = {kind, types.kind(node.other.names)} - {"other"}
         if len(kinds) > 1 or not kinds <= {"number", "time"}:
@@ -208,7 +199,7 @@ def _problems(node: Condition, types: FieldTypes, text: str) -> Iterator[str]:
             yield "fields that are compared are single values: no arrays, and no abs()"
     is_moment = kind == "time" and types.base(path) != "duration"
     for value in node.operands:
-        if kind == "other" or value is None:
+        if kind == "other":
             continue
         given = next(name for name, known in _VALUES.items() if isinstance(value, known))
         if given != kind and (kind, given) != ("time", "number"):

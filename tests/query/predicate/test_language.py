@@ -9,10 +9,11 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from hybridlog.query.predicate.evaluate import on_objects
+from hybridlog.query.predicate.evaluate import on_columns
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.tree import Condition, Predicate
 from hybridlog.query.predicate.types import check
+from hybridlog.schema.arrow_columns import objects_array
 from hybridlog_storage.errors import WhereError
 
 Document = dict[str, object]
@@ -65,7 +66,10 @@ ANYTHING = dict.fromkeys(
         ("s !~ '^a'", "s !~ '^a'"),
         ("x exists", "x exists"),
         ("x MISSING", "x missing"),
-        ("x == null", "x == null"),
+        ("x == null", "x missing"),
+        ("x != null", "x exists"),
+        ("x in [null, 1]", "x missing or x in [1]"),
+        ("x not in [null]", "x exists"),
         ("x == true", "x == true"),
         ("x == 0x1F", "x == 31"),
         ("x == 1e-3", "x == 0.001"),
@@ -128,10 +132,9 @@ def test_nan() -> None:
         ("x ~ '('", "missing", 4),
         ("x ~ '" + "a" * 1001 + "'", "longer than 1000", None),
         (r"x ~ '(\pL{100}){9}'", "too large", None),
-        ('x == "a\\q"', "no escape", 7),
-        ('x == "\\ud800"', "surrogate", 5),
-        ("x == 'abc", "not closed", 5),
-        ("x.", "does not end", 1),
+        ('x == "a\\q"', "escapes that JSON has not", 5),
+        ('x == "\\ud800"', "escapes that JSON has not", 5),
+        ("x == 'abc", "no meaning", 5),
         ("x == 5furlongs", "nor a duration", 5),
         ("x == 1e999", "too large", 5),
         ("x == " + "9" * 500, "400 characters", None),
@@ -140,9 +143,9 @@ def test_nan() -> None:
         ("5 < 6", "name of a field", 4),
         ("x", "expected an operator", 1),
         ("$where == 1", "no meaning", 0),
-        ("`$where` == 1", "begin with", 0),
-        ("`a.b` == 1", "must not", 0),
-        ("`` == 1", "must not", 0),
+        ("`$where` == 1", "no meaning", 0),
+        ("`a.b` == 1", "no meaning", 0),
+        ("`` == 1", "no meaning", 0),
         ("x in []", "list is empty", 2),
         ("x in 5", "expected a list", 5),
         ("x between 5 and 3", "expected an operator", 2),
@@ -151,9 +154,7 @@ def test_nan() -> None:
         ("x[].0 == 1", "only of named", 3),
         ("x[0:2][0] == 1", "only of named", 6),
         ("x[2:2] == 1", "slice is empty", 1),
-        ("x[-1] == 1", r"write an element as x\[3\]", 1),
-        ("x[-5:] == 1", "a slice is x", 4),
-        ("x[0][a] == 1", "a slice as", 4),
+        ("x[-1] == 1", "expected an operator", 1),
         ("x[3:2] == 1", "slice is empty", 1),
         ("x[0:99999999999] == 1", "index", 1),
         ("x < 1 < 2", "expected 'and'", 6),
@@ -220,7 +221,6 @@ def test_limits() -> None:
         ("t > 1760000000", 't"1760000000" for seconds'),
         ("1760000000.5 < t", 't"1760000000.5" for seconds'),
         ("1760000000000 < _meta.t < 1770000000000", "nanoseconds here"),
-        ("x > 1 & x < 2", "write and"),
         ("x == s", "strings need quotes"),
         ("x == base", "no field base"),
         ("a > x", "no arrays"),
@@ -228,9 +228,7 @@ def test_limits() -> None:
         ("x > nine[0]", "no arrays"),
         ("t > x", "two numbers, or two times"),
         ("s == names", "two numbers"),
-        ("abs(x) > -5", "never negative"),
         ("abs(t) > 5", r"abs\(\) is of numbers"),
-        ("o:x > 1", "a space follows the name"),
     ],
 )
 def test_types(where: str, message: str) -> None:
@@ -254,7 +252,7 @@ def test_any_text_is_a_filter_or_an_error(where: str) -> None:
         predicate = parse(where)
     except WhereError:
         return
-    on_objects(predicate, None, [{}])
+    on_columns(predicate, None, objects_array([{}], None))
     assert parse(predicate.text) == predicate
 
 
@@ -404,7 +402,7 @@ def absolute(leaf: Any) -> object:
     """Numbers without their signs; of a list, those of its elements."""
     if isinstance(leaf, list):
         return [absolute(value) for value in leaf]
-    return leaf if leaf is None else abs(leaf)
+    return abs(leaf)
 
 
 def same_kind(left: object, right: object) -> bool:
@@ -448,7 +446,8 @@ def holds(question: Question, document: Document) -> bool:
             return not is_equal if order == "!=" else compares(one, str(order), other)
     word, path, *rest = question
     is_absolute = str(path).startswith("abs(")
-    found = leaves(document, str(path).removeprefix("abs(").removesuffix(")"))
+    asked = str(path).removeprefix("abs(").removesuffix(")")
+    found = [leaf for leaf in leaves(document, asked) if leaf is not None]
     if is_absolute:
         found = [absolute(leaf) for leaf in found]
     values = [item for leaf in found for item in (leaf if isinstance(leaf, list) else [leaf])]
@@ -457,6 +456,8 @@ def holds(question: Question, document: Document) -> bool:
             return bool(found)
         case "missing", _:
             return not found
+        case "compare", [order, None]:
+            return bool(found) == (order == "!=")
         case "compare", ["!=", value]:
             return bool(found) and not any(compares(item, "==", value) for item in values)
         case "compare", [order, value]:
@@ -473,7 +474,9 @@ def holds(question: Question, document: Document) -> bool:
                 ]
             return any(compares(item, order, value) for item in values)
         case "in", [wanted]:
-            return any(compares(item, "==", value) for item in values for value in wanted)
+            return (None in wanted and not found) or any(
+                compares(item, "==", value) for item in values for value in wanted
+            )
         case "not in", [wanted]:
             return bool(found) and not any(
                 compares(item, "==", value) for item in values for value in wanted
@@ -499,12 +502,13 @@ def test_messages_answer_as_the_language_says(docs: list[Document], asked: list[
             return where, [docs[n] for n in found ^ expected]  # type: ignore[index]
 
         predicate = parse(where)
-        mask = on_objects(predicate, types, docs).holds
+        mask = on_columns(predicate, types, objects_array(docs, None)).holds
         in_memory: set[object] = {*np.flatnonzero(mask).tolist()}
         assert in_memory == expected, wrong(in_memory)
 
 
 def test_the_deepest_predicate_is_taken() -> None:
     for where in ("not " * 49 + "m.q.min < 5", " or ".join(["m.q.mean < 5"] * 200)):
-        mask = on_objects(checked(where, TYPES), TYPES, [{"m": [{"q": [1.0]}]}]).holds
+        records = objects_array([{"m": [{"q": [1.0]}]}], None)
+        mask = on_columns(checked(where, TYPES), TYPES, records).holds
         assert mask.tolist() == ["not" not in where]

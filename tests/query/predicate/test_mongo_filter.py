@@ -104,9 +104,8 @@ def test_the_paths_it_asks_for() -> None:
     }
     (node,) = mongo_filter(query, None).filters
     assert dict(node.paths) == {
-        **dict.fromkeys(("a", "c.0", "f", "f.g", "_meta.seq"), "value"),
-        "d": "whole",
-        "b": "exists",
+        **dict.fromkeys(("a", "c.0", "d", "f", "f.g", "_meta.seq"), True),
+        "b": False,
     }
     assert node.asks_fields
     assert not mongo_filter({"_meta.error": {"$exists": True}}, None).asks_fields
