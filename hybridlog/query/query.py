@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from msgspec.structs import asdict, replace
 
-from hybridlog.query.choice import Choice
+from hybridlog.query.choice import Choice, choose
 from hybridlog.query.planner import Planner
 from hybridlog.query.question import Clock, Counters, Question
 from hybridlog.query.times import parse_duration, parse_time
@@ -104,32 +104,26 @@ class Query:
         return Query(self.source, self.question, conditions=self.conditions)
 
     def __repr__(self) -> str:
-        return f"<Query {'; '.join(self._described().values())}>"
-
-    def _described(self) -> dict[str, str]:
-        """The parts of the question in words."""
         question = self.question
         begin, end = question.bounds or (None, None)
         try:
-            known = self.source.now().summaries_of(self.question)
-            one = f"recording {known[0].name}" if len(known) == 1 else f"{len(known)} recordings"
+            known = self.source.now().summaries_of(question)
+            those = f"recording {known[0].name}" if len(known) == 1 else f"{len(known)} recordings"
         except HybridlogError as error:
-            one = str(error)
+            those = str(error)
         predicate = "" if question.predicate is None else question.predicate.text
         clock = "" if question.clock == "log" else f" by {question.clock} time"
-        found = {
-            "topics": listed(self.topics, 3),
-            "recordings": one,
-            "time": question.bounds is not None and f"between {begin} and {end}{clock}",
-            "during": question.during is not None and f"during {len(question.during)} intervals",
-            "predicate": predicate and f"where {predicate[:200]}{'…' * (len(predicate) > 200)}",
-            "fields": question.fields is not None and f"fields {listed(question.fields, 5)}",
-            "frame": question.frame and f"in frame {question.frame}",
-            "every": question.every > 1 and f"every {question.every}th",
-            "limit": question.limit is not None and f"at most {question.limit}",
-            "order": question.reverse and "latest first",
-        }
-        return {name: words for name, words in found.items() if words}
+        words = (
+            listed(self.topics, 3),
+            those,
+            question.bounds is not None and f"between {begin} and {end}{clock}",
+            question.during is not None and f"during {len(question.during)} intervals",
+            predicate and f"where {predicate[:200]}{'…' * (len(predicate) > 200)}",
+            question.every > 1 and f"every {question.every}th",
+            question.limit is not None and f"at most {question.limit}",
+            question.reverse and "latest first",
+        )
+        return f"<Query {'; '.join(one for one in words if isinstance(one, str) and one)}>"
 
     # Steps.
 
@@ -278,8 +272,6 @@ class Query:
         Raises:
             TopicError: no such recording exists, or none has the topic.
         """
-        from hybridlog.query.choosing import choose
-
         chosen = choose(self.source.now(), Choice.of(names))
         if chosen.problem:
             raise TopicError(chosen.problem)
@@ -610,20 +602,16 @@ class Query:
 
     # What an answer lacks.
 
-    def completeness(self, *, is_empty: bool | None = None) -> Completeness:
+    def completeness(self) -> Completeness:
         """Completeness of the last answer, or, without one, of an answer given now.
 
         Losses of topics in conditions count as an unknown number. Its sentences also tell of
-        topics that lack fields of the predicate, and likely causes of an empty answer.
-
-        Args:
-            is_empty: Whether the answer was empty; without, if `counters` has no messages.
+        topics that lack fields of the predicate.
         """
         from hybridlog.query.answers.completeness import completeness_of
 
         session, others = self.source.now(), [(q.question, q.counters) for q in self.conditions]
-        nothing = not self.counters.messages if is_empty is None else is_empty
-        return completeness_of(session, self.question, self.counters, *others, is_empty=nothing)
+        return completeness_of(session, self.question, self.counters, *others)
 
     def _intervals(self) -> IntervalQueries:
         from hybridlog.query.answers.interval_queries import IntervalQueries

@@ -15,6 +15,7 @@ from hybridlog.query.times import (
     parse_range,
     parse_time,
 )
+from hybridlog.wording import listed
 from hybridlog_storage.errors import TimeError, UsageError
 from hybridlog_storage.times import BEGIN, END, span_of
 
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.summary import RecordingSummary
 
 _MAX_NAMES = 5  # recordings in a message
+_MAX_LOOKED_AT = 100
 _FAR_NS = 10 * 365 * 86_400 * 10**9
 
 
@@ -174,16 +176,11 @@ class RangeResolver:
         """Refuse a range that overlaps no recording."""
         assert self._question.bounds is not None
         begin, stop = self._question.bounds
-        spans: list[str] = []
-        for one in chosen:
-            start, end = self._clock_span(one)
-            low, high = self.bounds_in(one)
-            # `2025-01-01` to `end` is no mistake: the recording simply ends before.
-            if low < high or low == start or high == end:
-                spans.append(f"{one.name} spans {format_time(start)} to {format_time(end)}")
-            if len(spans) == _MAX_NAMES:
-                break
-        if not spans:
-            start, end = self._clock_span(chosen[0])
-            parse_range(begin, stop, start=start, end=end)
-        raise TimeError(f"Nothing was recorded between {begin} and {stop}: {'; '.join(spans)}.")
+        spans = [self._clock_span(one) for one in chosen[:_MAX_LOOKED_AT]]
+        start, end = min(low for low, _ in spans), max(high for _, high in spans)
+        parse_range(begin, stop, start=start, end=end)
+        names = listed((one.name for one in chosen), _MAX_NAMES)
+        raise TimeError(
+            f"Nothing was recorded between {begin} and {stop}: {names} spans {format_time(start)} "
+            f"to {format_time(end)}."
+        )

@@ -79,7 +79,7 @@ _ISO = re.compile(
     r"(?P<date>[0-9]{4}-[0-9]{2}-[0-9]{2}|[0-9]{8}(?=[Tt]))"
     r"(?:(?:[Tt]|\s+)(?P<time>[0-9]{2}(?::?[0-9]{2}(?P<second>:?[0-9]{2})?)?)"
     r"(?(second)(?:[.,](?P<fraction>[0-9]+))?)"
-    r"\s*(?P<zone>[Zz]|UTC|utc|[+-][0-9]{2}(?::?[0-5][0-9])?)?)?"
+    r"\s*(?P<zone>[Zz]|UTC|utc|[+-][0-9]{2}(?::?[0-5][0-9](?::[0-5][0-9])?)?)?)?"
 )
 _PART = r"(?:([0-9]+)(?:\.([0-9]+))?\s*{}\s*)?"
 _UNITS: tuple[tuple[str, int], ...] = (
@@ -104,17 +104,25 @@ def parse_time(text: TimeLike, *, start: int | None, end: int | None) -> int:
     one past the last message, which makes `[start, end)` the whole recording; both are None without
     one.
     """
-    if isinstance(text, str):
-        return _checked(_parse_text(text, start, end), text)
     if isinstance(text, bool):
         raise _no_time(text)
-    if isinstance(text, Integral):
-        return _checked(int(text), text)
-    if isinstance(text, Real):
-        return _checked(_from_float(float(text)), text)
-    if isinstance(text, date):
-        return _checked(_from_date(text), text)
-    return _checked(_from_datetime64(text), text)
+    if isinstance(text, str):
+        ns = _parse_text(text, start, end)
+    elif isinstance(text, Integral):
+        ns = int(text)
+    elif isinstance(text, Real):
+        ns = _from_float(float(text))
+    else:  # dates of Python, pandas and numpy show themselves as ISO 8601
+        found = _absolute(str(text))
+        if found is None:
+            raise _no_time(text)
+        ns = found
+    if not -TIME_LIMIT <= ns < TIME_LIMIT:
+        raise TimeError(
+            f"{_shown(text)} is out of range: times lie from 1677-09-21 to 2262-04-11 "
+            "(-2**63 to 2**63 nanoseconds since 1970)"
+        )
+    return ns
 
 
 def is_relative(time: TimeLike | None) -> bool:
@@ -305,37 +313,6 @@ def _from_float(number: float) -> int:
 def _timedelta(delta: timedelta) -> int:
     whole = (delta.days * 86_400 + delta.seconds) * _SECOND + delta.microseconds * 1_000
     return whole + int(getattr(delta, "nanoseconds", 0))
-
-
-def _from_date(moment: date) -> int:
-    if not isinstance(moment.year, int):  # pandas.NaT is a datetime whose year is nan
-        raise _no_time(moment)
-    if not isinstance(moment, datetime):
-        moment = datetime(moment.year, moment.month, moment.day)
-    if moment.utcoffset() is None:
-        moment = moment.replace(tzinfo=UTC)
-    return _timedelta(moment - _EPOCH)
-
-
-def _from_datetime64(moment: object) -> int:
-    import numpy as np
-
-    if not isinstance(moment, np.datetime64) or np.isnat(moment):
-        raise _no_time(moment)
-    ns = moment.astype("datetime64[ns]")
-    is_finer = np.datetime_data(moment.dtype)[0] in {"ps", "fs", "as"}
-    if not is_finer and ns.astype(moment.dtype) != moment:
-        return TIME_LIMIT  # numpy has gone beyond 64 bits
-    return int(ns.astype(np.int64))
-
-
-def _checked(ns: int, source: object) -> int:
-    if not -TIME_LIMIT <= ns < TIME_LIMIT:
-        raise TimeError(
-            f"{_shown(source)} is out of range: times lie from 1677-09-21 to 2262-04-11 "
-            "(-2**63 to 2**63 nanoseconds since 1970)"
-        )
-    return ns
 
 
 def _spelled(source: object, default: str, ns: int) -> str:

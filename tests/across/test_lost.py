@@ -198,7 +198,7 @@ def test_python_says_what_the_commands_say(damaged: Damaged) -> None:
         ("+8s", "+9s", [lack.format("1 message lost in 1 place (segment)")]),
     ):
         asked = topic.between(begin, end)
-        found = asked.completeness(is_empty=False)
+        found = asked.completeness()
         assert ([*found.sentences], found.has_losses) == (said, bool(said))
     # The message that was lost may have been the current one.
     assert [*at_time(topic, "+4.5s").completeness().sentences] == [

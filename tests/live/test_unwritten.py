@@ -89,7 +89,7 @@ def test_it_is_told_only_where_the_time_reaches_past_the_last_flush(live: hl.Sto
         (query.between(None, 2 * SECOND).clock("header"), 3),
     ):
         assert part.completeness().unwritten == unwritten, part
-        assert len(part.completeness(is_empty=False).sentences) == (unwritten > 0)
+        assert len(part.completeness().sentences) == (unwritten > 0)
     options = ["fetch", "-t", "/a", "--count", "--strict", "--between", "start"]
     done = run(*options, "2000000000ns", store=live.directory.path)
     assert (done.out, "not written" in done.err) == ("1\n", False)
@@ -120,7 +120,7 @@ def test_without_a_socket_it_is_told_in_words(tmp_path: Path) -> None:
             recording.write(CHANNEL, text("x"), log_time=number * SECOND)
         wait_until_flushed(store, 2)
         query = store.topic("/a")
-        assert [*query.completeness(is_empty=False).sentences] == [
+        assert [*query.completeness().sentences] == [
             "own is being recorded: up to 0.5 s not written yet, nor in this answer."
         ]
         assert query.completeness().unwritten is None
@@ -130,7 +130,7 @@ def test_without_a_socket_it_is_told_in_words(tmp_path: Path) -> None:
         query.between(None, 2 * SECOND).completeness().check()
         assert "up to 0.5 s not written yet" in run("fetch", "-t", "/a", "--count", store=path).err
         recording.close()
-        assert not query.completeness(is_empty=False).sentences
+        assert not query.completeness().sentences
         assert query.completeness().unwritten == 0
         query.completeness().check()
 
@@ -149,7 +149,7 @@ def test_what_the_index_lacks_is_told_where_mongodb_answers(tmp_path: Path, limi
         assert len(documents) < 5
         raw = query.where({"data": "x"})
         assert raw.count() == len(documents)
-        assert any(late in line for line in raw.completeness(is_empty=False).sentences)
+        assert any(late in line for line in raw.completeness().sentences)
         with pytest.raises(IncompleteError, match=late):
             raw.between(None, 5 * SECOND + 1).completeness().check()
         # What others answer is whole.

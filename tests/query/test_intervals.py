@@ -19,8 +19,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import hybridlog as hl
+from hybridlog.query.answers.interval_queries import rows_differ
 from hybridlog.query.intervals import Interval, Intervals, changing, holding
-from hybridlog.query.rows_differ import rows_differ
 from hybridlog_storage.errors import TimeError, UsageError, WhereError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings

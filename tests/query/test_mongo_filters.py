@@ -356,10 +356,7 @@ def test_messages_without_fields_are_told(tmp_path: Path) -> None:
         query = topic.where({"x": {"$ne": 1}})
         assert query.count() == 1
         assert query.counters.unreadable == 1
-        assert (
-            "could not be tested: it has no fields in the index"
-            in query.completeness().sentences[0]
-        )
+        assert "could not be tested: no fields in the index" in query.completeness().sentences[0]
         both = topic.where({"x": {"$ne": 1}}).where("x < 5")
         assert (both.count(), both.counters.unreadable) == (1, 1)
         assert topic.where({"_meta.error": {"$exists": True}}).count() == 1

@@ -143,7 +143,7 @@ def export_command(given: _Given) -> None:
                 _write_log(one, form, path, given, settings)
             else:
                 _write_tables(one, form, path, given)
-            output.remarks(one.completeness(is_empty=None if is_log else False).sentences)
+            output.remarks(one.completeness().sentences)
 
 
 def _write_log(

@@ -114,7 +114,7 @@ def fetch_command(choices: _Choices) -> None:
                 query = at_time(query, choices.at)
             except TopicError:
                 before = query.between("start", choices.at)
-                output.remarks(before.completeness(is_empty=False).sentences)
+                output.remarks(before.completeness().sentences)
                 raise
         if choices.strict:
             query.completeness().check(payloads=not choices.count)

@@ -64,7 +64,7 @@ def open_command(given: _Given) -> None:
             speed=given.speed,
             origins=given.origins,
         )
-        output.remarks([*query.completeness(is_empty=False).sentences, *unplayed(query)])
+        output.remarks([*query.completeness().sentences, *unplayed(query)])
         asyncio.run(_until_signal(server))
 
 

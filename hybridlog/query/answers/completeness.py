@@ -1,4 +1,4 @@
-"""Completeness of an answer: what it lacks, as a value and in sentences, and why it may be empty.
+"""Completeness of an answer: what it lacks, as a value and in sentences.
 
 An answer may lack messages that are lost (see `lost.py`), not written or not indexed yet, or
 that it could not read.
@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from itertools import islice
 from typing import TYPE_CHECKING, Any, Final
 
 from msgspec import Struct
@@ -26,7 +25,6 @@ from hybridlog.query.planner import Planner
 from hybridlog.query.predicate.tree import is_meta
 from hybridlog.query.question import field_types
 from hybridlog.query.ranges import RangeResolver
-from hybridlog.query.times import format_time
 from hybridlog.record.losses import Cause
 from hybridlog.schema.states import CAUSES, GONE, State, without_fields, without_payload
 from hybridlog.snapshot import UNFINISHED
@@ -35,8 +33,7 @@ from hybridlog_storage.errors import HybridlogError, IncompleteError, TimeError,
 from hybridlog_storage.times import BEGIN, END
 
 if TYPE_CHECKING:
-    from hybridlog.query.predicate.tree import Predicate
-    from hybridlog.query.question import Counters, Question, RecordedChannel, Span
+    from hybridlog.query.question import Counters, Question, RecordedChannel
     from hybridlog.session import Session
     from hybridlog_storage.summary import RecordingSummary
 
@@ -133,18 +130,10 @@ def completeness_of(
     question: Question,
     counters: Counters | None = None,
     *others: tuple[Question, Counters | None],
-    is_empty: bool = False,
 ) -> Completeness:
-    """Completeness of an answer.
+    """Completeness of an answer, or of a question without one (`counters` is None).
 
-    Args:
-        session: The open store.
-        question: The question.
-        counters: Of the answer; None before there is one. An answer that was limited lacks
-            nothing that comes later.
-        others: Questions that the answer depends on. What they have lost counts as an unknown
-            number.
-        is_empty: The answer has no messages: sentences tell likely causes.
+    What the `others` that it depends on have lost is an unknown number.
     """
     answered = [(question, counters), *others]
     given = 0 if counters is None else counters.messages
@@ -169,7 +158,6 @@ def completeness_of(
     with suppress(TimeError):  # nothing is in the range
         for one, _ in reversed(answered):
             sentences += _remarks(session, one)
-        sentences += _causes(session, question) if is_empty and question.limit != 0 else ()
     is_exact = not unread and all(row["count"] is not None for row in lost)
     is_exact &= all(row["cause"] in NOT_LOST for rows in ledgers[1:] for row in rows)
     dropped = sum(row["count"] or 0 for row in ledgers[0] if row["cause"] == Cause.DEGRADE)
@@ -231,14 +219,14 @@ def _left_out(session: Session, question: Question, counters: Counters) -> Itera
     if counters.lacking or counters.without_arrays:  # a copy may be waiting for them
         gone = _gone(session, question)
         expired = ", or ".join(CAUSES[state] for state in gone) or CAUSES[State.REDUCED]
-    if (unreadable := counters.unreadable - counters.without_arrays) > 0:
-        yield _unreadable(unreadable, question.predicate)
-    if counters.without_arrays:
-        its = "its payload was" if counters.without_arrays == 1 else "their payloads were"
-        yield (
-            f"{counted(counters.without_arrays, 'message')} could not be tested: {its} {expired}; "
-            "of long arrays only summaries are left."
-        )
+    predicate, unreadable = question.predicate, counters.unreadable - counters.without_arrays
+    if unreadable > 0 and (predicate is None or not predicate.asks_fields):
+        yield f"{unfit(unreadable)}: not in this answer; --format raw, mcap or bag gives payloads."
+    elif unreadable > 0:
+        what = "fields in the index" if predicate and predicate.filters else "definition that fits"
+        yield f"{counted(unreadable, 'message')} could not be tested: no {what}."
+    if number := counters.without_arrays:
+        yield f"{counted(number, 'message')} could not be tested: their arrays were {expired}."
     for gone_ones in _payloads_gone(counters):
         yield f"{gone_ones}: not in this answer; --where and --fields find the fields."
     if counters.lacking:
@@ -249,22 +237,6 @@ def _left_out(session: Session, question: Question, counters: Counters) -> Itera
     for why, number in reasons.items():
         yield f"{counted(number, 'message')} without a transform {why}."
     yield from counters.of_frames
-
-
-def _unreadable(messages: int, predicate: Predicate | None) -> str:
-    """A number of messages whose fields could not be read."""
-    one = messages == 1
-    if predicate is None or not predicate.asks_fields:
-        return (
-            f"{unfit(messages)} and {'is' if one else 'are'} not in this answer; --format raw, "
-            "mcap or bag gives the payloads."
-        )
-    why = "it does not fit its definition, or has none"
-    if predicate.filters:
-        why = "it has no fields in the index" if one else "they have no fields in the index"
-    elif not one:
-        why = "they do not fit their definition, or have none"
-    return f"{counted(messages, 'message')} could not be tested: {why}."
 
 
 def _unreadable_recordings(session: Session, question: Question) -> list[str]:
@@ -392,29 +364,3 @@ def _remarks(session: Session, question: Question) -> Iterator[str]:
         for path in dict.fromkeys(one.names for one in asked if known):
             if not any(is_part(path, name) for name in plain):
                 yield f"No message of {topic} has a field {path!r}."
-
-
-def _causes(session: Session, question: Question) -> Iterator[str]:
-    """Likely causes of an empty answer: topics without a message in its time."""
-    if question.during is not None and not len(question.during):
-        yield "Nothing matched the condition that gives the times: no time is left to look at."
-        return
-    if question.bounds is None or not question.is_by_log_time:
-        return
-    spans: dict[str, list[Span]] = defaultdict(list)
-    inside: set[str] = set()
-    for summary, bounds, _ in islice(RangeResolver(session, question).resolve(), _MAX_RECORDINGS):
-        for channel in session.channels_of(session.entry_of(summary), {*question.topics}):
-            topic, stats = channel.channel.topic, channel.stats
-            if stats.first is None or stats.last is None:
-                continue
-            spans[topic].append((stats.first, stats.last))
-            if bounds is None or (stats.first < bounds[1] and stats.last >= bounds[0]):
-                inside.add(topic)
-    for topic, found in spans.items():
-        if topic not in inside:
-            first, last = min(low for low, _ in found), max(high for _, high in found)
-            yield (
-                f"No message of {topic} is in that time; it has messages from "
-                f"{format_time(first)} to {format_time(last)}."
-            )

@@ -97,15 +97,8 @@ def in_force(
     """Messages from before the time range of a question, which precede its answer.
 
     They are the latched ones that a subscriber receives which joins then, and the frames that
-    the first ones of video refer to: those from the last key frame on.
-    Their log time becomes the beginning of the range, which keeps the slice within the
-    range. The publish time remains the time at which they were sent.
-
-    Args:
-        session: The open store.
-        question: The question.
-        counters: Count the messages, as `latched` and `frames`, and what is read.
-        original_times: The messages keep their log time.
+    the first ones of video refer to. Their log time becomes the beginning of the range, unless
+    they keep their `original_times`; the publish time remains.
     """
     for summary, begin in _beginnings(session, question):
         recording = session.entry_of(summary)
@@ -207,15 +200,9 @@ def _is_key(run: MessageRun, row: int) -> bool:
 
 
 def next_time(session: Session, recording: RecordingEntry, topic: str, moment: int) -> int | None:
-    """The least log time of a topic's messages that is not before a time, ns; None without any.
+    """The least log time of a topic's messages from a time on, ns; None without any.
 
     No payload is read for it. A time with a damaged chunk is left out.
-
-    Args:
-        session: The open store.
-        recording: The recording.
-        topic: Full name.
-        moment: The time, ns.
     """
     planner = Planner(session, Question((topic,), (recording.id,)))
     if recording.span is None or not session.channels_of(recording, [topic]):

@@ -41,16 +41,8 @@ _EVERY_S: Final = 0.25
 class Arrivals(Planner):
     """The messages of running recordings that have come since the last look.
 
-    Args:
-        session: The open store.
-        question: About recordings by their ids.
-        counters: Count what is read.
-        takes: Tells whether a topic that appears later is part of the question.
-
-    Attributes:
-        question: As above, with the topics so far.
-        read: Chunks that were read, by recording and segment.
-        sealed: Numbers of the segments that were read to their end, by recording.
+    `takes` tells whether a topic that appears later is part of the question. By recording, `read`
+    counts chunks that were read by segment, and `sealed` has segments that were read to their end.
     """
 
     def __init__(

@@ -6,11 +6,14 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from functools import partial, reduce
 from itertools import groupby
 from operator import itemgetter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 from msgspec.structs import replace
 
+from hybridlog.columns.fields import joined
 from hybridlog.query.answers.lost import lost_times
 from hybridlog.query.answers.marks import mark_topics, marks
 from hybridlog.query.intervals import Intervals, changing, clipped, holding
@@ -21,6 +24,8 @@ from hybridlog.query.question import Counters
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import TIME_LIMIT, DurationLike, parse_duration
 from hybridlog.record.losses import extent_of
+from hybridlog.schema.arrow_types import is_list, lengths_of
+from hybridlog.schema.column import ranges
 from hybridlog.wording import listed
 from hybridlog_storage.errors import UsageError, WhereError
 from hybridlog_storage.times import END, earlier, inside, placed
@@ -31,6 +36,8 @@ if TYPE_CHECKING:
     from hybridlog.query.question import Part, Question, Span
     from hybridlog.query.rows import RowBatch
     from hybridlog.session import Session
+
+    Places = NDArray[np.intp]
 
 _NONE = np.empty(0, np.int64)
 
@@ -185,7 +192,6 @@ class IntervalQueries:
     ) -> NDArray[np.int64]:
         """Log times of the messages in a span that differ from the one before."""
         from hybridlog.frames.answer import columns
-        from hybridlog.query.rows_differ import steps
 
         ask = partial(columns, self._planner, fields=paths)
         before = self._last_before(part, span, ask)
@@ -231,15 +237,7 @@ def near_others(
 ) -> tuple[Question, list[tuple[Question, Counters]]]:
     """The question in the times at which conditions hold, each asked in those of the last one.
 
-    Args:
-        session: The open store.
-        question: The question.
-        text: The predicate as written.
-        nodes: The conditions on other topics.
-        reach: Time before and after a message that satisfies one, durations.
-
-    Returns:
-        Also the questions about other topics, and what their answers have cost.
+    `reach` is before and after a message of another topic. Also the questions about other topics.
     """
     asked: list[tuple[Question, Counters]] = []
     everything = np.array([[0, TIME_LIMIT - 1, 0]], np.int64)
@@ -299,3 +297,95 @@ def _question_about(
     rows = ((one.id, np.array([[begin, end, 0]], np.int64)) for one, (begin, end) in spans)
     near = Intervals(rows).widened(after, before).merged()
     return replace(found, during=near)
+
+
+# Comparison of messages: numbers by value, strings by bytes, lists by length and elements.
+
+
+def steps(
+    carried: pa.StructArray | None, rows: pa.StructArray, tolerance: float
+) -> tuple[NDArray[np.bool_], pa.StructArray]:
+    """The rows that differ from the row before them (bool[n]), and the last row.
+
+    `carried` is the row before the first one, if there is one.
+    """
+    whole = rows if carried is None else joined([carried, rows])
+    numbers = np.arange(len(whole))
+    differs = rows_differ(whole, numbers, np.maximum(numbers - 1, 0), tolerance)
+    return differs[len(whole) - len(rows) :], whole[-1:]
+
+
+def rows_differ(
+    column: pa.Array[Any], one: Places, other: Places, tolerance: float = 0.0
+) -> NDArray[np.bool_]:
+    """True where rows of a column, possibly nested, differ from other rows of it.
+
+    NaN equals NaN, -0 equals 0, and null equals only null; numbers are equal if they differ by at
+    most the tolerance. Lists of different lengths differ.
+    """
+    kind = column.type
+    if isinstance(kind, pa.BaseExtensionType):  # JSON text
+        return rows_differ(column.storage, one, other)
+    if pa.types.is_null(kind):
+        return np.zeros(len(one), np.bool_)
+    valid: NDArray[np.bool_] = np.asarray(column.is_valid(), np.bool_)
+    differs: NDArray[np.bool_] = valid[one] != valid[other]
+    there = valid[one] & valid[other]
+    if pa.types.is_struct(kind):
+        for inner in column.flatten():
+            differs |= there & rows_differ(inner, one, other, tolerance)
+        return differs
+    if is_list(kind):
+        rows = np.flatnonzero(there)
+        differs[rows] = _lists(column, one[rows], other[rows], tolerance)
+        return differs
+    differs |= there & _values(column, one, other, tolerance)
+    return differs
+
+
+def _values(
+    column: pa.Array[Any], one: Places, other: Places, tolerance: float
+) -> NDArray[np.bool_]:
+    kind = column.type
+    if not (pa.types.is_primitive(kind) and not pa.types.is_decimal(kind)):
+        codes = pc.fill_null(column.dictionary_encode().indices, -1)
+        values = codes.to_numpy(zero_copy_only=False)
+    else:
+        if pa.types.is_temporal(kind):
+            column = column.view(pa.int64())
+        values = pc.fill_null(column, False if pa.types.is_boolean(kind) else 0).to_numpy(
+            zero_copy_only=False
+        )
+    left, right = values[one], values[other]
+    same = left == right
+    if left.dtype.kind == "f":
+        same |= np.isnan(left) & np.isnan(right)
+    if tolerance and left.dtype.kind in "iuf" and pa.types.is_primitive(kind):
+        with np.errstate(invalid="ignore"):  # inf - inf is NaN, which is not near
+            same |= np.abs(left.astype(np.float64) - right.astype(np.float64)) <= tolerance
+    differs: NDArray[np.bool_] = ~same
+    return differs
+
+
+def _lists(
+    column: pa.Array[Any], one: Places, other: Places, tolerance: float
+) -> NDArray[np.bool_]:
+    length = lengths_of(column)
+    if pa.types.is_fixed_size_list(column.type):
+        start = (column.offset + np.arange(len(column))) * column.type.list_size
+    else:
+        start = column.offsets.to_numpy()[:-1].astype(np.int64)
+    elements = column.values
+    count = length[one]
+    found: NDArray[np.bool_] = count != length[other]
+    alike = np.flatnonzero(~found & (count > 0))
+    if len(alike):
+        count = count[alike]
+        differs = rows_differ(
+            elements,
+            ranges(start[one[alike]], count),
+            ranges(start[other[alike]], count),
+            tolerance,
+        )
+        found[alike] = np.logical_or.reduceat(differs, np.cumsum(count) - count)
+    return found

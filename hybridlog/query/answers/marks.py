@@ -42,12 +42,7 @@ class Mark(NamedTuple):
 
 
 def mark_topics(session: Session, recordings: Collection[str] | None = None) -> tuple[str, ...]:
-    """Full names of the topics with marks.
-
-    Args:
-        session: The open store.
-        recordings: Ids; None for all.
-    """
+    """Full names of the topics with marks in some recordings (ids), or in all."""
     snapshot = session.look(recordings)
     return snapshot.topics_with([n for n in snapshot.types if plain_type(n) in {MARK, EVENT}])
 

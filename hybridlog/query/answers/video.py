@@ -61,10 +61,7 @@ def back_to_key(
 ) -> Iterator[tuple[Message, str, bytes]]:
     """A frame and those before it, the latest first, with format and bytes: back to a key frame.
 
-    Args:
-        session: The open store.
-        message: The frame.
-        stop: A frame, as log time and arrival number, that ends them before; not among them.
+    Or back to a frame (log time and arrival number) to `stop` at, which is not among them.
     """
     last, picture = _place(message), picture_of(session)
     bounds = (None, message.log_time_ns + 1)
