@@ -24,13 +24,10 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 from msgspec import Struct
 
-from hybridlog.schema.states import encoding_of
 from hybridlog_storage.errors import StoreError
-from hybridlog_storage.messages import schema_hash
 
 if TYPE_CHECKING:
     from hybridlog_storage.catalog import RecordingEntry
-    from hybridlog_storage.messages import Channel
 
 TABLES: Final = "tables"
 """Folder of the store that holds finished tables."""
@@ -85,15 +82,6 @@ def shape_folder(type_name: str, schema: Any) -> str:
     """Folder of a message type, whose name may be empty, by the Arrow schema of its tables."""
     text = schema.to_string(truncate_metadata=False, show_schema_metadata=False)
     return type_prefix(type_name) + hashlib.sha256(text.encode()).hexdigest()[:8]
-
-
-def table_schema_of(channel: Channel) -> str:
-    """Original encoding and schema hash of a channel, which determine its columns.
-
-    A reduced channel names its original encoding in its metadata.
-    """
-    schema = "" if channel.schema is None else schema_hash(channel.schema)
-    return f"{encoding_of(channel.message_encoding, channel.metadata)}:{schema}"
 
 
 def topics_of(entry: RecordingEntry) -> set[str]:

@@ -13,7 +13,7 @@ import errno
 import logging
 import shutil
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Hashable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -30,7 +30,6 @@ from hybridlog.columns.layout import (
     Section,
     parts_folder,
     shape_folder,
-    table_schema_of,
     type_prefix,
 )
 from hybridlog.columns.left_rows import LeftFields
@@ -190,7 +189,7 @@ class TableWriter:
         self._numbers = 0
         self._has_ended = False
         self.problem = ""  # why no table was written
-        self._topics: dict[tuple[str, str], _Topic] = {}
+        self._topics: dict[Hashable, _Topic] = {}
         self._cut: dict[int, str] = {}  # digests of the closed ones
 
     def add(self, messages: Iterable[Messages]) -> None:
@@ -241,7 +240,8 @@ class TableWriter:
             self.discard()
 
     def _topic(self, channel: Channel) -> _Topic:
-        key = channel.topic, table_schema_of(channel)
+        encoding = encoding_of(channel.message_encoding, channel.metadata)
+        key = channel.topic, encoding, channel.schema
         if key not in self._topics:
             arrays = channel.topic in self._arrays
             self._topics[key] = _Topic(self._recording, channel, arrays=arrays)

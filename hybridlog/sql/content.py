@@ -13,13 +13,6 @@ from msgspec.structs import replace
 
 from hybridlog.columns.fields import records_of
 from hybridlog.columns.layout import POINTS
-from hybridlog.columns.recordings_file import (
-    TAGS,
-    TIME,
-    TIMES,
-    recordings_table,
-    times,
-)
 from hybridlog.columns.rows import is_cloud
 from hybridlog.frames.answer import FIXED
 from hybridlog.index.indexing import rows_by_channel
@@ -183,6 +176,28 @@ def _is_fixed(channel: RecordedChannel) -> bool:
     )
 
 
+_TIME: Final = pa.timestamp("us", "UTC")
+_TIMES: Final = [
+    *[(name, _TIME) for name in ("first_time", "last_time")],
+    *[(name, pa.int64()) for name in ("first_t", "last_t")],
+]
+"""Columns of a first and a last log time."""
+_TAGS: Final = pa.map_(pa.string(), pa.string())
+_RECORDINGS: Final = pa.schema(
+    [
+        ("recording", pa.string()),
+        ("id", pa.string()),
+        ("tags", _TAGS),
+        ("status", pa.string()),
+        ("created", _TIME),
+        *_TIMES,
+        ("messages", pa.int64()),
+        ("topics", pa.int64()),
+        ("segments", pa.int64()),
+        ("bytes", pa.int64()),
+        ("has_losses", pa.bool_()),
+    ]
+)
 _TOPICS: Final = pa.schema(
     [
         ("topic", pa.string()),
@@ -193,7 +208,7 @@ _TOPICS: Final = pa.schema(
         ("encoding", pa.string()),
         ("messages", pa.int64()),
         ("bytes", pa.int64()),
-        *TIMES,
+        *_TIMES,
         ("mean_skew", pa.float64()),
         ("unset_stamps", pa.int64()),
         ("problem", pa.string()),
@@ -205,30 +220,55 @@ _LOSSES: Final = pa.schema(
         ("topic", pa.string()),
         ("cause", pa.string()),
         ("messages", pa.int64()),
-        *TIMES,
+        *_TIMES,
         ("file", pa.string()),
         ("reason", pa.string()),
     ]
 )
 _MARKS: Final = pa.schema(
     [
-        ("log_time", TIME),
+        ("log_time", _TIME),
         ("t", pa.int64()),
-        ("end_time", TIME),
+        ("end_time", _TIME),
         ("end_t", pa.int64()),
         ("recording", pa.string()),
         ("text", pa.string()),
-        ("tags", TAGS),
+        ("tags", _TAGS),
     ]
 )
 
 
 def store_table(name: str, content: StoreContent) -> pa.Table:
     """One of the tables about a store: `recordings`, `topics`, `losses` or `marks`."""
-    if name == "recordings":
-        return recordings_table(content.summaries)
     rows, schema = _TABLES[name]
     return pa.Table.from_pylist(list(rows(content)), schema=schema)
+
+
+def _times(first: int | None, last: int | None) -> dict[str, Any]:
+    """Cells of `_TIMES` for a first and a last log time, ns."""
+    return {
+        "first_time": None if first is None else first // 1000,
+        "last_time": None if last is None else last // 1000,
+        "first_t": first,
+        "last_t": last,
+    }
+
+
+def _recordings(content: StoreContent) -> Iterator[Mapping[str, Any]]:
+    for one in content.summaries:
+        yield {
+            "recording": one.name,
+            "id": one.id,
+            "tags": list(one.tags.items()),
+            "status": one.status,
+            "created": one.created // 1000,
+            **_times(*(one.span or (None, None))),
+            "messages": one.messages,
+            "topics": one.topic_count,
+            "segments": one.segments,
+            "bytes": one.stored_bytes,
+            "has_losses": one.has_losses,
+        }
 
 
 def _topics(content: StoreContent) -> Iterator[Mapping[str, Any]]:
@@ -251,7 +291,7 @@ def _topics(content: StoreContent) -> Iterator[Mapping[str, Any]]:
                 "encoding": ", ".join(encodings) or None,
                 "messages": total.messages,
                 "bytes": total.payload_bytes,
-                **times(total.first, total.last),
+                **_times(total.first, total.last),
                 "mean_skew": total.mean_skew,
                 "unset_stamps": total.unset if entry.is_decoded else None,
                 "problem": "; ".join(problems) or None,
@@ -267,7 +307,7 @@ def _losses(content: StoreContent) -> Iterator[Mapping[str, Any]]:
                 "topic": loss.get("topic"),
                 "cause": str(loss["cause"]),
                 "messages": loss["count"],
-                **times(loss.get("from"), loss.get("to")),
+                **_times(loss.get("from"), loss.get("to")),
                 "file": loss.get("file") or None,
                 "reason": loss.get("reason") or None,
             }
@@ -293,6 +333,7 @@ def _marks(content: StoreContent) -> Iterator[Mapping[str, Any]]:
 
 _Rows = Callable[["StoreContent"], Iterator[Mapping[str, Any]]]
 _TABLES: Final[Mapping[str, tuple[_Rows, Any]]] = {
+    "recordings": (_recordings, _RECORDINGS),
     "topics": (_topics, _TOPICS),
     "losses": (_losses, _LOSSES),
     "marks": (_marks, _MARKS),
