@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from itertools import chain, groupby, islice
 from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, ClassVar, Final, TypeVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar
 
 import click
 
@@ -20,7 +20,6 @@ from hybridlog.cli.options import AsJson, Forced, Topics
 from hybridlog.cli.output import ROWS_AT_ONCE, Bar, Column, print_table
 from hybridlog.formats import OUTPUTS, formats_of, is_directory, suffixes_of
 from hybridlog_storage.errors import PayloadError, UsageError
-from hybridlog_storage.stopping import anywhere
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -34,7 +33,6 @@ if TYPE_CHECKING:
     from hybridlog.query.answers.follow import Following
     from hybridlog.query.query import Query
     from hybridlog.query.question import Counters
-    from hybridlog_storage.messages import Buffer
 
 
 SCREEN: Final = "table"
@@ -297,22 +295,8 @@ def write_following(following: Following, form: str) -> None:
     from hybridlog.frames.lines import lines
 
     answer = Answer(lines=lines(following), tables=stream(following, at_once=True), is_live=True)
-    OUTPUTS[form].write(answer, cast("BinaryIO", _Anywhere()))
+    OUTPUTS[form].write(answer, sys.stdout.buffer)
     output.notes(answer.notes)
-
-
-class _Anywhere:
-    """Standard output; signals may stop the process while it waits for the reader."""
-
-    name = "standard output"
-
-    def write(self, data: Buffer) -> int:
-        with anywhere():
-            return sys.stdout.buffer.write(data)
-
-    def flush(self) -> None:
-        with anywhere():
-            sys.stdout.buffer.flush()
 
 
 def _rows(tables: Iterable[pa.Table]) -> Answer:

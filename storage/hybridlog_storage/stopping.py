@@ -56,7 +56,6 @@ class _Block:
         self.flag = Flag()
         self.thread = threading.get_ident()
         self.action: Action | None = None
-        self.is_anywhere = False
 
 
 _block: _Block | None = None
@@ -132,21 +131,6 @@ def safe_point() -> None:
         action()
 
 
-@contextmanager
-def anywhere() -> Iterator[None]:
-    """Within `at_safe_points`: work that shares no locks, stopped at any instruction."""
-    safe_point()
-    block = _block
-    if block is None or block.thread != threading.get_ident():
-        yield
-        return
-    block.is_anywhere = True
-    try:
-        yield
-    finally:
-        block.is_anywhere = False
-
-
 def pause(seconds: float) -> None:
     """Sleep; a safe point at the beginning and at the end, which a signal hastens."""
     safe_point()
@@ -166,9 +150,6 @@ def postpone(action: Action) -> bool:
     block = _block
     if block is None:
         return False
-    if block.is_anywhere:
-        block.is_anywhere = False
-        action()
     if block.action is None:
         block.action = action
     block.flag.set()

@@ -220,7 +220,7 @@ def test_a_database_in_the_uri_wins(mongo: str) -> None:
     own = mongo.partition("?")[0].rpartition("/")[2]
     with Database.connect(mongo.replace(f"/{own}", "/")) as connected:
         assert connected.name == "hybridlog"
-    with Database.connect(mongo, "yours") as connected:
+    with Database.connect(mongo) as connected:
         assert connected.name == own
         assert connected.address.endswith(f"/{own}")
 

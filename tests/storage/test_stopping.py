@@ -12,7 +12,6 @@ import pytest
 
 from hybridlog_storage.stopping import (
     Flag,
-    anywhere,
     at_safe_points,
     pause,
     postpone,
@@ -112,36 +111,11 @@ def test_a_handler_of_the_program_stays() -> None:
     assert seen == [signal.SIGINT]
 
 
-def test_work_of_one_thread_is_stopped_anywhere() -> None:
-    done = []
-
-    def work() -> None:
-        with at_safe_points():
-            with anywhere():
-                pass
-            signal.raise_signal(signal.SIGTERM)
-            done.append("not there")
-            with anywhere():
-                done.append("stopped at its beginning")
-
-    with pytest.raises(Stop):
-        work()
-
-    def work_within() -> None:
-        with at_safe_points(), anywhere():
-            signal.raise_signal(signal.SIGTERM)
-            done.append("stopped in it")
-
-    with pytest.raises(Stop):
-        work_within()
-    assert done == ["not there"]
-
-
 def test_other_threads_are_not_stopped() -> None:
     done = []
 
     def elsewhere() -> None:
-        with at_safe_points(), anywhere():
+        with at_safe_points():
             pause(0)
             safe_point()
             done.append("all")

@@ -32,7 +32,7 @@ from hybridlog_storage.errors import (
     TimeError,
     UsageError,
 )
-from hybridlog_storage.stopping import anywhere, at_safe_points, safe_point
+from hybridlog_storage.stopping import at_safe_points, safe_point
 
 if TYPE_CHECKING:
     from hybridlog.formats.find import Watch
@@ -219,9 +219,7 @@ class LogRecorder:
         from hybridlog.record.recorder import RecordOptions
 
         choices = self._choices
-        with anywhere():
-            source = log.open()
-        with source:
+        with log.open() as source:
             matcher, no_index = choices.matchers()
             options = RecordOptions(
                 name=choices.name or log.name,

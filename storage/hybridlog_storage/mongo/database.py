@@ -74,13 +74,12 @@ class Database:
         self.name, self.address = name, address
 
     @classmethod
-    def connect(cls, uri: str, name: str = "hybridlog", *, timeout_s: float = 5.0) -> Self:
+    def connect(cls, uri: str, *, timeout_s: float = 5.0) -> Self:
         """Connect and check that the server answers and is new enough.
 
         `timeout_s` is the wait for the server, now and in every later operation; 20 seconds more
-        for a replica set, which may elect a primary. A database named in the URI wins over `name`,
-        a `serverSelectionTimeoutMS` in it over `timeout_s`. A URI or name that is not allowed
-        raises `UsageError`.
+        for a replica set, which may elect a primary. The URI may name the database, and a
+        `serverSelectionTimeoutMS` in it wins. One that is not allowed raises `UsageError`.
         """
         from pymongo import MongoClient
         from pymongo.errors import InvalidURI, PyMongoError
@@ -89,7 +88,7 @@ class Database:
         address = without_secrets(uri)
         try:
             parsed = parse_uri(uri, warn=False)
-            name = ".".join(filter(None, (parsed["database"] or name, parsed["collection"])))
+            name = ".".join(filter(None, (parsed["database"] or "hybridlog", parsed["collection"])))
             if name in _RESERVED_NAMES or not re.fullmatch(r"[A-Za-z0-9_-]{1,38}", name):
                 raise UsageError(
                     f"{name!r} cannot be the name of hybridlog's database: use up to 38 letters, "

@@ -14,7 +14,7 @@ import struct
 from collections.abc import Collection, Mapping
 from datetime import UTC, datetime
 from functools import lru_cache
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
@@ -224,11 +224,10 @@ class IndexState:
         hour around its messages and losses, and in all topics unless the recording is complete.
         """
         chosen: dict[str, object] = {"_meta.rec": entry.key}
-        rows = entry.losses
-        times = [*(entry.span or (None,)), *(row[one] for row in rows for one in ("from", "to"))]
-        known = [time for time in times if time is not None]
-        if len(known) == len(times):
-            chosen.update(between(max(0, min(known) - _AROUND_NS), max(known) + _AROUND_NS))
+        lost = (row[one] for row in entry.losses for one in ("from", "to"))
+        times: list[Any] = [*(entry.span or ()), *lost]
+        if times and None not in times:
+            chosen.update(between(max(0, min(times) - _AROUND_NS), max(times) + _AROUND_NS))
         if but:
             chosen["_meta.ref.seg"] = {"$nin": sorted(map(int, but))}
         collections = {collection_of(channel.topic) for channel in entry.channels}
