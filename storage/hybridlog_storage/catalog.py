@@ -247,8 +247,9 @@ class Catalog:
 
     def put_indexed(self, recordings: Collection[str], index: str) -> None:
         """Note that an index is complete for recordings, as long as they look the same."""
+        known = self._cells.each(_INDEX, recordings)
         cells = [
-            put(_INDEX, one.id, _body([index, one.look, self._index(one.id)[2]]))
+            put(_INDEX, one.id, _body([index, one.look, _indexed(known.get(one.id))[2]]))
             for one in self.summaries(recordings)
             if one.indexed_by != index
         ]
@@ -304,10 +305,7 @@ class Catalog:
                 self._topics[digest] = found
         return self._topics.get(digest)
 
-    def _index(self, recording: str) -> _Indexed:
-        return _indexed(self._cells.read(_INDEX, recording))
-
-    def damaged(self, recordings: Collection[str]) -> dict[str, Damage]:
+    def damaged(self, recordings: Collection[str]) -> dict[str, dict[tuple[int, int], str]]:
         """The unreadable chunks of those recordings, by id, that are known to have some."""
         known = self._cells.each(_INDEX, recordings)
         rows = {recording: _indexed(body)[2] for recording, body in known.items()}
@@ -315,7 +313,7 @@ class Catalog:
 
     def damage(self, recording: str) -> dict[tuple[int, int], str]:
         """The unreadable chunks of a recording."""
-        return {(number, chunk): why for number, chunk, why in self._index(recording)[2]}
+        return self.damaged([recording]).get(recording, {})
 
     def decoded(
         self, recording: str, digests: Mapping[int, str]

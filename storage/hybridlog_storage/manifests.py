@@ -54,9 +54,9 @@ class Manifests(ABC):
     place: str
     cure: ClassVar[str] = "`hybridlog verify --repair` makes it again."
 
-    @abstractmethod
     def ids(self) -> list[str]:
         """Ids of all recordings that have a manifest, sorted; also of those being removed."""
+        raise NotImplementedError
 
     def without(self) -> list[str]:
         """Ids of recordings that have lost their manifest, sorted; of none by default."""

@@ -37,7 +37,6 @@ from hybridlog_storage.manifests import (
     RECORDINGS,
     WAIT_S,
     Manifests,
-    ids_of,
 )
 from hybridlog_storage.settings import MAX_SETTINGS, StoreSettings, settings_of, settings_text
 from hybridlog_storage.settings import NAME as SETTINGS
@@ -256,10 +255,6 @@ class _ServerManifests(Manifests):
 
     def __init__(self, server: Server) -> None:
         self.place, self._server = server.address, server
-
-    def ids(self) -> list[str]:
-        """Ids of all recordings that have a manifest, sorted."""
-        return ids_of(self._server.listed(MANIFESTS))
 
     def _create(self, manifest: Manifest) -> None:
         exists = RecordingExistsError(f"There is a recording {manifest.id} already.")

@@ -51,14 +51,6 @@ def test_urls(sshd: dict[str, Sshd], tmp_path: Path) -> None:
         pass
 
 
-def test_recordings_there_are_listed(make: Makes) -> None:
-    source, target = make("directory"), make("shell")
-    source.begin(recording())
-    assert target.place.manifests.ids() == []
-    copy(source.source, target.place, RECORDING)
-    assert target.place.manifests.ids() == [RECORDING]
-
-
 def test_a_copy_waits_for_another_one(make: Makes, limit: Limit) -> None:
     limit(copy_wait_s=0.2, server_copy_wait_s=1)
     for kind in ("directory", "shell"):

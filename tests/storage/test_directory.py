@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 
+from hybridlog_storage.cells import put
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import LOCK, Holder, StoreDirectory
 from hybridlog_storage.errors import HeldError, TopicError
@@ -175,3 +176,18 @@ def test_a_recording_that_was_removed_is_not_locked(
     monkeypatch.setattr(files, "open_file", opened)
     with pytest.raises(TopicError, match="no longer in the store"), store.writing("r"):
         pass
+
+
+def test_the_catalog_of_a_store_that_is_not_written_lies_in_the_users_cache(
+    store: StoreDirectory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    before = [*store.path.iterdir()]
+    for _ in range(2):
+        cells = StoreDirectory(store.path, read_only=True).cells
+        found = cells.read("a", "b")
+        cells.write([put("a", "b", b"c")])
+        cells.close()
+    assert found == b"c"
+    assert [*store.path.iterdir()] == before
+    assert len([*tmp_path.glob("cache/**/*.sqlite")]) == 1
