@@ -119,12 +119,9 @@ def _table(blocks: list[Block], question: Question) -> pa.Table:
 
 
 class Decoder:
-    """Makes blocks from the messages of a query.
+    """Makes blocks from the messages of a query, with the built-in columns `own`.
 
-    Attributes:
-        own: Names of the built-in columns.
-        fields: The requested fields, without the names of built-in columns; None for all.
-        fits_tables: False if tables of topics lack a column.
+    `fields` are the requested ones without those, None for all; tables may lack columns.
     """
 
     def __init__(self, planner: Planner) -> None:

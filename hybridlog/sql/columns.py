@@ -57,15 +57,10 @@ Key = tuple[Path, bool]
 
 
 class ViewColumn(Struct, frozen=True):
-    """A column of a view, or a field inside one.
+    """A column of a view, or a field inside one; `inner` are the fields of a struct.
 
-    Attributes:
-        source: Path of the field in the messages.
-        kind: Type of the field, as codecs give it.
-        type: Its type in SQL.
-        inner: Fields of a struct.
-        is_summary: True for the twin of an array.
-        is_points: True for the points of clouds.
+    Its `source` is the path of a field of messages, of a `kind` as codecs give it, its `type` that
+    in SQL. The twin of an array is a summary.
     """
 
     name: str

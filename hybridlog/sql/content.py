@@ -42,12 +42,8 @@ _SAMPLED: Final = 20  # recordings that tell how many messages a topic has
 class StoreContent:
     """Recordings and views of a store at one moment. Thread safe.
 
-    Attributes:
-        scope: The recordings and times of this question alone, whatever its topics.
-        snapshot: All recordings of the store.
-        summaries: Those of the scope, oldest first.
-        resolved: Those that may have rows, with their times, by id, oldest first.
-        names: Names of the views.
+    The recordings and times of the question `scope` alone, whatever its topics, are in
+    `summaries`; those that may have rows are `resolved`, by id; both oldest first.
     """
 
     def __init__(self, session: Session, scope: Question) -> None:

@@ -42,12 +42,7 @@ if TYPE_CHECKING:
 
 
 class Limits(NamedTuple):
-    """The rows that a query asks for.
-
-    Attributes:
-        span: Their log time `[begin, end)`, ns.
-        recordings: Names of their recordings; None for all.
-    """
+    """The log time `[begin, end)`, ns, of the rows that a query asks for, and their recordings."""
 
     span: Span = (BEGIN, END)
     recordings: Collection[str] | None = None

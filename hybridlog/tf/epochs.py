@@ -20,7 +20,6 @@ from hybridlog.query.planner import Planner
 from hybridlog.query.question import Question
 from hybridlog.query.times import format_time
 from hybridlog.schema.column import STAMP
-from hybridlog.tf import TYPES
 from hybridlog.wording import listed
 from hybridlog_storage.errors import TopicError
 from hybridlog_storage.times import BEGIN, END
@@ -33,6 +32,11 @@ if TYPE_CHECKING:
     Times = NDArray[np.int64]
     Stamps = tuple[Times, Times]  # log times of a topic's messages, ascending, and their stamps
 
+TYPES: Final = frozenset({
+    "tf2_msgs/TFMessage", "tf/tfMessage", "geometry_msgs/TransformStamped",
+    "foxglove.FrameTransform", "foxglove.FrameTransforms",
+})  # fmt: skip
+"""Message types with transforms, as `plain_type` names them."""
 _SECOND: Final = 10**9
 _FALL_NS: Final = _SECOND
 _TOGETHER_NS: Final = 2 * _SECOND

@@ -17,8 +17,7 @@ from hybridlog.frames.answer import stream, to_arrow
 from hybridlog.query.answers.completeness import completeness_of
 from hybridlog.query.planner import Planner, log_times
 from hybridlog.query.question import Counters, Question
-from hybridlog.tf import is_of_transforms
-from hybridlog.tf.epochs import epochs_of, transforms_of
+from hybridlog.tf.epochs import TYPES, epochs_of, transforms_of
 from hybridlog.tf.transform import Transform, unknown
 from hybridlog.tf.tree import Frame, FrameTree, Lookup
 from hybridlog.wording import counted, listed
@@ -40,16 +39,10 @@ _MAX_NORM_ERROR: Final = 1e-2
 class Trees:
     """The trees of frames of a recording, each read once it is asked for.
 
-    A tree is of the topics `tf` and `tf_static` of a namespace. What it lacks comes from the
-    root's, to which Foxglove's messages belong, whatever their topic.
-
-    Args:
-        summaries: The recording; a TopicError if there are several.
-        only: Topics of one tree that takes the place of all others.
-
-    Attributes:
-        topics: Topics of each tree, by its namespace, the root's first; empty is the root's.
-        epochs: The epochs of the recording; each has transforms of its own.
+    A tree is of the topics `tf` and `tf_static` of a namespace, by which `topics` has them; empty
+    is the root's. What it lacks comes from the root's, to which Foxglove's messages belong,
+    whatever their topic. Each epoch of the recording has transforms of its own. The tree of `only`
+    some topics takes the place of all others. Several recordings are a TopicError.
     """
 
     def __init__(
@@ -62,12 +55,14 @@ class Trees:
         entry = session.entry_of(self._recording)
         self.epochs = epochs_of(session, entry.id)
         found: dict[str, list[str]] = {}
-        types = {one.topic: one.type for one in entry.channels if not only or one.topic in only}
-        for topic, name in sorted(types.items()):
+        types = {one.topic: plain_type(one.type) for one in entry.channels}
+        for topic, kind in sorted(types.items()):
             above, _, last = topic.lstrip("/").rpartition("/")
-            if is_of_transforms(name) and (only or plain_type(name).startswith("foxglove.")):
+            if kind not in TYPES or (only and topic not in only):
+                continue
+            if only or kind.startswith("foxglove."):
                 found.setdefault("", []).append(topic)
-            elif is_of_transforms(name) and last in _NAMES:
+            elif last in _NAMES:
                 found.setdefault(above, []).append(topic)
         self.topics: Mapping[str, Sequence[str]] = dict(sorted(found.items()))
         self._trees: dict[tuple[str, int], FrameTree] = {}

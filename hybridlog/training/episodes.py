@@ -47,15 +47,10 @@ class Values(NamedTuple):
 
 
 class Episode(Struct, frozen=True):
-    """Frames at regular times in one recording.
+    """Frames at regular times, int64[n], ns, in a recording, whose id is `recording`.
 
-    Attributes:
-        name: Its recording and part.
-        recording: Id of the recording.
-        times: int64[n], log times of the frames, ns.
-        vectors: float32[n, width] by name of the feature.
-        names: Names of the columns, by name of the feature.
-        held: Frames whose value is older than usual, by topic.
+    Their `vectors` are float32[n, width] by name of the feature, as the names of columns are.
+    `held` counts frames whose value is older than usual, by topic.
     """
 
     name: str

@@ -330,16 +330,11 @@ class _Set:
 
 
 class _Video:
-    """Encodes the pictures of a camera, several episodes a file.
-
-    Attributes:
-        key: Name of the feature.
-        counts: int64[3, 256], how often each value occurs in a colour, of some pictures.
-    """
+    """Encodes the pictures of a camera, several episodes a file, and counts values of colours."""
 
     def __init__(self, root: Path, name: str, options: LerobotOptions) -> None:
         self.key = f"{IMAGE_PREFIX}{name}"
-        self.counts = np.zeros((3, 256), np.int64)
+        self.counts = np.zeros((3, 256), np.int64)  # how often each value occurs in some pictures
         self._root, self._options = root, options
         self._size: tuple[int, ...] = ()  # rows and columns of a picture
         self._file: Any = None
