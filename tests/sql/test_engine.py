@@ -311,6 +311,6 @@ def test_threads_ask_at_once(store: hl.Store) -> None:
 
 
 def test_an_answer_that_is_left_early_reads_no_more(store: hl.Store) -> None:
-    answer = store.sql("select ranges from scan limit 3")
+    answer = store.sql("select angle from scan limit 3")
     assert len(answer.rows()) == 3
     assert len(answer.reading.groups) < 3
