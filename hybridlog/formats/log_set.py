@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from contextlib import nullcontext, suppress
-from itertools import pairwise
+from itertools import chain, pairwise
 from stat import S_ISDIR, S_ISREG
 from typing import TYPE_CHECKING, Final
 
@@ -15,7 +15,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from hybridlog.formats import LOGS, LogFormat
-from hybridlog.formats.reading import BATCH_BYTES, Damage, Source, cannot_open, size_of
+from hybridlog.formats.reading import BATCH_BYTES, Damage, Source, cannot_open, size_of, split
 from hybridlog.formats.rosbag2.directory import NAME, BagMetadata, locate, plain, read_metadata
 from hybridlog.formats.spool import ZSTD_MAGIC, peek, spool
 from hybridlog.wording import listed
@@ -86,16 +86,6 @@ def kinds() -> str:
     """The logs that can be read."""
     *others, last = (log.files for log in LOGS)
     return f"{', '.join(others)} and {last}"
-
-
-def files_in(folder: Path) -> list[LogFile]:
-    """The logs and the empty files directly in a folder, in natural order of their names."""
-    try:
-        paths = [p for p in folder.iterdir() if not p.name.startswith(".") and p.is_file()]
-    except OSError as error:
-        raise cannot_open(folder, error) from error
-    files = map(LogFile.at, sorted(paths, key=natural))
-    return [file for file in files if file.format is not UNKNOWN or not size_of(file.path)]
 
 
 # Names of the parts of a split log: `name_3.db3`, `name_2024-05-06-07-08-09_3.bag`, `3.mcap`.
@@ -256,15 +246,19 @@ def _in_folder(folder: Path) -> LogSet:
     bag = metadata if isinstance(metadata, BagMetadata) else None
     damage = [metadata] if isinstance(metadata, Damage) else []
     found, missing = ([], []) if bag is None else locate(folder, bag)
-    there, files = files_in(folder), [*map(LogFile.at, found)]
-    if not found:  # the listed files may have got other names
+    files = [*map(LogFile.at, found)]
+    paths = (path for path in folder.iterdir() if path.name[:1] != "." and path.is_file())
+    there = [*map(LogFile.at, sorted(paths, key=natural))]
+    there = [one for one in there if one.format is not UNKNOWN or not size_of(one.path)]
+    if not found:
         files = [file for file in there if file.format is not UNKNOWN]
         _check_one(folder, files)
     first = next((file for file in files if file.format is not UNKNOWN), None)
-    paths = {file.path for file in files}
     more: list[LogFile] = []
-    for file in (one for one in there if one.path not in paths):
-        if first is not None and is_split([first, file]):
+    names = {plain(file.path) for file in files}
+    for file in (one for one in there if one not in files):
+        is_new = plain(file.path) not in names
+        if is_new and first is not None and is_split([first, file]):
             more.append(file)
         elif file.format is not UNKNOWN:  # the log lacks nothing by that
             reason = "the file is not read: it is no part of this log; record it by its own path"
@@ -406,7 +400,7 @@ class _JoinedSource(Source):
         """
         may_be = np.empty(0, np.bool_)
         broken = 0
-        for batch in inner.batches():
+        for batch in chain.from_iterable(map(split, inner.batches())):
             if len(may_be) < len(inner.channels):
                 may_be = np.array([c.message_encoding in _CDR for c in inner.channels], np.bool_)
             packed = may_be[batch.channel] & _is_frame(batch)

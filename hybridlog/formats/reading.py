@@ -16,7 +16,7 @@ from msgspec import Struct
 from msgspec.structs import force_setattr, replace
 
 from hybridlog_storage.errors import SourceError
-from hybridlog_storage.messages import MAX_CHANNELS, joined
+from hybridlog_storage.messages import MAX_CHANNELS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -143,9 +143,8 @@ class Source(ABC):
     def batches(self) -> Iterator[Batch]:
         """Yield all readable messages once, in file order, in bounded memory.
 
-        Each batch holds about `BATCH_BYTES` and at most `BATCH_MESSAGES` messages. Its
-        buffer stays valid after the source is closed. A file that cannot be read any more raises
-        SourceError.
+        A batch may have any size; its buffer stays valid after the source is closed. A file that
+        cannot be read any more raises SourceError.
         """
 
     @abstractmethod
@@ -180,32 +179,6 @@ def cannot_open(path: Path, error: OSError) -> SourceError:
         f"{path}: cannot be read ({error.strerror or error}); check the disk, or copy the "
         "file to another one and use the copy"
     )
-
-
-def regroup(batches: Iterator[Batch]) -> Iterator[Batch]:
-    """Join small batches and split large ones, in order; empty ones are omitted.
-
-    Each then has about `BATCH_BYTES` and at most `BATCH_MESSAGES` messages.
-    """
-    held: list[Batch] = []
-    size = rows = 0
-    for batch in batches:
-        if not len(batch):
-            continue
-        if held and (size + len(batch.buffer) > BATCH_BYTES or rows + len(batch) > BATCH_MESSAGES):
-            yield joined(held)
-            held, size, rows = [], 0, 0
-        if len(batch.buffer) * 8 > BATCH_BYTES or len(batch) * 2 > BATCH_MESSAGES:
-            if held:
-                yield joined(held)
-                held, size, rows = [], 0, 0
-            yield from split(batch)
-        else:
-            held.append(batch)
-            size += len(batch.buffer)
-            rows += len(batch)
-    if held:
-        yield joined(held)
 
 
 def split(batch: Batch) -> Iterator[Batch]:

@@ -118,17 +118,10 @@ def record(
     options: RecordOptions,
     progress: Callable[[int, int], None] | None = None,
 ) -> RecordReport:
-    """Record a whole source. A signal stops it at safe points only, and then nothing is stored.
+    """Record a whole source, which is open and not yet read; `fingerprint` is of its content.
 
-    Args:
-        source: The source, open and not yet read.
-        directory: The store.
-        catalog: Its catalog.
-        follow: Starts the follower of the recording.
-        known: Returns all recordings of the store.
-        fingerprint: Fingerprint of the source's content.
-        options: Options of the recording.
-        progress: Called periodically with bytes read and messages stored.
+    A signal stops it at safe points only, and then nothing is stored. `follow` and `known` are as
+    of `Capture`. `progress` is called with bytes read and messages stored.
 
     Raises:
         AlreadyRecordedError: the same content is in the store.
@@ -319,21 +312,12 @@ def _identity(fingerprint: Fingerprint) -> dict[str, object]:
 
 
 def _refuse_known(source: Source, fingerprint: Fingerprint, snapshot: Snapshot) -> None:
-    recorded = snapshot.by_fingerprint
-    known = recorded.get(fingerprint.whole)
-    if known is None and len(fingerprint.parts) > 1:
-        parts = [recorded.get(part) for part in fingerprint.parts]
-        names = dict.fromkeys(one.name for one in parts if one is not None)
-        if None not in parts:
-            raise AlreadyRecordedError(
-                f"{source.path} is in the store already, part by part: {listed(names)}. "
-                "Use --again to record it once more."
-            )
-    if known is not None:
-        state = {"recovered": " (cut short by a crash)", "open": " (being recorded now)"}
+    whole = snapshot.by_fingerprint.get(fingerprint.whole)
+    found = [whole] if whole else [*map(snapshot.by_fingerprint.get, fingerprint.parts)]
+    names = dict.fromkeys(repr(one.name) for one in found if one is not None)
+    if found and None not in found:
         raise AlreadyRecordedError(
-            f"{source.path} is in the store already, as {known.name!r}"
-            f"{state.get(known.status, '')}. "
+            f"{source.path} is in the store already, as {listed(names)}. "
             "Use --again to record it once more."
         )
 

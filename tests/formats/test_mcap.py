@@ -21,7 +21,7 @@ from mcap.writer import CompressionType, Writer
 
 import hybridlog as hl
 from hybridlog.formats.mcap.reader import McapSource
-from hybridlog.formats.reading import BATCH_MESSAGES, Damage
+from hybridlog.formats.reading import Damage
 from hybridlog_storage import messages as log
 from hybridlog_storage.mcap.mcap_content import MAGIC
 from hybridlog_storage.segments.segment_format import METADATA_CHECK
@@ -64,7 +64,6 @@ def read(path: Path) -> Read:
     with McapSource(path) as source:
         for batch in source.batches():
             assert len(batch) > 0
-            assert len(batch) <= BATCH_MESSAGES
             for i in range(len(batch)):
                 channel = source.channels[batch.channel[i]]
                 schema = channel.schema

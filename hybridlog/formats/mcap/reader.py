@@ -9,7 +9,7 @@ import numpy as np
 from mcap import records
 from msgspec.structs import replace
 
-from hybridlog.formats.reading import Damage, Source, cannot_open, split
+from hybridlog.formats.reading import Damage, Source, cannot_open
 from hybridlog.wording import listed
 from hybridlog_storage.errors import SourceError
 from hybridlog_storage.mcap import mcap_content
@@ -119,7 +119,7 @@ class McapSource(Source):
             batch, found = batch.take(known), found[known]
         if len(batch):
             self._given += len(batch)
-            yield from split(replace(batch, channel=found))
+            yield replace(batch, channel=found)
 
     def _channels(self, ids: NDArray[np.int32]) -> NDArray[np.int32]:
         """Indexes of channels by the definitions so far; negative if there is none."""

@@ -22,7 +22,6 @@ from hybridlog.formats.reading import (
     Damage,
     Source,
     cannot_open,
-    regroup,
 )
 from hybridlog.wording import listed
 from hybridlog_storage.errors import SourceError
@@ -55,7 +54,6 @@ _MAX_HEADER: Final = 1 << 20
 _OP: Final = b"\x04\0\0\0op="
 _LOOK_BACK: Final = 320  # most bytes in front of this field in a header that is searched for
 _MAX_FOUND: Final = 4096  # longest header that is searched for
-_MAX_INDEX: Final = 64 << 20  # of an index that is not where the bag header says
 _WINDOW = 4 << 20  # bytes of messages outside of compressed chunks that are read at once
 _UNSTATED = 16 << 20  # bytes that a chunk may unpack to whatever its header says
 _STEP: Final = 256 << 10  # bytes that are searched or unpacked at once
@@ -211,10 +209,6 @@ class Rosbag1Source(Source):
         """Close the file."""
         self._file.close()
 
-    def batches(self) -> Iterator[Batch]:
-        """Yield all readable messages in file order."""
-        return regroup(self._pieces())
-
     # Opening: the bag header, and the index if it exists.
 
     def _open(self) -> None:
@@ -238,12 +232,8 @@ class Rosbag1Source(Source):
             self._read_index(record)
 
     def _read_index(self, head: _Record) -> None:
-        """Read connections and chunk list; bytes lost or added before them have moved them."""
-        begin = said = head.number(b"index_pos")
-        if begin > self.size_bytes or not self._is_sound(begin):
-            tail = max(head.end, self.size_bytes - _MAX_INDEX)
-            last = self._read(tail, _MAX_INDEX).rfind(_OP + bytes([_INDEX_DATA]))
-            begin = self.size_bytes if last < 0 else self._search(tail + last)
+        """Read connections and chunk list, where the bag header says that they are."""
+        begin = head.number(b"index_pos")
         pos, count, chunks, connections = begin, 0, 0, 0
         times: list[int] = []
         while pos < self.size_bytes:
@@ -266,8 +256,8 @@ class Rosbag1Source(Source):
             pos = record.end
         wanted = head.number(b"conn_count"), head.number(b"chunk_count")
         if pos != self.size_bytes or (connections, chunks) != wanted:
-            reason = f"the index, which starts at {said}, is not whole: the file was cut short"
-            self._cut = reason, 0 if said <= self.size_bytes else None
+            reason = f"the index, which starts at {begin}, is not whole: the file was cut short"
+            self._cut = reason, 0 if begin <= self.size_bytes else None
             return
         if chunks or begin == head.end:  # a bag without chunks has no list of messages
             self.message_count = count
@@ -335,7 +325,8 @@ class Rosbag1Source(Source):
 
     # Reading the file.
 
-    def _pieces(self) -> Iterator[Batch]:
+    def batches(self) -> Iterator[Batch]:
+        """Yield all readable messages in file order."""
         pos = len(MAGIC)
         try:
             while pos < self.size_bytes:
