@@ -299,6 +299,7 @@ class _JoinedSource(Source):
         for damage in log.damage:
             self.note(damage)
         self._numbers: dict[tuple[object, ...], int] = {}
+        self._alike: Counter[tuple[object, ...]] = Counter()  # channels of a file
         self._inner: Source | None = None
         with suppress(SourceError) if len(log.parts) > 1 else nullcontext():
             self._inner = self._open(log.parts[0])
@@ -364,20 +365,18 @@ class _JoinedSource(Source):
     def _read(self, part: LogFile, inner: Source, done: int, size: int) -> Iterator[Batch]:
         """Yield the messages of one open file, over the channels of this source."""
         numbers = np.empty(0, np.int32)
-        alike: Counter[tuple[object, ...]] = Counter()
+        self._alike.clear()
         for batch in self._unpacked(part.path, inner):
             self._got += len(batch)
-            numbers = self._numbered(inner, numbers, alike)
+            numbers = self._numbered(inner, numbers)
             share = inner.bytes_read / inner.size_bytes if inner.size_bytes else 1.0
             self.bytes_read = done + int(size * min(share, 1.0))
             yield replace(batch, channel=numbers[batch.channel])
-        self._numbered(inner, numbers, alike)
+        self._numbered(inner, numbers)
         self.damage.extend(replace(damage, file=part.path) for damage in inner.damage)
 
-    def _numbered(
-        self, inner: Source, numbers: NDArray[np.int32], alike: Counter[tuple[object, ...]]
-    ) -> NDArray[np.int32]:
-        """Numbers of the channels of a file in this source; `alike` is changed.
+    def _numbered(self, inner: Source, numbers: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Numbers of the channels of a file in this source.
 
         Equal channels of one file are publishers of their own, of two files the same ones.
         """
@@ -386,8 +385,8 @@ class _JoinedSource(Source):
             metadata = tuple(sorted(channel.metadata.items()))
             own = channel.topic, channel.message_encoding, channel.schema, metadata
             said = *own, channel.has_publish_time
-            alike[said] += 1
-            key = alike[said], *said
+            self._alike[said] += 1
+            key = self._alike[said], *said
             if key not in self._numbers:
                 self._numbers[key] = self.add_channel(channel)
             more.append(self._numbers[key])

@@ -54,7 +54,7 @@ class SqliteSource(Source):
         page, pages = _read_header(path)
         self._missing = pages * page - self.size_bytes
         try:
-            self._db = _connect_whole_pages(path, page, self.size_bytes)
+            self._db = _connect(path, page, self.size_bytes)
         except sqlite3.Error as error:
             raise _unreadable(path, error) from error
         try:
@@ -263,30 +263,23 @@ def _read_header(path: Path) -> tuple[int, int]:
     return 1 << 16 if page == 1 else page, int.from_bytes(data[28:32], "big")
 
 
-def _connect_whole_pages(path: Path, page: int, size: int) -> sqlite3.Connection:
-    """Open a database without its truncated last page.
-
-    SQLite would read zeros for the missing part of that page, and return them as payload.
-    """
-    if page < 512 or size % page == 0:
-        return _connect(path)
-    whole = copy_start(path, size - size % page)
-    try:
-        return _connect(whole)
-    finally:
-        whole.unlink(missing_ok=True)
-
-
-def _connect(path: Path) -> sqlite3.Connection:
-    """Open an untrusted database read-only.
+def _connect(path: Path, page: int, size: int) -> sqlite3.Connection:
+    """Open an untrusted database read-only, without its last page if that is truncated.
 
     A database with a write-ahead log, left by a crashed recorder, is opened with it. Others are
     opened as immutable, so that no file is written beside them.
     """
-    log = path.with_name(path.name + "-wal")
-    has_log = log.is_file() and log.stat().st_size
-    uri = f"file:{quote(os.fsencode(path.absolute()))}?mode=ro{'' if has_log else '&immutable=1'}"
-    db = sqlite3.connect(uri, uri=True, check_same_thread=False)
+    is_whole = page < 512 or size % page == 0
+    # SQLite would read zeros for the missing part of a page, and return them as payload.
+    whole = path if is_whole else copy_start(path, size - size % page)
+    try:
+        log = whole.with_name(whole.name + "-wal")
+        mode = "ro" if log.is_file() and log.stat().st_size else "ro&immutable=1"
+        uri = f"file:{quote(os.fsencode(whole.absolute()))}?mode={mode}"
+        db = sqlite3.connect(uri, uri=True, check_same_thread=False)
+    finally:
+        if not is_whole:
+            whole.unlink(missing_ok=True)
     db.text_factory = lambda data: data.decode(errors="replace")
     db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_PAYLOAD)
     db.executescript(

@@ -7,6 +7,7 @@ other kinds are rare and become objects.
 from __future__ import annotations
 
 import struct
+from array import array
 from io import BytesIO
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
@@ -23,7 +24,7 @@ from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.messages import Batch
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator
+    from collections.abc import Callable, Collection
 
     from numpy.typing import NDArray
 
@@ -102,11 +103,14 @@ def chunk_head_of(record: Buffer) -> ChunkHead | None:
     return ChunkHead(opcode, length, first, last, size, crc, name.decode(), start, end)
 
 
+_Defines = records.Schema | records.Channel
+
+
 class Definition(NamedTuple):
     """A schema or channel, and the first row of the batch that it applies to, 0 to n."""
 
     row: int
-    record: records.Schema | records.Channel
+    record: _Defines
 
 
 class Damage(Struct, frozen=True):
@@ -152,62 +156,38 @@ def parse_content(buffer: Buffer, *, loose: bool = False, most: int = 1 << 62) -
     definition. More than `most` records, one that runs over the end, or one of the invalid kind 0
     raise a `SegmentError` that names the offset.
     """
-    walk = _Walk(buffer)
-    starts = np.fromiter(walk.messages(most, loose=loose), np.int64)
-    if walk.records > most:
+    found, definitions, unreadable = array("q"), list[Definition](), list[str]()
+    unpack, size, at, skipped = RECORD_HEAD.unpack_from, len(buffer), 0, 0
+    while at + HEAD <= size and len(found) + skipped <= most:  # over single messages
+        opcode, length = unpack(buffer, at)
+        end = at + HEAD + length
+        if end > size:
+            break
+        if opcode == _MESSAGE:
+            found.append(at)
+        elif not opcode or (loose and opcode not in _DEFINITIONS):
+            break
+        else:
+            skipped += 1
+            if opcode in _DEFINITIONS:
+                try:
+                    record, _ = read_record(opcode, memoryview(buffer)[at + HEAD : end])
+                except SegmentError as error:
+                    unreadable.append(str(error))
+                else:
+                    definitions.append(Definition(len(found), cast("_Defines", record)))
+        at = end
+    if len(found) + skipped > most:
         raise SegmentError("it holds too many records for its size")
-    if not loose and walk.end != len(buffer):
-        problem = f"runs over the end at {len(buffer)}" if buffer[walk.end] else "has no kind"
-        raise SegmentError(f"the record at byte {walk.end} of its content {problem}")
+    if not loose and at != size:
+        problem = f"runs over the end at {size}" if buffer[at] else "has no kind"
+        raise SegmentError(f"the record at byte {at} of its content {problem}")
+    starts = np.frombuffer(found, np.int64)
     batch, good = _batch(buffer, starts)
-    definitions = walk.definitions
     if not good.all():  # rows count valid messages only
         before = np.concatenate(([0], np.cumsum(good)))
         definitions = [Definition(int(before[one.row]), one.record) for one in definitions]
-    return ChunkContent(batch, definitions, starts[~good], walk.unreadable, walk.end)
-
-
-class _Walk:
-    """Walks from record to record; collects the definitions and the end position."""
-
-    def __init__(self, buffer: Buffer) -> None:
-        self.end = self.records = 0
-        self.definitions: list[Definition] = []
-        self.unreadable: list[str] = []
-        self._buffer = buffer
-
-    def messages(self, most: int, *, loose: bool) -> Iterator[int]:
-        """Yield the start of each message record. The only loop over single messages."""
-        buffer, at = self._buffer, 0
-        head, head_size = RECORD_HEAD.unpack_from, RECORD_HEAD.size
-        size = len(buffer)
-        last = size - head_size
-        row = skipped = 0
-        while at <= last and row + skipped <= most:
-            opcode, length = head(buffer, at)
-            end = at + head_size + length
-            if end > size:
-                break
-            if opcode == _MESSAGE:
-                yield at
-                row += 1
-            elif not opcode or (loose and opcode not in _DEFINITIONS):
-                break
-            else:
-                skipped += 1
-                if opcode in _DEFINITIONS:
-                    self._define(row, opcode, at + head_size, end)
-            at = end
-        self.end, self.records = at, row + skipped
-
-    def _define(self, row: int, opcode: int, start: int, end: int) -> None:
-        try:
-            record, _ = read_record(opcode, memoryview(self._buffer)[start:end])
-        except SegmentError as error:
-            self.unreadable.append(str(error))
-        else:
-            found = cast("records.Schema | records.Channel", record)
-            self.definitions.append(Definition(row, found))
+    return ChunkContent(batch, definitions, starts[~good], unreadable, at)
 
 
 def _batch(buffer: Buffer, starts: NDArray[np.int64]) -> tuple[Batch, NDArray[np.bool_]]:

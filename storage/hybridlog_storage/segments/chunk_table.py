@@ -82,12 +82,6 @@ class ChunkTable(Struct, frozen=True, eq=False):
         end = int(self.chunks["parts"][: number + 1].sum())
         return self.parts[end - int(self.chunks["parts"][number]) : end]
 
-    def with_added(self, added: int) -> ChunkTable:
-        """The table with all messages on channels whose ids are greater by a number."""
-        parts = self.parts.copy()
-        parts["channel"] += added
-        return replace(self, parts=parts)
-
     def as_stored(self) -> ChunkTable:
         """The table as the file has it: expired messages on the channel that they came on."""
         parts = self.parts.copy()

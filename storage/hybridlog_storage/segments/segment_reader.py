@@ -171,7 +171,9 @@ class SegmentReader:
         if recording is None:
             raise SegmentError(f"{self.path} is no segment of a hybridlog store.")
         if self._added:
-            table = table.with_added(self._added)
+            parts = table.parts.copy()
+            parts["channel"] += self._added
+            table = ChunkTable(table.chunks, parts)
         schemas = {i: schema_of(r) for i, r in records.schemas.items()}
         channels = {i: channel_of(r, schemas) for i, r in records.channels.items()}
         return SegmentSummary(
