@@ -269,16 +269,6 @@ def many(count: int, channel: int = 0, size: int = 100, step: int = 10**7) -> li
     return [(channel, bytes([i % 251]) * size, i * step, i * step, i) for i in range(count)]
 
 
-def test_large_payloads_do_not_share_chunks(tmp_path: Path) -> None:
-    rows = [row for pair in zip(many(200), many(200, 1, 5000), strict=True) for row in pair]
-    _, chunks = write(tmp_path, [rows], SegmentSettings(span_size=0))
-    for chunk in chunks:
-        assert len(set(chunk.batch.channel.tolist())) == 1
-        if int(chunk.batch.length[0]) == 5000:
-            span = int(chunk.batch.log_time.max() - chunk.batch.log_time.min())
-            assert span < SegmentSettings().chunk_span_ns
-
-
 @pytest.mark.parametrize("at_once", [1, 7, 100])
 def test_a_chunk_that_holds_little_spans_more(tmp_path: Path, at_once: int) -> None:
     setup = SegmentSettings()

@@ -157,27 +157,26 @@ def parse_content(buffer: Buffer, *, loose: bool = False, most: int = 1 << 62) -
     raise a `SegmentError` that names the offset.
     """
     found, definitions, unreadable = array("q"), list[Definition](), list[str]()
-    unpack, size, at, skipped = RECORD_HEAD.unpack_from, len(buffer), 0, 0
-    while at + HEAD <= size and len(found) + skipped <= most:  # over single messages
+    unpack, add, size, at, count = RECORD_HEAD.unpack_from, found.append, len(buffer), 0, 0
+    while at + HEAD <= size and count <= most:  # over single messages
         opcode, length = unpack(buffer, at)
         end = at + HEAD + length
         if end > size:
             break
         if opcode == _MESSAGE:
-            found.append(at)
+            add(at)
         elif not opcode or (loose and opcode not in _DEFINITIONS):
             break
-        else:
-            skipped += 1
-            if opcode in _DEFINITIONS:
-                try:
-                    record, _ = read_record(opcode, memoryview(buffer)[at + HEAD : end])
-                except SegmentError as error:
-                    unreadable.append(str(error))
-                else:
-                    definitions.append(Definition(len(found), cast("_Defines", record)))
+        elif opcode in _DEFINITIONS:
+            try:
+                record, _ = read_record(opcode, memoryview(buffer)[at + HEAD : end])
+            except SegmentError as error:
+                unreadable.append(str(error))
+            else:
+                definitions.append(Definition(len(found), cast("_Defines", record)))
         at = end
-    if len(found) + skipped > most:
+        count += 1
+    if count > most:
         raise SegmentError("it holds too many records for its size")
     if not loose and at != size:
         problem = f"runs over the end at {size}" if buffer[at] else "has no kind"

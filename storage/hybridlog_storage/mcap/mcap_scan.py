@@ -168,10 +168,9 @@ class Scan:
             return end, [Damage(at, end - at, why)]
 
     def _content(self, start: int, head: ChunkHead, end: int) -> ChunkContent:
-        if max(head.size, end - start) > self._limit or end > self._bytes.size:
-            raise SegmentError(
-                f"it claims {head.size} bytes uncompressed, more than the limit of {self._limit}"
-            )
+        most = max(head.size, end - start)
+        if most > self._limit or end > self._bytes.size:
+            raise SegmentError(f"it claims {most} bytes, more than the limit of {self._limit}")
         data = self._bytes.at(start, end - start, move=end - start <= _WINDOW)
         content = decompress(head.codec, data, head.size)
         if head.crc not in {0, crc32(content)}:
