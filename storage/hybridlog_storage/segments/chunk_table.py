@@ -15,7 +15,7 @@ from msgspec.structs import replace
 
 from hybridlog_storage.cache import RowType
 from hybridlog_storage.errors import SegmentError
-from hybridlog_storage.messages import EXPIRED_IDS, MARKS_CHANNEL, run_starts
+from hybridlog_storage.messages import EXPIRED_IDS, run_starts
 from hybridlog_storage.segments.compression import checked_frame, decompress
 
 if TYPE_CHECKING:
@@ -162,11 +162,6 @@ class ChunkPlace(Struct, frozen=True, kw_only=True):
     def end(self) -> int:
         """Byte behind what belongs to it."""
         return self.offset + self.length + self.trailer
-
-    @property
-    def is_expired(self) -> bool:
-        """True if its payloads were deleted, or are to be copied later."""
-        return EXPIRED_IDS <= self.channels[0] < MARKS_CHANNEL
 
 
 def places_of(table: ChunkTable) -> list[ChunkPlace]:
