@@ -347,7 +347,11 @@ class Session:
         known = self.shared.schemas
         wanted = {c.schema: c for c in recording.channels if c.schema is not None}
         if not wanted.keys() <= known.keys():
-            known |= schemas_in(self.directory, recording)
+            known |= self.catalog.schemas(wanted.keys() - known.keys())
+        if not wanted.keys() <= known.keys():
+            found = schemas_in(self.directory, recording)
+            known |= found
+            self.catalog.put_schemas(found.values())
         missing = wanted.keys() - known.keys()
         if any(c.schema in missing and c.stats.messages for c in recording.channels):
             for number in recording.logs:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 from msgspec import Struct, field
 
 from hybridlog_storage.copy_places import RefusedError, Sending
-from hybridlog_storage.errors import RecordingExistsError
+from hybridlog_storage.errors import RecordingExistsError, StoreError
 from hybridlog_storage.manifest import File, Manifest, replace
 from hybridlog_storage.manifests import MANIFEST_LOCK, MANIFEST_OLD, RECORDINGS, WRITER_LOCK
 from hybridlog_storage.stopping import pause, safe_point
@@ -224,6 +224,7 @@ class _Copy:
 
     def _publish(self, here: Manifest, there: Manifest | None, brought: set[int]) -> Manifest:
         manifests = self._target.manifests
+        self._check_files()
         if there is None:
             # Another process may be faster.
             with suppress(RecordingExistsError), manifests.creating() as create:
@@ -232,6 +233,14 @@ class _Copy:
                 create(made)
                 return made
         return manifests.change(here.id, lambda now: merged(here, now, brought))
+
+    def _check_files(self) -> None:
+        """Raise if files are no longer there: a removal that ends takes them along."""
+        if self._new and not self._new <= self._target.sizes(self._here.id).keys():
+            raise StoreError(
+                f"Files of {self._here.name} have gone from {self._target.address} meanwhile. "
+                "Copy again."
+            )
 
     def _clear(self, there: Manifest | None, now: Manifest, sizes: Mapping[str, int]) -> None:
         """Delete files that others have replaced, and what has arrived of those not to come."""
