@@ -10,12 +10,11 @@ from typing import Any
 import pytest
 
 import hybridlog as hl
-from hybridlog.entries import topic_of
 from hybridlog.maintenance import keep
 from hybridlog.maintenance.copying import CopyOptions
 from hybridlog.maintenance.verify import RESTORE
 from hybridlog_storage.errors import IncompleteError, StoreError
-from hybridlog_storage.manifest import File
+from hybridlog_storage.manifest import File, Manifest
 from tests import places
 from tests.cli.within import answer
 from tests.copies import bring
@@ -39,6 +38,10 @@ def gone(copy: Path) -> Path:
     """A store with a log that is gone and had two larger topics."""
     expire(copy, [0])
     return copy
+
+
+def topic_of(rows: File, manifest: Manifest) -> str:
+    return manifest.channels[next(iter(rows.parts))].topic
 
 
 def rows_of(store: Path, which: int) -> tuple[File, str]:
