@@ -261,12 +261,12 @@ class Follower:
                 if not segment.is_decoded:  # else tables may have its fields
                     self._damage[number, place.number] = str(error)
                 continue
+            group.append(chunk)
             size += len(chunk.batch.buffer)
             rows += len(chunk.batch)
-            if group and (size > _GROUP_BYTES or rows > _GROUP_ROWS):
+            if size >= _GROUP_BYTES or rows >= _GROUP_ROWS:
                 yield group
-                group, size, rows = [], len(chunk.batch.buffer), len(chunk.batch)
-            group.append(chunk)
+                group, size, rows = [], 0, 0
         if group:
             yield group
 
@@ -313,7 +313,7 @@ class Follower:
     def _connect(self) -> None:
         """Begin to send documents, also after the database has failed."""
         target = self._target
-        is_due = self.failure is None or time.monotonic() >= self._retry_at
+        is_due = time.monotonic() >= self._retry_at
         if self._sender is not None or not target.is_wanted or not is_due:
             return
         database = target.database if self.failure is None else None

@@ -385,7 +385,7 @@ def test_what_a_mongod_had_lost_when_it_died_is_indexed_again_and_counted_once(
         recording.write(speech, text(b"lost"), log_time=1)
         wait_for(lambda: recording.lag == 0 and recording.stored[0] == 1)
         database, key = store.shared.index.database_for("This"), recording.id[-16:]
-        assert database.delete(collection_of("/speech"), {"_meta.rec": key}) == 1
+        database.delete(collection_of("/speech"), {"_meta.rec": key})
         kill_mongod(store.directory.path)
         recording.write(speech, text(b"after"), log_time=2, publish_time=3)
         wait_for(lambda: recording.index_failure is not None)
