@@ -13,7 +13,7 @@ import numpy as np
 
 from hybridlog.arrays import VIDEOS
 from hybridlog.arrays.point_arrays import MAX_EMPTY, POINT_MAKERS, byte_array, check_rows, view_of
-from hybridlog_storage.errors import MissingDependencyError, PayloadError
+from hybridlog_storage.errors import PayloadError, extra
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -168,12 +168,8 @@ def _depth(form: str, data: bytes) -> NDArray[Any]:
 
 
 def _picture(data: bytes) -> NDArray[Any]:
-    try:
+    with extra("images", "compressed images need Pillow"):
         from PIL import Image, UnidentifiedImageError
-    except ImportError as error:
-        raise MissingDependencyError(
-            "compressed images need Pillow: pip install 'hybridlog[images]'"
-        ) from error
 
     # Pillow would silently cut these to eight bits.
     if data.startswith(_PNG) and data[24:25] == b"\x10" and data[25:26] != b"\x00":

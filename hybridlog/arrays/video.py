@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from hybridlog.arrays.message_arrays import attributes
 from hybridlog.arrays.point_arrays import byte_array
-from hybridlog_storage.errors import MissingDependencyError, PayloadError
+from hybridlog_storage.errors import MissingDependencyError, PayloadError, extra
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -172,12 +172,8 @@ def _leb128(data: bytes, at: int) -> tuple[int, int]:
 
 def pyav() -> Any:
     """The module of PyAV, or a `MissingDependencyError`."""
-    try:
+    with extra("video", "pictures of video need PyAV"):
         import av
-    except ImportError as error:
-        raise MissingDependencyError(
-            "pictures of video need PyAV: pip install 'hybridlog[video]'"
-        ) from error
     return av
 
 

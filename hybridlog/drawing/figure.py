@@ -17,7 +17,7 @@ from hybridlog.frames.names import is_summary
 from hybridlog.query.query import narrowed, spans_of
 from hybridlog.query.times import format_time
 from hybridlog.wording import listed
-from hybridlog_storage.errors import MissingDependencyError, UsageError
+from hybridlog_storage.errors import UsageError, extra
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -34,12 +34,8 @@ _UNITS = ((300, 1, "seconds"), (3 * 3600, 60, "minutes"), (3 * 86_400, 3600, "ho
 
 @contextmanager
 def _matplotlib() -> Iterator[None]:
-    try:
+    with extra("plot", "a plot needs matplotlib"):
         import matplotlib as mpl  # noqa: F401
-    except ImportError as error:
-        raise MissingDependencyError(
-            "a plot needs matplotlib: pip install 'hybridlog[plot]'"
-        ) from error
     with warnings.catch_warnings():
         # Letters that the font lacks are boxes; in a picture that is too small, names overlap.
         warnings.filterwarnings("ignore", "Glyph|constrained_layout")

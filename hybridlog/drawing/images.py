@@ -15,7 +15,7 @@ from isal import isal_zlib
 from msgspec import Struct
 
 from hybridlog.arrays.message_arrays import COMPRESSED_IMAGES, IMAGES, depth_picture
-from hybridlog_storage.errors import MissingDependencyError, PayloadError
+from hybridlog_storage.errors import PayloadError, extra
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -128,12 +128,8 @@ def _check_size(data: bytes) -> None:
 
 
 def _jpeg(shown: NDArray[np.uint8]) -> bytes:
-    try:
+    with extra("images", "JPEG needs Pillow"):
         from PIL import Image
-    except ImportError as error:
-        raise MissingDependencyError(
-            "JPEG needs Pillow: pip install 'hybridlog[images]'"
-        ) from error
 
     file = io.BytesIO()
     try:

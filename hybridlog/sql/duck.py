@@ -14,9 +14,9 @@ from typing import Any, Final, TypeVar
 
 from hybridlog_storage.errors import (
     HybridlogError,
-    MissingDependencyError,
     ResourceError,
     UsageError,
+    extra,
 )
 from hybridlog_storage.stopping import at_safe_points, safe_point
 from hybridlog_storage.threads import processors
@@ -50,10 +50,8 @@ os.environ.setdefault("MIMALLOC_ARENA_EAGER_COMMIT", "0")
 
 def duckdb() -> Any:
     """The package, or a `MissingDependencyError`."""
-    try:
+    with extra("sql", "SQL needs DuckDB"):
         return import_module("duckdb")
-    except ImportError as error:
-        raise MissingDependencyError("SQL needs DuckDB: pip install 'hybridlog[sql]'") from error
 
 
 def open_duckdb(memory: int) -> Any:

@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import errno
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, ClassVar, Final
 
 if TYPE_CHECKING:
@@ -169,6 +171,15 @@ class MissingDependencyError(HybridlogError):
     """An optional package is missing; the message says how to install it."""
 
     exit_code = 9
+
+
+@contextmanager
+def extra(name: str, what: str) -> Iterator[None]:
+    """Say which extra is to be installed where a package cannot be imported."""
+    try:
+        yield
+    except ImportError as error:
+        raise MissingDependencyError(f"{what}: pip install 'hybridlog[{name}]'") from error
 
 
 class DefinitionError(HybridlogError):

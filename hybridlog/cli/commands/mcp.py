@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from hybridlog.cli.binder import command
 from hybridlog.cli.options import Place
-from hybridlog_storage.errors import MissingDependencyError
+from hybridlog_storage.errors import extra
 
 
 @command(Place)
@@ -14,10 +14,8 @@ def mcp_command(given: Place) -> None:
     It speaks the Model Context Protocol over standard input and output. The store is only read;
     answers are bounded and say what they lack.
     """
-    try:
+    with extra("mcp", "mcp needs the package of this protocol"):
         from hybridlog.view.tool_server import serve
-    except ModuleNotFoundError as error:
-        raise MissingDependencyError("mcp needs: pip install 'hybridlog[mcp]'") from error
     from hybridlog.store import open_store
 
     with open_store(given.store, read_only=True) as opened:

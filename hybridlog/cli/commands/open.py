@@ -12,7 +12,7 @@ from hybridlog.cli.binder import command, option
 from hybridlog.cli.options import Filtered, Served
 from hybridlog.cli.signals import ended_by_signal
 from hybridlog.wording import listed
-from hybridlog_storage.errors import MissingDependencyError
+from hybridlog_storage.errors import extra
 
 if TYPE_CHECKING:
     from hybridlog.query.query import Query
@@ -44,12 +44,8 @@ def open_command(given: _Given) -> None:
     """
     import asyncio
 
-    try:
+    with extra("foxglove", "open needs websockets"):
         from hybridlog.view.playback.server import PlaybackServer
-    except ImportError as error:
-        raise MissingDependencyError(
-            "open needs websockets: pip install 'hybridlog[foxglove]'"
-        ) from error
     from hybridlog.view.playback.played import PlayedLog
 
     with given.opened() as store:

@@ -8,7 +8,7 @@ from hybridlog.cli import output
 from hybridlog.cli.binder import command
 from hybridlog.cli.options import AsJson, InStore, Served, one_recording
 from hybridlog.cli.signals import ended_by_signal
-from hybridlog_storage.errors import MissingDependencyError
+from hybridlog_storage.errors import extra
 
 
 class _Given(InStore, AsJson, Served):
@@ -26,12 +26,8 @@ def view_command(given: _Given) -> None:
     """
     from urllib.parse import quote
 
-    try:
+    with extra("view", "The view needs starlette and uvicorn"):
         from hybridlog.view.server import ViewServer
-    except ModuleNotFoundError as error:
-        raise MissingDependencyError(
-            "The view needs starlette and uvicorn: pip install 'hybridlog[view]'"
-        ) from error
     with given.opened() as store:
         server = ViewServer(store, given.port or 0)
         url = server.url

@@ -21,7 +21,7 @@ from __future__ import annotations
 from hybridlog.live.sources.base import Sink
 from hybridlog.live.sources.foxglove.protocol import parse_address, without_user
 from hybridlog.live.sources.network import LoopSource
-from hybridlog_storage.errors import MissingDependencyError
+from hybridlog_storage.errors import extra
 
 
 class FoxgloveSource(LoopSource):
@@ -50,10 +50,6 @@ class FoxgloveSource(LoopSource):
     def start(self, sink: Sink) -> None:
         """Begin to listen; the server need not be up yet."""
         address = parse_address(self._url)
-        try:
+        with extra("foxglove", "recording from Foxglove needs picows"):
             from hybridlog.live.sources.foxglove.connection import Client
-        except ImportError as error:
-            raise MissingDependencyError(
-                "recording from Foxglove needs picows: pip install 'hybridlog[foxglove]'"
-            ) from error
         self._begin_loop(sink, Client(sink, address, self._reached).run)
