@@ -200,14 +200,12 @@ def write_answer(
     settings: Mapping[str, Any] | None = None,
 ) -> None:
     """Write an answer, all or nothing; its counters are about what was written."""
-    from hybridlog.formats.slices import IN_FORCE, payload_bytes
+    from hybridlog.formats.slices import IN_FORCE
 
     counters, in_frame = query.counters, query.question.frame is not None
     answer = _answer_of(query, form, target, front or IN_FORCE, extras)
     completeness = query.completeness if strict and in_frame else None
-    size = payload_bytes(query) if isinstance(target, Path) and output.has_bars() else 0
-    about: Any = {"settings": settings, "counters": counters, "size": size}
-    written = _write(answer, form, target, completeness, **about)
+    written = _write(answer, form, target, completeness, settings=settings, counters=counters)
     if left_out := len(answer.unreadable):
         many = output.counted(left_out, "message")
         output.note(f"{many} left out; the first: {answer.unreadable[0]}.")
@@ -223,7 +221,6 @@ def _write(
     *,
     settings: Mapping[str, Any] | None = None,
     counters: Counters | None = None,
-    size: int = 0,
 ) -> int:
     """Write an answer, all of it or nothing, with progress; gives the number of rows or lines."""
     rows = 0
@@ -238,7 +235,7 @@ def _write(
 
     for name in ("lines", "tables", "batches", "points", "messages"):
         setattr(answer, name, _checked(told(getattr(answer, name)), completeness))
-    with Bar(form, size, quiet=not isinstance(target, Path)) as bar:
+    with Bar(form, quiet=not isinstance(target, Path)) as bar:
         OUTPUTS[form].write(answer, target, **settings or {})
     output.notes(answer.notes)
     return rows

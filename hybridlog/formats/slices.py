@@ -9,7 +9,6 @@ from copy import copy
 from typing import TYPE_CHECKING, Final
 
 from msgspec import Struct
-from msgspec.structs import replace
 
 from hybridlog.formats.answer import Answer
 from hybridlog.query.planner import Planner
@@ -52,15 +51,6 @@ def fingerprint(query: Query) -> str:
         for o in query.source.now().summaries_of(query.question)
     ]
     return hashlib.sha256(pickle.dumps((query.question, states), protocol=5)).hexdigest()
-
-
-def payload_bytes(query: Query) -> int:
-    """Bytes of payload of a slice, about."""
-    question = query.question
-    if not question.is_by_log_time:
-        question = replace(question, bounds=None)
-    parts = Planner(query.source.now(), question).split()
-    return int(sum(p.share * sum(s.payload_bytes for s in p.stats) for p in parts))
 
 
 def profile_of(query: Query) -> str:

@@ -15,7 +15,7 @@ from msgspec.structs import asdict
 from hybridlog.cli import options, output
 from hybridlog.cli.answers import check_room
 from hybridlog.cli.binder import command, option
-from hybridlog.cli.commands.keep import pin_cells, pin_dict
+from hybridlog.cli.commands.keep import pin_dict
 from hybridlog.cli.commands.ls import recording_dict, status_text
 from hybridlog.cli.options import AsJson, Choosing, Forced, InStore, names_argument, query_of
 from hybridlog.cli.output import Column, bytes_of, duration_of, print_fields, print_table
@@ -183,10 +183,6 @@ def _fields(store: Store, entry: RecordingEntry, about: dict[str, Any]) -> list[
         *(("", line_of(loss)) for loss in about["losses"]),
         *(("tag", f"{key}={value}") for key, value in sorted(entry.tags.items())),
         *(("note", note.text) for note in manifest.notes),
-        *(
-            ("pin", f"{one['id']}: {', '.join(filter(None, pin_cells(one)))}")
-            for one in about["pins"]
-        ),
         ("index", store.shared.index.place),
     ]
 

@@ -175,11 +175,6 @@ def pin_dict(pin: Pin) -> dict[str, Any]:
     return {"id": pin.id, "from": pin.first, "to": end, **about}
 
 
-def pin_cells(pin: dict[str, Any]) -> list[str]:
-    """From, to, topics and reason of a pin."""
-    return [column.cell(pin) for column in _PIN]
-
-
 def _keep(store: Store, rules: dict[str, Any], given: _Given) -> int:
     from hybridlog.maintenance.retention import Rules
 
