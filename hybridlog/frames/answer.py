@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 
 from hybridlog.columns.left_rows import LeftFields
 from hybridlog.frames.names import (
@@ -431,34 +430,17 @@ def columns(
 
 
 def in_order(column: pa.ChunkedArray[Any], order: NDArray[np.intp]) -> pa.ChunkedArray[Any]:
-    """The rows of a column in another order.
-
-    Strings and lists with more elements than 32-bit offsets allow are returned in pieces.
-    """
+    """The rows of a column in another order; what may be long for 32-bit offsets in pieces."""
     kind = column.type
-    size = _elements(column)
-    if size <= OFFSET_LIMIT:
+    if is_list(kind):
+        wide = column.cast(pa.large_list(kind.value_type))
+    elif pa.types.is_string(kind) or pa.types.is_binary(kind):
+        wide = column.cast(pa.large_binary() if pa.types.is_binary(kind) else pa.large_string())
+    else:
         return column.take(pa.array(order))
-    wide = column.cast(_large(kind))
-    count = max(1, len(order) * (OFFSET_LIMIT // 4) // size)
+    count = max(1, len(order) * (OFFSET_LIMIT // 16) // max(column.nbytes, 1))
     pieces: list[pa.Array[Any]] = []
     for begin in range(0, len(order), count):
         part = wide.take(pa.array(order[begin : begin + count]))
         pieces.extend(part.cast(kind).chunks)
     return pa.chunked_array(pieces, type=kind)
-
-
-def _elements(column: pa.ChunkedArray[Any]) -> int:
-    """Maximum number of elements, or bytes, at one level of a column of strings or lists."""
-    kind = column.type
-    if pa.types.is_string(kind) or pa.types.is_binary(kind):
-        return sum(pc.sum(pc.binary_length(chunk)).as_py() or 0 for chunk in column.chunks)
-    if pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind):
-        return sum(len(chunk.flatten()) for chunk in column.chunks)
-    return 0
-
-
-def _large(kind: pa.DataType) -> pa.DataType:
-    if is_list(kind):
-        return pa.large_list(kind.value_type)
-    return pa.large_binary() if pa.types.is_binary(kind) else pa.large_string()

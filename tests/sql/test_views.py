@@ -150,23 +150,6 @@ def test_arrays_come_from_payloads_only_when_they_are_named(store: hl.Store) -> 
     assert store.sql(near).rows() == [(language,)] == [(10,)]
 
 
-def test_each_chunk_is_read_once(store: hl.Store) -> None:
-    chunks = {
-        (chunk.segment, chunk.number)
-        for entry in store.recordings()
-        for chunk in store.session.chunks(
-            entry,
-            [c.id for c in entry.channels if c.topic == "/base/scan"],
-            None,
-            "log",
-        )
-    }
-    answer = store.sql("select sum(ranges[1]) from scan")
-    assert answer.rows() == [(sum(range(SCANS)),)]
-    assert answer.reading.counters.chunks_read == len(chunks)
-    assert len(chunks) > 3
-
-
 def test_plans_know_the_number_of_rows(store: hl.Store) -> None:
     ((_, plan),) = store.sql("explain select * from large").rows()
     assert f"~{LARGE + 40:,} row" in plan
