@@ -284,7 +284,7 @@ def test_memory_grows_with_what_comes_and_not_with_what_is_announced() -> None:
     ("greeting", "words"),
     [
         (b"\xff\xff\xff\xff", "connection header of 4294967295 bytes"),
-        (b"\x07\0\0\0\x03\0\0\0\xff\xfe\xfd", "no '='"),
+        (b"\x07\0\0\0\x03\0\0\0\xff\xfe\xfd", "header is malformed"),
         (b"\x20\0\0\0abc", "closed the connection within its header"),
         (framed(framed(b"error=you \x1b[31m may not")), "it refuses: you ?[31m may not"),
     ],

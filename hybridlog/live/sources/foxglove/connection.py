@@ -138,9 +138,6 @@ class Client:
             raise PeerError(
                 f"does not speak TLS ({error.reason or error}); try ws:// instead of wss://"
             ) from error
-        except socket.gaierror as error:
-            reason = f"host {place.host!r} is unknown ({error.strerror}); check its spelling"
-            raise PeerError(reason) from error
         except OSError as error:
             raise PeerError(_reason_of(error)) from error
         if listener is None:
@@ -326,16 +323,19 @@ class Session(WSListener):
 
     def _binary(self, data: bytes | memoryview) -> None:
         """Take a binary message."""
-        if len(data) < _HEAD.size or data[0] != MESSAGE_DATA:
-            self._other(data)
-            return
-        subscription, log_time = _HEAD.unpack_from(data)
-        route = self._routes.get(subscription)
+        received = time.time_ns()
+        route, log_time = None, 0
+        if len(data) >= _HEAD.size and data[0] == MESSAGE_DATA:
+            subscription, log_time = _HEAD.unpack_from(data)
+            route = self._routes.get(subscription)
+        elif data and data[0] != MESSAGE_DATA:
+            return  # such as an answer to a request
         if route is None:
-            self._ignored("messages of an unknown subscription", "of an unknown subscription")
+            detail = "a binary message that is of no subscription"
+            self._sink.lost(Loss(Cause.UNREADABLE, "", 1, received, received, detail))
+            self._say(f"sends {detail}; it is ignored")
             return
         channel, gaps = route
-        received = time.time_ns()
         if log_time >= _MAX_NS:
             self._say(
                 f"gives {channel.topic!r} a time after the year 2262; it is replaced by the "
@@ -349,29 +349,13 @@ class Session(WSListener):
             if gaps.waiting:
                 self._report(channel.topic, gaps.confirmed())
 
-    def _other(self, data: bytes | memoryview) -> None:
-        """Ignore what is no message, such as answers to requests."""
-        if not data:
-            self._ignored("an empty binary message")
-        elif data[0] == MESSAGE_DATA:
-            self._ignored(f"a message of {len(data)} bytes, shorter than its header")
-
-    def _ignored(self, what: str, detail: str = "too short for a message") -> None:
-        """Note a lost message of an unknown topic."""
-        now = time.time_ns()
-        self._sink.lost(Loss(Cause.UNREADABLE, "", 1, now, now, detail))
-        are = "they are" if what.startswith("messages") else "it is"
-        self._say(f"sends {what}; {are} ignored")
-
     # JSON messages.
 
     def _text(self, data: bytes) -> None:
         """Handle a JSON message; operations that do not matter to a recorder are ignored."""
-        try:
+        message: object = None
+        with suppress(ValueError, RecursionError):
             message = json.loads(data.decode())
-        except (ValueError, RecursionError) as error:
-            self._say(f"sent a message that is not JSON ({error}); it is ignored")
-            return
         match message:
             case {"op": "advertise", "channels": list(channels)}:
                 self._advertise(channels)
@@ -379,14 +363,12 @@ class Session(WSListener):
                 for number in numbers:
                     if type(number) is int and number in self._subscriptions:
                         self._retire(number)
-            case {"op": "advertise" | "unadvertise" as operation}:
-                self._say(f"sent something else than a list of channels to {operation}")
-            case {"op": "status"}:
-                self._status(str(message.get("message")))
-            case {"op": str()}:
+            case {"op": "status", **about}:
+                self._status(str(about.get("message")))
+            case {"op": str(operation)} if operation not in {"advertise", "unadvertise"}:
                 pass
             case _:
-                self._say("sent a JSON message without an operation ('op'); it is ignored")
+                self._say("sent a text that is no message of Foxglove; it is ignored")
 
     def _advertise(self, channels: list[object]) -> None:
         wanted: list[_Subscription] = []

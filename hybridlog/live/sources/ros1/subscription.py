@@ -234,16 +234,10 @@ def decode_header(body: bytes) -> dict[str, str]:
     fields: dict[str, str] = {}
     pos = 0
     while pos < len(body):
-        if pos + 4 > len(body):
-            raise PeerError(f"its header has {len(body) - pos} surplus bytes")
-        end = pos + 4 + u32(body, pos)[0]
-        if end > len(body):
-            raise PeerError(f"a field of its header exceeds it by {end - len(body)} bytes")
+        end = pos + 4 + int.from_bytes(body[pos : pos + 4], "little")
         key, equals, value = body[pos + 4 : end].partition(b"=")
-        if not equals:
-            raise PeerError(f"a field of its header has no '=': {one_line(key)}")
-        if len(fields) == _MAX_FIELDS:
-            raise PeerError(f"its header has more than {_MAX_FIELDS} fields")
+        if end > len(body) or not equals or len(fields) == _MAX_FIELDS:
+            raise PeerError(f"its header is malformed at byte {pos}")
         fields[key.decode(errors="replace").strip()] = value.decode(errors="replace")
         pos = end
     return fields
