@@ -143,11 +143,6 @@ def choose(directory: StoreDirectory, named: Sequence[str]) -> list[str]:
         UsageError: No recorder runs, several run and no name is given, or a name matches
             none or several.
     """
-    if directory.is_remote:
-        raise UsageError(
-            f"No recorder runs in the bucket of {directory.path}; `hybridlog mark --at` marks "
-            "recordings there."
-        )
     names = running(directory)
     if not names:
         raise UsageError("No recorder runs on this store; start one with `hybridlog record`.")

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 _MIN_PAUSE_S: Final = 0.001  # messages that are due within it go out together
 _MAX_PAUSE_S: Final = 3600.0
-_LATE_S: Final = 0.5
 
 
 class ReplaySource(ThreadedSource):
@@ -34,8 +33,7 @@ class ReplaySource(ThreadedSource):
     it is unknown. Attachments and metadata of an MCAP file are ignored.
 
     Args:
-        speed: Seconds of the log per second, above zero. A sink or disk that cannot keep up is
-            reported once.
+        speed: Seconds of the log per second, above zero.
     """
 
     kind = "replay"
@@ -47,12 +45,10 @@ class ReplaySource(ThreadedSource):
         self._speed = speed
         self._source: Source
         self._sink: Sink
-        self._is_late = False
         self._present: set[str] = set()
         self._channels: list[Channel | None] = []
         self._told = 0  # damaged places
         self._began: float | None = None  # monotonic time of log time 0
-        self._newest = 0
 
     def check(self) -> None:
         """Check that the log can be opened."""
@@ -110,14 +106,6 @@ class ReplaySource(ThreadedSource):
         while (pause := self._began + at - time.monotonic()) > 0:
             if self._stopping.wait(min(max(pause, _MIN_PAUSE_S), _MAX_PAUSE_S)):
                 return False
-        # A message in the wrong place of the log is not played late.
-        if -pause > _LATE_S and log_time >= self._newest and not self._is_late:
-            self._is_late = True
-            self._sink.say(
-                f"{self.address}: cannot be played at speed {self._speed:g}, messages are "
-                f"{-pause:.1f} s late; none is skipped, but a lower speed keeps their timing"
-            )
-        self._newest = max(self._newest, log_time)
         return not self._stopping.is_set()
 
     def _tell_news(self) -> None:

@@ -18,7 +18,6 @@ from hybridlog_storage.messages import Channel, Schema
 from tests import independent
 from tests.calls import Calls
 from tests.data import DATA, needs_data
-from tests.limits import Limit
 from tests.live.sources.heard import Heard
 
 BEGIN = 1_700_000_000_000_000_000
@@ -188,16 +187,6 @@ def test_only_what_is_wanted_is_played(tmp_path: Path) -> None:
     assert len(heard.taken) == 10
     assert asked == [("/a", "T"), ("/b", "T")]
     assert heard.topics == [("/b", "T"), ("/b",)]
-
-
-def test_falling_behind_is_said_once(tmp_path: Path, limit: Limit) -> None:
-    limit(replay_late_s=0.0)
-    path = write(tmp_path / "a.mcap", [("/a", BEGIN + at, b"x") for at in range(100)])
-    heard = Heard()
-    play(path, heard)
-    (line,) = heard.said
-    assert "cannot be played at speed 1e+09" in line
-    assert len(heard.taken) == 100
 
 
 def test_what_is_not_wanted_takes_its_time_all_the_same(
