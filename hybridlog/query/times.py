@@ -297,8 +297,8 @@ def _duration(word: str) -> int | None:
     match = _DURATION.fullmatch(word)
     if not word or match is None:
         return None
-    parts = zip(match.groups("0")[::2], match.groups("0")[1::2], _UNITS, strict=True)
-    found = [Fraction(f"{whole}.{part}") * size for whole, part, (_, size) in parts]
+    parts = zip(match.groups()[::2], match.groups()[1::2], _UNITS, strict=True)
+    found = [Fraction(f"{one}.{part or 0}") * size for one, part, (_, size) in parts if one]
     return _exact(sum(found, Fraction(0)), word)
 
 

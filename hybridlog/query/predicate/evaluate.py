@@ -323,13 +323,16 @@ def _absolute(values: Any) -> Any:
 def _apart(found: _Values, part: str | int | Slice | None = None) -> Iterator[_Values]:
     """Values in JSON text, apart by the types that they have; of objects a field that is wanted."""
     wanted = [[part]] if isinstance(part, str) else None
-    alike: dict[pa.DataType, tuple[list[Any], list[int]]] = defaultdict(lambda: ([], []))
+    alike: dict[object, tuple[list[Any], list[int]]] = defaultdict(lambda: ([], []))
     for row, value in zip(found.rows.tolist(), plain_values(found.values), strict=True):
-        values, rows = alike[values_array([value], wanted).type]
+        kind: object = type(value)
+        if kind in {list, dict} or (kind is int and not LOW <= value <= HIGH):
+            kind = values_array([value], wanted).type
+        values, rows = alike[kind]
         values.append(value)
         rows.append(row)
     for kind, (values, rows) in alike.items():
-        made = values_array(values, wanted)
+        made: Any = values_array(values, wanted)
         if kind == _JSON:  # an integer beyond 64 bits, or what is nested too deeply
             are_integers = all(isinstance(value, int) for value in values)
             made = np.array(values, object) if are_integers else None
