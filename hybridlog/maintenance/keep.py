@@ -55,6 +55,7 @@ from hybridlog_storage.manifest import (
     LetGo,
     Loss,
     Manifest,
+    digest_of,
     replace,
     with_rows,
     with_totals,
@@ -73,6 +74,7 @@ if TYPE_CHECKING:
 
 _WHOLE: Final = -1
 _MAX_ROUNDS: Final = 20  # rows take room, too: then a little more has to go
+_PIECE: Final = 1 << 20
 SPARE: Final = "spare"
 """File whose room a pass uses for manifests and rows when the disk is full."""
 _SPARE_BYTES: Final = 8 << 20
@@ -309,8 +311,8 @@ def expire(
     freed = sum(log.bytes for log in going)
     if manifest.is_ended:
         _remove_arrays(directory, manifest, going)
-    rows, there = manifest.rows, directory.listing(recording)
-    ready = [log for log in going if log.number in rows and there.has_all(rows[log.number])]
+    path, rows = directory.recording(recording), manifest.rows
+    ready = [log for log in going if _are_whole(path, rows.get(log.number, ()))]
     gone = {"gone": "expired", "copy": copy}
     _list(directory, recording, {log.number: () for log in ready}, check, gone)
     for log in (one for one in going if one not in ready):
@@ -346,6 +348,18 @@ def _have_rows(
             return
         use_spare(directory)
         time.sleep(_POLL_S)
+
+
+def _are_whole(path: Path, rows: Collection[File]) -> bool:
+    """True if files of rows are as listed: they will be all that is left."""
+    try:
+        for line in rows:
+            with os.fdopen(files.open_file(path / line.name, os.O_RDONLY), "rb") as file:
+                if digest_of(iter(partial(file.read, _PIECE), b"")) != line.digest:
+                    return False
+    except OSError:
+        return False
+    return bool(rows)
 
 
 def _lines_of(number: int, manifest: Manifest) -> list[File]:
