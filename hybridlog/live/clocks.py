@@ -40,13 +40,9 @@ _CDR = {0: struct.Struct(">4xiI"), 1: struct.Struct("<4xiI")}
 class SimulatedTime:
     """Passes messages on to a recorder, with the time of `/clock` as their receive time.
 
-    It is a `Sink`; what is not about times is done by the recorder.
-
-    Args:
-        recorder: Takes them.
-        drop: Counts a message as received and lost; called with its channel, the bytes of its
-            payload, the cause, a text for the user and the time of the loss, ns.
-        max_bytes: Memory for messages that come before the clock.
+    It is a `Sink`; what is not about times is done by the recorder. Messages that come before the
+    clock are held in `max_bytes`. `drop` counts one as received and lost: its channel, bytes of its
+    payload, cause, a text for the user, time of the loss (ns).
     """
 
     def __init__(
@@ -214,13 +210,7 @@ _MAX_KEPT_JUMPS: Final = 1000
 
 
 class Jump(NamedTuple):
-    """The clock was set.
-
-    Attributes:
-        at: Steady time, ns.
-        by: Nanoseconds forward; negative for back.
-        set_by: Sum of all jumps, this one included, ns.
-    """
+    """The clock was set, at a steady time, forward or back; in all, this one included. All ns."""
 
     at: int
     by: int
@@ -228,15 +218,9 @@ class Jump(NamedTuple):
 
 
 class MachineClock:
-    """Notices when the clock is set. Thread safe.
+    """Notices when the clock is set: by `set_by` ns since the beginning. Thread safe.
 
-    Args:
-        now: Returns its time, ns since the epoch.
-        monotonic: Returns a time that nobody sets, ns.
-
-    Attributes:
-        now: As above.
-        set_by: Nanoseconds by which it was set since the beginning, as far as noticed.
+    `now` returns its time, ns since the epoch, `monotonic` one that nobody sets, ns.
     """
 
     def __init__(

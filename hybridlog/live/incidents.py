@@ -234,9 +234,7 @@ class SilenceWatch:
     def look(self, now: int, *, is_end: bool = False) -> None:
         """Note the silences that have begun since the last look, and those that have ended.
 
-        Args:
-            now: The present time, ns.
-            is_end: True if the recording ends now, and with it all silences.
+        `now` is in ns; with `is_end` the recording ends now, and with it all silences.
         """
         with self._lock:
             over, self._over = self._over, []

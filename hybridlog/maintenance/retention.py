@@ -275,14 +275,8 @@ def may_go(log: File) -> bool:
 class Step(Struct, frozen=True):
     """A deletion; without segments and groups, that of the whole recording, with its fields.
 
-    Attributes:
-        recording: Name of the recording.
-        id: Its id.
-        segments: Numbers of the segments whose payloads go.
-        bytes: About the bytes that become free.
-        reason: Why it goes; empty for a ring.
-        groups: Numbers of the groups of segments that go with their fields.
-        but: Numbers of segments of these that stay.
+    Of `segments` the payloads go, of `groups` the fields, too, but for the segments `but`. About
+    so many `bytes` become free. The `reason` is empty for a ring.
     """
 
     recording: str
