@@ -6,7 +6,7 @@ the folder that somebody may find after the power has failed.
 
 The model: writes to a file reach the disk in any order, in pieces of a sector, or not at all,
 until the file is synced. Names reach it in order, until the folder is synced. To sync a file
-keeps its name, too, as journalling file systems do; others do not, see `keeps_names`. A file
+keeps its name, too, as journalling file systems do. A file
 that is renamed into another folder keeps its old name until that folder has the new one.
 """
 
@@ -82,22 +82,15 @@ class PowerCut(System):
     Args:
         root: The folder that is watched, as it is now.
         calls: How many calls work; None for all.
-        keeps_names: Whether a file that is synced keeps its name.
-        forgets: Tells of a sync whether it is to do nothing.
     """
 
     def __init__(
         self,
         root: Path,
         calls: int | None = None,
-        *,
-        keeps_names: bool = True,
-        forgets: Callable[[], bool] = lambda: False,
     ) -> None:
         self.calls = 0
         self._left = calls
-        self._keeps_names = keeps_names
-        self._forgets = forgets
         self._files: dict[int, _File] = {}
         self._folders: dict[int, _Folder] = {}
         self._numbers: dict[int, int] = {}
@@ -154,8 +147,6 @@ class PowerCut(System):
 
     def sync(self, fd: int) -> None:
         self._step()
-        if self._forgets():
-            return
         number = self._number(os.fstat(fd))
         if number in self._folders:
             folder = self._folders[number]
@@ -174,7 +165,7 @@ class PowerCut(System):
                 _put(content, position, data)
         file.durable = bytes(content)
         file.pending.clear()
-        for folder in self._folders.values() if self._keeps_names else ():
+        for folder in self._folders.values():
             places = [n for n, change in enumerate(folder.pending) if change[2] == number]
             if places and folder.pending[places[0]][0] is None:  # it is new
                 count = places[0] + 1

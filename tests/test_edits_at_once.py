@@ -86,7 +86,7 @@ def start(script: str, *args: object) -> subprocess.Popen[str]:
 
 @pytest.mark.parametrize(
     ("editors", "edits"),
-    [(4, 5), pytest.param(10, 50, marks=[pytest.mark.slow, pytest.mark.timeout(1800)])],
+    [(4, 5), pytest.param(10, 50, marks=[pytest.mark.exhaustive, pytest.mark.timeout(1800)])],
 )
 def test_what_was_acknowledged_while_it_was_recorded_is_there(
     tmp_path: Path, editors: int, edits: int
@@ -145,7 +145,7 @@ def keep(
 
 
 @pytest.mark.parametrize(
-    "rounds", [6, pytest.param(60, marks=[pytest.mark.slow, pytest.mark.timeout(1800)])]
+    "rounds", [6, pytest.param(60, marks=[pytest.mark.exhaustive, pytest.mark.timeout(1800)])]
 )
 @pytest.mark.parametrize("protect", ["pin", "tag"])
 def test_what_was_protected_first_outlasts_retention(

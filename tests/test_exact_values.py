@@ -47,11 +47,6 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
         yield opened
 
 
-IMAGE = (
-    b"uint32 width\nuint32 height\nstring encoding\nuint8 is_bigendian\nuint32 step\nuint8[] data"
-)
-
-
 def record_made(recorder: Any) -> None:
     """Two topics whose fields are called as columns of ours are."""
     text = b"Header header\nuint32 seq\nstring recording\nfloat64 log_time\nint64[] many\n" + (
@@ -59,10 +54,6 @@ def record_made(recorder: Any) -> None:
     )
     channel = Channel("/own", "ros1", Schema("p/Own", "ros1msg", text), {}, True)
     plain = Channel("/plain", "ros1", Schema("p/Plain", "ros1msg", b"float32[] r\nstring s"))
-    image = Channel("/images", "ros1", Schema("sensor_msgs/Image", "ros1msg", IMAGE))
-    for n, encoding in enumerate((b"mono8", b"xxxxx", b"mono8")):
-        payload = struct.pack("<II5sBII2s", 1, 5, encoding, 0, 2, 2, bytes([n + 1, n + 2]))
-        recorder.write(image, struct.pack("<I", 2) + payload, log_time=1000 + n)
     for n in range(10):
         many = struct.pack(f"<I{n}q", n, *((1 << 62) + k for k in range(n)))
         payload = struct.pack("<III", n, 7, 8 + n) + struct.pack("<I", 1) + b"f"
@@ -259,38 +250,6 @@ def test_protobuf_is_whole_in_every_output(store: hl.Store) -> None:
 
 
 # --- names ------------------------------------------------------------------------------
-
-
-def test_a_field_called_topic_and_the_topic(store: hl.Store) -> None:
-    from rosbags.rosbag1 import Reader
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-    types = get_typestore(Stores.ROS1_NOETIC)
-    with Reader(CASES / "z_dup_stamp.bag") as reader:
-        for connection in reader.connections:
-            types.register(get_types_from_msg(connection.msgdef.data, connection.msgtype))
-        seen: list[tuple[str, int, Any]] = [
-            (connection.topic, time, types.deserialize_ros1(raw, connection.msgtype))
-            for connection, time, raw in reader.messages()
-        ]
-    names = {topic for topic, _, message in seen if hasattr(message, "topic")}
-    assert names
-    for topic in names:
-        wanted: list[Any] = [message.topic for name, _, message in seen if name == topic]
-        query = store.topic(topic).in_recording("z_dup_stamp")
-        both = query.fields("topic")
-        table = both.to_arrow()
-        assert table["topic"].to_pylist() == [topic] * len(wanted)
-        assert table["topic_"].to_pylist() == wanted
-        assert table.schema.field("topic_").metadata == {b"hybridlog.field": b"topic"}
-        assert parquet(query)["topic_"].to_pylist() == wanted
-        assert [float(row["topic_"]) for row in csv_rows(query)] == wanted
-        rows = json_lines(query)
-        assert [(row["topic"], row["topic_"]) for row in rows] == [(topic, w) for w in wanted]
-        frame = query.to_pandas()
-        assert frame["topic_"].tolist() == wanted
-    everything = store.all_topics().in_recording("z_dup_stamp").to_pandas()
-    assert everything["topic"].tolist() == [topic for topic, _, _ in seen]
 
 
 def test_columns_of_ours(store: hl.Store) -> None:

@@ -11,7 +11,6 @@ import pytest
 
 import hybridlog as hl
 from benchmarks.simulator.write import write_bag
-from hybridlog_storage.settings import StoreSettings, write_settings
 from tests import places
 from tests.other_user import User, needs_root, open_place
 from tests.waiting import wait_for
@@ -164,17 +163,6 @@ def test_somebody_outside_of_the_group_changes_nothing(place: Path) -> None:
 
 
 @needs_root
-def test_a_store_for_its_owner_alone(place: Path) -> None:
-    home = place / "open"
-    home.mkdir()
-    home.chmod(0o777)
-    ann, bob = User(place, 12345, umask=0o077), User(place, 12346)
-    ann.run("record", place / "small.bag", "-q", "--store", home / "store")
-    done = bob.run("ls", "--store", home / "store", code=5)
-    assert "Permission denied" in done.err
-
-
-@needs_root
 def test_root_takes_no_ones_server(place: Path) -> None:
     ann = User(place, 12345, 12345, (LAB,), 0o002)
     store = place / "lab" / "store"
@@ -185,21 +173,6 @@ def test_root_takes_no_ones_server(place: Path) -> None:
     theirs = [store / "mongod", *(store / "mongod").rglob("*")]
     assert {p.stat().st_uid for p in theirs if p.exists()} == {ann.uid}
     ann.run(*ASK, "--store", store)
-
-
-@needs_root
-def test_a_name_that_is_taken(place: Path) -> None:
-    ann = User(place, 12345, 12345, (LAB,), 0o002)
-    store = place / "lab" / "store"
-    places.root(store).mkdir(parents=True)
-    for name in ("mongod", f"mongod-{ann.uid}"):
-        (store / name).mkdir()
-    write_settings(store, StoreSettings("x"))
-    places.root(store).chmod(0o2775)
-    store.chmod(0o2775)
-    done = ann.run("index", "rebuild", "--store", store, code=6)
-    assert "belongs to another user" in done.err
-    assert "Remove it" in done.err
 
 
 # --- what others can and cannot read ---

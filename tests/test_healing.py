@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import psutil
 import pytest
@@ -21,21 +20,16 @@ from pymongo import MongoClient
 import hybridlog as hl
 from benchmarks.simulator.write import write_bag
 from benchmarks.usage import working_below
-from hybridlog.columns.tables import TableRows, TopicTable
 from hybridlog.index import access
-from hybridlog.query import index_reader
-from hybridlog.query.planner import Planner
 from hybridlog_storage.cells import CATALOG
 from hybridlog_storage.errors import (
-    ConnectionLostError,
     DatabaseError,
     ResourceError,
-    StoreError,
 )
 from hybridlog_storage.mongo.database import Database
 from tests.calls import Calls
 from tests.cli.running import run
-from tests.damage import WAYS
+from tests.damage import OF_MONGOD
 from tests.indexed import EVERYTHING, misindexed
 from tests.servers.mongods import Mongod, free_port
 from tests.some import in_turn
@@ -92,32 +86,13 @@ def documents(store: hl.Store) -> list[int]:
 
 # --- damaged data files ---
 
-SOME = [
-    "WiredTiger.turtle garbled",  # mongod does not start
-    "a collection removed",  # mongod ends when a question needs it
-]
 
-
-def heal(store: Path, way: str) -> str:
-    """Damage the index; return what the commands say until all is well again."""
-    WAYS[way](store / "mongod" / "data")
-    said = ""
-    for _ in range(2):
-        said += run("index", "rebuild", store=store).err
-    return said
-
-
-@pytest.mark.parametrize("way", SOME)
+@pytest.mark.parametrize("way", ["turtle garbled", "collection removed"])
 def test_a_damaged_index_is_made_again(store: Path, way: str) -> None:
-    said = heal(store, way)
+    OF_MONGOD[way](store / "mongod" / "data")
+    said = "".join(run("index", "rebuild", store=store).err for _ in range(2))
     assert said.startswith(REPLACED)
     assert len(said.splitlines()) == 2
-
-
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("way", WAYS)
-def test_an_index_damaged_in_any_way_is_made_again(store: Path, way: str) -> None:
-    assert len(heal(store, way).splitlines()) <= 2
 
 
 def test_the_running_question_is_answered(store: Path) -> None:
@@ -126,7 +101,7 @@ def test_the_running_question_is_answered(store: Path) -> None:
         want = documents(opened)
         scans = [m.seq for m in opened.topic(SCAN).where(WHERE)]
     ended(store)
-    WAYS["a collection garbled behind the head"](store / "mongod" / "data")
+    OF_MONGOD["collection garbled"](store / "mongod" / "data")
     with hl.open(store, require_database=True) as opened:
         asked = opened.topic(IMU).where(EVERYTHING)
         assert asked.count() + asked.counters.unindexed == want[0]
@@ -148,7 +123,7 @@ def test_a_foreign_mongodb_is_only_told_about(store: Path, tmp_path: Path) -> No
         data = tmp_path / "other"
         assert want
     shutil.copytree(data, tmp_path / "kept")
-    WAYS["WiredTiger.turtle garbled"](data)
+    OF_MONGOD["turtle garbled"](data)
     before = sorted(p.name for p in data.iterdir())
     with hl.open(store, mongo=f"{uri}&serverSelectionTimeoutMS=300") as opened:
         with pytest.raises(DatabaseError, match="does not answer"):
@@ -229,40 +204,6 @@ def test_an_unreachable_server_is_not_waited_for_by_each_question(
         with other_mongod(tmp_path, port=port):
             assert sum(documents(opened)) == 0  # nothing is indexed there
             assert len(tried) == 2
-
-
-def test_chunks_go_on_where_a_table_fails(store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with hl.open(store) as opened:
-        question = opened.topic(IMU).where(WHERE).question
-        planner = Planner(opened.session, question)
-        part = planner.parts()[0]
-        want = [row for found in planner.outcomes(part) for row in zip(*found[:3], strict=True)]
-
-        def breaking(table: TopicTable, *asked: Any, **more: Any) -> Iterator[TableRows]:
-            for found in scan(table, *asked, **more):
-                yield found.slice(0, 7)
-                raise StoreError("gone")
-
-        scan = TopicTable.scan
-        monkeypatch.setattr(TopicTable, "scan", breaking)
-        planner = Planner(opened.session, question)
-        got = [row for found in planner.outcomes(part) for row in zip(*found[:3], strict=True)]
-        assert got == want
-        assert len(want) > 100
-
-
-def test_what_only_mongodb_knows_is_asked_once_more(store: Path, calls: Calls) -> None:
-    def breaking(*_: object) -> None:
-        if len(read) == 1:
-            raise ConnectionLostError("gone")
-
-    with hl.open(store, require_database=True) as opened:
-        asked = opened.topic(IMU).where({"header.seq": {"$mod": [7, 0]}})
-        want = [(m.recording, m.seq) for m in asked]
-        assert len(want) > 20
-        read = calls(index_reader, "_numbers", breaking)
-        assert [(m.recording, m.seq) for m in asked] == want
-        assert len(read) == 3  # two groups of recordings, one of them twice
 
 
 @pytest.mark.parametrize("name", ["mongod", "mongod/data"])

@@ -21,7 +21,6 @@ from benchmarks.simulator.write import write_bag
 from hybridlog_storage.errors import HybridlogError, StoreError
 from hybridlog_storage.mongo.mongod import EmbeddedMongod
 from tests import places
-from tests.cli.running import run
 from tests.some import in_turn
 from tests.waiting import wait_for
 
@@ -324,44 +323,6 @@ def test_symlinks_that_come_while_mongod_runs(tmp_path: Path) -> None:
 
 
 # --- by the commands ---
-
-
-def test_the_commands(tmp_path: Path, bag: Path) -> None:
-    """As a user does it, with the store's own MongoDB, and several symlinks at once."""
-    store = tmp_path / "store"
-    run("record", bag, "-q", store=store)
-    wait_for(lambda: not (store / "mongod/data/mongod.lock").read_bytes())
-    victims = Victims(tmp_path / "victims")
-    targets = {
-        store / "mongod/mongod.log": "a",
-        store / "mongod/data/new.wt": "b",
-        places.folder(store, "small") / "writer.lock": "new",
-        store / "recorders/live.json": "d",
-    }
-    for place, victim in targets.items():
-        place.parent.mkdir(exist_ok=True)
-        place.unlink(missing_ok=True)
-        place.symlink_to(victims.place / victim)
-        if victim != "new":
-            (victims.place / victim).write_text(f"precious {victim}")
-    victims.watch()
-    commands: list[tuple[object, ...]] = [
-        ("ls",),
-        ("info",),
-        ("fetch", "-t", "/imu/data", "--count", "-q"),
-        ("fetch", "-t", "/imu/data", "--where", "header.seq >= 0", "--count", "-q"),
-        ("rm", "-y", "nosuch"),
-        ("verify", "-q"),
-        ("index", "rebuild", "-q"),
-        ("top", "--once"),
-        ("mark", "here"),
-        ("record", bag, "--again", "-q"),
-        ("record", "--replay", bag, "--name", "live", "--duration", "1s", "-q"),
-        ("rm", "-y", "small"),
-    ]
-    for command in commands:
-        run(*command, store=store, code=None)
-        victims.check()
 
 
 def test_every_kind_of_file_is_tried(tmp_path: Path, bag: Path) -> None:

@@ -2,44 +2,27 @@
 
 from __future__ import annotations
 
-import fcntl
-import os
 import re
 import shutil
-from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, suppress
-from itertools import count
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 import hybridlog as hl
-from hybridlog.columns.folders import files_of
-from hybridlog.index.access import IndexAccess
-from hybridlog.maintenance.copying import Copying
 from hybridlog.maintenance.verify import become_another
-from hybridlog_storage.disk import files
 from hybridlog_storage.errors import (
-    HeldError,
-    HybridlogError,
-    RecordingGoneError,
     StoreError,
     TimeError,
     TopicError,
 )
 from hybridlog_storage.manifest import replace
-from hybridlog_storage.manifests import MANIFEST_LOCK, manifests_at
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.mongo.database import Database
 from hybridlog_storage.mongo.index_documents import IndexState
 from hybridlog_storage.segments.segment_writer import SegmentSettings
-from tests import logs, places
-from tests.copies import bring
-from tests.damage import flip
+from tests import places
 from tests.independent import write_mcap
-from tests.limits import Limit
 from tests.running.running import NO_MONGODB as NOWHERE
 from tests.waiting import wait_for
 
@@ -217,179 +200,6 @@ def test_a_removal_that_was_announced_is_finished(place: Path, mongo: str) -> No
         database = store.shared.index.database_for("This")
         assert database.count("n", {}) == 0
         assert IndexState(database).of() == {}
-
-
-class Exchange:
-    """Another process removes a recording, before or after a folder is opened.
-
-    Args:
-        recording: Its folder.
-        step: The opening, from 0.
-        after: Whether the folder is open already.
-    """
-
-    def __init__(self, recording: Path, step: int, *, after: bool):
-        self.recording = recording
-        self.left = step
-        self.after = after
-        self.is_over = False
-
-    @contextmanager
-    def folder(self, path: Path) -> Iterator[int]:
-        if not self.after:
-            self.take()
-        with FOLDER(path) as fd:
-            if self.after:
-                self.take()
-            yield fd
-
-    def take(self) -> None:
-        self.left -= 1
-        if self.left == -1:
-            self.is_over = True
-            with ExitStack() as held, suppress(BlockingIOError, HeldError, RecordingGoneError):
-                for path in self.recording.glob("writer.lock"):
-                    fd = os.open(path, os.O_RDONLY)
-                    held.callback(os.close, fd)
-                    fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)  # as who removes one does
-                manifests_at(self.recording).remove(self.recording.name)
-
-
-def is_removed(store: Path, recording: str) -> bool:
-    """Whether a recording is gone, or about to."""
-    try:
-        return places.read_in(places.root(store) / recording) is None
-    except RecordingGoneError:
-        return True
-
-
-_LOCKS = {"writer.lock", MANIFEST_LOCK}
-
-
-def content_of(store: Path, recording: str) -> dict[str, bytes]:
-    """Files of a recording, by its id, and their content; empty if it is gone."""
-    top, found = places.root(store) / recording, {}
-    with suppress(FileNotFoundError):
-        found["manifest"] = places.manifest_of(top).read_bytes()
-    for path in top.rglob("*") if top.exists() else ():
-        if path.is_file() and path.name not in _LOCKS:
-            found[str(path.relative_to(top))] = path.read_bytes()
-    for file in files_of(store):
-        for section in file.about.sections:
-            if section.id == recording:
-                name = str(file.path.relative_to(store))
-                found[name] = found.get(name, b"") + repr(section).encode()
-    return found
-
-
-FOLDER = files.folder
-CHANGES: dict[str, Callable[[hl.Store, str], object]] = {
-    "rm": lambda store, one: store.remove(one),
-    "tag": lambda store, one: store.edit(one, tag={"b": "2"}),
-    "untag": lambda store, one: store.edit(one, untag=["a"]),
-    "note": lambda store, one: store.edit(one, note="seen"),
-    "rename": lambda store, one: store.edit(one, name="new"),
-    "mark": lambda store, one: store.mark(one, "start", "seen"),
-    "repair": lambda store, one: store.verify([one], repair=True),
-}
-
-
-@pytest.fixture(scope="module")
-def two(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, str]:
-    """A store of two recordings, and their ids."""
-    base = tmp_path_factory.mktemp("two")
-    ids = []
-    with hl.open(base / "store", create=True) as store:
-        for name, messages in (("a", 3), ("b", 4)):
-            log = logs.write(base / f"{name}.mcap", logs.content(0, messages, scans=True))
-            ids.append(
-                store.record(log, name=name, tags={"a": "1"}, settings=logs.SETTINGS).entry.id
-            )
-    shutil.rmtree(base / "store" / "mongod")
-    return base / "store", *ids
-
-
-SOME_OR_EACH = [23, pytest.param(1, marks=pytest.mark.exhaustive)]
-"""Steps from one that is tried to the next."""
-
-
-@pytest.mark.parametrize("stride", SOME_OR_EACH)
-@pytest.mark.parametrize("command", CHANGES)
-def test_a_command_whose_recording_is_removed_changes_no_other(
-    command: str,
-    stride: int,
-    two: tuple[Path, str, str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    limit: Limit,
-) -> None:
-    base, one, other = two
-    others = content_of(base, other)
-    limit(sync=lambda *_: None, manifest_wait_s=0)
-    monkeypatch.setattr(IndexAccess, "reached", lambda *_, **__: None)
-    for first, after in enumerate([False, True]):
-        for step in count(7 * first % stride, stride):
-            place = tmp_path / "store"
-            shutil.rmtree(place, ignore_errors=True)
-            shutil.copytree(base, place)
-            if command == "repair":
-                flip(places.segment(place, "a"), -60)
-            with hl.open(place, mongo=NOWHERE) as store:
-                before = content_of(place, one)
-                exchange = Exchange(places.root(place) / one, step, after=after)
-                problem = None
-                with monkeypatch.context() as patch:
-                    patch.setattr(files, "folder", exchange.folder)
-                    try:
-                        CHANGES[command](store, one)
-                    except HybridlogError as error:
-                        problem = error
-            about = (after, step, problem)
-            assert content_of(place, other) == others, about
-            is_gone = is_removed(place, one)
-            assert problem is None or is_gone, about
-            if not is_gone:
-                assert content_of(place, one) != before, about
-            if not exchange.is_over:
-                assert step > 10
-                break
-
-
-@pytest.mark.parametrize("stride", SOME_OR_EACH)
-def test_a_copy_of_a_recording_that_is_removed_is_whole_or_refused(
-    stride: int,
-    two: tuple[Path, str, str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    limit: Limit,
-) -> None:
-    base, one, _ = two
-    limit(sync=lambda *_: None)
-    for step in count(0, stride):
-        place, target = tmp_path / "store", tmp_path / "target"
-        shutil.rmtree(place, ignore_errors=True)
-        shutil.rmtree(target, ignore_errors=True)
-        shutil.copytree(base, place)
-        exchange = Exchange(places.root(place) / one, step, after=bool(step % 2))
-        with hl.open(target, mongo=NOWHERE, create=True) as store:
-            run = Copying.run
-
-            def armed(*args: Any, run: Any = run, exchange: Exchange = exchange) -> None:
-                patch.setattr(files, "folder", exchange.folder)  # it is chosen
-                run(*args)
-
-            with monkeypatch.context() as patch:
-                patch.setattr(Copying, "run", armed)
-                done = bring(store, place, [one])
-                if done.refused:
-                    done = bring(store, base, [one])
-        assert len(done.copied) == 1, step
-        with hl.open(target, mongo=NOWHERE) as store:
-            assert [entry.id for entry in store.recordings()] == [one], step
-            assert not store.verify().findings, step
-        if not exchange.is_over:
-            assert step > 10
-            break
 
 
 def test_names_are_unique_when_recordings_begin_and_are_renamed(tmp_path: Path) -> None:

@@ -129,13 +129,6 @@ def calls_of(tmp_path: Path, sync: str, monkeypatch: pytest.MonkeyPatch) -> int:
     return run.power.calls
 
 
-@pytest.mark.parametrize("sync", ["chunk", "seal", "never"])
-def test_a_power_cut_while_recording(
-    tmp_path: Path, sync: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    try_cuts(tmp_path, sync, monkeypatch, cuts=5, fates=2)
-
-
 def test_a_segment_of_the_last_group_that_a_power_cut_took(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -154,21 +147,12 @@ def test_a_segment_of_the_last_group_that_a_power_cut_took(
     assert check(run.store, run, "never") == "recovered"
 
 
-@pytest.mark.exhaustive
+@pytest.mark.parametrize(
+    ("cuts", "fates"), [(5, 2), pytest.param(1000, 4, marks=pytest.mark.exhaustive)]
+)
 @pytest.mark.parametrize("sync", ["chunk", "seal", "never"])
-def test_power_cuts_at_every_call(
-    tmp_path: Path, sync: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    try_cuts(tmp_path, sync, monkeypatch, cuts=1000, fates=4)
-
-
-def try_cuts(
-    tmp_path: Path,
-    sync: str,
-    monkeypatch: pytest.MonkeyPatch,
-    *,
-    cuts: int,
-    fates: int,
+def test_a_power_cut_while_recording(
+    tmp_path: Path, sync: str, monkeypatch: pytest.MonkeyPatch, cuts: int, fates: int
 ) -> None:
     calls = calls_of(tmp_path, sync, monkeypatch)
     assert calls > 20

@@ -208,20 +208,3 @@ def test_topics_that_another_process_changes_meanwhile(
         assert store.topic("/a").count() == store.topic("/b").count() == 1
         store.refresh()
         assert [one.topic_count for one in store.session.look().summaries] == [2, 1]
-
-
-def test_representations_are_short(tmp_path: Path) -> None:
-    many = Channel("/many", "json", None)
-    with hl.open(tmp_path / "store", create=True, mongo="none") as store:
-        with store.start("run") as recording:
-            recording.write(many, json.dumps({f"f{n}": n for n in range(50)}).encode(), log_time=9)
-        assert repr(store) == f"<Store {store.directory.path}>"
-        (entry,) = store.recordings()
-        assert repr(store.recordings()) == "<Recordings run>"
-        assert repr(entry) == "<Recording run; 1 channels, 1 messages>"
-        assert repr(entry.channels[0]) == "<Channel /many ; 1 messages>"
-        query = store.topic("/many").between("+0s", "end").where("f1 > 0").limit(3)
-        right = "<Query /many; recording run; between +0s and end; where f1 > 0; at most 3>"
-        assert repr(query) == right
-        wide = store.all_topics().where(" or ".join(f"f{n} > {n}" for n in range(40)))
-        assert len(repr(wide)) < 450

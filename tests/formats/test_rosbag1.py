@@ -152,18 +152,6 @@ def payload_ends(data: bytes, messages: Messages) -> list[tuple[int, int]]:
 ENDS = payload_ends(*CASES["none"])
 
 
-@pytest.mark.parametrize(
-    "first", [0, *(pytest.param(n, marks=pytest.mark.exhaustive) for n in range(1, 3))]
-)
-def test_cut_anywhere_in_the_index(first: int) -> None:
-    """Between two of its records, too, where all that is left is sound."""
-    whole, expected = CASES["none"]
-    for cut in range(len(whole) - 2000 + first, len(whole), 3):
-        found, damage = read_bytes(whole[:cut])
-        assert found == expected, cut
-        assert damage, cut
-
-
 @given(compression=st.sampled_from(sorted(CASES)), data=st.data())
 def test_cut_anywhere(compression: str, data: st.DataObject) -> None:
     whole, expected = CASES[compression]

@@ -6,7 +6,7 @@ import os
 import stat
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from types import FrameType
@@ -132,17 +132,8 @@ def test_a_broken_pipe_stays_one() -> None:
     stream.close()
 
 
-def write_whole(name: str, target: Path) -> None:
-    """What a command does: whoever began it holds nothing when it is interrupted."""
-    try:
-        write(name, target, messages=5)
-    except BaseException:
-        undo_unfinished()
-        raise
-
-
-def write_alone(name: str, target: Path) -> None:
-    """What a script does."""
+def write_few(name: str, target: Path) -> None:
+    """What a script does; a command takes back what is unfinished, besides."""
     write(name, target, messages=5)
 
 
@@ -164,7 +155,7 @@ class Interruption:
     def __call__(self, frame: FrameType, event: str, arg: object) -> object:
         code = frame.f_code
         ours = code.co_filename.startswith(self.OURS)
-        if not ours and code not in {write_whole.__code__, write_alone.__code__}:
+        if not ours and code is not write_few.__code__:
             caller = frame.f_back
             if caller is not None and caller.f_code.co_filename.startswith(self.OURS):
                 self._step()
@@ -184,13 +175,13 @@ class Interruption:
             raise KeyboardInterrupt
 
 
-def interrupted(at: int, write: Callable[[str, Path], None], name: str, target: Path) -> int:
+def interrupted(at: int, name: str, target: Path) -> int:
     """Write with an interruption; returns how many steps were done."""
     interruption = Interruption(at)
     before = sys.gettrace()
     try:
         sys.settrace(interruption)  # type: ignore[arg-type]
-        write(name, target)
+        write_few(name, target)
     except BaseException:
         # Libraries may make another error of it; what counts is what they leave.
         assert at > 0
@@ -206,11 +197,9 @@ UNCLOSED = pytest.mark.filterwarnings(
 
 
 @UNCLOSED
-@pytest.mark.parametrize("write", [write_whole, write_alone])
 @pytest.mark.parametrize("name", WRITERS)
 def test_an_interruption_at_any_instant_leaves_the_file_or_nothing(
     name: str,
-    write: Callable[[str, Path], None],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -220,13 +209,13 @@ def test_an_interruption_at_any_instant_leaves_the_file_or_nothing(
     for time in range(2):  # what is done once only, such as imports, is not counted
         target = tmp_path / f"whole{time}" / "out"
         target.parent.mkdir()
-        steps = interrupted(0, write, name, target)
+        steps = interrupted(0, name, target)
     whole = contents(target)
     outcomes = set()
     for at in [*range(1, steps, max(1, steps // 8)), steps]:
         place = tmp_path / str(at)
         place.mkdir()
-        interrupted(at, write, name, place / "out")
+        interrupted(at, name, place / "out")
         left = [path.name for path in place.iterdir()]
         assert left in ([], ["out"]), at
         assert list(scratch.iterdir()) == [], at

@@ -192,26 +192,3 @@ def test_latched_messages_in_force_stay_and_marks(plain: hl.Store) -> None:
     assert front == [text("map")]
     plain.keep({"max-age": "0s"})
     assert [m.raw for m in plain.topic("/map")] == [text("map")]
-
-
-def test_a_file_that_was_let_go_and_not_deleted_is_deleted_later(plain: hl.Store) -> None:
-    robot = Robot(plain)
-    manifests, recording = plain.directory.manifests, robot.recorder._target.id
-    while (manifest := manifests.find(recording)) is None or not manifest.files:
-        robot.run(0.1)
-    name = manifest.files[0].name
-    kept = (robot.folder / name).read_bytes()
-    robot.run_until(lambda: not (robot.folder / name).exists())
-    entry = robot.stop()
-    (robot.folder / name).write_bytes(kept)
-    (finding,) = plain.verify().findings
-    assert (finding.place, finding.problem[:16]) == (name, "it was left over")
-    before = ids(plain)
-    with hl.open(plain.directory.path, mongo="none") as other:
-        assert ids(other) == before
-    with plain.directory.writing(entry.id):
-        from hybridlog.maintenance.opening import recover
-        from hybridlog.maintenance.report import RepairReport
-
-        recover(plain.directory, entry.id, RepairReport())
-    assert not (robot.folder / name).exists()

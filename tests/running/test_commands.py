@@ -9,7 +9,6 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.cli import app
-from hybridlog_storage.settings import NONE
 from tests.calls import Calls
 from tests.cli.running import run
 from tests.cli.within import Answer, answer
@@ -23,6 +22,7 @@ from tests.some import in_turn
 pytestmark = pytest.mark.mongo("embedded")
 
 EVERY = [one for rules in COMMANDS.values() for one in rules]
+FIRST = [rules[0] for rules in COMMANDS.values()]
 
 
 def _id(one: Asked) -> str:
@@ -57,17 +57,8 @@ def test_every_command_has_a_rule() -> None:
     assert all(one.words[0] == name for name, rules in COMMANDS.items() for one in rules)
 
 
-@pytest.mark.parametrize(
-    "mongo", ["", pytest.param(NONE, marks=pytest.mark.slow)], ids=["mongodb", "without"]
-)
 @asked_in_turn(EVERY)
-def test_at_rest(
-    running: Running, one: Asked, mongo: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    if mongo:
-        if one.words[0] in {"index", "verify"}:
-            pytest.skip("needs MongoDB")
-        monkeypatch.setenv("HYBRIDLOG_MONGO_URI", mongo)
+def test_at_rest(running: Running, one: Asked, tmp_path: Path) -> None:
     words, out = place_for(one.words, tmp_path / "out")
     done = answer(*words, store=running.path, code=one.code)
     found, wanted = one.read(done, out), one.right(running.flushed())
@@ -76,7 +67,7 @@ def test_at_rest(
         assert not misfit(done.json, schema_of(words))
 
 
-@asked_in_turn([rules[0] for rules in COMMANDS.values()], every=4)
+@asked_in_turn(FIRST, every=4)
 def test_in_a_process_of_its_own(running: Running, one: Asked, tmp_path: Path) -> None:
     words, out = place_for(one.words, tmp_path / "out")
     done = run(*words, store=running.path, code=one.code, before=lambda: None)
@@ -104,7 +95,7 @@ def seen(calls: Calls) -> list[dict[str, int]]:
     return found
 
 
-@asked_in_turn(EVERY)
+@asked_in_turn(FIRST)
 def test_while_segments_are_sealed(
     running: Running, one: Asked, tmp_path: Path, seen: list[dict[str, int]]
 ) -> None:

@@ -20,12 +20,7 @@ from tests.some import in_turn
 pytestmark = pytest.mark.mongo("embedded")
 
 SPECIAL = {"__iter__", "__eq__", "__hash__", "__repr__"}
-READERS = (
-    pytest.param("writer", marks=pytest.mark.slow),
-    "before",
-    "without mongodb",
-    pytest.param("later", marks=pytest.mark.slow),
-)
+READERS = ("writer", "before", "without mongodb", "later")
 
 
 @pytest.fixture(scope="module", params=["one", "many"])
@@ -135,7 +130,7 @@ MAX_BEHIND_S = 2.0
 def test_each_call_while_segments_are_sealed(running: Running, mongo: str | None) -> None:
     """Each answer is a beginning of the sequence, without a gap, and at most 2 s short."""
     with hl.open(running.path, mongo=mongo) as store:
-        with running.writing(100, 0.02) as writing:
+        with running.writing(50, 0.02) as writing:
             while writing.is_alive():
                 for name, call in CALLS.items():
                     begun = time.monotonic()

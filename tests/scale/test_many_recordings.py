@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import struct
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -15,7 +12,6 @@ import pytest
 import hybridlog as hl
 from hybridlog_storage.messages import Channel
 from tests.copies import bring
-from tests.imports import ROOT
 from tests.independent import write_mcap
 from tests.many_topics import FLOAT
 from tests.scale.cost import Cost, cost_of
@@ -274,37 +270,3 @@ def test_one_more_recording_costs_the_same(stores: dict[int, Path], tmp_path: Pa
             assert store.topic("pose").count() == count * MESSAGES
     check_alike(counts, looks=False)  # no other has its name or its content
     check_alike(removals)
-
-
-LIMITED = """
-import resource, sys
-limit = int(sys.argv[2])
-resource.setrlimit(resource.RLIMIT_NOFILE, (limit, limit))
-import hybridlog as hl
-with hl.open(sys.argv[1]) as store:
-    pose = store.topic("pose")
-    print(pose.count(), pose.where("data > 4.5").count(), sum(1 for _ in pose))
-    print(len(pose.to_pandas()), len(store.index.rebuild()), len(store.verify().findings))
-"""
-
-
-def check_with_few_files(path: Path, recordings: int, limit: int) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", LIMITED, str(path), str(limit)],
-        cwd=ROOT,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "storage")])},
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=280,
-    )
-    assert (done.returncode, done.stderr) == (0, "")
-    messages = recordings * MESSAGES
-    wanted = (messages, messages - recordings * 5, messages, messages, recordings, 0)
-    assert done.stdout.split() == [str(number) for number in wanted]
-
-
-@pytest.mark.exhaustive
-def test_all_of_it_works_with_1024_files(tmp_path: Path) -> None:
-    fill(tmp_path / "store", 1_100)
-    check_with_few_files(tmp_path / "store", 1_100, 1024)

@@ -196,18 +196,12 @@ def _quick(limit: Limit) -> Iterator[None]:
     ("url", "words"),
     [
         ("robot:8765", "does not begin with ws://"),
-        ("http://robot:8765", "does not begin with ws://"),
         ("ws://", "names no host"),
-        ("ws://:8765", "names no host"),
         ("ws://robot:0", "port 0"),
-        ("ws://robot:99999", "not the address"),
         ("ws://robot:port", "not the address"),
-        ("ws://[::1:8765", "not the address"),
         ("ws://robot:8765/#x", "'#'"),
-        ("ws://ro bot:8765", "not the address"),
         ("ws://robot\x1b[31m:8765", "not the address"),
         ("ws://me@robot:8765", "without a password"),
-        ("ws://" + "a" * 80 + ".\u00e9:8765", "not the address"),
         ("", "does not begin"),
     ],
 )
@@ -485,12 +479,9 @@ def test_a_message_over_the_limit_ends_the_connection_and_is_counted(limit: Limi
 
 BREAKS = [
     (frame(2, body(0, 0, b"x"), length=1 << 62), "announces a message"),
-    (frame(1, b"{", length=1 << 40), "announces a message of more than"),
     (frame(2, b"\x01", is_last=False, length=1 << 40), "announces a message of more than"),
     (frame(9, b"x", length=1 << 40), "violates the websocket protocol"),
     (b"\x82\x85abcd12345", "violates the websocket protocol"),
-    (b"\x83\x01x", "violates the websocket protocol"),
-    (b"\xc2\x01x", "violates the websocket protocol"),
     (frame(0, b"x"), "messages in pieces"),
     (frame(2, b"", is_last=False) + frame(2, b"x"), "messages in pieces"),
     (frame(8, b"\x03\xe9going"), "closed the connection (going)"),

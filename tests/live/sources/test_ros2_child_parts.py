@@ -61,14 +61,6 @@ def test_what_the_user_has_set_up_is_left_alone(tmp_path: Path, name: str) -> No
     assert qos.is_set_up({}, tmp_path)
 
 
-def test_what_is_asked_for_fits_all_publishers() -> None:
-    best = Profile(reliability=qos.RELIABLE, durability=qos.TRANSIENT_LOCAL)
-    poor = Profile(reliability=qos.BEST_EFFORT, durability=qos.VOLATILE)
-    assert qos.request([best, best], 7)[:4] == (1, 7, qos.RELIABLE, qos.TRANSIENT_LOCAL)
-    mixed = qos.request([best, poor], 7)
-    assert mixed[:4] == (1, 7, qos.BEST_EFFORT, qos.VOLATILE)
-
-
 def test_offers_are_written_as_bags_have_them() -> None:
     text = qos.offered_text(
         [Profile(3, 0, 1, 1, 2**63 - 1, 10_000_000_000, 1, 2**63 - 1), Profile(depth=5)]
@@ -249,15 +241,6 @@ def live_topic(tmp_path: Path, *offers: Offer, kind: str = "a/msg/T") -> Rig:
     return rig
 
 
-@pytest.mark.parametrize(
-    ("kind", "depth"),
-    [("T", qos.DEPTH), ("Arrays", qos.DEPTH), ("Bytes", qos.DEPTH_OF_BYTES)],
-)
-def test_types_that_may_be_large_have_shorter_queues(tmp_path: Path, kind: str, depth: int) -> None:
-    rig = live_topic(tmp_path, offer(), kind=f"a/msg/{kind}")
-    assert rig.ros.made[0].profile.depth == depth
-
-
 def test_a_subscription_outlives_its_publishers(tmp_path: Path) -> None:
     rig = live_topic(tmp_path, offer())
     rig.ros.graph = {}
@@ -347,29 +330,9 @@ def test_a_late_message_is_stored_and_no_loss(tmp_path: Path, late: list[int]) -
     assert len(rig.messages) == 5 + len(late)
 
 
-def test_times_of_a_gap_are_in_order_when_those_of_messages_are_not(tmp_path: Path) -> None:
-    rig = live_topic(tmp_path, offer())
-    now = time.time_ns()
-    times = [(1, now), (4, now - 200)]
-    rig.ros.made[0].queue = [(b"", info(n, received_timestamp=at)) for n, at in times]
-    rig.child._take(0.0)
-    rig.topics.look()
-    [lost] = rig.told("lost")
-    assert (lost["count"], lost["first"], lost["last"]) == (2, now - 200, now)
-
-
 def unnamed(rig: Rig, *numbers: int) -> None:
     rig.ros.made[0].queue = [(b"", info(number, None)) for number in numbers]
     rig.child._take(0.0)
-
-
-def test_without_names_one_publisher_is_judged(tmp_path: Path) -> None:
-    rig = live_topic(tmp_path, offer(node="/one"))
-    unnamed(rig, 1, 2, 3, 4, 8)
-    rig.topics.look()
-    rig.topics.look()
-    [lost] = rig.told("lost")
-    assert (lost["count"], lost["detail"]) == (3, "from /one")
 
 
 def test_without_names_nobody_is_accused_when_publishers_change(tmp_path: Path) -> None:
