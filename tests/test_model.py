@@ -35,8 +35,6 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 from mcap.writer import CompressionType
-from rosbags.interfaces import ConnectionExtRosbag1
-from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import hybridlog as hl
@@ -93,7 +91,7 @@ class Spec:
     who: str = ""
 
 
-MCAP_CHANNELS = (
+CHANNELS = (
     Spec("/a/b", "cdr"),
     Spec("a/b", "cdr", stamped=False),
     Spec("/a__b", "json"),
@@ -103,15 +101,8 @@ MCAP_CHANNELS = (
     Spec("/big", "cdr", padding=1500),
     Spec("/ros1", "ros1"),
 )
-BAG_CHANNELS = (
-    Spec("/a/b", "ros1"),
-    Spec("/twin", "ros1", who="one"),
-    Spec("/twin", "ros1", who="two"),
-    Spec("/big", "ros1", padding=2500),
-    Spec("/plain", "ros1", stamped=False),
-)
 MARKS = "/hybridlog/marks"
-TOPICS = sorted({MARKS, *(c.topic for c in (*MCAP_CHANNELS, *BAG_CHANNELS))})
+TOPICS = sorted({MARKS, *(c.topic for c in CHANNELS)})
 NAMES = {"run": "run", "calm sea": "calm sea", "x/y": "x-y", "log1": "log1", "\u00e9": "\u00e9"}
 """Names that people give, and those that recordings get."""
 
@@ -187,7 +178,7 @@ segment_settings = st.builds(
 )
 
 
-def said(spec: Spec, draft: Draft, bag: bool) -> Said:
+def said(spec: Spec, draft: Draft) -> Said:
     """The message of a draft, its payload written by somebody else's serializer."""
     text = (draft.text + "p" * spec.padding).replace("\0", "0")
     data = [draft.number + i / 4 for i in range(draft.count)]
@@ -217,7 +208,7 @@ def said(spec: Spec, draft: Draft, bag: bool) -> Said:
         spec.topic,
         payload,
         BEGIN + draft.time * STEP,
-        None if bag else BEGIN + draft.published * STEP,
+        BEGIN + draft.published * STEP,
         stamp if has_stamp else None,
         fields,
         torn,
@@ -255,38 +246,16 @@ def write_log(path: Path, chosen: Sequence[Draft]) -> list[Said]:
             full = f"x/msg/{name}" if encoding == "cdr" else f"x/{name}"
             schemas[encoding, name] = Schema(full, kind, definition.encode())
     channels = []
-    for spec in MCAP_CHANNELS:
+    for spec in CHANNELS:
         schema = schemas.get((spec.encoding, "Stamped" if spec.stamped else "Plain"))
         channels.append(Channel(spec.topic, spec.encoding, schema, {"who": spec.who}))
     out, rows = [], []
     for number, draft in enumerate(chosen):
         channel = draft.channel % len(channels)
-        one = said(MCAP_CHANNELS[channel], draft, bag=False)
+        one = said(CHANNELS[channel], draft)
         rows.append((channels[channel], one.log_time, one.payload, one.published, number))
         out.append(one)
     write_mcap(path, rows, channels, chunk_size=2000, compression=CompressionType.ZSTD)
-    return out
-
-
-def write_bag(path: Path, chosen: Sequence[Draft]) -> list[Said]:
-    """A ROS 1 bag, by `rosbags`; several connections share a topic."""
-    out: list[Said] = []
-    writer = BagWriter(path)
-    writer.chunk_threshold = 2000
-    with writer:
-        ids = []
-        for spec in BAG_CHANNELS:
-            name = f"x/msg/{'Stamped' if spec.stamped else 'Plain'}"
-            made = writer.add_connection(
-                spec.topic, name, typestore=STORES["ros1"], callerid=f"/{spec.who}"
-            )
-            assert isinstance(made.ext, ConnectionExtRosbag1)
-            ids.append(made)
-        for draft in chosen:
-            channel = draft.channel % len(BAG_CHANNELS)
-            message = said(BAG_CHANNELS[channel], draft, bag=True)
-            writer.write(ids[channel], message.log_time, message.payload)
-            out.append(message)
     return out
 
 
@@ -384,11 +353,10 @@ class Machine(RuleBasedStateMachine):
 
     @initialize(chosen=drafts, settings=segment_settings)
     def begin(self, chosen: list[Draft], settings: SegmentSettings) -> None:
-        self.record_log(chosen, settings, is_bag=False)
+        self.record(chosen, settings)
 
     @rule(
         chosen=drafts,
-        is_bag=st.booleans(),
         settings=segment_settings,
         wanted=st.none() | st.lists(st.sampled_from(TOPICS), min_size=1, unique=True),
         between=st.none() | bounds,
@@ -396,32 +364,20 @@ class Machine(RuleBasedStateMachine):
     def record(
         self,
         chosen: list[Draft],
-        is_bag: bool,
         settings: SegmentSettings,
-        wanted: list[str] | None,
-        between: tuple[int, int] | None,
-    ) -> None:
-        self.record_log(chosen, settings, is_bag=is_bag, wanted=wanted, between=between)
-
-    def record_log(
-        self,
-        chosen: list[Draft],
-        settings: SegmentSettings,
-        *,
-        is_bag: bool,
         wanted: list[str] | None = None,
         between: tuple[int, int] | None = None,
     ) -> None:
         self.written += 1
-        path = self.logs / f"log{self.written}{'.bag' if is_bag else '.mcap'}"
-        everything = (write_bag if is_bag else write_log)(path, chosen)
+        path = self.logs / f"log{self.written}.mcap"
+        everything = write_log(path, chosen)
         kept = [
             m
             for m in everything
             if (wanted is None or m.topic in wanted)
             and (between is None or between[0] <= m.log_time < between[1])
         ]
-        tags = {"kind": "bag"} if is_bag else {}
+        tags = {"kind": "log"} if self.written % 2 else {}
         options = RecordOptions(
             settings=settings,
             tags=tags,
@@ -445,8 +401,7 @@ class Machine(RuleBasedStateMachine):
         entry = report.entry
         numbered = [replace(m, recording=entry.id, seq=seq) for seq, m in enumerate(kept)]
         # Channels without messages are kept, too.
-        specs = BAG_CHANNELS if is_bag else MCAP_CHANNELS
-        channels = {spec.topic for spec in specs if wanted is None or spec.topic in wanted}
+        channels = {spec.topic for spec in CHANNELS if wanted is None or spec.topic in wanted}
         self.model[entry.id] = Recording(numbered, channels, self.free_name(path.stem), tags)
         self.changed = True
 
@@ -926,14 +881,13 @@ def small() -> SegmentSettings:
     return SegmentSettings(chunk_size=1 << 10, segment_size=6 << 10, sync="never")
 
 
-@pytest.mark.parametrize("is_bag", [False, True])
-def test_whatever_happens_happens(machine: type[Machine], is_bag: bool) -> None:
+def test_whatever_happens_happens(machine: type[Machine]) -> None:
     """What chance may leave out: each rule once, in an order that makes it hard."""
     model = machine()
     indexed = [True, False, True, True, False]
     again = {"indexed": indexed, "has_half": True}
     steps: list[Callable[[], object]] = [
-        lambda: model.record_log(drafts_of(85, 70), small(), is_bag=is_bag),
+        lambda: model.record(drafts_of(85, 70), small()),
         lambda: model.lose_a_segment(0, 1, reopened=False),
         lambda: model.lose_a_segment(0, 0, reopened=True),
         lambda: model.mark(0, 3, "hit"),
@@ -943,7 +897,7 @@ def test_whatever_happens_happens(machine: type[Machine], is_bag: bool) -> None:
         model.rebuild,
         lambda: model.restore_a_segment(0),
         lambda: model.mark(0, 5, "\u00e9"),
-        lambda: model.record_log(drafts_of(12, 60), small(), is_bag=not is_bag),
+        lambda: model.record(drafts_of(12, 60), small()),
         lambda: model.crash(0, SPOTS // 3, "trailer", **again),  # type: ignore[arg-type]
         lambda: model.crash(0, SPOTS // 2, "chunk", **again),  # type: ignore[arg-type]
         lambda: model.crash(0, 0, "sealed", **again),  # type: ignore[arg-type]

@@ -22,11 +22,8 @@ pytestmark = [needs_data, pytest.mark.mongo]
 
 WHOLE = [
     *(f"real/{n}" for n in (
-        "leg_tracker_negative_2.bag",
         "leg_tracker_stationary.bag",
-        "leg_tracker_positive_7.bag",
         "robot_localization_test1.bag",
-        "robot_localization_test3.bag",
         "tilt_laser.bag",
         "sick_laser_radar.bag",
         "luminar_pointcloud.bag",
@@ -160,6 +157,6 @@ def dump(store: hl.Store) -> dict[str, list[bytes]]:
 def test_verify_finds_nothing_and_reindex_changes_nothing(store: hl.Store) -> None:
     assert store.verify().findings == []
     before = dump(store)
-    assert sum(map(len, before.values())) > 150_000
+    assert sum(map(len, before.values())) > 50_000
     store.index.rebuild()
     assert dump(store) == before

@@ -144,7 +144,7 @@ def interrupt(*_):
 signal.signal(signal.SIGALRM, interrupt)
 with hl.open(sys.argv[1], create=True) as store:
     with store.start("talk") as recording:
-        while interrupted < 16:
+        while interrupted < 8:
             signal.setitimer(signal.ITIMER_REAL, 0.0005 + interrupted * 0.00002)
             try:
                 writing = True
@@ -174,7 +174,7 @@ def test_an_interruption_leaves_no_half_message(tmp_path: Path) -> None:
         check=False,
         timeout=100,
     )
-    assert (done.stdout, done.stderr) == ("whole after 16\n", "")
+    assert (done.stdout, done.stderr) == ("whole after 8\n", "")
 
 
 def test_a_full_disk(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -22,7 +23,6 @@ from tests.some import in_turn
 pytestmark = pytest.mark.mongo("embedded")
 
 EVERY = [one for rules in COMMANDS.values() for one in rules]
-FIRST = [rules[0] for rules in COMMANDS.values()]
 
 
 def _id(one: Asked) -> str:
@@ -42,12 +42,17 @@ def asked_in_turn(rules: list[Asked], every: int = 1) -> pytest.MarkDecorator:
     )
 
 
-@pytest.fixture(scope="module", params=KINDS)
-def running(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[Running]:
-    with begun(tmp_path_factory.mktemp("running") / "store", request.param) as found:
-        yield found
+@pytest.fixture(scope="module")
+def both(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Running]]:
+    """A recording of one segment, and one of many; they go on in all tests."""
+    places = {kind: tmp_path_factory.mktemp("running") / "store" for kind in KINDS}
+    with ExitStack() as stack:
+        yield {kind: stack.enter_context(begun(place, kind)) for kind, place in places.items()}
+
+
+@pytest.fixture
+def running(request: pytest.FixtureRequest, both: dict[str, Running]) -> Running:
+    return both[request.param]
 
 
 def test_every_command_has_a_rule() -> None:
@@ -67,7 +72,7 @@ def test_at_rest(running: Running, one: Asked, tmp_path: Path) -> None:
         assert not misfit(done.json, schema_of(words))
 
 
-@asked_in_turn(FIRST, every=4)
+@asked_in_turn([rules[0] for rules in COMMANDS.values()], every=4)
 def test_in_a_process_of_its_own(running: Running, one: Asked, tmp_path: Path) -> None:
     words, out = place_for(one.words, tmp_path / "out")
     done = run(*words, store=running.path, code=one.code, before=lambda: None)
@@ -95,7 +100,7 @@ def seen(calls: Calls) -> list[dict[str, int]]:
     return found
 
 
-@asked_in_turn(FIRST)
+@asked_in_turn(EVERY, every=2)
 def test_while_segments_are_sealed(
     running: Running, one: Asked, tmp_path: Path, seen: list[dict[str, int]]
 ) -> None:

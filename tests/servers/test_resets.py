@@ -63,7 +63,7 @@ def test_resets_at_any_time(way: Proxy, uri: str, log: Path, tmp_path: Path, aft
     with hl.open(path, create=True, mongo=uri, require_database=True) as store:
         store.record(log)
     way.reset_after = after
-    ask = f"{uri}?serverSelectionTimeoutMS=1000"
+    ask = f"{uri}?serverSelectionTimeoutMS=300"
     try:
         with hl.open(path, mongo=ask, require_database=True) as store:
             assert store.topic("/number").where(RAW).count() == MESSAGES - 10

@@ -322,7 +322,7 @@ def test_a_dead_node_is_told_of_once_and_its_topics_do_not_come() -> None:
         sink.wait_said(uri, "rosnode cleanup")
         master.add("/dead/late", "std_msgs/String", "/dead", uri)
         calls = master.calls.count("getSystemState")
-        wait_for(lambda: master.calls.count("getSystemState") > calls + 30)
+        wait_for(lambda: master.calls.count("getSystemState") > calls + 10)
         assert source.was_reached
     assert len({*sink.said}) == 1
     assert sink.topics == []
