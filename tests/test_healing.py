@@ -91,8 +91,7 @@ def documents(store: hl.Store) -> list[int]:
 def test_a_damaged_index_is_made_again(store: Path, way: str) -> None:
     OF_MONGOD[way](store / "mongod" / "data")
     said = "".join(run("index", "rebuild", store=store).err for _ in range(2))
-    assert said.startswith(REPLACED)
-    assert len(said.splitlines()) == 2
+    assert said == REPLACED
 
 
 def test_the_running_question_is_answered(store: Path) -> None:
@@ -346,7 +345,7 @@ def test_a_catalog_lost_while_the_store_is_open(store: Path, way: str) -> None:
         else:
             OF_CATALOG[way](store / CATALOG)
         assert (imu.count(), imu.where(WHERE).count(), sum(1 for _ in imu)) == want
-        assert two.manifest.source.fingerprint in opened.session.snapshot().by_fingerprint
+        assert two.source["fingerprint"] in opened.session.snapshot().by_fingerprint
         assert opened.edit(one.id, name=two.name).name == f"{two.name}-2"
         opened.refresh()
         assert len(opened.recordings()) == 2
