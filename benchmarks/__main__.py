@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import re
 import shutil
+import signal
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -17,11 +18,9 @@ from typing import TYPE_CHECKING
 
 from benchmarks.samples import NAME, Journal
 from benchmarks.side import SideError
-from hybridlog.cli import signals
 from hybridlog.cli.app import of_os_error
 from hybridlog.cli.output import note, printable
 from hybridlog_storage.errors import HybridlogError, UsageError
-from hybridlog_storage.stopping import anywhere, at_safe_points
 
 if TYPE_CHECKING:
     from benchmarks.backends.base import Backend
@@ -69,20 +68,19 @@ def pieces() -> list[tuple[str, Callable[[Context], None], bool]]:
 
 def main(arguments: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
-    signals.install()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.default_int_handler)
     try:
-        # Wherever it stops, the processes of a run are ended and the journal is closed.
-        with at_safe_points(), anywhere():
-            chosen = _parser().parse_args(arguments)
-            if chosen.render:
-                return _write(Journal(chosen.out), chosen)
-            return _run(chosen, ["python", "-m", "benchmarks", *arguments])
+        chosen = _parser().parse_args(arguments)
+        if chosen.render:
+            return _write(Journal(chosen.out), chosen)
+        return _run(chosen, ["python", "-m", "benchmarks", *arguments])
     except HybridlogError as error:
         print(f"benchmarks: {printable(str(error))}", file=sys.stderr)
         return error.exit_code
-    except signals.Stopped as stopped:
-        print(f"\nbenchmarks: interrupted. {stopped.consequence}".rstrip(), file=sys.stderr)
-        return stopped.exit_code
+    except KeyboardInterrupt:  # the processes of a run are ended, and the journal is closed
+        print("\nbenchmarks: interrupted.", file=sys.stderr)
+        return 130
     except OSError as error:
         text = printable(f"{error}. What was measured before stays.")
         print(f"benchmarks: {text}", file=sys.stderr)
@@ -130,8 +128,8 @@ def _run(chosen: argparse.Namespace, command: list[str]) -> int:
                     # The others go on.
                     context.say(f"{part} FAILED: {printable(str(error))}")
                     is_broken = True
-        except signals.Stopped as stopped:
-            stopped.consequence = f"What was measured is in {journal.path}."
+        except KeyboardInterrupt:
+            context.say(f"What was measured is in {journal.path}.")
             raise
         return max(_write(journal, chosen), int(is_broken))
 
