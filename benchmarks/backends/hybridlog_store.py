@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+from msgspec.structs import replace
 
 from benchmarks.backends.base import (
     ARM,
@@ -37,6 +38,7 @@ class Hybridlog(Backend):
 
     name = title = "hybridlog"
     answers = reads = True
+    compression: Literal["zstd", "none"] = "zstd"
 
     def __init__(self, directory: Path) -> None:
         super().__init__(directory)
@@ -75,7 +77,10 @@ class Hybridlog(Backend):
         except HybridlogError as error:
             raise BackendMissingError(f"hybridlog: {error}") from error
         if fresh:  # or it is opened to be asked
-            self._recording = self.store.start("benchmark")
+            from hybridlog.live.recording import LIVE_SETTINGS
+
+            settings = replace(LIVE_SETTINGS, compression=self.compression)
+            self._recording = self.store.start("benchmark", settings=settings)
             # As a recorder would that has just subscribed.
             self._recording.expect(*channels)
 
@@ -162,3 +167,11 @@ class Hybridlog(Backend):
 
     def table(self, topic: str) -> pd.DataFrame:
         return self.store.topic(topic).to_pandas()
+
+
+class HybridlogUncompressed(Hybridlog):
+    """The same with chunks that are not compressed, as a ROS bag has them."""
+
+    name, title = "hybridlog_uncompressed", "hybridlog, uncompressed"
+    answers = reads = False
+    compression = "none"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from benchmarks.backends.base import Backend
 from benchmarks.backends.files import BagFile, McapFile
-from benchmarks.backends.hybridlog_store import Hybridlog
+from benchmarks.backends.hybridlog_store import Hybridlog, HybridlogUncompressed
 from benchmarks.backends.mongo import Mongo, MongoIndexed
 from benchmarks.backends.nothing import Nothing
 from benchmarks.backends.postgres import Postgres, PostgresIndexed
@@ -14,6 +14,7 @@ BACKENDS: dict[str, type[Backend]] = {
     backend.name: backend
     for backend in (
         Hybridlog,
+        HybridlogUncompressed,
         Mongo,
         MongoIndexed,
         Postgres,
