@@ -246,6 +246,17 @@ def follower_of(recorder: subprocess.Popen[str]) -> Path | None:
     return None
 
 
+def test_without_triggers_it_takes_the_time_that_nobody_wants(logs: Path, tmp_path: Path) -> None:
+    words = ("--replay", logs / "robot.bag", "--mongo", "none")
+    with recorder(tmp_path / "store", *words) as process:
+        until_it_speaks(process)
+        wait_for(lambda: follower_of(process))
+        place = follower_of(process)
+        assert place is not None
+        wait_for(lambda: os.sched_getscheduler(int(place.name)) == os.SCHED_IDLE)
+        assert end_and_hear(process, signal.SIGTERM)[0]["exit_code"] == 0
+
+
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
 def test_triggers_have_a_process_that_ends_with_the_recorder(
     logs: Path, tmp_path: Path, number: int
@@ -259,6 +270,7 @@ def test_triggers_have_a_process_that_ends_with_the_recorder(
         place = follower_of(process)
         assert place is not None
         wait_for(lambda: (place / "oom_score_adj").read_text() == "500\n")
+        assert os.sched_getscheduler(int(place.name)) == os.SCHED_OTHER
         assert b"NOTIFY_SOCKET" not in (place / "environ").read_bytes()
         if number == signal.SIGTERM:
             report, _ = end_and_hear(process, number)
