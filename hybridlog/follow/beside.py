@@ -14,6 +14,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from msgspec.structs import replace
+
 import hybridlog
 from hybridlog.entries import put_entry
 from hybridlog.follow.child import ENDED, Task, Trigger
@@ -26,6 +28,7 @@ from hybridlog.query.question import Counters, Question
 from hybridlog.record.marks import MARKS
 from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.errors import (
+    DatabaseError,
     DefinitionError,
     DiskFullError,
     HybridlogError,
@@ -208,6 +211,8 @@ class _Beside:
         why = index.unavailable
         if why is not None and not isinstance(why, WithoutMongoError):
             self.tell("say", f"MongoDB is unavailable, {target.without}: {why}")
+            if task.had_mongo and not target.is_wanted:
+                target = replace(target, failure=DatabaseError(str(why)))
         entry = put_entry(directory, catalog, task.recording)
         done: Collection[str] = ()
         topics: Collection[str] | None = None

@@ -54,6 +54,7 @@ class Task(NamedTuple):
     """What the process is to do.
 
     `interval_s` lies between two looks of the follower; with None it does everything at the end.
+    With `had_mongo` the recorder reached MongoDB: if the process does not, that is a failure.
     After an earlier process has died (`is_again`), `seen` tells what the triggers have seen.
     """
 
@@ -62,6 +63,7 @@ class Task(NamedTuple):
     recording: str
     triggers: Sequence[str]
     interval_s: float | None
+    had_mongo: bool = False
     is_again: bool = False
     seen: Any = None
 
@@ -123,7 +125,7 @@ class FollowerProcess:
 
         def start(entry: RecordingEntry) -> FollowerProcess:
             place = shared.directory.address
-            task = Task(place, index.wanted, entry.id, (), interval_s)
+            task = Task(place, index.wanted, entry.id, (), interval_s, target.is_wanted)
             followed = cls(
                 shared.directory,
                 shared.catalog,

@@ -10,11 +10,8 @@ import numpy as np
 import pytest
 
 import hybridlog as hl
-from hybridlog.live.state import choose
 from hybridlog.maintenance.copying import CopyOptions
 from hybridlog_storage.disk import files
-from hybridlog_storage.errors import UsageError
-from hybridlog_storage.remote import directory_of
 from hybridlog_storage.remote.bucket import Object
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.remote.conftest import BEGIN, SCAN
@@ -42,12 +39,6 @@ def states(address: str | Path) -> dict[str, int]:
     files.mounted.clear()
     with hl.open(address) as store:
         return dict(Counter(str(one.state) for one in store.topic("scan")))
-
-
-def test_messages_have_addresses(robot: hl.Store, address: str) -> None:
-    robot.copy(address)
-    with pytest.raises(UsageError, match=f"bucket of {address};"):
-        choose(directory_of(Path(address)), [])
 
 
 @pytest.mark.parametrize("has_digests", [True, False])
