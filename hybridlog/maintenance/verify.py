@@ -213,7 +213,6 @@ class _Check:
             if not has_summary or (found and not found[0].offset):  # or it is another one
                 self._lost[file.number, WHOLE] = ""
             cure = RESTORE if has_summary or found[1:] else _REPAIR
-            self._lost |= {(file.number, c): why for _, why, c in found if c is not None}
             for at, problem, _ in found:
                 yield f"{file.name} byte {at}", problem, cure
 
