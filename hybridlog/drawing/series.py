@@ -140,8 +140,8 @@ def _check(wanted: Sequence[Wanted], known: Mapping[str, str]) -> None:
         has_fields = any(path.startswith(f"{one.path}.") for path in known)
         if kind and not (one.access or has_fields or kind in NUMERIC):
             raise UsageError(
-                f"{one.text} is no number but {kind}: name a number, of an array {one.text}[0], "
-                f"{one.text}[0].x or {one.text}.min."
+                f"{one.text} is no number but {kind}: name a number, of an array {one.text}[0] "
+                f"or {one.text}.min, of an array of messages one of their fields."
             )
 
 
