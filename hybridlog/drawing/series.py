@@ -139,9 +139,9 @@ def _check(wanted: Sequence[Wanted], known: Mapping[str, str]) -> None:
         kind = known.get(one.path)
         has_fields = any(path.startswith(f"{one.path}.") for path in known)
         if kind and not (one.access or has_fields or kind in NUMERIC):
+            numbers = f"{one.text}[0].x" if "/" in kind else f"{one.text}[0] or {one.text}.min"
             raise UsageError(
-                f"{one.text} is no number but {kind}: name a number, of an array {one.text}[0] "
-                f"or {one.text}.min, of an array of messages one of their fields."
+                f"{one.text} is no number but {kind}: name a number, of an array {numbers}."
             )
 
 
