@@ -18,14 +18,17 @@ from starlette.testclient import TestClient
 
 import hybridlog as hl
 from hybridlog.query.answers.marks import marks_in
-from hybridlog.record.marks import mark_channel, mark_payload
+from hybridlog.record.marks import MARKS_SEGMENT, mark_channel, mark_payload
+from hybridlog.record.marks_log import beside
 from hybridlog.view.guard import Admission
 from hybridlog.view.server import make_app
-from hybridlog_storage.errors import StoreError, TimeError, UsageError
+from hybridlog_storage.errors import SegmentError, StoreError, TimeError, UsageError
 from hybridlog_storage.manifest import MAX_MARKS, Mark, replace
 from hybridlog_storage.messages import Channel
+from hybridlog_storage.segments.chunk_table import places_of
 from tests import places
 from tests.cli.within import answer
+from tests.independent import write_mcap
 
 S = 10**9
 BEGIN = 1000
@@ -106,6 +109,20 @@ def test_a_mark_is_removed(store: hl.Store, tmp_path: Path) -> None:
         assert times(opened.topic(marks)) == [90]
         assert opened.verify().findings == []
         assert len(opened.topic("log").to_arrow()) == 100
+
+
+def test_marks_that_were_set_meanwhile_are_not_taken_for_others(tmp_path: Path) -> None:
+    with hl.open(tmp_path / "store", create=True, mongo="none") as store:
+        write_mcap(tmp_path / "a.mcap", [(Channel("/n", "json", None), BEGIN * S, b"{}")])
+        store.record(tmp_path / "a.mcap", name="drive")
+        one, two = (
+            beside(store.mark("drive", "+0s", text)).flushed[MARKS_SEGMENT]
+            for text in ("carpet", "stairs")
+        )
+        (place,) = places_of(one.table)
+        assert len(one.reader.read_chunk(place).batch) == 1
+        with pytest.raises(SegmentError, match="Ask again"):
+            two.reader.read_chunk(place)
 
 
 def test_marks_answer_as_messages_do(tmp_path: Path) -> None:
