@@ -12,7 +12,7 @@ import pytest
 
 from hybridlog_storage.copy import Copied, How, copy
 from hybridlog_storage.copy_places import Directory, Place, RefusedError
-from hybridlog_storage.errors import HybridlogError
+from hybridlog_storage.errors import HybridlogError, StoreError
 from hybridlog_storage.manifest import Channel, Manifest, Mark, Note, Pin, replace, with_rows
 from hybridlog_storage.remote.bucket import Bucket
 from hybridlog_storage.remote.store import BucketStore
@@ -169,6 +169,23 @@ def test_what_is_removed_meanwhile_does_not_come_back(pair: Pair) -> None:
     with pytest.raises(HybridlogError):
         copy(source.source, target.place, RECORDING, How(progress=remove))
     assert not target.is_there()
+    assert removed
+    copy(source.source, target.place, RECORDING)
+    target.check(recording())
+
+
+def test_files_that_go_meanwhile_are_not_listed(pair: Pair) -> None:
+    """A removal that another process finishes takes them along."""
+    source, target = pair
+    removed: list[str] = []
+
+    def remove(done: int, total: int) -> None:
+        if done == total and not removed:
+            removed.append(f"recordings/{RECORDING}/{FILE.name}")
+            target.delete(removed[0])
+
+    with pytest.raises(StoreError, match=r"have gone .* Copy again"):
+        copy(source.source, target.place, RECORDING, How(progress=remove))
     assert removed
     copy(source.source, target.place, RECORDING)
     target.check(recording())
