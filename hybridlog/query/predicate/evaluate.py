@@ -247,13 +247,14 @@ class _Columns:
         """The values at a path, whole arrays, statistics of arrays; none of them null."""
         parts, start = target.parts, _Values(self._records, np.arange(len(self._records)))
         stat = self._types.statistic(parts)
+        if stat is None:
+            yield from self._reach(start, parts)
+            return
         is_named = np.zeros(len(self._records), np.bool_)
-        if stat is None or not self._types.known:
+        if not self._types.known:
             for found in self._reach(start, parts):
                 is_named[found.rows] = True
                 yield found
-        if stat is None:
-            return
         for array in self._reach(start, parts[:-1]):
             for found in _statistics(array, stat):
                 yield found.some(~is_named[found.rows])
