@@ -15,7 +15,7 @@ from msgspec import Struct, field
 from msgspec.structs import replace
 
 from hybridlog.query.choice import Choice
-from hybridlog.query.latching import depth_of
+from hybridlog.query.latching import depth_of, publisher_of
 from hybridlog.query.times import parse_duration
 from hybridlog.query.topics import matcher
 from hybridlog.wording import listed, parse_size, size
@@ -235,7 +235,7 @@ def _in_force(manifest: Manifest) -> set[int]:
         came = Counter[Hashable]()
         for own, part in log.parts.items():
             channel = manifest.channels[own]
-            publisher = channel.topic, channel.metadata.get("callerid") or own
+            publisher = publisher_of(channel, own)
             came[publisher] += part.messages
             if part.messages and newer[publisher] < depth_of(channel):
                 found.add(number)

@@ -66,13 +66,12 @@ def is_key_frame(channel: Channel, payload: Buffer) -> bool:
     return video.is_key_frame(form, data)
 
 
-def publisher_of(channel: Channel) -> Hashable:
-    """Identifies the publishers whose messages displace one another.
+def publisher_of(channel: Channel | ListedChannel, own: Hashable) -> Hashable:
+    """Identifies the publishers whose messages displace one another; `own` stands for unknown ones.
 
     A ROS 1 node may have several connections, for example after a restart.
     """
-    caller = channel.metadata.get("callerid")
-    return (channel.topic, caller) if caller else channel
+    return channel.topic, channel.metadata.get("callerid") or own
 
 
 @lru_cache(maxsize=256)
@@ -151,7 +150,7 @@ class LatchedFront:
         for channel in channels[len(self._depths) :]:
             self._depths.append(KEEP_ALL if is_video(channel) else depth_of(channel))
             self._channels.append(channel)
-            self._publishers.append(publisher_of(channel))
+            self._publishers.append(publisher_of(channel, channel))
         is_latched = np.array(self._depths, np.int64)[batch.channel] > 0
         hold = is_latched & (batch.log_time < self._begin)
         if not self._original_times:

@@ -157,7 +157,7 @@ def _last_messages(
     """The last messages of each publisher before a log time, in order; None without any."""
     publishers: dict[Hashable, dict[int, int]] = defaultdict(dict)
     for index, channel in enumerate(channels):
-        publishers[publisher_of(channel.channel)][channel.channel_id] = index
+        publishers[publisher_of(channel.channel, channel.channel)][channel.channel_id] = index
     found: list[MessageRun] = []
     for indexes in publishers.values():
         chunks = session.chunks(recording, [*indexes], (BEGIN, begin), "log")
