@@ -168,7 +168,7 @@ class Keeper:
         `logs` are the numbers of the segments that have a copy in the store at `copy`.
         """
         with self._alone():
-            found, now = KeepReport(Plan(0, None)), self._directory.manifests.read(recording)
+            found, now = KeepReport(Plan(0, 0)), self._directory.manifests.read(recording)
             own = [now.logs[number] for number in sorted(logs) if number in now.logs]
             going = [log.number for log in own if may_go(log) and not is_pinned(log, now)]
             if going and not rules.is_never(now.tags):

@@ -293,14 +293,14 @@ class Plan(Struct):
 
     Attributes:
         used_bytes: Bytes that the store takes.
-        free_bytes: Free bytes of the disk; None in a bucket.
+        free_bytes: Free bytes of the disk.
         steps: The deletions.
         warnings: What the rules cannot reach, in sentences.
         is_short: Whether more should go than may go.
     """
 
     used_bytes: int
-    free_bytes: int | None
+    free_bytes: int
     steps: list[Step] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     is_short: bool = False
@@ -311,16 +311,15 @@ def plan(
     rules: Rules,
     *,
     used: int,
-    free: int | None,
+    free: int,
     now: int,
     has_arrays: bool = False,
 ) -> Plan:
     """Plan deletions: their order, and the reason of each.
 
     `held` are recordings with their logs, none of those that another process records; `used` and
-    `free` are bytes, the latter None in a bucket; `now` is ns. With `has_arrays`, tables
-    shrink when payloads go, by unknown amounts: whole groups wait for the next plan, which
-    measures again.
+    `free` are bytes, `now` is ns. With `has_arrays`, tables shrink when payloads go, by unknown
+    amounts: whole groups wait for the next plan, which measures again.
     """
     return _Planning(rules, Plan(used, free), now, has_arrays=has_arrays).made(held)
 
@@ -429,9 +428,8 @@ class _Planning:
         rules, need = self._rules, -math.inf
         if rules.quota is not None:
             need = self._plan.used_bytes - share * rules.quota
-        free = self._plan.free_bytes
-        if rules.min_free is not None and free is not None:
-            need = max(need, times * rules.min_free - free)
+        if rules.min_free is not None:
+            need = max(need, times * rules.min_free - self._plan.free_bytes)
         return need - self._freed
 
     def _reason(self, share: float, times: float) -> str:

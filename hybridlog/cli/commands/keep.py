@@ -194,9 +194,9 @@ def _keep(store: Store, rules: dict[str, Any], given: _Given) -> int:
         given.show(plan.steps, _STEPS)
     size = output.size
     freed = sum(step.bytes for step in plan.steps) if dry_run else found.freed_bytes
-    free = "" if plan.free_bytes is None else f", {size(plan.free_bytes)} free"
     what = "would become free" if dry_run else "freed"
-    told = f"{size(plan.used_bytes)} used{free}: {size(freed)} {what}"
+    room = f"{size(plan.used_bytes)} used, {size(plan.free_bytes)} free"
+    told = f"{room}: {size(freed)} {what}"
     output.tell({**asdict(found), "dry_run": dry_run}, [told])
     topics = store.topics()
     useless = (
