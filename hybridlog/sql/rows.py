@@ -101,15 +101,15 @@ class ViewRows(Rows):
 
     def read(self, part: Part) -> Iterator[pa.RecordBatch]:
         """The rows of a topic of a recording."""
-        found = self.tabled(part)
-        if found is not None and not self._has_all(found.table, part):
-            found = None
-        for group in () if found is None else found.table.parts:
-            if found is not None and touches(part.log_windows, group.first, group.last):
-                yield from self._in_group(part, found.table, group)
-        rest = part if found is None else found.rest
-        scan = None if rest is None else ChunkScan(self.chunk_plan([rest]), self.session)
-        for run in () if scan is None else scan.runs():
+        found, rest = self.tabled(part), part
+        if found is not None and self._has_all(found.table, part):
+            for group in found.table.parts:
+                if touches(part.log_windows, group.first, group.last):
+                    yield from self._in_group(part, found.table, group)
+            if found.rest is None:
+                return
+            rest = found.rest
+        for run in ChunkScan(self.chunk_plan([rest]), self.session).runs():
             for number, rows in rows_by_channel(run.batch.channel):
                 yield self._decoded(run.channels[number], run.batch.take(rows), run.seq[rows])
 
