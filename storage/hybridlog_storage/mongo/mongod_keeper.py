@@ -60,6 +60,8 @@ def main(linger_s: float, socket: str, lock: int, command: list[str]) -> None:
 
 def _tie(keeper: int) -> None:
     """Runs in mongod's process before exec: ends it when the keeper ends."""
+    if not sys.platform.startswith("linux"):
+        return
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGTERM), 0, 0, 0)
     if os.getppid() != keeper:  # which died before the line above
         os._exit(1)
