@@ -58,13 +58,7 @@ def run(load: Load, backend: type[Backend], directory: Path, speed: float = 1.0)
         speed: Times as fast as the load says.
     """
     directory = directory.resolve()
-    data = directory / "data"
-    data.mkdir()
-    common = {
-        "load": str(load.payloads.parent.resolve()),
-        "backend": spelled(backend),
-        "directory": str(data),
-    }
+    common = given_to(backend, load, directory)
     counters = directory / "counters"
     publishing = {"counters": str(counters), "speed": speed, "limit": QUEUE}
     timeout = 3 * load.duration_s / speed + _START_S
@@ -80,7 +74,7 @@ def run(load: Load, backend: type[Backend], directory: Path, speed: float = 1.0)
     if status == "missing" or not counters.is_file():
         return Outcome(status, {}, reason)
     values["due_s"] = load.duration_s / speed
-    values["disk_bytes"] = usage.disk_bytes(data)
+    values["disk_bytes"] = usage.disk_bytes(Path(common["directory"]))
     try:
         limit_s = _COUNT_S if status == "ok" else _COUNT_FAILED_S
         found = run_side("benchmarks.harness.logger:count", common, directory, limit_s)
@@ -93,6 +87,23 @@ def run(load: Load, backend: type[Backend], directory: Path, speed: float = 1.0)
     if status == "ok" and wrong:
         status, reason = "failed", wrong
     return Outcome(status, values, reason)
+
+
+def given_to(backend: type[Backend], load: Load, directory: Path) -> dict[str, str]:
+    """The arguments of a side: its backend gets the new folder `data` of the run's directory.
+
+    Args:
+        backend: A class at the top of a module.
+        load: What it gets or has.
+        directory: Of the run, and absolute.
+    """
+    data = directory / "data"
+    data.mkdir()
+    return {
+        "load": str(load.payloads.parent.resolve()),
+        "backend": spelled(backend),
+        "directory": str(data),
+    }
 
 
 def _account(

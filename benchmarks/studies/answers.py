@@ -31,10 +31,11 @@ from benchmarks.backends.base import (
 )
 from benchmarks.backends.conversion import typestore_of
 from benchmarks.harness.logger import StoppedError, ended_by_signals
+from benchmarks.harness.run import given_to
 from benchmarks.loads.base import Load
 from benchmarks.loads.hcr_like import hcr_like, true_answers
 from benchmarks.samples import Sample, Scale
-from benchmarks.side import SideError, Values, named, run_side, spelled, warm_cache
+from benchmarks.side import SideError, Values, named, run_side, warm_cache
 from benchmarks.studies.record import robot_log
 from benchmarks.studies.runs import Context, run_directory
 
@@ -115,14 +116,7 @@ def _turns(
 def _turn(context: Context, side: str, kind: type[Backend], load: Load, repetitions: int) -> Values:
     warm_cache(load.payloads)
     with run_directory(context.work) as directory:
-        data = directory / "data"
-        data.mkdir()
-        given = {
-            "load": str(load.payloads.parent.resolve()),
-            "backend": spelled(kind),
-            "directory": str(data),
-            "repetitions": repetitions,
-        }
+        given = {**given_to(kind, load, directory), "repetitions": repetitions}
         try:
             return run_side(f"{__name__}:{side}", given, directory, _TIMEOUT_S)
         except SideError as error:
