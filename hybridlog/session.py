@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import (
     Callable,
     Collection,
@@ -35,7 +35,7 @@ from hybridlog_storage.errors import (
 )
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segments.chunk_table import place_of
-from hybridlog_storage.times import BEGIN, END, placed
+from hybridlog_storage.times import END, placed
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -530,22 +530,14 @@ class Session:
             raise _changed(entry)
 
     def table(self, recording: RecordingEntry, topic: str) -> TopicTable | None:
-        """The table of a topic, of all segments or of some; None without one.
+        """The table of a topic of an ended recording; None without one.
 
         Where messages are lost there is none, since rows of these must not answer.
         """
-        if (topic == MARKS and recording.manifest.marks) or any(
-            True for _ in lost_spans(recording)
-        ):
+        has_marks = topic == MARKS and recording.manifest.marks
+        if recording.status in UNFINISHED or has_marks or any(True for _ in lost_spans(recording)):
             return None
-        if recording.status not in UNFINISHED:
-            return self.tables.of(recording, topic)
-        ids = [channel.id for channel in recording.channels if channel.topic == topic]
-        messages: Counter[int] = Counter()
-        parts = self.parts(recording, ids, (BEGIN, END))
-        for segment, number in parts[["segment", "messages"]].tolist():
-            messages[segment] += number
-        return self.tables.of_sealed(recording, topic, messages)
+        return self.tables.of(recording, topic)
 
 
 def _file_in(entry: RecordingEntry, number: int) -> tuple[object, ...]:

@@ -41,6 +41,8 @@ _TAIL: Final = 8  # bytes: length of the footer, `PAR1`
 _SEAL: Final = 4  # bytes: CRC-32 of the footer, in front of it
 _MAX_FOOTER: Final = 256 << 20
 _NUMBERS: Final = count()
+_GROUP_ROWS: Final = 131_072  # of a row group, at most
+_GROUP_BYTES: Final = 32 << 20  # of the columns of a row group in memory, at most
 _RUNNING: Final = frozenset({"t", "log_time", "seq", "pub", "stamp", "ref.chunk", "ref.off"})
 FIRST: Final = -(1 << 63)
 """Lower bound of all log times."""
@@ -132,8 +134,9 @@ class ColumnFileWriter:
             raise
 
     def write(self, table: pa.Table) -> None:
-        """Write a row group."""
-        self._parquet.write_table(table, row_group_size=max(table.num_rows, 1))
+        """Write rows as row groups, one if they are few."""
+        step = table.num_rows * _GROUP_BYTES // max(table.nbytes, 1)
+        self._parquet.write_table(table, row_group_size=max(min(_GROUP_ROWS, step), 1))
         self.rows += table.num_rows
 
     def close(self, sections: Sequence[Section], *, sync: bool = False) -> None:

@@ -94,39 +94,53 @@ class TableFolders:
         """Remove older rows of topics that go, and add tables; an empty folder is removed."""
         place = self._root / TABLES / folder
         names = [n for n in files.names(place) if n.endswith(SUFFIX)]
-        shared = [*shared_for(shared_times(names), self._created)]
-        pieces, old = addition.pieces, list[Path]()
+        self._share(place, shared_for(shared_times(names), self._created), addition.pieces, goes)
+        old: list[Path] = []
+        own = f"{self._recording}-"
         if goes is not None:
-            own = [name for name in sorted(names) if name.startswith(f"{self._recording}-")]
-            readers = [reader for name in own if (reader := _reader(place / name)) is not None]
-            old = [one.path for one in readers if all(goes(s.topic) for s in one.about.sections)]
-            for name in shared:
-                reader = _reader(place / name)
-                if reader is not None and reader.about.has(self._recording):
-                    self._rewrite(reader, pieces, goes)
-                    pieces = []
-                    break
-        if pieces:
-            self._merge(place, shared, pieces)
-        self._publish(place, addition.files, old)
+            readers = map(_reader, (place / name for name in sorted(names) if name.startswith(own)))
+            known = [reader for reader in readers if reader is not None]
+            old = [one.path for one in known if all(goes(s.topic) for s in one.about.sections)]
+        numbered = (f"{own}{number}{SUFFIX}" for number in count())
+        free = (place / name for name in numbered if name not in names)
+        for part, path in zip(addition.files, chain(old, free), strict=False):
+            files.rename(part, path)
+        for path in old[len(addition.files) :]:
+            files.remove_tree(path)
         with suppress(OSError), files.folder(place.parent) as fd:
             files.system.rmdir(folder, dir_fd=fd)
 
-    def _merge(self, place: Path, shared: Sequence[str], pieces: Sequence[_Piece]) -> None:
-        """Add rows to the shared file that may have them, or to a new one."""
-        reader = next(filter(None, (_reader(place / name) for name in shared)), None)
-        own = _shared_name(0 if reader is None else max(self._created or 0, 0))
-        if reader is not None and (
-            reader.path.name == own
-            or (
-                len({one.id for one in reader.about.sections}) < MAX_SHARED_RECORDINGS
-                and reader.size_bytes < MAX_SHARED_BYTES
-                and reader.rows + sum(one.rows for one, _ in pieces) <= MAX_SHARED_ROWS
-            )
+    def _share(
+        self,
+        place: Path,
+        names: Iterable[str],
+        pieces: Sequence[_Piece],
+        goes: Callable[[str], bool] | None,
+    ) -> None:
+        """Add rows to the shared file that has the recording, to the likeliest, or to a new one."""
+        readers = (one for one in (_reader(place / name) for name in names) if one is not None)
+        first = reader = next(readers, None)
+        while goes is not None and reader is not None and not reader.about.has(self._recording):
+            reader = next(readers, None)
+        if goes is not None and reader is not None:
+            self._rewrite(reader, pieces, goes)
+            return
+        own = _shared_name(0 if first is None else max(self._created or 0, 0))
+        if (
+            first is not None
+            and pieces
+            and (first.path.name == own or self._has_room(first, pieces))
         ):
-            self._rewrite(reader, pieces, lambda _: False)
-        else:
+            self._rewrite(first, pieces, lambda _: False)
+        elif pieces:
             self._write(place / own, pieces)
+
+    def _has_room(self, reader: ColumnFile, pieces: Sequence[_Piece]) -> bool:
+        return (
+            len({one.id for one in reader.about.sections}) < MAX_SHARED_RECORDINGS
+            and reader.size_bytes < MAX_SHARED_BYTES
+            and reader.rows + sum(one.rows for one, _ in pieces) <= MAX_SHARED_ROWS
+        )
 
     def _rewrite(
         self, reader: ColumnFile, new: Sequence[_Piece], goes: Callable[[str], bool]
@@ -169,16 +183,6 @@ class TableFolders:
             writer.discard()
             raise
         files.rename(part, path)
-
-    def _publish(self, place: Path, parts: Sequence[Path], old: Sequence[Path]) -> None:
-        """Give finished files free names: first those of the old files, which they replace."""
-        names = files.names(place)
-        numbered = (f"{self._recording}-{number}{SUFFIX}" for number in count())
-        free = (place / name for name in numbered if name not in names)
-        for part, path in zip(parts, chain(old, free), strict=False):
-            files.rename(part, path)
-        for path in old[len(parts) :]:
-            files.remove_tree(path)
 
 
 def _folders(root: Path) -> list[str]:

@@ -4,8 +4,7 @@
 tables/<type>~<shape8>/shared-<time>.parquet     several recordings
 tables/<type>~<shape8>/<id>-<number>.parquet     a long topic of one recording
 tables.part/r<id>/                               unfinished files
-tables.part/r<id>/<type>~<shape8>/               sealed segments of a recording in progress
-recordings/<id>/000002.rows.parquet           what is left of the messages of a log
+recordings/<id>/000002.rows.parquet              what is left of the messages of a log
 ```
 
 A folder of `tables` has the rows of all ended recordings of one message type. All of its

@@ -1,8 +1,8 @@
 """Writes the tables of a recording during indexing.
 
-Rows remain in memory until their segment is sealed, or until there are too many. Then they
-become row groups of an unfinished file of their topic. Topics with few rows wait until the
-recording has ended, and go to files that recordings share.
+Rows remain in memory until there are too many. Then those of the largest topics become row groups
+of unfinished files. When the recording has ended, all files get their names, and topics with few
+rows go to files that recordings share.
 
 Tables are derived. After any failure the recording continues, and a topic has no table.
 """
@@ -13,13 +13,12 @@ import errno
 import logging
 import shutil
 from collections import Counter, defaultdict
-from collections.abc import Collection, Hashable, Iterable, Iterator
+from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import pyarrow as pa
-import pyarrow.compute as pc
 from msgspec.structs import replace
 
 from hybridlog.columns.column_file import ColumnFileWriter
@@ -37,7 +36,7 @@ from hybridlog.columns.rows import PointColumns, columns_from, is_cloud, rows_of
 from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.codec import no_messages
 from hybridlog.schema.codecs import codec_for
-from hybridlog.schema.states import State, encoding_of, state_of
+from hybridlog.schema.states import encoding_of, state_of
 from hybridlog_storage.disk import files
 from hybridlog_storage.messages import EXPIRED_IDS, distinct, order_of
 from hybridlog_storage.settings import read_settings
@@ -48,10 +47,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.messages import Channel
 
-GROUP_ROWS: Final = 131_072
-"""Maximum number of rows in a row group."""
-GROUP_BYTES: Final = 32 << 20
-"""Maximum bytes of the columns of a row group in memory."""
 _PENDING = 16 << 20  # bytes of rows waiting in memory
 _LEFT = _PENDING // 4  # bytes of the smallest topics, which continue to wait for more rows
 _PIECES = 32  # pieces of a topic that become one: small ones take far more than their bytes
@@ -69,8 +64,7 @@ pa.array([0]).to_numpy(zero_copy_only=False)
 class _Topic:
     """Messages of one topic and definition."""
 
-    def __init__(self, recording: str, channel: Channel, *, arrays: bool) -> None:
-        self._names = {"recording": recording, "topic": channel.topic}
+    def __init__(self, channel: Channel, *, arrays: bool) -> None:
         self.name = channel.topic
         self.type = channel.schema.name if channel.schema is not None else ""
         self.has_arrays = arrays
@@ -81,15 +75,12 @@ class _Topic:
         decoded = codec.columns_of(no_messages()) if codec.indexed else None
         # No rows, with the columns that the definition fixes.
         self._none = structs({}, 0) if decoded is None else columns_from(decoded, arrays=arrays)
-        self.rows = 0
+        self.rows = self.unreadable = 0
+        self.segments: set[int] = set()
         self.waiting: list[Any] = []
-        """Rows in memory, with all columns but those of `_names`."""
-        self._segments: set[int] = set()  # of these
-        self.files: list[_File] = []
-        """Unfinished files, with rows of segments that are not closed yet."""
-        self.finished: list[tuple[str, Path]] = []
-        """Folders and paths of finished files."""
-        self.has_failed = False
+        """Rows in memory, without the names of recording and topic."""
+        self.files: list[ColumnFileWriter] = []
+        """Unfinished files, each with other columns."""
 
     @property
     def size(self) -> int:
@@ -98,8 +89,8 @@ class _Topic:
 
     @property
     def is_long(self) -> bool:
-        """True if the rows in memory have a file of their own."""
-        return sum(map(len, self.waiting)) >= LONG_ROWS or self.size >= LONG_BYTES
+        """True if it has files of its own."""
+        return bool(self.files) or self.rows >= LONG_ROWS or self.size >= LONG_BYTES
 
     def add(self, messages: Messages) -> None:
         """Make rows of messages."""
@@ -111,30 +102,27 @@ class _Topic:
             columns=self._columns,
         )
         self.waiting.append(side_by_side(own, fields))
-        self._segments.update(distinct(messages.placed.segment).tolist())
+        self.segments.update(distinct(messages.placed.segment).tolist())
         self.rows += len(fields)
+        self.unreadable += len(fields) - own["error"].null_count
         if len(self.waiting) >= _PIECES:
             self.waiting = [joined(self.waiting)]
 
-    def take(self) -> tuple[set[int], pa.Table]:
-        """Remove the rows in memory, of which there are some; returns their segments, and them.
-
-        They are in the order of log time and arrival.
-        """
-        rows, segments = joined([*self.waiting, self._none]), self._segments
-        self.waiting, self._segments = [], set()
+    def take(self, recording: str) -> pa.Table:
+        """Remove the rows in memory, of which there are some, in order of time and arrival."""
+        rows, self.waiting = joined([*self.waiting, self._none]), []
         named = {
-            name: pa.repeat(pa.scalar(value), len(rows)) for name, value in self._names.items()
+            name: pa.repeat(pa.scalar(value), len(rows))
+            for name, value in (("recording", recording), ("topic", self.name))
         }
         table = pa.Table.from_struct_array(side_by_side(named, rows))
         order = order_of(table["t"].to_numpy(), table["seq"].to_numpy())
-        return segments, table if order is None else table.take(pa.array(order))
+        return table if order is None else table.take(pa.array(order))
 
     def give_up(self) -> None:
         """Make no table of the topic."""
-        self.has_failed, self.rows = True, 0
+        self.rows = 0
         self.waiting.clear()
-        self.finished.clear()
         for file in self.files:
             file.discard()
         self.files.clear()
@@ -144,29 +132,6 @@ class _Topic:
         if self._points is not None and not isinstance(decoded.records, LeftFields):
             columns = self._points.with_points(columns, decoded.arrow())
         return copied(columns)
-
-
-def _unreadable_in(table: pa.Table) -> int:
-    """Number of rows without fields."""
-    return pc.sum(pc.equal(table["state"], State.UNREADABLE.value)).as_py() or 0
-
-
-class _File(ColumnFileWriter):
-    """An unfinished file of one topic."""
-
-    def __init__(self, path: Path, schema: pa.Schema) -> None:
-        super().__init__(path, schema)
-        self.segments: set[int] = set()
-        self.unreadable = 0
-
-    def add(self, segments: set[int], table: pa.Table) -> None:
-        """Write rows of some segments as row groups."""
-        rows = max(table.num_rows, 1)
-        step = max(min(GROUP_ROWS, rows * GROUP_BYTES // max(table.nbytes, 1)), 1)
-        for begin in range(0, table.num_rows, step):
-            self.write(table.slice(begin, step))
-        self.segments |= segments
-        self.unreadable += _unreadable_in(table)
 
 
 class TableWriter:
@@ -190,10 +155,9 @@ class TableWriter:
         self._has_ended = False
         self.problem = ""  # why no table was written
         self._topics: dict[Hashable, _Topic] = {}
-        self._cut: dict[int, str] = {}  # digests of the closed ones
 
     def add(self, messages: Iterable[Messages]) -> None:
-        """Add messages of one segment."""
+        """Add messages of the recording; rows of the largest topics go to files if many wait."""
         if self._has_ended:
             return
         with self._harmless():
@@ -203,16 +167,6 @@ class TableWriter:
                     with self._only(topic):
                         topic.add(one)
             self._spill()
-
-    def cut(self, segment: int, digest: str) -> None:
-        """Finish the files of a segment; topics with few rows wait for the next one."""
-        with self._harmless():
-            self._cut[segment] = digest
-            for topic in self._topics.values():
-                with self._only(topic):
-                    if topic.is_long or any(segment in one.segments for one in topic.files):
-                        self._write(topic)
-                    self._finish(topic)
 
     def close(self, entry: RecordingEntry) -> None:
         """Finish all tables; topics with another number of messages keep an older one."""
@@ -239,14 +193,6 @@ class TableWriter:
             _log.warning("No tables of recording %s were written: %s", self._name, self.problem)
             self.discard()
 
-    def _topic(self, channel: Channel) -> _Topic:
-        encoding = encoding_of(channel.message_encoding, channel.metadata)
-        key = channel.topic, encoding, channel.schema
-        if key not in self._topics:
-            arrays = channel.topic in self._arrays
-            self._topics[key] = _Topic(self._recording, channel, arrays=arrays)
-        return self._topics[key]
-
     @contextmanager
     def _only(self, topic: _Topic) -> Iterator[None]:
         """Limit a failure to the table of one topic; a full disk ends all tables."""
@@ -258,59 +204,43 @@ class TableWriter:
             _log.warning("no table of %s: %s", topic.name, error or repr(error))
             topic.give_up()
 
-    # From rows in memory to files.
+    def _topic(self, channel: Channel) -> _Topic:
+        encoding = encoding_of(channel.message_encoding, channel.metadata)
+        key = channel.topic, encoding, channel.schema
+        if key not in self._topics:
+            self._topics[key] = _Topic(channel, arrays=channel.topic in self._arrays)
+        return self._topics[key]
 
     def _spill(self) -> None:
-        """Write rows of the largest topics if too many are waiting in memory."""
         left = sum(topic.size for topic in self._topics.values())
         if left < _PENDING:
             return
         for topic in sorted(self._topics.values(), key=lambda topic: -topic.size):
-            if left <= _LEFT:
-                return
-            left -= topic.size
-            with self._only(topic):
-                self._write(topic)
+            if left > _LEFT:
+                left -= topic.size
+                with self._only(topic):
+                    self._write(topic)
 
     def _write(self, topic: _Topic) -> None:
-        """Write rows to an unfinished file of a topic."""
-        if topic.waiting:
-            self._check_room()
-            segments, table = topic.take()
-            file = next((one for one in topic.files if one.schema == table.schema), None)
-            if file is None:
-                file = _File(self._new_part(), table.schema)
-                topic.files.append(file)
-            file.add(segments, table)
-
-    def _new_part(self) -> Path:
-        if not self._numbers:
-            with suppress(FileNotFoundError):
-                files.remove_tree(self._parts)  # left from a crash
-            files.make_folders(self._parts)
-        self._numbers += 1
-        return self._parts / f"{self._recording}-{self._numbers}{SUFFIX}"
+        """Write the rows in memory to an unfinished file of a topic."""
+        if not topic.waiting:
+            return
+        self._check_room()
+        table = topic.take(self._recording)
+        file = next((one for one in topic.files if one.schema == table.schema), None)
+        if file is None:
+            if not self._numbers:
+                with suppress(FileNotFoundError):
+                    files.remove_tree(self._parts)  # left from a crash
+                files.make_folders(self._parts)
+            self._numbers += 1
+            file = ColumnFileWriter(self._parts / f"{self._numbers}{SUFFIX}", table.schema)
+            topic.files.append(file)
+        file.write(table)
 
     def _check_room(self) -> None:
         if shutil.disk_usage(self._root).free < _RESERVE:
             raise OSError(errno.ENOSPC, f"the disk needs {_RESERVE >> 20} MiB free; make room")
-
-    def _finish(self, topic: _Topic) -> None:
-        """Finish a topic's files of closed segments."""
-        for file in [one for one in topic.files if one.segments <= self._cut.keys()]:
-            topic.files.remove(file)
-            file.close([self._section(topic, file.segments, file.rows, file.unreadable)])
-            folder = shape_folder(topic.type, file.schema)
-            place = self._parts / folder / file.path.name
-            files.make_folders(place.parent)
-            files.rename(file.path, place)
-            topic.finished.append((folder, place))
-
-    def _section(self, topic: _Topic, segments: set[int], rows: int, unreadable: int) -> Section:
-        """The description of rows in their file."""
-        digests = {str(number): self._cut[number] for number in sorted(segments)}
-        counts = rows, unreadable, topic.has_arrays
-        return Section(self._recording, topic.name, digests, *counts)
 
     def _close(self, entry: RecordingEntry) -> None:
         incomplete = self._incomplete(entry)
@@ -319,16 +249,7 @@ class TableWriter:
             if topic.name in incomplete:
                 topic.give_up()
             with self._only(topic):
-                if topic.is_long:
-                    self._write(topic)
-                    self._finish(topic)
-                elif topic.waiting:
-                    segments, table = topic.take()
-                    counts = table.num_rows, _unreadable_in(table)
-                    rows = self._section(topic, segments, *counts), table
-                    additions[shape_folder(topic.type, table.schema)].pieces.append(rows)
-            for folder, path in topic.finished:
-                additions[folder].files.append(path)
+                self._finish(topic, entry, additions)
         replaced: set[str] = set()
         if self._wanted is not None:
             # An older table may be the only copy of fields in a damaged chunk.
@@ -338,6 +259,24 @@ class TableWriter:
             types = {type_prefix(c.type) for c in entry.channels if c.topic in replaced}
             folders = TableFolders(self._root, self._recording, entry.created)
             folders.add(additions, replaced, types)
+
+    def _finish(
+        self, topic: _Topic, entry: RecordingEntry, additions: Mapping[str, Addition]
+    ) -> None:
+        """Finish the files of a topic, or take its few rows."""
+        digests = {str(number): entry.digests[str(number)] for number in sorted(topic.segments)}
+        counts = topic.rows, topic.unreadable, topic.has_arrays
+        section = Section(self._recording, topic.name, digests, *counts)
+        if topic.is_long:
+            self._write(topic)
+        elif topic.waiting:
+            table = topic.take(self._recording)
+            additions[shape_folder(topic.type, table.schema)].pieces.append((section, table))
+        for file in topic.files:
+            file.close([replace(section, rows=file.rows)])
+            section = replace(section, unreadable=0)  # of a table all are told in its first file
+        for file in topic.files:
+            additions[shape_folder(topic.type, file.schema)].files.append(file.path)
 
     def _incomplete(self, entry: RecordingEntry) -> set[str]:
         """Topics that can have no table."""

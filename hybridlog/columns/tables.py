@@ -5,7 +5,7 @@ rows is the catalog's number of messages. All bytes read are verified by checksu
 table is ignored, and chunks answer.
 
 A file is opened once for all recordings and topics in it. A recording that is not found is a
-reason to look at the folders again.
+reason to look at the folders again. Recordings in progress have no tables.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
@@ -36,7 +35,6 @@ from hybridlog.columns.layout import (
     SUFFIX,
     TABLES,
     Section,
-    parts_folder,
     type_prefix,
 )
 from hybridlog.schema.arrow_columns import structs
@@ -102,16 +100,9 @@ class TableRows(Struct, frozen=True, eq=False):
 
 
 class TopicTable:
-    """All messages of a topic in the `segments` of a recording that it covers, by number."""
+    """All messages of a topic of a recording."""
 
-    def __init__(
-        self,
-        parts: Sequence[TablePart],
-        *,
-        unreadable: int = 0,
-        segments: Iterable[int] = (),
-    ) -> None:
-        self.segments = frozenset(segments)
+    def __init__(self, parts: Sequence[TablePart], *, unreadable: int = 0) -> None:
         self.rows = sum(part.rows for part in parts)
         self.unreadable = unreadable
         self.files = list({part.file.number: part.file for part in parts}.values())
@@ -287,7 +278,6 @@ def _in_order(parts: Sequence[TableRows]) -> TableRows:
     return rows if order is None else rows.take(order)
 
 
-_MAX_RUNNING: Final = 16  # recordings in progress whose tables are kept open
 _MAX_FOUND: Final = 65_536  # tables that are kept
 _STABLE_NS: Final = 100_000_000  # a time of change that is older tells of every later change
 
@@ -304,130 +294,90 @@ class TopicRows(NamedTuple):
         return self.section.segments.items() <= recording.digests.items()
 
 
-class _Listing:
-    """Status of a folder's entries by name, read again after a change; none without the folder."""
+class _Folder:
+    """The entries of a folder, and those files with tables in it that were looked at."""
 
     def __init__(self, path: Path, cache: Cache) -> None:
-        self.names: dict[str, os.stat_result] = {}
         self._path = path
         self._cache = cache
         self._read_at: tuple[int, int] | None = None  # inode, and time of its last change
-
-    def read(self) -> bool:
-        """Read the entries if they may have changed; returns whether it did."""
-        try:
-            now, names = files.changed_names(self._path, self._read_at)
-            if names is None:
-                return False
-            self.names = names
-        except FileNotFoundError:
-            self.names, self._read_at = {}, None
-            return True
-        except OSError as error:
-            raise unreadable(error, self._path) from error
-        # A change within the same tick of the clock would have the same time.
-        self._read_at = now if time.time_ns() - now[1] > _STABLE_NS else None
-        return True
-
-
-class _Folder(_Listing):
-    """The files of a folder."""
-
-    def __init__(self, path: Path, cache: Cache) -> None:
-        super().__init__(path, cache)
+        self.names: dict[str, os.stat_result] = {}
+        """Status of each entry."""
         self._shared: list[int] = []  # numbers in the names of shared files
         self._own: dict[str, list[str]] = {}  # files of long topics, by recording
         self._files: dict[str, tuple[tuple[int, int, int], ColumnFile | None]] = {}
         self.rows: dict[tuple[str, str], list[TopicRows]] = {}
-        """The rows in the files that were looked at, by recording and topic."""
+        """The rows in files that were looked at, by recording and topic."""
 
     @property
     def damaged(self) -> list[str]:
         """Files that were looked at and cannot be read."""
         return [str(self._path / name) for name, (_, file) in self._files.items() if file is None]
 
+    def read(self) -> bool:
+        """Read the entries, none without the folder, if they may have changed; tells whether."""
+        try:
+            now, names = files.changed_names(self._path, self._read_at)
+        except FileNotFoundError:
+            now, names = (0, 0), {}
+        except OSError as error:
+            raise unreadable(error, self._path) from error
+        if names is not None:
+            # A change within the same tick of the clock would have the same time.
+            self._read_at = now if 0 < now[1] < time.time_ns() - _STABLE_NS else None
+            self.names = names
+        return names is not None
+
     def look(self, recording: RecordingEntry) -> None:
         """Open files that may have rows of a recording, if they are new or replaced."""
         if self.read():
-            self._drop_replaced()
-        for name in self._own.get(recording.id, []):
+            before, self._files, self.rows, self._own = self._files, {}, {}, {}
+            tables = sorted(name for name in self.names if name.endswith(SUFFIX))
+            self._shared = shared_times(tables)
+            for name in tables:
+                self._own.setdefault(name.rpartition("-")[0], []).append(name)
+                if name in before and before[name][0] == _identity(self.names[name]):
+                    self._add(name, before[name][1])
+        for name in self._own.get(recording.id, ()):
             self._open(name)
         for name in shared_for(self._shared, recording.created):
             file = self._open(name)
             if file is not None and file.about.has(recording.id):
                 break
 
-    def _drop_replaced(self) -> None:
-        before, self._files, self.rows, self._own = self._files, {}, {}, {}
-        tables = sorted(name for name in self.names if name.endswith(SUFFIX))
-        self._shared = shared_times(tables)
-        for name in tables:
-            self._own.setdefault(name.rpartition("-")[0], []).append(name)
-            identity = _identity(self.names[name])
-            if name in before and before[name][0] == identity:
-                self._add(name, *before[name])
-
     def _open(self, name: str) -> ColumnFile | None:
-        """A file, if there is one that can be read."""
-        status = self.names.get(name)
-        if name in self._files or status is None:
-            return self._files[name][1] if status is not None else None
-        try:
-            file: ColumnFile | None = ColumnFile(self._path / name, self._cache)
-        except FileNotFoundError:
-            return None
-        except StoreError:
-            file = None
-        self._add(name, _identity(status), file)
-        return file
+        """A file, if it can be read."""
+        if name not in self._files:
+            try:
+                self._add(name, ColumnFile(self._path / name, self._cache))
+            except FileNotFoundError:
+                return None
+            except StoreError:
+                self._add(name, None)
+        return self._files[name][1]
 
-    def _add(self, name: str, identity: tuple[int, int, int], file: ColumnFile | None) -> None:
-        self._files[name] = identity, file
+    def _add(self, name: str, file: ColumnFile | None) -> None:
+        self._files[name] = _identity(self.names[name]), file
         if file is not None:
             for begin, section in file.sections():
-                rows = TopicRows(file, begin, section)
-                self.rows.setdefault((section.id, section.topic), []).append(rows)
+                rows = self.rows.setdefault((section.id, section.topic), [])
+                rows.append(TopicRows(file, begin, section))
 
 
 def _identity(status: os.stat_result) -> tuple[int, int, int]:
     return status.st_ino, status.st_size, status.st_mtime_ns
 
 
-class _Folders(_Listing):
-    """The folders in one place."""
-
-    def __init__(self, path: Path, cache: Cache) -> None:
-        super().__init__(path, cache)
-        self._known: dict[str, dict[str, _Folder]] = {}  # by the beginning of their names
-
-    def look(self) -> None:
-        """Look which folders there are."""
-        if not self.read():
-            return
-        before, self._known = self._known, {}
-        for name, about in sorted(self.names.items()):
-            if S_ISDIR(about.st_mode):
-                begin = f"{name.rpartition('~')[0]}~"
-                folder = before.get(begin, {}).get(name)
-                folder = folder or _Folder(self._path / name, self._cache)
-                self._known.setdefault(begin, {})[name] = folder
-
-    def of(self, types: Iterable[str]) -> list[_Folder]:
-        """The folders of some message types."""
-        return [f for one in types for f in self._known.get(type_prefix(one), {}).values()]
-
-
 class Tables:
     """The tables of a store. Thread safe."""
 
     def __init__(self, root: Path, cache: Cache | None = None) -> None:
-        self._root = root
         self._cache = cache or Cache()
+        self._place = root / TABLES
         self._found: dict[tuple[str, str], TopicTable | None] = {}
-        self._folders = _Folders(root / TABLES, self._cache)
+        self._all = _Folder(self._place, self._cache)
+        self._folders: dict[str, dict[str, _Folder]] = {}  # by the beginning of their names
         self._looked_at: set[str] = set()  # types whose folders were looked at
-        self._sealed: dict[str, _Folders] = {}  # of recordings in progress
-        self._channels: tuple[RecordingEntry, dict[str, list[ChannelEntry]]] | None = None
         self._lock = threading.RLock()
 
     def of(self, recording: RecordingEntry, topic: str) -> TopicTable | None:
@@ -459,128 +409,86 @@ class Tables:
 
     def damaged(self, recording: RecordingEntry, topic: str) -> list[str]:
         """Files that may have rows of a topic, which were looked at and cannot be read."""
-        folders = self._folders.of(self._types_of(recording, topic))
-        return [path for folder in folders for path in folder.damaged]
-
-    def _find(self, recording: RecordingEntry, topic: str) -> TopicTable | None:
-        if recording.status == "open" or not self._can_have(recording, topic):
-            return None
-        with suppress(StoreError):
-            table = self._table(recording, topic, self._look(recording, [topic])[topic])
-            if table is not None and table.rows == self._messages_of(recording, topic):
-                return table
-        return None
-
-    def _can_have(self, recording: RecordingEntry, topic: str) -> bool:
-        """True if a topic has a table when all is well: only with one definition."""
-        found = {
-            (encoding_of(channel.message_encoding, channel.metadata), channel.schema)
-            for channel in self._channels_of(recording, topic)
-            if channel.stats.messages
-        }
-        return len(found) == 1
+        return [path for own in self._of(_channels(recording, topic)) for path in own.damaged]
 
     def sections_of(self, recording: RecordingEntry) -> list[TopicRows]:
         """The rows of a recording in files."""
         topics = sorted({channel.topic for channel in recording.channels})
-        return [rows for own in self._look(recording, topics).values() for rows in own]
+        return [rows for topic in topics for rows in self._rows(recording, topic)[0]]
 
     def lacking(self, recording: RecordingEntry, topics: Collection[str]) -> set[str]:
         """Topics of which files lack messages, whatever their definitions are."""
         try:
-            found = self._look(recording, topics)
+            found = {topic: self._rows(recording, topic) for topic in topics}
         except StoreError:
             return set(topics)
-        return {
+        confirmed = {
             topic
-            for topic, rows in found.items()
-            if not self._is_whole(recording, topic, rows)
-            or not all(one.is_of(recording) for one in rows)
+            for topic, (rows, is_whole) in found.items()
+            if is_whole and all(one.is_of(recording) for one in rows)
         }
+        return {*topics} - confirmed
 
-    def of_sealed(
-        self, recording: RecordingEntry, topic: str, messages: Mapping[int, int]
-    ) -> TopicTable | None:
-        """The table of some sealed segments of a running recording; None without a valid one.
+    def _find(self, recording: RecordingEntry, topic: str) -> TopicTable | None:
+        channels = [one for one in _channels(recording, topic) if one.stats.messages]
+        kinds = {(encoding_of(one.message_encoding, one.metadata), one.schema) for one in channels}
+        if recording.status == "open" or len(kinds) != 1:
+            return None
+        with suppress(StoreError):
+            found, is_whole = self._rows(recording, topic)
+            if not found or not is_whole or not all(rows.is_of(recording) for rows in found):
+                return None
+            if any(one.id >= EXPIRED_IDS for one in channels) and any(
+                rows.section.arrays for rows in found
+            ):
+                return None  # its arrays have expired with their payloads
+            table = TopicTable(
+                [part for one in found for part in one.file.parts(one.begin, one.section.rows)],
+                unreadable=sum(one.section.unreadable for one in found),
+            )
+            if len(table.files) > 1:
+                table.fields()  # which some have not in common
+            return table
+        return None
 
-        `messages` counts those of the topic by segment.
+    def _rows(self, recording: RecordingEntry, topic: str) -> tuple[list[TopicRows], bool]:
+        """The rows of a topic in files, and whether these are as many as its messages.
+
+        The folders of its types are looked at if it lacks some.
         """
-        if not self._can_have(recording, topic):
-            return None
+        channels, key = _channels(recording, topic), (recording.id, topic)
+        types = {channel.type for channel in channels}
+        messages = sum(channel.stats.messages for channel in channels)
         with self._lock:
-            place = _Folders(parts_folder(self._root, recording.id), self._cache)
-            place = self._sealed.setdefault(recording.id, place)
-            if len(self._sealed) > _MAX_RUNNING:
-                del self._sealed[next(iter(self._sealed))]
-            rows = self._look(recording, [topic], place)[topic]
-        try:
-            table = self._table(recording, topic, rows)
-        except StoreError:
-            return None
-        if table is None or table.rows != sum(messages.get(n, 0) for n in table.segments):
-            return None  # its files are just getting their names
-        return table
-
-    def _look(
-        self, recording: RecordingEntry, topics: Collection[str], place: _Folders | None = None
-    ) -> dict[str, list[TopicRows]]:
-        """The rows of topics in files, after a look at the folders of those that lack some."""
-        place = place or self._folders
-        with self._lock:
-            types = set[str]()
-            for topic in topics:
-                own = self._types_of(recording, topic)
-                rows = self._rows_in(place, recording, topic)
-                if not own <= self._looked_at or not self._is_whole(recording, topic, rows):
-                    types |= own
-            if types:
-                place.look()
-                for folder in place.of(types):
+            for is_looked_at in (False, True):
+                found = [rows for own in self._of(channels) for rows in own.rows.get(key, ())]
+                is_whole = sum(one.section.rows for one in found) == messages
+                if is_looked_at or (is_whole and types <= self._looked_at):
+                    break
+                self._look()
+                for folder in self._of(channels):
                     folder.look(recording)
-            if place is self._folders:
                 self._looked_at |= types
-            return {one: self._rows_in(place, recording, one) for one in topics}
+        return found, is_whole
 
-    def _rows_in(self, folders: _Folders, recording: RecordingEntry, topic: str) -> list[TopicRows]:
-        """The rows of a topic in the files of some folders that were looked at."""
-        own = folders.of(self._types_of(recording, topic))
-        return [rows for folder in own for rows in folder.rows.get((recording.id, topic), [])]
+    def _look(self) -> None:
+        """See which folders there are."""
+        if not self._all.read():
+            return
+        before, self._folders = self._folders, {}
+        for name, about in sorted(self._all.names.items()):
+            if S_ISDIR(about.st_mode):
+                begin = f"{name.rpartition('~')[0]}~"
+                folder = before.get(begin, {}).get(name) or _Folder(self._place / name, self._cache)
+                self._folders.setdefault(begin, {})[name] = folder
 
-    def _is_whole(self, recording: RecordingEntry, topic: str, rows: Collection[TopicRows]) -> bool:
-        """True if the files have as many rows as the catalog messages."""
-        return sum(one.section.rows for one in rows) == self._messages_of(recording, topic)
+    def _of(self, channels: Iterable[ChannelEntry]) -> list[_Folder]:
+        """The known folders of the types of some channels."""
+        types = {type_prefix(channel.type) for channel in channels}
+        return [folder for one in types for folder in self._folders.get(one, {}).values()]
 
-    def _messages_of(self, recording: RecordingEntry, topic: str) -> int:
-        return sum(one.stats.messages for one in self._channels_of(recording, topic))
 
-    def _types_of(self, recording: RecordingEntry, topic: str) -> set[str]:
-        return {channel.type for channel in self._channels_of(recording, topic)}
-
-    def _table(
-        self, recording: RecordingEntry, topic: str, found: Sequence[TopicRows]
-    ) -> TopicTable | None:
-        """The table of a topic from some files; None without rows of it, or with stale ones."""
-        if not found or not all(rows.is_of(recording) for rows in found):
-            return None
-        has_arrays = any(one.section.arrays for one in found)
-        if has_arrays and any(c.id >= EXPIRED_IDS for c in self._channels_of(recording, topic)):
-            return None  # its arrays have expired with their payloads
-        table = TopicTable(
-            [part for one in found for part in one.file.parts(one.begin, one.section.rows)],
-            unreadable=sum(one.section.unreadable for one in found),
-            segments=(int(number) for one in found for number in one.section.segments),
-        )
-        if len(table.files) > 1:
-            table.fields()  # which some have not in common
-        return table
-
-    def _channels_of(self, recording: RecordingEntry, topic: str) -> list[ChannelEntry]:
-        """The channels of a topic; those of the recording asked about last are at hand."""
-        found = self._channels
-        if found is None or found[0] is not recording:
-            by_topic: dict[str, list[ChannelEntry]] = defaultdict(list)
-            for channel in recording.channels:
-                if channel.id != MARKS_CHANNEL:  # marks that somebody set are in no table
-                    by_topic[channel.topic].append(channel)
-            found = self._channels = recording, dict(by_topic)
-        return found[1].get(topic, [])
+def _channels(recording: RecordingEntry, topic: str) -> list[ChannelEntry]:
+    """The channels of a topic; marks that somebody set are in no table."""
+    found = (one for one in recording.channels if one.topic == topic)
+    return [one for one in found if one.id != MARKS_CHANNEL]

@@ -300,7 +300,6 @@ class Follower:
     def _end_segment(self, number: int, digest: str) -> None:
         """Note that all of a segment was read."""
         segment = self._segments.pop(number)
-        self._tables.cut(number, digest)
         if not segment.is_decoded:
             with suppress(HybridlogError):  # it is derived, and the disk may be full
                 self._catalog.put_decoded(self._entry.id, number, digest, segment.decoded)

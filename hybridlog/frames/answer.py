@@ -72,7 +72,7 @@ def _groups(planner: Planner, parts: Sequence[Part] | None) -> Iterator[Iterable
     yield decoder.empty()
     if parts and decoder.fits_tables and planner.question.returns_all:
         found = [planner.tabled(part, decoder.fields) for part in parts]
-        if all(one is not None and one.rest is None for one in found):
+        if None not in found:
             for part in parts:
                 values = planner.values(part, decoder.fields)
                 yield from ([block] for block in decoder.of_table(part, values))

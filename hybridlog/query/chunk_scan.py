@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import TYPE_CHECKING
@@ -91,8 +91,7 @@ class ScanPlan(Struct):
     """Everything to read, in order.
 
     Attributes:
-        filters: By index of a channel the part whose predicate is asked of each message, but for
-            those in some segments.
+        filters: By index of a channel the part whose predicate is asked of each message.
         offsets: Payload offsets of the other messages that are wanted, by chunk; int64[k].
         is_chosen: Only messages with offsets, or which a filter accepts, are wanted.
         reverse: Latest message first.
@@ -102,7 +101,7 @@ class ScanPlan(Struct):
     channels: list[RecordedChannel]
     scans: list[RecordingScan]
     clock: Clock = "log"
-    filters: Mapping[int, tuple[Part, Collection[int]]] = field(default_factory=dict)
+    filters: Mapping[int, Part] = field(default_factory=dict)
     offsets: Mapping[ChunkKey, NDArray[np.int64]] = field(default_factory=dict)
     is_chosen: bool = False
     reverse: bool = False
@@ -126,8 +125,7 @@ class ScanPlan(Struct):
         """Indexes of the channels on whose messages in a chunk filters decide."""
         own = task.scan.channels
         held = (own[channel] for channel in task.chunk.place.channels if channel in own)
-        segment = task.chunk.segment
-        return [i for i in held if i in self.filters and segment not in self.filters[i][1]]
+        return [index for index in held if index in self.filters]
 
 
 def with_payloads(run: MessageRun, counters: Counters) -> MessageRun:
@@ -292,7 +290,7 @@ class ChunkScan:
             if index in undecided:
                 rows = np.flatnonzero(run.batch.channel == index)
                 channel = self._plan.channels[index]
-                part, _ = self._plan.filters[index]
+                part = self._plan.filters[index]
                 holds[rows], lacking, gone = matches(
                     part, channel, run.batch.take(rows), run.seq[rows]
                 )

@@ -1,8 +1,8 @@
 """Rows of a topic of one recording: from tables that hold what is asked, else from chunks.
 
-A table answers what its columns can decide, for the segments that it covers. What a running
-recording has written since, and what no table can tell, is decoded from chunks. Counts and
-times without a predicate come from chunk tables and message indexes.
+A table answers what its columns can decide. Recordings in progress have none, and what no table
+can tell is decoded from chunks. Counts and times without a predicate come from chunk tables and
+message indexes.
 """
 
 from __future__ import annotations
@@ -67,15 +67,10 @@ class _UndecidedError(StoreError):
 
 
 class Tabled(NamedTuple):
-    """A part of a question, as asked, with its table.
-
-    Attributes:
-        rest: It in the segments that the table does not cover, which are all later; or None.
-    """
+    """A part of a question, as asked, with its table."""
 
     part: Part
     table: TopicTable
-    rest: Part | None
 
 
 class Rows:
@@ -118,14 +113,7 @@ class Rows:
             return None  # fields of such messages are not in the table
         if not table.has_fields and any(c.codec.indexed for c in part.channels):
             return None  # it is older than a definition
-        if table.rows == part.messages:
-            return Tabled(part, table, None)
-        spans = [span for span in part.recording.spans if span[0] not in table.segments]
-        rest = replace(part, recording=replace(part.recording, spans=spans))
-        late = self._held(replace(rest, bounds=None, windows=None))["first"]
-        if len(late) and late.min() <= max(one.last for one in table.parts):
-            return None  # no order of times would be theirs
-        return Tabled(part, table, rest)
+        return Tabled(part, table)
 
     # Answers.
 
@@ -238,21 +226,22 @@ class Rows:
             else:
                 found = self.tabled(part)
                 total += sum(int(holds.sum()) for _, holds in self._in_table(found))
-                left += _rest_of(part, found)
+                left += [part] if found is None else []
         return total + (self.count_in_chunks(left) if left else 0)
 
     def _outcomes(self, part: Part) -> Iterator[RowBatch]:
         found = self.tabled(part)
         for rows, holds in self._in_table(found):
             yield RowBatch(rows.t, rows.seq, holds)
-        for rest in _rest_of(part, found):
-            if part.predicate is None and part.is_by_log_time:
-                with suppress(SegmentError):
-                    time = self._times(rest, self._held(rest))
-                    yield RowBatch(time, np.zeros_like(time), np.ones(len(time), np.bool_))
-                    return
-            for channel, run in self._by_channel(rest):
-                yield RowBatch(run.batch.log_time, run.seq, self._decided(rest, channel, run))
+        if found is not None:
+            return
+        if part.predicate is None and part.is_by_log_time:
+            with suppress(SegmentError):
+                time = self._times(part, self._held(part))
+                yield RowBatch(time, np.zeros_like(time), np.ones(len(time), np.bool_))
+                return
+        for channel, run in self._by_channel(part):
+            yield RowBatch(run.batch.log_time, run.seq, self._decided(part, channel, run))
 
     def _values(
         self, part: Part, fields: Collection[str] | None, *, partial: bool
@@ -273,8 +262,7 @@ class Rows:
             yield RowBatch(chosen.t, chosen.seq, holds[holds], records)
         arrays = {path.rpartition(".")[0] for path in summaries}
         wanted = None if wanted is None else wanted | arrays
-        runs = (own for rest in _rest_of(part, found) for own in self._by_channel(rest))
-        for channel, run in runs:
+        for channel, run in self._by_channel(part) if found is None else ():
             own = run.take(self._decided(part, channel, run))
             decoded, made = channel.codec.columns_of(own.batch, wanted), {}
             self.counters.unreadable += len(own.batch) - len(decoded.rows)
@@ -345,9 +333,7 @@ class Rows:
             if any(map(is_meta, part.predicate.fields())):
                 continue  # known of the part, not of a row
             found = self.tabled(part)
-            if found is None or found.rest is not None:
-                continue
-            if len(found.table.files) == 1:
+            if found is not None and len(found.table.files) == 1:
                 by_file[found.table.files[0].number].append(found)
         for group in by_file.values():
             if len(group) > 1:
@@ -355,7 +341,7 @@ class Rows:
                     self._count_in_file(group)
 
     def _count_in_file(self, group: Sequence[Tabled]) -> None:
-        (first, table, _), types = group[0], group[0].part.field_types
+        (first, table), types = group[0], group[0].part.field_types
         whole = self.session.tables.whole(table.files[0])
         sums, before = [np.zeros((2, 1), np.int64)], [0]
         for rows, holds in self._scanned(first, whole):
@@ -363,7 +349,7 @@ class Rows:
             both = np.stack([holds, rows.is_unreadable()])
             sums.append(sums[-1][:, -1:] + np.cumsum(both, axis=1))
         total = np.concatenate(sums, axis=1)
-        for part, table, _ in group:
+        for part, table in group:
             if part.field_types == types:
                 begin = np.array([before[p.group] + p.begin for p in table.parts])
                 end = begin + [p.rows for p in table.parts]
@@ -378,7 +364,7 @@ class Rows:
         Where a table decides, it says where they are; else filters decide on what is read.
         """
         channels: list[RecordedChannel] = []
-        filters: dict[int, tuple[Part, Collection[int]]] = {}
+        filters: dict[int, Part] = {}
         offsets: dict[ChunkKey, list[NDArray[np.int64]]] = defaultdict(list)
         of_recording: dict[str, tuple[Part, dict[int, int]]] = {}
         for part in parts:
@@ -389,8 +375,8 @@ class Rows:
                 offsets[key].append(own)
             for channel in part.channels:
                 indexes[channel.channel_id] = len(channels)
-                if asks and (found is None or found.rest is not None):
-                    filters[len(channels)] = part, () if found is None else found.table.segments
+                if asks and found is None:
+                    filters[len(channels)] = part
                 channels.append(channel)
         return ScanPlan(
             channels,
@@ -474,12 +460,6 @@ class Rows:
         """Messages of a part in chunks, as of `Session.parts`."""
         ids = [channel.channel_id for channel in part.channels]
         return self.session.parts(part.recording, ids, part.log_span)
-
-
-def _rest_of(part: Part, found: Tabled | None) -> list[Part]:
-    """The rest of a part that a table does not cover; all of it without a table."""
-    rest = part if found is None else found.rest
-    return [] if rest is None else [rest]
 
 
 def summaries_in(fields: Collection[str] | None, types: Mapping[str, str] | None) -> set[str]:

@@ -111,9 +111,10 @@ class TopicView:
         found = []
         for part in self._planner.split():
             table = self._planner.tabled(part)
-            found += [] if table is None else table.table.whole_types()
-            rest = part if table is None else table.rest
-            found += [] if rest is None else (records_of(one).type for one in self._read(rest))
+            if table is not None:
+                found += table.table.whole_types()
+            else:
+                found += (records_of(one).type for one in self._read(part))
         return found
 
     def _points(self) -> list[Any]:

@@ -101,15 +101,13 @@ class ViewRows(Rows):
 
     def read(self, part: Part) -> Iterator[pa.RecordBatch]:
         """The rows of a topic of a recording."""
-        found, rest = self.tabled(part), part
+        found = self.tabled(part)
         if found is not None and self._has_all(found.table, part):
             for group in found.table.parts:
                 if touches(part.log_windows, group.first, group.last):
                     yield from self._in_group(part, found.table, group)
-            if found.rest is None:
-                return
-            rest = found.rest
-        for run in ChunkScan(self.chunk_plan([rest]), self.session).runs():
+            return
+        for run in ChunkScan(self.chunk_plan([part]), self.session).runs():
             for number, rows in rows_by_channel(run.batch.channel):
                 yield self._decoded(run.channels[number], run.batch.take(rows), run.seq[rows])
 

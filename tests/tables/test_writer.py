@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import errno
-import itertools
-import time
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +11,7 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.columns.folders import TableFolders
-from hybridlog.columns.layout import OWN_COLUMNS, TABLES, parts_folder
+from hybridlog.columns.layout import OWN_COLUMNS, TABLES
 from hybridlog.columns.table_writer import TableWriter
 from hybridlog.columns.tables import TableRows, Tables
 from hybridlog.index.indexing import ChunkIndexer
@@ -29,7 +27,6 @@ from tests.tables.conftest import SMALL_CHUNKS
 from tests.tables.logs import (
     BASE,
     Decoded,
-    channel,
     decoded,
     payload,
     same,
@@ -116,34 +113,8 @@ def test_tables_are_what_the_messages_say(
     assert compare(store) == 300
 
 
-def test_a_segment_has_its_tables_once_it_is_sealed(store: hl.Store, limit: Limit) -> None:
-    """Below the unfinished tables, until the recording has ended."""
-    limit(long_table_rows=300)
-    settings = SegmentSettings(chunk_size=4096, segment_size=300_000)
-    # Chunks are flushed when they are full: partly filled ones make segments of few rows.
-    with store.start("live", settings=settings, flush_interval_s=60) as recording:
-        parts = parts_folder(store.directory.path, recording.id)
-        own = channel("/state")
-        until = time.monotonic() + 120
-        for n in itertools.count(1):
-            recording.write(own, varied(n), log_time=BASE + n)
-            if n % 500 == 0:  # the tables are made beside it
-                if len(list(parts.glob("test_State~*/*.parquet"))) >= 2:
-                    break
-                assert time.monotonic() < until
-                time.sleep(0.1)
-        assert not files_of(store)
-    compared = compare(store)
-    assert compared == n
-    (entry,) = store.recordings()
-    assert not parts.exists()
-    names = [path.name for path in files_of(store) if path.name.startswith(entry.id)]
-    assert entry.segments - 1 <= len(names) <= entry.segments
-    assert store.verify().findings == []
-
-
-def test_few_rows_a_segment_wait_for_more(store: hl.Store, tmp_path: Path, limit: Limit) -> None:
-    """A topic of one message a second has no file a segment."""
+def test_a_long_topic_has_a_file_of_its_own(store: hl.Store, tmp_path: Path, limit: Limit) -> None:
+    """One, of however many segments; a short one shares a file."""
     limit(long_table_rows=1000)
     said = [(BASE + n, "/slow" if n % 20 == 0 else "/fast", varied(n)) for n in range(12_000)]
     write_log(tmp_path / "log.mcap", said)
@@ -152,10 +123,7 @@ def test_few_rows_a_segment_wait_for_more(store: hl.Store, tmp_path: Path, limit
     (entry,) = store.recordings()
     assert entry.segments >= 4
     names = [path.name for path in files_of(store)]
-    assert len(names) >= 4
-    assert [name for name in names if not name.startswith(entry.id)] == [
-        "shared-00000000000000000000.parquet"
-    ]
+    assert names == [f"{entry.id}-0.parquet", "shared-00000000000000000000.parquet"]
     assert compare(store) == 12_000
 
 
@@ -193,12 +161,6 @@ def chunks_of(store: hl.Store, entry: RecordingEntry) -> list[Any]:
     return found
 
 
-def close(writer: TableWriter, entry: RecordingEntry) -> None:
-    for number, digest in entry.digests.items():
-        writer.cut(int(number), digest)
-    writer.close(entry)
-
-
 def waiting(writer: TableWriter) -> int:
     """Rows in memory."""
     return sum(len(rows) for topic in writer._topics.values() for rows in topic.waiting)
@@ -218,7 +180,7 @@ def test_memory_does_not_grow_with_the_recording(
         for chunk, channels in chunks_of(store, entry):
             writer.add(indexer.messages_in([chunk], channels))
             held.append(waiting(writer))
-        close(writer, entry)
+        writer.close(entry)
         most.append(max(held))
         assert waiting(writer) == 0
     assert most[0] < 1000
