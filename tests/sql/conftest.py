@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
+from hybridlog.columns import column_file
 from hybridlog.columns import table_writer as writer
 from hybridlog.sql.engine import SqlAnswer
 from hybridlog_storage.messages import Schema
@@ -74,7 +75,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("sql")
     logs = first_log(folder / "first.mcap"), second_log(folder / "second.mcap")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(writer, "GROUP_ROWS", 300)
+        patch.setattr(column_file, "_GROUP_ROWS", 300)
         patch.setattr(writer, "LONG_ROWS", 1000)
         with hl.open(folder / "store", create=True, mongo="none") as opened:
             opened.record(logs[0], name="first", tags={"site": "hall"}, settings=CHUNKS)
