@@ -367,6 +367,7 @@ class Store:
         topics: Sequence[str] = (),
         between: tuple[TimeLike | None, TimeLike | None] | None = None,
         tolerance: float = 0.0,
+        counters: bool = False,
     ) -> list[Difference]:
         """Compare two recordings, or two choices of recordings, by topic; TopicError without any.
 
@@ -377,12 +378,13 @@ class Store:
             between: Only messages of this range of each; None for the time that both have, and
                 what only one has is one difference.
             tolerance: Numbers are equal that differ by at most this share of the greater one.
+            counters: Also counters and stamps in messages, which differ always.
         """
         from hybridlog.contract.diff import diff
 
         now = self.snapshot()
         sides = (now.recordings(one).check() for one in (a, b))
-        return diff(*sides, topics=topics, between=between, tolerance=tolerance)
+        return diff(*sides, topics=topics, between=between, tolerance=tolerance, counters=counters)
 
     def align(
         self,

@@ -6,12 +6,21 @@ import difflib
 import re
 from collections import defaultdict
 from collections.abc import Iterable
+from html import escape
+from typing import Any, TypeVar
+
+from msgspec import Struct
+from msgspec.structs import asdict
 
 from hybridlog_storage.errors import UsageError
 
 MAX_LISTED = 10
+MAX_ROWS = 20
+"""Rows of a table in a notebook."""
+_MAX_TEXT = 100  # characters of a cell
 _MAX_LIKE = 5
 _PARTS = re.compile(r"[./]")
+_T = TypeVar("_T", bound=Struct)
 _UNITS = ("B", "kB", "MB", "GB", "TB")
 _SIZE = re.compile(r"\s*(\d{1,15}(?:\.\d{1,15})?)\s*([kKmMgGtT]?)(i?)[bB]?\s*")
 
@@ -86,3 +95,30 @@ def parse_size(text: str) -> int:
     base = 1024 if binary else 1000
     power = " kmgt".index(prefix.lower()) if prefix else 0
     return int(float(number) * base**power)
+
+
+class Rows(list[_T]):
+    """Structs of one kind, which a notebook shows as a table."""
+
+    def _repr_html_(self) -> str:
+        rows: list[dict[str, Any]] = [asdict(one) for one in self[:MAX_ROWS]]
+        heading = [*rows[0]] if rows else []
+        return table_html(counted(len(self), "row"), [heading, *(one.values() for one in rows)])
+
+
+def table_html(title: str, rows: Iterable[Iterable[object]]) -> str:
+    """A table for a notebook; all text is escaped, since names and values come from logs."""
+    cells = ("".join(f"<td>{_escaped(cell)}</td>" for cell in row) for row in rows)
+    body = "".join(f"<tr>{row}</tr>" for row in cells)
+    return f"<p><b>{_escaped(title)}</b></p><table>{body}</table>"
+
+
+def _escaped(value: object) -> str:
+    text = str(value)[: _MAX_TEXT + 1]
+    return escape(text if len(text) <= _MAX_TEXT else f"{text[:_MAX_TEXT]}…")
+
+
+def arrow_html(title: str, table: Any) -> str:
+    """The first rows of an Arrow table for a notebook."""
+    rows = zip(*(column.to_pylist() for column in table.slice(0, MAX_ROWS).columns), strict=True)
+    return table_html(title, [table.column_names, *rows])

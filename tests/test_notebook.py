@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from contextlib import closing
 from html.parser import HTMLParser
 
 import pytest
@@ -11,6 +12,7 @@ import pytest
 import hybridlog as hl
 from hybridlog.drawing.notebook import message_html, recordings_html
 from hybridlog.message import Message
+from hybridlog_storage.errors import TopicError
 from hybridlog_storage.messages import Channel
 from tests.test_snapshot import summary
 
@@ -103,3 +105,23 @@ def test_representations_are_short(store: hl.Store) -> None:
     wide = store.all_topics().where(" or ".join(f"f{n} > {n}" for n in range(40)))
     assert len(repr(wide)) < 450
     assert "and 3 more" in repr(wide)
+
+
+def test_every_answer_is_a_table_and_an_error_has_no_traceback(store: hl.Store) -> None:
+    many = store.topic("/many")
+    answers = (
+        many.stats("f1"),
+        many.check(),
+        store.check(),
+        many.intervals(),
+        store.align("/many", "/a"),
+        many.resample("1s"),
+    )
+    with closing(store.sql_engine.connect()) as connection:
+        for thing in (*answers, connection.query("select 1 as x, '<b>' as y")):
+            parsed = Parsed(thing._repr_html_())
+            assert set(parsed.tags) <= PLAIN
+            assert "table" in parsed.tags
+    with pytest.raises(TopicError) as caught:
+        store.topic("/mny")
+    assert caught.value._render_traceback_() == [f"TopicError: {caught.value}"]

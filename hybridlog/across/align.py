@@ -29,7 +29,7 @@ from hybridlog.query.times import DurationLike, parse_duration
 from hybridlog.schema.arrow_columns import numbers
 from hybridlog.schema.arrow_types import common_schema
 from hybridlog.snapshot import UNFINISHED
-from hybridlog.wording import counted, listed
+from hybridlog.wording import MAX_ROWS, arrow_html, counted, listed
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
@@ -99,6 +99,9 @@ class Aligned:
     def __repr__(self) -> str:
         names = [name for reader in self._beside for name in reader.question.topics]
         return f"<Aligned {', '.join(names)}; {self._how}>"
+
+    def _repr_html_(self) -> str:
+        return arrow_html(repr(self), next(self.to_tables(MAX_ROWS)))
 
     def to_tables(self, limit: int | None = None) -> Iterator[pa.Table]:
         """The rows, or the first ones, in Arrow tables of bounded size; at least one table.

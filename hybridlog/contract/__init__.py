@@ -172,39 +172,51 @@ _KINDS: Final[Mapping[str, Callable[[Any], Any]]] = {
 
 
 def contract_of(topics: Sequence[TopicCheck]) -> str:
-    """A contract in YAML that a good recording keeps, with room for the next one.
+    """A contract in YAML that good recordings keep, with room for the next one.
 
     Topics whose messages come now and then, latched ones and those of few messages get no
     times. Marks are no part of it: another recording need not have any.
     """
-    recording = topics[0].recording if topics else "no topic"
-    lines = [f"# Made by `hybridlog check --make` from {json.dumps(recording)}.", "topics:"]
-    for one in sorted(topics, key=lambda one: one.topic):
-        if one.messages and one.topic != MARKS:
-            lines.append(f"  {json.dumps(one.topic, ensure_ascii=False)}:")
-            lines += [f"    {key}: {value}" for key, value in _made(one)]
+    recordings = sorted({one.recording for one in topics})
+    made_from = ", ".join(map(json.dumps, recordings)) or "no topic"
+    lines = [f"# Made by `hybridlog check --make` from {made_from}.", "topics:"]
+    for topic in sorted({one.topic for one in topics if one.messages} - {MARKS}):
+        lines.append(f"  {json.dumps(topic, ensure_ascii=False)}:")
+        own = [one for one in topics if one.topic == topic and one.messages]
+        lines += [f"    {key}: {value}" for key, value in _made(own, len(recordings))]
     return "\n".join(lines) + "\n"
 
 
-def _made(one: TopicCheck) -> Iterator[tuple[str, str]]:
-    yield "type", json.dumps(one.type, ensure_ascii=False)
-    if one.lost is not None:
-        yield "lost", str(one.lost)
-    if one.is_latched or one.messages < _REGULAR_FROM or one.rate_hz is None:
+def _made(own: Sequence[TopicCheck], recordings: int) -> Iterator[tuple[str, str]]:
+    """The rules of a topic that all of these keep."""
+    if len({one.type for one in own}) == 1:
+        yield "type", json.dumps(own[0].type, ensure_ascii=False)
+    if len(own) < recordings:
+        yield "optional", "true"
+    losses = [one.lost for one in own if one.lost is not None]
+    if len(losses) == len(own):
+        yield "lost", str(max(losses))
+    rates = [one.rate_hz for one in own if one.rate_hz is not None]
+    is_steady = len(rates) == len(own) and not any(one.is_latched for one in own)
+    if not is_steady or min(one.messages for one in own) < _REGULAR_FROM:
         return
-    if one.silent_periods > GAP_PERIODS:
+    if max(one.silent_periods for one in own) > GAP_PERIODS:
         return
-    late, early = one.late_ns or 0, one.early_ns or 0
-    yield "rate", f"{one.rate_hz:.4g}"
-    yield "tolerance", "10%"
-    yield "longest_gap", _roomy(max(one.gap_ns or 0, late, early), 10**6)
-    yield "jitter", _roomy(one.jitter_ns or 0, 10**6)
-    yield "late_start", _roomy(late, 10**9)
-    yield "early_stop", _roomy(early, 10**9)
+    rate = sum(rates) / len(rates)
+    spread = max(abs(one - rate) for one in rates) / rate
+    period = 1e9 / rate
+    late, early = (max(getattr(one, f"{end}_ns") or 0 for one in own) for end in ("late", "early"))
+    gap = max(one.gap_ns or 0 for one in own)
+    yield "rate", f"{rate:.4g}"
+    yield "tolerance", f"{max(20, math.ceil(200 * spread))}%"
+    yield "longest_gap", _roomy(max(gap, late, early), GAP_PERIODS * period)
+    yield "jitter", _roomy(max(one.jitter_ns or 0 for one in own), period / 2)
+    yield "late_start", _roomy(late, 5e9)
+    yield "early_stop", _roomy(early, 5e9)
 
 
-def _roomy(ns: float, least: int) -> str:
+def _roomy(ns: float, least: float) -> str:
     """Twice a duration, and at least some ns; rounded up to two digits."""
-    wanted = max(math.ceil(2 * ns), least)
+    wanted = math.ceil(max(2 * ns, least))
     step = 10 ** max(len(str(wanted)) - 2, 0)
     return format_duration(-(-wanted // step) * step)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -12,7 +13,7 @@ from msgspec import Struct
 from hybridlog.query.times import format_duration
 from hybridlog.query.topics import resolve
 from hybridlog.record.marks import MARKS
-from hybridlog.wording import counted
+from hybridlog.wording import Rows, counted
 
 if TYPE_CHECKING:
     from hybridlog.query.answers.statistics import FieldStatistics, TopicCheck
@@ -24,6 +25,8 @@ Range = tuple["TimeLike | None", "TimeLike | None"]
 _LEAST_SHARE: Final = 0.01
 """Of the longer recording: only a difference in length above that is one of times."""
 _ENDS: Final = ("late_start", "early_stop")
+_COUNTED: Final = re.compile(r"(.*\.)?(seq|sequence|stamp(\..*)?)")
+"""Fields that differ between any two recordings: counters and stamps."""
 _STATISTICS: Final = ("count", "nan", "infinite", "min", "max", "mean", "std")
 
 
@@ -92,12 +95,14 @@ def diff(
     topics: Sequence[str] = (),
     between: Range | None = None,
     tolerance: float = 0.0,
+    counters: bool = False,
 ) -> list[Difference]:
     """Differences between two choices of recordings: what only one has first, then by topic.
 
     Of two recordings of different length, the time that only one has is one difference, and the
     others are those of the time that both have. Topics are as `Store.topic` takes them, empty for
-    all; `tolerance` is a share of the greater number.
+    all; `tolerance` is a share of the greater number. Counters and stamps in messages differ
+    always, and are left out unless asked for.
     """
     known = sorted({*a.topics(), *b.topics()})
     wanted = resolve(topics, known) if topics else known
@@ -126,8 +131,16 @@ def diff(
                 words = [_worded(what, one) for one in (value, second[what])]
                 rest.append(Difference(topic, what, words[0], words[1], _finite(share)))
         counts = first["messages"], second["messages"]
-        rest += _of_fields(topic, sides[0].fields[topic], sides[1].fields[topic], tolerance, counts)
-    return found + rest
+        own = [
+            {
+                n: row
+                for n, row in one.fields[topic].items()
+                if counters or not _COUNTED.fullmatch(n)
+            }
+            for one in sides
+        ]
+        rest += _of_fields(topic, own[0], own[1], tolerance, counts)
+    return Rows(found + rest)
 
 
 class _Shared(NamedTuple):

@@ -6,25 +6,21 @@ All text is escaped, since names and values come from logs, and output is bounde
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from html import escape
 from itertools import islice
 from typing import TYPE_CHECKING
 
 from hybridlog.query.times import format_duration, format_time
-from hybridlog.wording import listed
+from hybridlog.wording import MAX_ROWS, listed, table_html
 
 if TYPE_CHECKING:
     from hybridlog_storage.summary import RecordingSummary
-
-MAX_ROWS = 20
-_MAX_TEXT = 100  # characters of a cell
 
 
 def recordings_html(title: str, recordings: Sequence[RecordingSummary]) -> str:
     """A table of recordings, the latest of them."""
     columns = ["recording", "start", "duration", "topics", "messages", "tags"]
     rows = [_recording_row(one) for one in recordings[-MAX_ROWS:]]
-    return _table(f"{title}, {len(recordings)} recordings", [columns, *rows])
+    return table_html(f"{title}, {len(recordings)} recordings", [columns, *rows])
 
 
 def _recording_row(one: RecordingSummary) -> list[object]:
@@ -37,7 +33,7 @@ def _recording_row(one: RecordingSummary) -> list[object]:
 
 def message_html(title: str, fields: Mapping[str, object]) -> str:
     """The first fields of a message, nested ones with dots in their names."""
-    return _table(title, [*islice(_leaves("", fields), MAX_ROWS)])
+    return table_html(title, [*islice(_leaves("", fields), MAX_ROWS)])
 
 
 def _leaves(prefix: str, fields: Mapping[str, object]) -> Iterator[tuple[str, object]]:
@@ -46,14 +42,3 @@ def _leaves(prefix: str, fields: Mapping[str, object]) -> Iterator[tuple[str, ob
             yield from _leaves(f"{prefix}{name}.", value)
         else:
             yield f"{prefix}{name}", value
-
-
-def _table(title: str, rows: Sequence[Sequence[object]]) -> str:
-    cells = ("".join(f"<td>{_shown(cell)}</td>" for cell in row) for row in rows)
-    body = "".join(f"<tr>{row}</tr>" for row in cells)
-    return f"<p><b>{_shown(title)}</b></p><table>{body}</table>"
-
-
-def _shown(value: object) -> str:
-    text = str(value)[: _MAX_TEXT + 1]
-    return escape(text if len(text) <= _MAX_TEXT else f"{text[:_MAX_TEXT]}…")

@@ -8,6 +8,7 @@ on access.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from msgspec import Struct
 
 from hybridlog.query.times import DurationLike, format_duration, format_time, parse_duration
 from hybridlog.schema.column import ranges
+from hybridlog.wording import MAX_ROWS, table_html
 from hybridlog_storage.errors import TopicError, UsageError
 from hybridlog_storage.messages import run_starts
 from hybridlog_storage.times import END, placed
@@ -107,6 +109,13 @@ class Intervals:
 
     def __repr__(self) -> str:
         return f"<Intervals {len(self)}, {format_duration(self.duration_ns)} in all>"
+
+    def _repr_html_(self) -> str:
+        rows = (
+            (one.recording, format_time(one.begin_ns), format_time(one.end_ns), one.messages)
+            for one in islice(self, MAX_ROWS)
+        )
+        return table_html(repr(self), [("recording", "begin", "end", "messages"), *rows])
 
     def __eq__(self, other: object) -> bool:
         """True if both have the same intervals of the same recordings."""

@@ -23,7 +23,7 @@ from hybridlog.query.choice import Choice, choose
 from hybridlog.query.planner import Planner
 from hybridlog.query.question import Clock, Counters, Question
 from hybridlog.query.times import parse_duration, parse_time
-from hybridlog.wording import listed, meant
+from hybridlog.wording import Rows, listed, meant
 from hybridlog_storage.errors import (
     DefinitionError,
     HybridlogError,
@@ -493,7 +493,7 @@ class Query:
         from hybridlog.query.answers.statistics import check
 
         with self.counters.timed():
-            return check(self.source.now(), self.question, self.counters)
+            return Rows(check(self.source.now(), self.question, self.counters))
 
     def stats(self, *fields: str) -> list[FieldStatistics]:
         """Statistics of the numeric fields: count, NaN, infinite, least, greatest, mean, deviation.
@@ -513,7 +513,7 @@ class Query:
         now = of_now(self)
         query = now.fields(*fields) if fields else now
         with self.counters.timed():
-            return statistics(now.source.now(), query.question, self.counters)
+            return Rows(statistics(now.source.now(), query.question, self.counters))
 
     # Intervals.
 

@@ -20,7 +20,7 @@ from hybridlog.sql.content import StoreContent, store_table
 from hybridlog.sql.duck import MEMORY, Worker, explained, open_duckdb, shortage_of
 from hybridlog.sql.names import EVERYTHING, TABLES, Usage, usage_of
 from hybridlog.sql.rows import Reading
-from hybridlog.wording import meant
+from hybridlog.wording import MAX_ROWS, arrow_html, meant
 from hybridlog_storage.errors import ChangedError, HybridlogError, TopicError, UsageError
 
 if TYPE_CHECKING:
@@ -223,6 +223,9 @@ class SqlAnswer:
 
     def __repr__(self) -> str:
         return f"<SqlAnswer of {len(self.columns)} columns: {', '.join(self.columns[:8])}>"
+
+    def _repr_html_(self) -> str:
+        return arrow_html(repr(self), self.first(MAX_ROWS, 1 << 20)[0])
 
     @property
     def columns(self) -> list[str]:

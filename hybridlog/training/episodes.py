@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from functools import reduce
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -39,24 +39,24 @@ MIN_FRAMES: Final = 2
 
 
 class Values(NamedTuple):
-    """Numbers of a topic, float32[n, width], at log times, int64[n], ns, ascending."""
+    """Numbers of a topic, [n, width], at log times, int64[n], ns, ascending."""
 
     times: NDArray[np.int64]
-    numbers: NDArray[np.float32]
+    numbers: NDArray[Any]
     names: tuple[str, ...]
 
 
 class Episode(Struct, frozen=True):
     """Frames at regular times, int64[n], ns, in a recording, whose id is `recording`.
 
-    Their `vectors` are float32[n, width] by name of the feature, as the names of columns are.
+    Their `vectors` are numbers[n, width] by name of the feature, as the names of columns are.
     `held` counts frames whose value is older than usual, by topic.
     """
 
     name: str
     recording: str
     times: NDArray[np.int64]
-    vectors: dict[str, NDArray[np.float32]]
+    vectors: dict[str, NDArray[Any]]
     names: dict[str, tuple[str, ...]]
     held: dict[str, int]
 
@@ -82,7 +82,8 @@ def episodes(
         for source in (part for parts in features.vectors.values() for part in parts):
             own = _query(query.source.now(), summary.id, source.topic, begin, end)
             read[source] = _values(own, source)
-            times[source.topic] = read[source].times
+            found_at = read[source].times
+            times[source.topic] = np.intersect1d(times.get(source.topic, found_at), found_at)
         first = max([begin, *(int(own[0]) for own in times.values())])
         count = max(end - first, 0) * fps // 10**9 + 1
         grid = first + np.arange(count, dtype=np.int64) * 10**9 // fps
@@ -124,11 +125,12 @@ def episodes(
 
 
 def pictures(
-    session: Session, episode: Episode, topic: str
+    session: Session, episode: Episode, topic: str, depth_scale: tuple[float, float] | None = None
 ) -> Iterator[tuple[NDArray[np.uint8] | None, int]]:
     """The picture of each frame of an episode, and how many frames in turn show it.
 
-    None stands for a picture that cannot be shown, or has no payload.
+    None stands for a picture that cannot be shown, or has no payload. Those of depth have one
+    scale: metres at 0 and at 255; what has no depth is 0.
     """
     current: Message | None = None
     place, frames = 0, episode.times.tolist()
@@ -137,18 +139,32 @@ def pictures(
         while place < len(frames) and frames[place] < message.log_time_ns:
             place += 1
         if place > shown:
-            yield _picture_or_none(current), place - shown
+            yield _picture_or_none(current, depth_scale), place - shown
         current = message
     if place < len(frames):
-        yield _picture_or_none(current), len(frames) - place
+        yield _picture_or_none(current, depth_scale), len(frames) - place
 
 
-def _picture_or_none(message: Message | None) -> NDArray[np.uint8] | None:
+def is_depth(pixels: NDArray[Any]) -> bool:
+    """True for one value a pixel that is no brightness: mm in 16 bits, or metres."""
+    return pixels.ndim == 2 and pixels.dtype != np.uint8
+
+
+def _picture_or_none(
+    message: Message | None, depth_scale: tuple[float, float] | None
+) -> NDArray[np.uint8] | None:
     """The picture of a message in colours; None if it cannot be shown, or has no payload."""
     if message is None:
         return None
     try:
-        pixels = shown_pixels(message)
+        raw = None if depth_scale is None else message.to_numpy()
+        if depth_scale is None or raw is None or not is_depth(raw):
+            pixels = shown_pixels(message)
+        else:
+            near, far = depth_scale
+            metres = raw * (1.0 if raw.dtype.kind == "f" else 0.001)
+            share = (metres - near) / (far - near) * np.where(raw != 0, 255, np.nan)
+            pixels = np.clip(np.nan_to_num(share, posinf=255), 0, 255).astype(np.uint8)
     except (PayloadError, DefinitionError):
         return None
     if pixels.ndim == 2:
@@ -172,7 +188,7 @@ def _times(query: Query) -> NDArray[np.int64]:
 
 
 def _values(query: Query, source: Source) -> Values:
-    """Numbers of a topic; messages without them are left out."""
+    """Numbers of a topic; messages without them, or with NaN, are left out: a gap."""
     table = query.fields(*source.paths).to_arrow()
     present = [column for column in table.column_names if column in source.paths]
     if missing := set(source.paths).difference(present):
@@ -185,9 +201,11 @@ def _values(query: Query, source: Source) -> Values:
         is_array = table[path].type.num_fields > 0
         names += [f"{short}[{n}]" for n in range(numbers.shape[1])] if is_array else [short]
         columns.append(numbers)
-    times = table["log_time"].cast(pa.int64()).to_numpy()
+    found = np.concatenate(columns, axis=1)
+    is_number = np.isfinite(found).all(axis=1)
+    times = table["log_time"].cast(pa.int64()).to_numpy()[is_number]
     _check(query, times)
-    return Values(times, np.concatenate(columns, axis=1), tuple(names))
+    return Values(times, found[is_number], tuple(names))
 
 
 def _check(query: Query, times: NDArray[np.int64]) -> None:
@@ -200,8 +218,8 @@ def _check(query: Query, times: NDArray[np.int64]) -> None:
         )
 
 
-def _numbers(column: pa.ChunkedArray, topic: str, path: str) -> NDArray[np.float32]:
-    """The numbers of a column: float32[n, width]."""
+def _numbers(column: pa.ChunkedArray, topic: str, path: str) -> NDArray[Any]:
+    """The numbers of a column, of its type: [n, width]."""
     kind = column.type
     width = 1
     if is_list(kind):
@@ -215,11 +233,11 @@ def _numbers(column: pa.ChunkedArray, topic: str, path: str) -> NDArray[np.float
         column, kind = pc.list_flatten(column), kind.value_type
     if not is_numeric(kind):
         raise UsageError(f"{topic}: {path} is {kind}, no number.")
-    flat: NDArray[np.float32] = column.cast(pa.float32(), safe=False).to_numpy()
+    flat: NDArray[Any] = column.to_numpy()
     return flat.reshape(-1, width)
 
 
-def _at(times: NDArray[np.int64], values: Values) -> NDArray[np.float32]:
+def _at(times: NDArray[np.int64], values: Values) -> NDArray[Any]:
     return values.numbers[match(times, values.times, "asof", None).before]
 
 

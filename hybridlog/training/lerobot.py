@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter, defaultdict
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -18,6 +18,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from msgspec import Struct
+from msgspec.structs import replace
 
 from hybridlog import __version__
 from hybridlog.arrays.video import pyav
@@ -26,9 +27,14 @@ from hybridlog.formats.writing import failures, new_directory
 from hybridlog.query.pieces import pieces
 from hybridlog.query.query import Query, narrowed
 from hybridlog.query.question import Question
-from hybridlog.training.episodes import episodes, pictures
+from hybridlog.training.episodes import episodes, is_depth, pictures
 from hybridlog.training.feature_map import IMAGE_PREFIX
-from hybridlog_storage.errors import MissingDependencyError, PayloadError, UsageError
+from hybridlog_storage.errors import (
+    DefinitionError,
+    MissingDependencyError,
+    PayloadError,
+    UsageError,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -76,7 +82,8 @@ class LerobotOptions(Struct, frozen=True):
             counts.
         codec: Codec of the pictures.
         on_gap: An episode with a gap in a topic is refused, is cut there, or keeps the last
-            value.
+            value. A message with NaN is none.
+        depth_scale: Metres at 0 and at 255 of pictures of depth, which are left out without.
     """
 
     fps: int
@@ -85,12 +92,15 @@ class LerobotOptions(Struct, frozen=True):
     task_topic: str | None = None
     codec: Codec = "h264"
     on_gap: OnGap = "refuse"
+    depth_scale: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if not 1 <= self.fps <= 1000:
             raise UsageError("Frames per second are 1 to 1000.")
         if bool(self.task.strip()) == (self.task_topic is not None):
             raise UsageError("Say what the robot does: --task TEXT or --task-topic TOPIC.")
+        if self.depth_scale is not None and not self.depth_scale[0] < self.depth_scale[1]:
+            raise UsageError("A scale of depth is metres at 0 and more metres at 255.")
 
 
 @dataclass(slots=True)
@@ -105,6 +115,7 @@ class LerobotReport:
         dropped: Frames in no episode, since a topic has a gap there.
         missing: Frames that show an earlier picture, since their own cannot be shown.
         lost: Messages that are lost in the episodes.
+        left_out: Topics of depth that are left out, since no scale is given.
         bytes: Size of the files.
     """
 
@@ -115,6 +126,7 @@ class LerobotReport:
     dropped: int = 0
     missing: int = 0
     lost: int = 0
+    left_out: tuple[str, ...] = ()
     bytes: int = 0
 
 
@@ -133,11 +145,19 @@ def write_lerobot(
     pyav()
     session, report = query.source.now(), LerobotReport(Path(path))
     features, dropped = features.resolved(session), Counter[str]()
+    depths = {topic for topic in features.images.values() if _is_of_depth(query, topic)}
+    if depths and options.depth_scale is None:
+        kept = {name: one for name, one in features.images.items() if one not in depths}
+        features, report.left_out = replace(features, images=kept), tuple(sorted(depths))
+        if not features.topics:
+            raise UsageError("Pictures of depth need --depth-scale: metres at 0 and at 255.")
     selected = narrowed(query, *features.topics)
     with failures(str(path)):
         final, unfinished = new_directory(path, "a training set is a directory")
         try:
-            with closing(_Set(session, unfinished.path, features, options, report)) as made:
+            with closing(
+                _Set(session, unfinished.path, features, options, report, depths=depths)
+            ) as made:
                 for piece in pieces(selected, options.episodes_by):
                     for one in episodes(piece, features, options.fps, options.on_gap, dropped):
                         made.add(one)
@@ -151,6 +171,14 @@ def write_lerobot(
     return report
 
 
+def _is_of_depth(query: Query, topic: str) -> bool:
+    """True if the first picture of a topic has depth in place of colours."""
+    for message in narrowed(query, topic).limit(1):
+        with suppress(PayloadError, DefinitionError):
+            return is_depth(message.to_numpy())
+    return False
+
+
 class _Set:
     """Writes the files of a set below `root`, and counts in `report`."""
 
@@ -161,6 +189,8 @@ class _Set:
         features: FeatureMap,
         options: LerobotOptions,
         report: LerobotReport,
+        *,
+        depths: set[str],
     ) -> None:
         self._session, self._root, self._features = session, root, features
         self._options, self._report = options, report
@@ -168,20 +198,26 @@ class _Set:
         self._about: list[dict[str, Any]] = []  # the episodes
         self._tasks: dict[str, int] = {}
         self._columns: defaultdict[str, list[NDArray[Any]]] = defaultdict(list)
-        self._videos = {name: _Video(root, name, options) for name in features.images}
+        self._videos = {
+            name: _Video(root, name, options, is_depth=topic in depths)
+            for name, topic in features.images.items()
+        }
         self._file: pq.ParquetWriter | None = None
         self._number, self._size = -1, 0
+        self._types: dict[str, str] = {}  # of the vectors
 
     def add(self, episode: Episode) -> None:
         """Write an episode."""
         begin, length, report = self._report.frames, len(episode.times), self._report
         about, missing = self._described(episode), Counter[str]()
         names, first = about["names"], self._about[0] if self._about else about
-        if names != first["names"]:
+        types = {key: str(one.dtype) for key, one in episode.vectors.items()}
+        if (names, self._types or types) != (first["names"], types):
             raise UsageError(
                 f"{first['name']} and {episode.name} have other columns: choose recordings that "
                 "are alike."
             )
+        self._types = types
         frames = np.arange(length, dtype=np.int64)
         task = self._tasks.setdefault(about["task"], len(self._tasks))
         columns: dict[str, NDArray[Any]] = episode.vectors | {
@@ -254,7 +290,7 @@ class _Set:
     def _shown(
         self, episode: Episode, topic: str, missing: Counter[str]
     ) -> Iterator[tuple[NDArray[np.uint8] | None, int]]:
-        for picture, frames in pictures(self._session, episode, topic):
+        for picture, frames in pictures(self._session, episode, topic, self._options.depth_scale):
             if picture is None:
                 if self._options.on_gap == "refuse":
                     raise UsageError(
@@ -289,6 +325,7 @@ class _Set:
             "task": options.task or options.task_topic,
             "codec": options.codec,
             "on_gap": options.on_gap,
+            "depth_scale": options.depth_scale,
             "episodes": self._about,
         }
         for file, value in (("stats", stats), ("hybridlog", own), ("info", self._info())):
@@ -299,7 +336,7 @@ class _Set:
     def _info(self) -> dict[str, Any]:
         """The description of the set for LeRobot."""
         features: dict[str, Any] = {
-            name: {"dtype": "float32", "shape": [len(columns)], "names": columns}
+            name: {"dtype": self._types[name], "shape": [len(columns)], "names": columns}
             for name, columns in self._about[0]["names"].items()
         }
         features |= {video.key: video.feature for video in self._videos.values()}
@@ -332,10 +369,10 @@ class _Set:
 class _Video:
     """Encodes the pictures of a camera, several episodes a file, and counts values of colours."""
 
-    def __init__(self, root: Path, name: str, options: LerobotOptions) -> None:
+    def __init__(self, root: Path, name: str, options: LerobotOptions, *, is_depth: bool) -> None:
         self.key = f"{IMAGE_PREFIX}{name}"
         self.counts = np.zeros((3, 256), np.int64)  # how often each value occurs in some pictures
-        self._root, self._options = root, options
+        self._root, self._options, self._is_depth = root, options, is_depth
         self._size: tuple[int, ...] = ()  # rows and columns of a picture
         self._file: Any = None
         self._track: Any = None
@@ -388,7 +425,7 @@ class _Video:
                 "video.channels": 3,
                 "video.codec": self._options.codec,
                 "video.pix_fmt": "yuv420p",
-                "video.is_depth_map": False,
+                "video.is_depth_map": self._is_depth,
                 "has_audio": False,
             },
         }

@@ -54,6 +54,10 @@ class HybridlogError(Exception):
         """The message; what was a path in a bucket is an address again."""
         return _ADDRESS.sub(r"\1://", super().__str__())
 
+    def _render_traceback_(self) -> list[str]:
+        """The error in a notebook, which asks for this: without the way to it."""
+        return [f"{type(self).__name__}: {self}"]
+
 
 class UsageError(HybridlogError):
     """An invalid question: a time, a predicate, an option."""

@@ -67,6 +67,7 @@ class Sent:
     stamp: int
     type: str
     x: float = 1.0
+    seq: int = 0
 
 
 def good() -> list[Sent]:
@@ -172,7 +173,7 @@ def play(store: hl.Store, sent: list[Sent], name: str, lost: int | None = 0) -> 
     with store.start(name) as live:
         for one in sorted(sent, key=lambda m: m.time):
             sec, nsec = divmod(one.stamp, SECOND)
-            payload = struct.pack("<3II d".replace(" ", ""), 0, sec, nsec, 0, one.x)
+            payload = struct.pack("<3II d".replace(" ", ""), one.seq, sec, nsec, 0, one.x)
             live.write(channels[one.topic, one.type], payload, log_time=one.time)
         if lost != 0:
             live.ledger.note(Loss(Cause.QUEUE, "/scan", lost, first=START, last=START))
@@ -395,6 +396,17 @@ def test_losses_choices_and_tolerance(pairs: hl.Store) -> None:
     assert {d.what for d in pairs.diff("base", "n-nothing", tolerance=0.0)} == set()
     assert not pairs.diff("base", "n-a-value", tolerance=1.0)
     assert pairs.diff("base", "n-no-scan", tolerance=1.0)
+
+
+def test_counters_and_stamps_are_left_out_unless_asked(tmp_path: Path) -> None:
+    with hl.open(tmp_path / "s", create=True, mongo="none") as store:
+        for name in ("a", "b"):
+            play(store, [replace(m, seq=m.seq + 7 * (name == "b")) for m in good()], name)
+        assert not store.diff("a", "b")
+        assert {one.what for one in store.diff("a", "b", counters=True)} == {"header.seq"}
+        made = contract_of(store.check())
+        assert not broken(store.judge(Contract.parse(made)))
+        assert '"a", "b"' in made
 
 
 def test_what_only_one_has_comes_first(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import shutil
+import struct
 import subprocess
 import sys
 from bisect import bisect_right
@@ -121,6 +122,10 @@ def export(store: hl.Store, to: Path, **options: Any) -> LerobotReport:
     query = store.topic("arm", "go", "cam")
     given: dict[str, Any] = {"fps": FPS, "task": "wave"} | options
     return store.to_lerobot(query, MAP, to, **given)
+
+
+def every_file(path: Path) -> dict[str, bytes]:
+    return {str(one): one.read_bytes() for one in path.rglob("*") if one.is_file()}
 
 
 def rows_of(path: Path) -> list[dict[str, Any]]:
@@ -399,6 +404,68 @@ def test_the_command_line(plain: Path, tmp_path: Path, monkeypatch: pytest.Monke
     answer("export", "own.yaml", "-F", "lerobot", "--propose-map", store=plain)
     assert FeatureMap.read("own.yaml").images == {"cam": "/cam"}
     answer("export", "own.yaml", "-F", "lerobot", "--propose-map", store=plain, code=2)
+
+
+def test_only_a_set_of_hybridlog_is_replaced_and_by_a_whole_one(
+    plain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("map.yaml").write_text(FeatureMap.of(MAP).to_yaml())
+    to = ("export", "set", "-F", "lerobot", "--map", "map.yaml", "-f", "--task", "wave", "--fps")
+    answer(*to, str(FPS), store=plain)
+    before = every_file(Path("set"))
+    answer(*to, "2000", store=plain, code=2)
+    answer(*to, str(FPS), "--between", "+1h", "+2h", store=plain, code=2)
+    assert every_file(Path("set")) == before
+    answer(*to, "10", store=plain)
+    assert json.loads(Path("set/meta/info.json").read_text())["fps"] == 10
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["map.yaml", "set"]
+    Path("set/meta/hybridlog.json").unlink()  # somebody else's
+    before = every_file(Path("set"))
+    answer(*to, str(FPS), store=plain, code=2)
+    assert every_file(Path("set")) == before
+
+
+def test_depth_has_one_scale_nan_is_a_gap_and_numbers_keep_their_type(tmp_path: Path) -> None:
+    state = Channel("/state", "ros1", Schema("t/S", "ros1msg", b"float64 v\nfloat32 w\n"), {})
+    deep = Channel("/deep", "ros1", Schema("sensor_msgs/Image", "ros1msg", IMAGE), {})
+    features = {
+        "features": {"observation.state": {"state": "v"}, "action": {"state": "w"}},
+        "images": {"deep": "deep"},
+    }
+    with hl.open(tmp_path / "store", create=True, mongo="none") as store:
+        with store.start("run") as recording:
+            for number in range(40):
+                time = START + number * 50 * MS
+                mm = np.full((16, 16), 1500, np.uint16)
+                mm[:8], mm[0, 0] = 0, 2000 if number < 20 else 60_000
+                value = np.nan if 10 <= number < 20 else number + 0.1
+                recording.write(deep, image(mm, "16UC1"), log_time=time)
+                recording.write(state, struct.pack("<df", value, number), log_time=time)
+        query, given = store.topic("state", "deep"), {"fps": FPS, "task": "x"}
+        with pytest.raises(UsageError, match="gap"):
+            store.to_lerobot(query, features, tmp_path / "set", **given)
+        given["on_gap"] = "hold"
+        report = store.to_lerobot(query, features, tmp_path / "set", **given)
+        assert report.left_out == ("/deep",)
+        store.to_lerobot(query, features, tmp_path / "scaled", depth_scale=(0, 3), **given)
+    info = json.loads((tmp_path / "scaled/meta/info.json").read_text())["features"]
+    assert [info[name]["dtype"] for name in ("observation.state", "action")] == [
+        "float64",
+        "float32",
+    ]
+    rows = rows_of(tmp_path / "scaled")
+    assert [row["observation.state"] for row in rows] == [
+        (9 if 10 <= n < 20 else n) + 0.1 for n in range(40)
+    ]
+    assert json.loads((tmp_path / "scaled/meta/hybridlog.json").read_text())["depth_scale"] == [
+        0,
+        3,
+    ]
+    (file,) = (tmp_path / "scaled/videos").rglob("*.mp4")
+    with av.open(str(file)) as opened:
+        shown = [frame.to_ndarray(format="gray") for frame in opened.decode(video=0)]
+    assert all(abs(int(one[12, 12]) - 127) < 8 and one[4, 12] < 24 for one in shown)
 
 
 def test_the_doctor_finds_nothing_wrong(plain: Path, tmp_path: Path) -> None:

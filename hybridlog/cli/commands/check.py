@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from msgspec.structs import asdict
 
 from hybridlog.cli import output
-from hybridlog.cli.answers import Listing, answering, check_room, write_bytes
+from hybridlog.cli.answers import SCREEN, Listing, answering, check_room, write_bytes
 from hybridlog.cli.app import DIFFERENT
 from hybridlog.cli.binder import command, option
 from hybridlog.cli.options import (
@@ -17,7 +17,6 @@ from hybridlog.cli.options import (
     Topics,
 )
 from hybridlog.cli.output import Column, duration_of, rate_of
-from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
     from hybridlog.contract.judge import Result
@@ -30,7 +29,7 @@ class _Given(Strict, Topics, Listing):
         excludes=("make", "words", "topic", "between"),
     )
     make: Path | None = option(
-        "Write a contract that this good recording keeps, to be edited.", "FILE"
+        "Write a contract that these good recordings keep, to be edited.", "FILE"
     )
     junit: Path | None = option(
         "With --contract: also write the results in JUnit's XML, for CI.",
@@ -60,8 +59,6 @@ def check_command(given: _Given) -> int:
     with answering(given) as query:
         found = query.check()
         if make is not None:
-            if len({one.recording for one in found}) != 1:
-                raise UsageError("A contract is made from one good recording: name it with -r.")
             write_bytes(make, contract_of(found).encode())
             return 0
         columns = [
@@ -96,7 +93,7 @@ def _show_verdict(results: Sequence[Result], recordings: int, given: _Given) -> 
         write_bytes(given.junit, junit_of(results).encode())
     bad = broken(results)
     names = ("recording", "topic", "rule", "wanted", "found")
-    given.show(map(asdict, results if given.as_json else bad), [*map(Column, names)])
+    given.show(map(asdict, bad if given.to_form == SCREEN else results), [*map(Column, names)])
     rules, where = output.counted(len(results), "rule"), output.counted(recordings, "recording")
     output.remarks([f"{rules} in {where}: {len(bad) or 'none'} broken."])
     return DIFFERENT if bad else 0

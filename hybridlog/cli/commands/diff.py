@@ -20,6 +20,7 @@ class _Given(Between, InStore, Quiet, Listing):
         "Numbers are equal that differ by at most this, such as 5%.", "SHARE", default="0"
     )
     topic: tuple[str, ...] = topics()
+    counters: bool = option("Also counters and stamps in messages, which differ always.")
 
 
 @command(_Given)
@@ -39,6 +40,7 @@ def diff_command(given: _Given) -> int:
             topics=(*given.words, *given.topic),
             between=given.between,
             tolerance=share,
+            counters=given.counters,
         )
     columns = [*map(Column, ("topic", "what", "a", "b"))]
     given.show(map(asdict, found), columns)

@@ -75,6 +75,12 @@ class _Training(Options):
         type=click.Choice(["refuse", "drop", "hold"]),
         default="refuse",
     )
+    depth_scale: tuple[float, float] | None = _option(
+        "Metres at 0 and at 255 in pictures of depth; without, these are left out.",
+        "NEAR FAR",
+        nargs=2,
+        type=float,
+    )
 
 
 class _Given(Topics, Latched, Forced, _Training):
@@ -259,8 +265,9 @@ def _export_set(store: Store, query: Query, target: Path, given: _Given) -> None
             "Name a map with --map FILE. `hybridlog export map.yaml --format lerobot "
             "--propose-map` writes one to begin with."
         )
-    if given.force and target.is_dir() and (target / "meta" / "info.json").exists():
-        shutil.rmtree(target)
+    # Only a set of hybridlog is replaced, once the new one is whole.
+    is_ours = given.force and (target / "meta" / "hybridlog.json").is_file()
+    place = target.resolve().with_name(f"{target.resolve().name}.new") if is_ours else target
     done, counted = 0, output.counted
     with Bar(target.name) as bar:
 
@@ -272,17 +279,22 @@ def _export_set(store: Store, query: Query, target: Path, given: _Given) -> None
         report = store.to_lerobot(
             query,
             given.features,
-            target,
+            place,
             fps=given.fps,
             episodes_by=given.episodes_by,
             task=given.task,
             task_topic=given.task_topic,
             codec=given.vcodec,
             on_gap=given.on_gap,
+            depth_scale=given.depth_scale,
             progress=tell,
         )
+    if is_ours:
+        old = target.resolve().rename(place.with_suffix(".old"))
+        place.rename(target.resolve())
+        shutil.rmtree(old)
     about = (
-        f"{report.path}: {counted(report.episodes, 'episode')}, "
+        f"{target}: {counted(report.episodes, 'episode')}, "
         f"{counted(report.frames, 'frame')} at {given.fps} Hz, {output.size(report.bytes)}"
     )
     output.remarks([about])
@@ -292,6 +304,9 @@ def _export_set(store: Store, query: Query, target: Path, given: _Given) -> None
         "with an earlier picture, since its own cannot be shown": report.missing,
     }
     output.notes(f"{counted(number, 'frame')} {what}." for what, number in said.items() if number)
+    if report.left_out:
+        depths = ", ".join(report.left_out)
+        output.note(f"Pictures of depth are left out without --depth-scale NEAR FAR: {depths}.")
     if report.lost:
         lost = f"{counted(report.lost, 'message')} of these topics are lost in the episodes"
         output.note(f"{lost}; meta/hybridlog.json says in which.")

@@ -115,6 +115,7 @@ class Rosbag2Writer(LogWriter):
         for channel in channels:
             if channel.message_encoding == "cdr" and channel.schema is not None:
                 self.topic(channel)
+                self._current().declare([channel])
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Add a metadata record to the current file."""
@@ -242,7 +243,8 @@ class _SqliteFile(LogWriter):
                 schema = topic.channel.schema
                 assert schema is not None
                 text = schema.data.decode(errors="replace")
-                types.setdefault(kind, (kind, schema.encoding, text, topic.type_hash))
+                if text:  # readers refuse a definition that is empty
+                    types.setdefault(kind, (kind, schema.encoding, text, topic.type_hash))
             self._db.executemany(
                 "INSERT INTO message_definitions(topic_type, encoding, "
                 "encoded_message_definition, type_description_hash) VALUES (?, ?, ?, ?)",
