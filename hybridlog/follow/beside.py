@@ -205,6 +205,21 @@ class _Beside:
             self.tell("say", f"tables and index are made later: {error or repr(error)}")
 
     def _derive(self) -> None:
+        task, index = self._task, self._store.shared.index
+        follower = self._begin(is_again=task.is_again)
+        while not self._ended.wait(task.interval_s):
+            with suppress(StoreError):  # the next look or the end sees it
+                follower.follow()
+            is_lost = follower.failure is not None and index.connected is None
+            if is_lost and index.reached(brings=False, writes=True) is not None:
+                follower.discard()
+                follower = self._begin(is_again=True)
+        follower.is_stopped = False
+        directory, catalog = self._store.directory, self._store.shared.catalog
+        follower.finish(put_entry(directory, catalog, task.recording))
+
+    def _begin(self, *, is_again: bool) -> Follower:
+        """A new follower; one that begins again keeps the documents of whole segments."""
         store, task = self._store, self._task
         directory, catalog, index = store.directory, store.shared.catalog, store.shared.index
         target = index.index_to_record("Recording", brings=False)
@@ -216,7 +231,7 @@ class _Beside:
         entry = put_entry(directory, catalog, task.recording)
         done: Collection[str] = ()
         topics: Collection[str] | None = None
-        if task.is_again:
+        if is_again:
             if target.database is not None:
                 done, _ = begin_again(target.database, entry)
             manifest = directory.manifests.read(task.recording)
@@ -224,13 +239,8 @@ class _Beside:
             self._before = sum(part.messages for log in logs for part in log.parts.values())
             if manifest.is_ended:
                 topics = missing(directory, entry)
-        follower = Follower(directory, catalog, entry, target, topics=topics, done=done)
-        self._follower = follower
-        while not self._ended.wait(task.interval_s):
-            with suppress(StoreError):  # the next look or the end sees it
-                follower.follow()
-        follower.is_stopped = False
-        follower.finish(put_entry(directory, catalog, task.recording))
+        self._follower = Follower(directory, catalog, entry, target, topics=topics, done=done)
+        return self._follower
 
     def _recover(self) -> None:
         """Seal what crashes have left of earlier recordings, and make their documents."""

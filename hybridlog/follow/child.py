@@ -19,7 +19,9 @@ from hybridlog.maintenance.report import Followed
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.topics import TopicMatcher, matcher, split_topic
 from hybridlog_storage.errors import (
+    DatabaseError,
     DiskFullError,
+    HybridlogError,
     StoreError,
     UsageError,
     WhereError,
@@ -72,7 +74,7 @@ class FollowerProcess:
     """Evaluates triggers, then makes rows, tables and documents, by a process that ends with this.
 
     When it ends before the recording, as for want of memory, it is started again, and goes on
-    where it was. With a `target`, a recording that has ended before `SHORT_S` is followed in this
+    where it was. With `reach`, a recording that has ended before `SHORT_S` is followed in this
     process, at its end.
     `judged` has the numbers of the sealed files that triggers have read; it is None without
     triggers, or when the process is given up. At the end it is waited for `wait_s`, if that is not
@@ -86,12 +88,12 @@ class FollowerProcess:
         task: Task,
         *,
         has_documents: bool,
-        target: IndexTarget | None = None,
+        failure: DatabaseError | None = None,
+        reach: Callable[[], IndexTarget] | None = None,
         triggers: Sequence[Trigger] = (),
         hit: Callable[[str, int], object] = lambda *_: None,
         say: Callable[[str], None] | None = None,
     ) -> None:
-        failure = None if target is None else target.failure
         self.state = Followed(has_documents, failure=failure)
         self.said: list[str] = []
         self.judged: Collection[int] | None = () if triggers else None
@@ -103,7 +105,7 @@ class FollowerProcess:
         self._task = task
         self._has_seen = not triggers
         self._why = "their process ends again and again"
-        self._target = target
+        self._reach = reach
         self._hit = hit
         self._say = say or self.said.append
         self._orders: list[Channel | str] = []
@@ -123,6 +125,13 @@ class FollowerProcess:
         index = shared.index
         target = index.index_to_record(purpose)
 
+        def reach() -> IndexTarget:
+            if target.is_wanted:
+                with suppress(HybridlogError):  # the server may have come, or may have gone
+                    index.connect(brings=False)
+            found: IndexTarget = index.index_to_record(purpose, brings=False)
+            return found
+
         def start(entry: RecordingEntry) -> FollowerProcess:
             place = shared.directory.address
             task = Task(place, index.wanted, entry.id, (), interval_s, target.is_wanted)
@@ -131,7 +140,8 @@ class FollowerProcess:
                 shared.catalog,
                 task,
                 has_documents=target.is_wanted,
-                target=target,
+                failure=target.failure,
+                reach=reach,
             )
             followed.start()
             return followed
@@ -151,8 +161,8 @@ class FollowerProcess:
 
     def finish(self, entry: RecordingEntry) -> RecordingEntry:
         """Wait until it has done everything, but no longer than wanted."""
-        if self._target is not None and time.monotonic() - self._begun < SHORT_S:
-            return self._finish_here(entry, self._target)
+        if self._reach is not None and time.monotonic() - self._begun < SHORT_S:
+            return self._finish_here(entry, self._reach())
         self._is_finishing = True
         self._orders.append(ENDED)
         begun = time.monotonic()
@@ -192,7 +202,7 @@ class FollowerProcess:
             self._thread.join()
 
     def _run(self) -> None:
-        if self._target is not None and self._over.wait(SHORT_S):
+        if self._reach is not None and self._over.wait(SHORT_S):
             return
         failed = 0
         while failed < _TRIES and not self._over.is_set():

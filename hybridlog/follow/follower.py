@@ -7,7 +7,6 @@ ends at any point costs nothing but the work of the next one.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any, Final
@@ -47,7 +46,6 @@ if TYPE_CHECKING:
 
 _GROUP_BYTES: Final = 8 << 20  # content of chunks that are decoded together
 _GROUP_ROWS: Final = 1 << 17  # messages that are decoded together
-_RETRY_S: Final = 2.0  # between attempts after the database has failed
 
 
 class _Segment(Struct):
@@ -55,7 +53,6 @@ class _Segment(Struct):
 
     Attributes:
         is_wanted: Whether documents are made.
-        sender: Who gets them; another one lacks some.
         opened: Its file while it grows.
         chunks: Number of chunks that were read.
         decoded: Results of decoding, by channel.
@@ -63,7 +60,6 @@ class _Segment(Struct):
     """
 
     is_wanted: bool
-    sender: Sender | None
     opened: Walk | None = None
     chunks: int = 0
     decoded: dict[int, ChannelStats] = field(default_factory=dict)
@@ -73,8 +69,8 @@ class _Segment(Struct):
 class Follower:
     """Brings what is derived of one recording up to date; this process has locked it.
 
-    A failing database stops the documents and nothing else. They go on with what comes after it
-    answers again; the next follower makes what is missing.
+    A failing database stops the documents and nothing else; the next follower makes what is
+    missing.
 
     Args:
         directory: The store.
@@ -86,8 +82,7 @@ class Follower:
         progress: Called after each chunk of `finish`.
 
     Attributes:
-        failure: The error of the database; None without any, or after it answers again. After
-            `finish`, why the index has missed something.
+        failure: The error of the database; None without any.
         made: Number of chunks whose documents were made.
         messages: Number of messages that were read.
         is_stopped: Set it to end `follow` before the next chunks.
@@ -117,20 +112,18 @@ class Follower:
         self._progress = progress
         self._indexer = ChunkIndexer(entry.id)
         self._sender: Sender | None = None
-        self._retry_at = 0.0
-        self._indexed = 0
-        self._gap: DatabaseError | None = None  # why the index has missed something
+        database = self._target.database
+        if database is not None:
+            with self._noting_failure():
+                if not IndexState(database).of([entry.key]):
+                    IndexState(database).begin(entry)
+                self._sender = Sender(entry.key, database)
         from hybridlog.columns.table_writer import TableWriter  # loads pyarrow
 
         self._tables = TableWriter(self._directory.path, entry, topics)
         self._damage = self._catalog.damage(entry.id)
         self._segments: dict[int, _Segment] = {}
         self._ended: set[int] = set()
-
-    @property
-    def indexed(self) -> int:
-        """Number of messages that the index has got."""
-        return self._indexed + (0 if self._sender is None else self._sender.messages)
 
     @property
     def problem(self) -> str:
@@ -140,9 +133,9 @@ class Follower:
     @property
     def state(self) -> Followed:
         """How far it is."""
-        read, indexed, failure = self.messages, self.indexed, self.failure
-        missed = 0 if failure is None else read - indexed
-        return Followed(self._target.is_wanted, read, indexed, missed, failure)
+        read, indexed = self.messages, 0 if self._sender is None else self._sender.messages
+        missed = 0 if self.failure is None else read - indexed
+        return Followed(self._target.is_wanted, read, indexed, missed, self.failure)
 
     def follow(self) -> None:
         """Read what was flushed since the last time.
@@ -150,7 +143,6 @@ class Follower:
         Raises:
             StoreError: Its files cannot be read now.
         """
-        self._connect()
         manifest = self._directory.manifests.read(self._entry.id)
         listing = self._directory.listing(self._entry.id).choosing(manifest)
         with suppress(InterruptedError):
@@ -175,34 +167,30 @@ class Follower:
             SegmentError: A segment cannot be read.
         """
         try:
-            self._retry_at = 0.0
-            self._connect()
             self._entry, done = entry, 0
             for number in [n for n, _, _ in entry.spans if n not in self._ended]:
                 if (digest := entry.digests.get(str(number))) is not None:
                     report = reporter(self._progress, entry.name, entry.stored_bytes, done)
                     done += self._read_sealed(number, file_of(entry, number), digest, report)
-            if self._sender is not None and self._gap is None:
+            if self._sender is not None:
                 self._sender.ended.update(entry.digests)  # also of segments without messages
             self._send()
             if self._damage != self._catalog.damage(entry.id):
                 self._catalog.put_damage(entry.id, self._damage)
             entry = put_entry(self._directory, self._catalog, entry.id)
             self._tables.close(entry)
-            self.failure = self._gap or self.failure
         finally:
             self.discard()
         return entry
 
     def discard(self) -> None:
         """Leave the rest to the next follower."""
-        self._stop_sending()
         self._tables.discard()
         self._segments.clear()
 
     def _segment(self, number: int) -> _Segment:
         is_wanted = self._target.is_wanted and str(number) not in self._done
-        return self._segments.setdefault(number, _Segment(is_wanted, self._sender))
+        return self._segments.setdefault(number, _Segment(is_wanted))
 
     def _read_open(self, number: int) -> None:
         """Read what a segment has got since the last time."""
@@ -227,7 +215,13 @@ class Follower:
                     wanted = {one.id for one in self._entry.channels if one.topic in self._topics}
                     places = [one for one in places if not wanted.isdisjoint(one.channels)]
             self._read(number, reader, places, summary.channels, report)
-        self._end_segment(number, digest)
+        del self._segments[number]
+        self._ended.add(number)
+        if not segment.is_decoded:
+            with suppress(HybridlogError):  # it is derived, and the disk may be full
+                self._catalog.put_decoded(self._entry.id, number, digest, segment.decoded)
+        if segment.is_wanted and self._sender is not None:
+            self._sender.ended[str(number)] = digest
         report(reader.size)
         return reader.size
 
@@ -239,20 +233,22 @@ class Follower:
         channels: Mapping[int, Channel],
         report: Callable[[int], None] = lambda _: None,
     ) -> None:
-        """Read those chunks of a segment that were not; InterruptedError if it is to stop."""
-        for group in self._groups(number, reader, places):
-            if self.is_stopped:
-                raise InterruptedError
-            self._take(self._segments[number], group, channels)
-            report(group[-1].place.offset)
+        """Read those chunks of a segment that were not; InterruptedError if it is to stop.
 
-    def _groups(
-        self, number: int, reader: SegmentReader, places: Iterable[ChunkPlace]
-    ) -> Iterator[list[StoredChunk]]:
-        """The chunks of a segment that can be read and were not; small ones together."""
+        Small ones are decoded together.
+        """
         segment, size, rows = self._segments[number], 0, 0
         group: list[StoredChunk] = []
-        for place in [one for one in places if one.number >= segment.chunks]:
+        for place in [*(one for one in places if one.number >= segment.chunks), None]:
+            is_full = size >= _GROUP_BYTES or rows >= _GROUP_ROWS
+            if group and (place is None or is_full):
+                if self.is_stopped:
+                    raise InterruptedError
+                self._take(segment, group, channels)
+                report(group[-1].place.offset)
+                group, size, rows = [], 0, 0
+            if place is None:
+                break
             if not segment.is_decoded:
                 self._damage.pop((number, place.number), None)
             try:
@@ -264,11 +260,6 @@ class Follower:
             group.append(chunk)
             size += len(chunk.batch.buffer)
             rows += len(chunk.batch)
-            if size >= _GROUP_BYTES or rows >= _GROUP_ROWS:
-                yield group
-                group, size, rows = [], 0, 0
-        if group:
-            yield group
 
     def _take(
         self, segment: _Segment, chunks: Sequence[StoredChunk], channels: Mapping[int, Channel]
@@ -285,50 +276,16 @@ class Follower:
             for table in self._indexer.take(one, segment.decoded, has_documents=segment.is_wanted)
         ]
         messages = sum(len(chunk.batch) for chunk in chunks)
-        if not segment.is_wanted and self._target.is_wanted:
-            return  # they are there already
-        self.messages += messages
-        if not segment.is_wanted:
-            return
-        self.made += len(chunks)
-        if self._sender is None:
-            segment.sender, self._gap = None, self.failure
-        else:
-            with self._noting_failure():
-                self._sender.add(documents, messages)
-
-    def _end_segment(self, number: int, digest: str) -> None:
-        """Note that all of a segment was read."""
-        segment = self._segments.pop(number)
-        if not segment.is_decoded:
-            with suppress(HybridlogError):  # it is derived, and the disk may be full
-                self._catalog.put_decoded(self._entry.id, number, digest, segment.decoded)
-        if segment.is_wanted and segment.sender is self._sender is not None:
-            self._sender.ended[str(number)] = digest
-        self._ended.add(number)
-
-    # The database.
-
-    def _connect(self) -> None:
-        """Begin to send documents, also after the database has failed."""
-        target = self._target
-        is_due = time.monotonic() >= self._retry_at
-        if self._sender is not None or not target.is_wanted or not is_due:
-            return
-        database = target.database if self.failure is None else None
-        with self._noting_failure():
-            if database is None:
-                if target.renew is None:
-                    return
-                database = target.renew()
-            state = IndexState(database)
-            if not state.of([self._entry.key]):
-                state.begin(self._entry)
-            self.failure = None
-            self._sender = Sender(self._entry.key, database)
+        if segment.is_wanted or not self._target.is_wanted:  # else they are there already
+            self.messages += messages
+        if segment.is_wanted:
+            self.made += len(chunks)
+            if self._sender is not None and self.failure is None:
+                with self._noting_failure():
+                    self._sender.add(documents, messages)
 
     def _send(self) -> None:
-        if self._sender is not None:
+        if self._sender is not None and self.failure is None:
             with self._noting_failure():
                 self._sender.send()
 
@@ -339,13 +296,6 @@ class Follower:
             yield
         except HybridlogError as error:
             self.failure = error if isinstance(error, DatabaseError) else DatabaseError(str(error))
-            if self._sender is not None:
-                self._gap = self.failure  # of what was sent, some may be lost
-            self._stop_sending()
-            self._retry_at = time.monotonic() + _RETRY_S
-
-    def _stop_sending(self) -> None:
-        self._indexed, self._sender = self.indexed, None
 
 
 def make_rows_ahead(

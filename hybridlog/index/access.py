@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from functools import partial, wraps
+from functools import wraps
 from typing import TYPE_CHECKING, NamedTuple, ParamSpec, TypeVar
 
 from hybridlog_storage.errors import (
@@ -144,15 +144,14 @@ class IndexAccess:
         """The index, for a new recording; it may be unavailable, or without `brings` be behind."""
         from hybridlog.index.indexing import IndexTarget
 
-        renew = partial(self.connect, brings=False)
         try:
             database = self.database_for(purpose, writes=True, brings=brings)
         except DatabaseError as error:
             why = self.unavailable if isinstance(self.unavailable, DatabaseError) else error
             # It does without MongoDB if none is wanted, or ours does not start.
             has_none = self._named in {EMBEDDED, NONE} and not isinstance(why, ConnectionLostError)
-            return IndexTarget(failure=None if has_none else why, renew=renew)
-        return IndexTarget(database, renew=renew)
+            return IndexTarget(failure=None if has_none else why)
+        return IndexTarget(database)
 
     def connect(self, *, brings: bool = True) -> Database:
         """Connect to the index and bring it up to date; once more if the connection breaks."""

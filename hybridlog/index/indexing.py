@@ -6,7 +6,7 @@ All that is derived of them needs only chunks and their channels, so it is dispo
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -15,7 +15,6 @@ from msgspec import Struct
 from hybridlog.schema.codec import stamps_of
 from hybridlog.schema.codecs import bodies_in, codec_for
 from hybridlog.schema.column import STAMP, Records, header_stamps
-from hybridlog.schema.document import MAX_BYTES
 from hybridlog.schema.states import encoding_of
 from hybridlog_storage.cache import lazy
 from hybridlog_storage.catalog import ChannelStats
@@ -32,9 +31,6 @@ if TYPE_CHECKING:
     from hybridlog.schema.codec import Codec, Decoded
     from hybridlog_storage.errors import DatabaseError
     from hybridlog_storage.mongo.database import Database
-
-
-_LARGE = MAX_BYTES >> 5  # bytes of a payload whose fields may be too large for a document
 
 
 class Messages:
@@ -97,9 +93,6 @@ class ChunkIndexer:
         elif found is not None:
             for bad in found.unreadable:
                 unreadable[bad.rows] = True
-            large = np.flatnonzero(placed.length > _LARGE)
-            for group in bodies_in(messages.codec.columns_of(batch.take(large)), len(large)):
-                unreadable[large[group.rows]] = group.error is not None
         if found is not None:
             surplus[found.surplus] = True
         stamped, stamps = _stamps_of(messages)
@@ -174,13 +167,10 @@ class IndexTarget(Struct, frozen=True):
     Attributes:
         database: The index; None if it is unavailable now, or the recording gets none.
         failure: Why it is unavailable now; None if it is not, or the recording gets none.
-        renew: Returns the index, connected again if that was lost; starts the embedded MongoDB
-            again if that has ended. Raises `DatabaseError`.
     """
 
     database: Database | None = None
     failure: DatabaseError | None = None
-    renew: Callable[[], Database] | None = None
 
     @property
     def is_wanted(self) -> bool:
