@@ -37,7 +37,7 @@ ALLOWED = {
         "hybridlog_storage.mongo",
     ),
     "click": ("hybridlog.cli",),
-    "duckdb": ("hybridlog.sql.source",),
+    "duckdb": ("hybridlog.sql.views",),
     "google": ("hybridlog.schema.protobuf_codec",),
     "isal": ("hybridlog.drawing.images", "hybridlog_storage.checksum"),
     "lz4": ("hybridlog.formats.rosbag1.reader", "hybridlog_storage.segments.compression"),

@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from msgspec import Struct
 
-from hybridlog.columns.fields import LIMIT, filled, has_summaries, original_name
+from hybridlog.columns.fields import LIMIT
 from hybridlog.columns.layout import OWN_COLUMNS, POINTS, column_names
 from hybridlog.schema.arrow_columns import json_array, structs
 from hybridlog.schema.arrow_types import (
@@ -84,34 +84,33 @@ class ViewColumn(Struct, frozen=True):
         """Tells it from the others of a view."""
         return self.source, self.is_summary
 
-    def values(self, records: Any, columns: Any, wanted: Collection[Key]) -> Any:
+    def values(self, records: Any, summaries: Any, wanted: Collection[Key]) -> Any:
         """Its values in SQL's types, null where messages lack them; those of `wanted` fields only.
 
-        `records` are fields of messages, and `columns` the same as tables have them.
+        `records` are fields of messages; `summaries` the same, with those of arrays that are gone.
         """
-        here, rows = field_of(records, self.source[-1]), len(records)
+        here = field_of(summaries if self.is_summary else records, self.source[-1])
         if self.inner:
-            beside = field_of(columns, self.source[-1])
-            here = here if here is not None else pa.nulls(rows, pa.struct([]))
-            beside = beside if beside is not None else here
+            here = pa.nulls(len(records), pa.struct([])) if here is None else here
+            beside = field_of(summaries, self.source[-1])
+            beside = here if beside is None else beside
             children = [one.values(here, beside, wanted) for one in self.inner]
             fields = list(self.type)
             return pa.StructArray.from_arrays(children, fields=fields, mask=here.is_null())
-        if self.is_summary and self.key in wanted:
-            here = field_of(columns, self.source[-1])
-            made = field_of(columns, self.source[-1], is_summary=True)
-            here = summary(here) if made is None and here is not None else filled(made, here)
         if here is None or self.key not in wanted:
-            return pa.nulls(rows, self.type)
-        return fitted(here, self.kind)
+            return pa.nulls(len(records), self.type)
+        return fitted(summary(here) if self.is_summary and is_array(here.type) else here, self.kind)
+
+    @classmethod
+    def of_points(cls, kind: Any) -> ViewColumn:
+        """The column of the points of clouds, of a type."""
+        return cls(POINTS, (POINTS,), kind, sql_type(kind), is_points=True)
 
 
-def field_of(columns: Any, name: str, *, is_summary: bool = False) -> Any:
-    """A field of structs, null where these are, or its summaries; None without it."""
-    for place, field in enumerate(columns.type if _types.is_struct(columns.type) else ()):
-        if original_name(field) == name and has_summaries(field) == is_summary:
-            return pc.struct_field(columns, [place])
-    return None
+def field_of(columns: Any, name: str) -> Any:
+    """A field of structs, null where these are; None without it."""
+    names = columns.type.names if _types.is_struct(columns.type) else ()
+    return pc.struct_field(columns, [names.index(name)]) if name in names else None
 
 
 def view_columns(kind: Any) -> list[ViewColumn]:
@@ -217,8 +216,3 @@ def _fitted(array: Any, kind: Any, target: Any) -> Any:
         return array.cast(pa.int64()).cast(target) if is_time(have) else array.cast(target)
     except pa.ArrowException as error:
         raise UsageError(f"{have} is not {target}: {error}") from error
-
-
-def points_column(kind: Any) -> ViewColumn:
-    """The column of the points of clouds, of a type."""
-    return ViewColumn(POINTS, (POINTS,), kind, sql_type(kind), is_points=True)

@@ -1,49 +1,60 @@
-"""Content of a store for SQL at one moment: recordings, views, and tables about the store."""
+"""Content of a store for SQL at one moment: names, views of topics, and tables about the store.
+
+DuckDB asks for whole columns, also where a query names one field of a struct: its syntax tree
+tells the paths that are named.
+"""
 
 from __future__ import annotations
 
-import threading
+import json
+import re
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from itertools import islice
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import pyarrow as pa
 from msgspec.structs import replace
 
-from hybridlog.columns.fields import records_of
-from hybridlog.columns.layout import POINTS
-from hybridlog.columns.rows import is_cloud
-from hybridlog.frames.answer import FIXED
-from hybridlog.index.indexing import rows_by_channel
+from hybridlog.columns.layout import column_names
 from hybridlog.query.answers.marks import marks_in
-from hybridlog.query.chunk_scan import ChunkScan
-from hybridlog.query.planner import Planner
-from hybridlog.query.question import Question
 from hybridlog.query.ranges import RangeResolver
-from hybridlog.schema.arrow_types import has_empty
-from hybridlog.sql.columns import OWN, merged, points_column, view_columns
-from hybridlog.sql.names import ViewNames
-from hybridlog.sql.rows import Limits, ViewRows, columns_in
+from hybridlog.sql.views import TopicView
 from hybridlog_storage.catalog import ChannelStats
+from hybridlog_storage.mongo.index_documents import collection_of
 from hybridlog_storage.times import BEGIN, END
 
 if TYPE_CHECKING:
-    from hybridlog.query.question import Part, RecordedChannel
-    from hybridlog.query.ranges import Resolved
+    from hybridlog.query.question import Question
     from hybridlog.session import Session
-    from hybridlog.sql.rows import Reading
+    from hybridlog.sql.views import Names
     from hybridlog_storage.summary import RecordingSummary
 
-
-_SAMPLED: Final = 20  # recordings that tell how many messages a topic has
+TABLES: Final = ("recordings", "topics", "losses", "marks")
+"""Tables about the store itself; their names are reserved."""
+TREE: Final = (
+    "select json_serialize_sql(?::varchar, skip_null := true, skip_empty := true, "
+    "skip_default := true)"
+)
+_WORD: Final = re.compile(r'"((?:[^"]|"")*)"|([^\W\d][\w$]*)')
+_PLAIN: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+_LISTING: Final = frozenset({
+    "database", "duckdb_columns", "duckdb_tables", "duckdb_views", "information_schema",
+    "pg_catalog", "pragma_show", "pragma_table_info", "show",
+})  # fmt: skip
+"""Words of statements that list views."""
+_OPEN: Final = frozenset(
+    {"STAR", "POSITIONAL_REFERENCE", "NATURAL", "PIVOT", "SHOW_REF", "TABLE_FUNCTION"}
+)
+"""Parts of a query that may use columns which it does not name."""
 
 
 class StoreContent:
     """Recordings and views of a store at one moment. Thread safe.
 
     The recordings and times of the question `scope` alone, whatever its topics, are in
-    `summaries`; those that may have rows are `resolved`, by id; both oldest first.
+    `summaries`; those that may have rows are `resolved`, by id; both oldest first. `views` are
+    their names by topic. DuckDB ignores case, so do names.
     """
 
     def __init__(self, session: Session, scope: Question) -> None:
@@ -57,120 +68,86 @@ class StoreContent:
         topics = self.snapshot.topics_at(places)
         found = RangeResolver(session, replace(scope, topics=tuple(topics))).resolve()
         self.resolved = {one.summary.id: one for one in found}
-        self.names = ViewNames(topics)
-        self._views: dict[str, TopicView] = {}
-        self._lock = threading.RLock()
+        # Of names that differ in case, the one in lower case stays as it is.
+        known = sorted(topics, key=lambda topic: (topic.casefold(), topic.swapcase()))
+        collections = dict(zip(map(collection_of, known), known, strict=True))
+        named = column_names(collections, TABLES)
+        self.views = {collections[collection]: view for collection, view in named}
+        taken = {view.casefold() for view in (*self.views.values(), *TABLES)}
+        short = [(topic, name) for topic in known for name in _short_names(topic)]
+        owners = Counter(name.casefold() for _, name in short)
+        self._short = [
+            (topic, name)
+            for topic, name in short
+            if owners[name.casefold()] == 1 and name.casefold() not in taken
+        ]
+        self._topics = {name.casefold(): topic for topic, name in self._short}
+        self._topics |= {view.casefold(): topic for topic, view in self.views.items()}
+        self._made: dict[str, TopicView] = {}
+
+    @property
+    def names(self) -> list[str]:
+        """All names: tables, views, short names."""
+        return [*TABLES, *self.views.values(), *(name for _, name in self._short)]
+
+    def short(self, topic: str) -> str | None:
+        """The shortest name of a topic's view; None if only the long one is unambiguous."""
+        return min((name for one, name in self._short if one == topic), key=len, default=None)
+
+    def named(self, query: str) -> list[str]:
+        """Names in the text of a query, in any role; all for statements that list views."""
+        found: list[tuple[str, str]] = _WORD.findall(query)
+        words = {(quoted.replace('""', '"') or plain).casefold() for quoted, plain in found}
+        is_listing = not words.isdisjoint(_LISTING)
+        return [name for name in self.names if is_listing or name.casefold() in words]
 
     def summaries_of(self, topic: str) -> list[RecordingSummary]:
         """Recordings that have a topic, oldest first."""
         places = self.snapshot.having([topic], self.scope.recordings)
         return [self.snapshot.summaries[place] for place in places.tolist()]
 
-    def view(self, topic: str) -> TopicView:
-        """The view of a topic."""
-        with self._lock:
-            if topic not in self._views:
-                self._views[topic] = TopicView(self, topic)
-            return self._views[topic]
+    def view(self, name: str) -> TopicView | None:
+        """The view of a name; None if there is none."""
+        topic = self._topics.get(name.casefold())
+        if topic is not None and topic not in self._made:
+            ids = [one.id for one in self.summaries_of(topic)]
+            self._made[topic] = TopicView(self.session, topic, ids, self.resolved)
+        return None if topic is None else self._made[topic]
+
+    def table(self, name: str) -> pa.Table:
+        """One of the tables about the store."""
+        rows, schema = _TABLES[name]
+        return pa.Table.from_pylist(list(rows(self)), schema=schema)
 
 
-class TopicView:
-    """The view of a topic: its columns, and rows for a query; `size` is nearly their number."""
-
-    def __init__(self, content: StoreContent, topic: str) -> None:
-        self.topic = topic
-        self._session = content.session
-        summaries = content.summaries_of(topic)
-        ids = tuple(one.id for one in summaries)
-        self._planner = Planner(self._session, Question((topic,), ids))
-        self._reason = next(filter(None, (c.codec.reason for c in self._planner.examples)), None)
-        kinds = self._kinds()
-        columns = view_columns(merged(kinds) if kinds else pa.struct([]))
-        self._columns = {column.name: column for column in columns}
-        if POINTS not in self._columns and (points := self._points()):
-            self._columns[POINTS] = points_column(merged(points))
-        fields = [pa.field(column.name, column.type) for column in self._columns.values()]
-        self.schema = pa.schema([*OWN, *fields])
-        self._parts: dict[str, Part | None] = {}
-        self._chosen = [content.resolved[one] for one in ids if one in content.resolved]
-        some = self._chosen[:_SAMPLED]
-        messages = sum(part.messages for part in map(self._part, some) if part is not None)
-        self.size = messages * len(self._chosen) // max(len(some), 1)
-
-    def _part(self, one: Resolved) -> Part | None:
-        """The topic in a recording, as asked; None without messages."""
-        if one.summary.id not in self._parts:
-            self._parts[one.summary.id] = next(self._planner.parts_in(*one), None)
-        return self._parts[one.summary.id]
-
-    def _kinds(self) -> list[Any]:
-        """Types of the messages; recordings with equal definitions have equal ones."""
-        channels = self._planner.examples
-        if all(map(_is_fixed, channels)):
-            return [channel.arrow_type() for channel in channels if channel.codec.indexed]
-        found = []
-        for part in self._planner.split():
-            table = self._planner.tabled(part)
-            if table is not None:
-                found += table.table.whole_types()
-            else:
-                found += (records_of(one).type for one in self._read(part))
-        return found
-
-    def _points(self) -> list[Any]:
-        """Types of the points of clouds, of a topic whose tables have them."""
-        if self.topic not in self._session.directory.settings.arrays:
-            return []
-        found = []
-        for part in self._planner.split():
-            table = self._planner.tabled(part)
-            if table is not None and table.table.points is not None:
-                found.append(table.table.points)
-            elif any(is_cloud(channel.channel) for channel in part.channels):
-                clouds = (one.type for one in self._read(part, has_points=True))
-                found += islice(
-                    (one.field(POINTS).type for one in clouds if POINTS in one.names), 1
-                )
-        return found
-
-    def _read(self, part: Part, *, has_points: bool = False) -> Iterator[Any]:
-        """The fields of messages in chunks, as `columns_in` has them."""
-        for run in ChunkScan(self._planner.chunk_plan([part]), self._session).runs():
-            for number, rows in rows_by_channel(run.batch.channel):
-                codec = run.channels[number].codec
-                if codec.indexed:
-                    decoded = codec.columns_of(run.batch.take(rows), None)
-                    yield columns_in(decoded, has_points=has_points)
-
-    def rows(self, schema: pa.Schema, limits: Limits, reading: Reading) -> Iterator[pa.RecordBatch]:
-        """Rows for a query, with those columns."""
-        if self._reason is not None:
-            reading.undefined[self.topic] = self._reason
-        read = ViewRows(self._session, schema, self._columns, reading)
-        low, high = limits.span
-        for one in self._chosen:
-            summary, (begin, end) = one.summary, one.summary.extent
-            is_beside = begin < end and (begin >= high or end <= low)
-            names = limits.recordings
-            if is_beside or (names is not None and summary.name not in names):
-                continue
-            reading.recordings[summary.id] = self._session.entry_of(summary)
-            reading.topics.add(self.topic)
-            part = self._part(one)
-            if part is not None:
-                span = Limits(part.bounds or (BEGIN, END)).common(limits).span
-                bounds = None if span == (BEGIN, END) else span
-                yield from read.read(replace(part, bounds=bounds))
+def _short_names(topic: str) -> Iterator[str]:
+    """Whole parts at the end of a name: `scan` and `base__scan` of `/robot/base/scan`."""
+    parts = topic.strip("/").split("/")
+    for start in range(1, len(parts)):
+        name = "__".join(parts[start:])
+        if _PLAIN.fullmatch(name):
+            yield name
 
 
-def _is_fixed(channel: RecordedChannel) -> bool:
-    """True if a definition fixes the fields of all messages."""
-    return (
-        channel.codec.reason is not None
-        or channel.encoding in FIXED
-        # The keys of a map of protobuf are fields, which no definition knows.
-        or (channel.encoding == "protobuf" and not has_empty(channel.arrow_type()))
+def paths_named(tree: str) -> Names:
+    """The paths that a query names, by its tree as of `TREE`; None where it may use any.
+
+    It may if a struct or a row can be used as a whole: `*`, a row as a value, a query in a text.
+    """
+    nodes: list[dict[str, Any]] = []
+    json.loads(tree, object_hook=nodes.append)
+    chains = {tuple(map(str.casefold, one.get("column_names", ()))) for one in nodes} - {()}
+    chains |= {(name.casefold(),) for one in nodes for name in one.get("using_columns", ())}
+    # A row as a value: `select s from scan s`.
+    sources = [one for one in nodes if "class" not in one]
+    rows = {one.get(key, "").casefold() for one in sources for key in ("alias", "table_name")}
+    is_open = any(
+        one.get("error")
+        or one.get("column_name_alias")
+        or not _OPEN.isdisjoint((one.get("class"), one.get("type"), one.get("ref_type")))
+        for one in nodes
     )
+    return None if is_open or any(one[-1] in rows for one in chains) else frozenset(chains)
 
 
 _TIME: Final = pa.timestamp("us", "UTC")
@@ -235,12 +212,6 @@ _MARKS: Final = pa.schema(
 )
 
 
-def store_table(name: str, content: StoreContent) -> pa.Table:
-    """One of the tables about a store: `recordings`, `topics`, `losses` or `marks`."""
-    rows, schema = _TABLES[name]
-    return pa.Table.from_pylist(list(rows(content)), schema=schema)
-
-
 def _times(first: int | None, last: int | None) -> dict[str, Any]:
     """Cells of `_TIMES` for a first and a last log time, ns."""
     return {
@@ -269,7 +240,7 @@ def _recordings(content: StoreContent) -> Iterator[Mapping[str, Any]]:
 
 
 def _topics(content: StoreContent) -> Iterator[Mapping[str, Any]]:
-    for topic, view in content.names.views.items():
+    for topic, view in content.views.items():
         for summary in content.summaries_of(topic):
             entry = content.session.entry_of(summary)
             channels = content.session.channels_of(entry, [topic])
@@ -282,7 +253,7 @@ def _topics(content: StoreContent) -> Iterator[Mapping[str, Any]]:
             yield {
                 "topic": topic,
                 "view": view,
-                "short": content.names.short(topic),
+                "short": content.short(topic),
                 "recording": summary.name,
                 "type": ", ".join(types) or None,
                 "encoding": ", ".join(encodings) or None,

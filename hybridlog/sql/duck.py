@@ -70,22 +70,29 @@ def open_duckdb(memory: int) -> Any:
 
 
 @contextmanager
-def explained(memory: int) -> Iterator[None]:
-    """Turn errors of DuckDB into ours; `memory` is its limit, bytes."""
+def explained(memory: int, first: Callable[[], Exception | None] = lambda: None) -> Iterator[None]:
+    """Turn errors of DuckDB into ours, or into the `first` of what it reads, which caused them.
+
+    `memory` is its limit, bytes.
+    """
     package = duckdb()
     try:
         yield
-    except package.PermissionException as error:
-        raise UsageError(
-            "SQL reads the views of this store alone; files, extensions and other databases are "
-            f"off. {_first_line(error)}"
-        ) from error
     except Exception as error:
-        shortage = shortage_of(error, memory)
+        cause = first() if isinstance(error, package.Error) else None
+        if isinstance(cause, HybridlogError):
+            raise cause from None
+        if isinstance(error, package.PermissionException):
+            text = str(error).strip().partition("\n")[0]
+            raise UsageError(
+                "SQL reads the views of this store alone; files, extensions and other databases "
+                f"are off. {text}"
+            ) from error
+        shortage = shortage_of(cause or error, memory)
         if shortage is not None:
             raise shortage from error
         if isinstance(error, package.Error):
-            raise UsageError(str(error).strip()) from error
+            raise UsageError(str(cause or error).strip()) from error
         raise
 
 
@@ -101,10 +108,6 @@ def shortage_of(error: Exception, memory: int) -> ResourceError | None:
         f"The query needs more than {memory >> 20} MiB of memory: ask for less at a time, or "
         "allow more (`hybridlog sql --memory`)."
     )
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).strip().partition("\n")[0]
 
 
 class Worker:

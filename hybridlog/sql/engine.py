@@ -5,10 +5,10 @@ from __future__ import annotations
 import re
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final
 
 import pyarrow as pa
 from msgspec.structs import replace
@@ -16,12 +16,11 @@ from msgspec.structs import replace
 from hybridlog.query.answers.completeness import completeness_of
 from hybridlog.query.question import Question
 from hybridlog.schema.states import without_fields
-from hybridlog.sql.content import StoreContent, store_table
-from hybridlog.sql.duck import MEMORY, Worker, explained, open_duckdb, shortage_of
-from hybridlog.sql.names import EVERYTHING, TABLES, Usage, usage_of
-from hybridlog.sql.rows import Reading
+from hybridlog.sql.content import TREE, StoreContent, paths_named
+from hybridlog.sql.duck import MEMORY, Worker, explained, open_duckdb
+from hybridlog.sql.views import Reading, TopicDataset
 from hybridlog.wording import MAX_ROWS, arrow_html, meant
-from hybridlog_storage.errors import ChangedError, HybridlogError, TopicError, UsageError
+from hybridlog_storage.errors import TopicError, UsageError
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -34,13 +33,7 @@ EVERYWHERE: Final = Question(())
 """A scope of all recordings and times."""
 _BATCH_ROWS: Final = 65_536
 _FIRST_ROWS: Final = 64
-_TREE: Final = (
-    "select json_serialize_sql(?::varchar, skip_null := true, skip_empty := true, "
-    "skip_default := true)"
-)
 _NO_TABLE: Final = re.compile(r"Catalog Error: Table with name (.+?) does not exist")
-_MAX_TRIES: Final = 10  # tables that may be damaged in one query
-_T = TypeVar("_T")
 
 
 class SqlEngine:
@@ -85,11 +78,6 @@ class SqlEngine:
                 known = self._content = StoreContent(session, scope)
             return known
 
-    def forget(self) -> None:
-        """Look at the tables again for the next query: some have changed or were damaged."""
-        with self._lock:
-            self._content = None
-
     def close(self) -> None:
         """Close DuckDB. May be called more than once."""
         with self._lock:
@@ -114,19 +102,19 @@ class SqlConnection:
         *,
         only_reads: bool = False,
     ) -> None:
-        self.engine = engine
         self.cursor = cursor
         self.memory = memory
         self.scope = scope
-        self._only_reads = only_reads
         self.reading = Reading()
+        self._engine = engine
+        self._only_reads = only_reads
         self._has_own = False  # views and macros of the user read what a query does not name
         self._names: set[str] = set()
 
     @property
     def content(self) -> StoreContent:
         """Recordings and views as they are now."""
-        return self.engine.content(self.scope)
+        return self._engine.content(self.scope)
 
     def query(self, text: str, params: Params = None, timeout: float | None = None) -> SqlAnswer:
         """Prepare a query; of several statements, all but the last are run.
@@ -147,47 +135,26 @@ class SqlConnection:
             statements = list(self.cursor.extract_statements(text))
         if not statements:
             raise UsageError("The query is empty.")
-        if self._only_reads and any(_kind(statement) != "SELECT" for statement in statements):
+        kinds = [*map(_kind, statements)]
+        if self._only_reads and {*kinds} != {"SELECT"}:
             raise UsageError("Only queries are possible here, such as select and show.")
-        self._names.update(self.content.names.named(text))
-        self.register()
-        answers = [
-            self._prepared(statement, params if statement is statements[-1] else None, timeout)
-            for statement in statements
-        ]
-        return answers[-1]
-
-    def _prepared(self, statement: Any, params: Params, timeout: float | None) -> SqlAnswer:
-        kind = _kind(statement)
-        is_reading = kind in {"SELECT", "EXPLAIN"}
-        usage = self._usage(statement) if kind == "SELECT" else EVERYTHING
-        answer = SqlAnswer(self, statement.query, params, usage, timeout)
-        if not is_reading:
-            self._has_own = True
-            answer.run()
-        return answer
-
-    def register(self) -> None:
-        """Register the views that were named so far, as they are now."""
-        from hybridlog.sql.source import TopicDataset
-
         content = self.content
-        for name in self._names:
-            topic = content.names.topic(name)
-            if topic is not None:
-                source: Any = TopicDataset(content.view(topic), lambda: self.reading)
-            elif name in TABLES:
-                source = store_table(name, content)
-            else:
-                continue
+        self._names.update(content.named(text))
+        for name in self._names.intersection(content.names):
+            view = content.view(name)
+            source = TopicDataset(view, lambda: self.reading) if view else content.table(name)
             self.cursor.register(name, source)
-
-    def _usage(self, statement: Any) -> Usage:
-        if self._has_own:
-            return EVERYTHING
-        text = statement.query.strip().rstrip(";")
-        ((tree,),) = self.cursor.cursor().execute(_TREE, [text]).fetchall()
-        return usage_of(tree, {name.casefold() for name in self._names})
+        for statement, kind in zip(statements, kinds, strict=True):
+            asked = params if statement is statements[-1] else None
+            named = None
+            if kind == "SELECT" and not self._has_own:
+                sql = statement.query.strip().rstrip(";")
+                named = paths_named(self.cursor.cursor().execute(TREE, [sql]).fetchone()[0])
+            answer = SqlAnswer(self, statement.query, asked, Reading(named), timeout)
+            if kind not in {"SELECT", "EXPLAIN"}:
+                self._has_own = True
+                answer.run()
+        return answer
 
     def close(self) -> None:
         """Close the connection."""
@@ -200,7 +167,7 @@ class SqlAnswer:
     The timeout is in seconds, None for no limit.
 
     Attributes:
-        columns: Names of the columns.
+        columns: Names of the columns; empty for statements that return nothing.
         reading: What was read for it, and what it may lack.
     """
 
@@ -209,17 +176,23 @@ class SqlAnswer:
         connection: SqlConnection,
         text: str,
         params: Params,
-        usage: Usage,
+        reading: Reading,
         timeout: float | None,
     ) -> None:
         self._connection = connection
-        self._text = text
-        self._params = params
         self._timeout = timeout
-        self.reading = Reading(usage)
-        self._relation: Any = None
+        self.reading = reading
         self._done: pa.Table | None = None  # of a statement that changes something
-        self._prepare()
+        try:
+            with explained(connection.memory):
+                self._relation = connection.cursor.sql(text, params=params)
+        except UsageError as error:
+            found = _NO_TABLE.match(str(error))
+            if found is None:
+                raise
+            hint = meant(found[1], connection.content.names)
+            raise TopicError(f"There is no view {found[1]!r}; {hint}") from error
+        self.columns: list[str] = [] if self._relation is None else list(self._relation.columns)
 
     def __repr__(self) -> str:
         return f"<SqlAnswer of {len(self.columns)} columns: {', '.join(self.columns[:8])}>"
@@ -227,19 +200,17 @@ class SqlAnswer:
     def _repr_html_(self) -> str:
         return arrow_html(repr(self), self.first(MAX_ROWS, 1 << 20)[0])
 
-    @property
-    def columns(self) -> list[str]:
-        """Names of the columns; empty for statements that return nothing."""
-        return [] if self._relation is None else list(self._relation.columns)
-
     def sentences(self) -> list[str]:
         """Sentences about what the computed answer may lack."""
         found = self.reading
-        lines = []
-        for topic, reason in found.undefined.items():
-            lines.append(f"{topic} has no columns of fields: {reason}.")
-        for (topic, state), count in found.absent.items():
-            lines.append(f"{topic}: {without_fields(count, state)}.")
+        lines = [
+            f"{topic} has no columns of fields: {reason}."
+            for topic, reason in found.undefined.items()
+        ]
+        lines += [
+            f"{topic}: {without_fields(count, state)}."
+            for (topic, state), count in found.absent.items()
+        ]
         return [*lines, *self.completeness().sentences]
 
     def completeness(self) -> Completeness:
@@ -268,9 +239,8 @@ class SqlAnswer:
         Raises:
             ResourceError: it needs more memory or time than it may.
         """
-        if self._done is not None:
-            return self._done
-        return pa.Table.from_batches([*self._batches(_BATCH_ROWS, None)])
+        done = self._done
+        return pa.Table.from_batches([*self.to_batches()]) if done is None else done
 
     def first(self, rows: int, size: int) -> tuple[pa.Table, bool]:
         """The first rows of a query, and whether there are more; the others are not computed.
@@ -279,7 +249,7 @@ class SqlAnswer:
         """
         taken: list[pa.RecordBatch] = []
         # Few rows at a time: each may be an image.
-        for batch in self._batches(_FIRST_ROWS, rows + 1):
+        for batch in self._batches(_FIRST_ROWS, self._relation.limit(rows + 1)):
             if sum(one.nbytes for one in taken) > size:
                 return pa.Table.from_batches(taken), True
             taken.append(batch)
@@ -295,36 +265,24 @@ class SqlAnswer:
             ResourceError: it needs more memory or time than it may.
         """
         if self._done is not None:
-            yield from self._done.to_batches()
-            return
-        yield from self._batches(_BATCH_ROWS, None)
+            return iter(self._done.to_batches())
+        return self._batches(_BATCH_ROWS, self._relation)
 
-    def _batches(self, size: int, limit: int | None) -> Iterator[pa.RecordBatch]:
-        """The answer in batches of so many rows, up to a limit."""
+    def _batches(self, size: int, relation: Any) -> Iterator[pa.RecordBatch]:
+        """The answer in batches of so many rows."""
         connection = self._connection
-        with closing(Worker(connection.cursor, self._timeout)) as worker:
-            reader, batch = self._begun(lambda: worker.run(partial(self._stream, size, limit)))
+        reading = self.reading = connection.reading = Reading(self.reading.named)
+        with (
+            closing(Worker(connection.cursor, self._timeout)) as worker,
+            explained(connection.memory, lambda: reading.error),
+        ):
+            reader = worker.run(lambda: relation.to_arrow_reader(size))
+            batch = worker.run(partial(next, reader, None))
             if batch is None:
                 yield pa.RecordBatch.from_pylist([], schema=reader.schema)
             while batch is not None:
                 yield batch
-                with self._explained():
-                    batch = worker.run(partial(next, reader, None))
-
-    def _begun(self, call: Callable[[], _T]) -> _T:
-        """The result of a call; repeated when a table was damaged or files were replaced."""
-        for tries in reversed(range(_MAX_TRIES)):
-            self.reading = self._connection.reading = Reading(self.reading.usage)
-            try:
-                with self._explained():
-                    return call()
-            except ChangedError:
-                if not tries:
-                    raise
-                self._connection.engine.forget()
-                self._connection.register()
-                self._prepare()
-        raise AssertionError
+                batch = worker.run(partial(next, reader, None))
 
     def to_pandas(self) -> pd.DataFrame:
         """The whole answer as a pandas frame.
@@ -355,38 +313,6 @@ class SqlAnswer:
         """The whole answer as tuples of Python values."""
         columns = [column.to_pylist(maps_as_pydicts="strict") for column in self.to_arrow().columns]
         return list(zip(*columns, strict=True))
-
-    def _stream(self, size: int, limit: int | None) -> tuple[Any, pa.RecordBatch | None]:
-        """A reader of the answer, and its first batch."""
-        relation = self._relation if limit is None else self._relation.limit(limit)
-        reader = relation.to_arrow_reader(size)
-        return reader, next(reader, None)
-
-    def _prepare(self) -> None:
-        try:
-            with self._explained():
-                self._relation = self._connection.cursor.sql(self._text, params=self._params)
-        except UsageError as error:
-            found = _NO_TABLE.match(str(error))
-            if found is None:
-                raise
-            hint = meant(found[1], [*self._connection.content.names])
-            raise TopicError(f"There is no view {found[1]!r}; {hint}") from error
-
-    @contextmanager
-    def _explained(self) -> Iterator[None]:
-        """Raise the error of the source instead of what DuckDB made of it."""
-        try:
-            with explained(self._connection.memory):
-                yield
-        except UsageError:
-            error = self.reading.error
-            if isinstance(error, HybridlogError):
-                raise error from None
-            if error is not None:
-                shortage = shortage_of(error, self._connection.memory)
-                raise shortage or UsageError(str(error)) from error
-            raise
 
 
 def _kind(statement: Any) -> str:

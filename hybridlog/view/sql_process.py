@@ -23,7 +23,7 @@ from hybridlog_storage.errors import HybridlogError, ResourceError
 from hybridlog_storage.stopping import check_wanted
 
 if TYPE_CHECKING:
-    from hybridlog.sql.rows import Reading
+    from hybridlog.sql.views import Reading
     from hybridlog.store import Store
 
 SQL_MEMORY: Final = 512 << 20

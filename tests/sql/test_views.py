@@ -7,7 +7,7 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.schema.arrow_types import plain_values
-from hybridlog.sql.rows import ViewRows
+from hybridlog.sql.views import ViewRows
 from hybridlog_storage.errors import UsageError
 from tests.sql.conftest import LARGE, SCANS, files_read
 from tests.tables.logs import BASE, SECOND, decoded, same
@@ -26,7 +26,7 @@ from "{}" where recording = 'first' order by t, seq
 
 @pytest.mark.parametrize("topic", ["/large", "/mixed", "/order", "/recordings"])
 def test_a_view_holds_what_messages_say(store: hl.Store, topic: str) -> None:
-    view = store.sql_engine.content().names.views[topic]
+    view = store.sql_engine.content().views[topic]
     fields = {**FIELDS}
     if topic == "/mixed":  # numbers in one recording and texts in the other are JSON text
         kinds = dict(store.sql(f'select column_name, column_type from (describe "{view}")').rows())

@@ -1,0 +1,393 @@
+"""Topics as DuckDB reads them: views with the rows that `query/rows.py` finds, in SQL's columns."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from functools import reduce
+from itertools import islice
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.dataset as ds
+from msgspec import Struct, field
+from msgspec.structs import replace
+
+from hybridlog.columns.fields import without
+from hybridlog.columns.layout import POINTS
+from hybridlog.columns.left_rows import LeftFields
+from hybridlog.columns.rows import NEEDED, PointColumns, is_cloud
+from hybridlog.frames.answer import FIXED
+from hybridlog.query.planner import Planner
+from hybridlog.query.question import Counters, Question
+from hybridlog.query.rows import RowBatch, Rows
+from hybridlog.schema.arrow_types import has_empty, is_array
+from hybridlog.schema.codec import stamp_array
+from hybridlog.schema.column import STAMP
+from hybridlog.schema.states import State
+from hybridlog.sql.columns import OWN, ViewColumn, merged, view_columns
+from hybridlog_storage.errors import extra
+from hybridlog_storage.times import BEGIN, END, touches
+
+with extra("sql", "SQL needs DuckDB"):
+    from duckdb._sources.nodes import Binary, Col, In, Lit, Node
+    from duckdb._sources.pyarrow import PyArrowDatasetSource
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from hybridlog.columns.tables import TopicTable
+    from hybridlog.query.chunk_scan import MessageRun
+    from hybridlog.query.question import Part, RecordedChannel, Span
+    from hybridlog.query.ranges import Resolved
+    from hybridlog.schema.codec import Decoded
+    from hybridlog.session import Session
+    from hybridlog_storage.catalog import RecordingEntry
+
+_SAMPLED: Final = 20  # recordings that tell how many messages a topic has
+_UNITS: Final = {"t": 1, "log_time": 1000}
+"""Columns of log time, and the nanoseconds that a number in each stands for."""
+_TABLE_OWN: Final = frozenset({"pub", "stamp"})
+Names = frozenset[tuple[str, ...]] | None
+"""Names on the way to fields that a query names, folded, from wherever each begins; None: any."""
+
+
+class Limits(NamedTuple):
+    """The log time `[begin, end)`, ns, of the rows that a query asks for, and their recordings."""
+
+    span: Span = (BEGIN, END)
+    recordings: Collection[str] | None = None
+
+    def common(self, other: Limits) -> Limits:
+        """Both limits."""
+        (begin, end), (first, behind) = self.span, other.span
+        names = [{*one} for one in (self.recordings, other.recordings) if one is not None]
+        span = max(begin, first), min(end, behind)
+        return Limits(span, set.intersection(*names) if names else None)
+
+
+class Reading(Struct):
+    """One execution of a query: what it reads, what it may lack, and the first error in that.
+
+    Attributes:
+        named: Fields that the query names.
+        counters: Chunks and payloads that were read.
+        groups: Row groups that rows came from, by file and number.
+        recordings: Recordings that were read, by id.
+        topics: Topics that were read.
+        absent: Messages without fields, by topic and state.
+        undefined: Topics without fields, with the reason.
+    """
+
+    named: Names = None
+    counters: Counters = field(default_factory=Counters)
+    groups: set[tuple[Path, int]] = field(default_factory=set)
+    recordings: dict[str, RecordingEntry] = field(default_factory=dict)
+    topics: set[str] = field(default_factory=set)
+    absent: Counter[tuple[str, State]] = field(default_factory=Counter)
+    undefined: dict[str, str] = field(default_factory=dict)
+    error: Exception | None = None
+
+    def names(self, path: tuple[str, ...]) -> bool:
+        """True if the query may use a field: its column, and fields in it, folded."""
+        if self.named is None:
+            return True
+        ends = (chain[start:] for chain in self.named for start in range(len(chain)))
+        # As far as both go, so above it and below it, too.
+        return any(end[: len(path)] == path[: len(end)] for end in ends)
+
+
+class TopicView:
+    """The view of a topic: its columns, and rows for a query; `size` is nearly their number.
+
+    `resolved` are the recordings and times that it shows, by id.
+    """
+
+    def __init__(
+        self, session: Session, topic: str, ids: Sequence[str], resolved: Mapping[str, Resolved]
+    ) -> None:
+        self.topic = topic
+        self._session = session
+        self._planner = Planner(session, Question((topic,), tuple(ids)))
+        self._reason = next(filter(None, (c.codec.reason for c in self._planner.examples)), None)
+        kinds = self._kinds()
+        columns = view_columns(merged(kinds) if kinds else pa.struct([]))
+        self._columns = {column.name: column for column in columns}
+        if POINTS not in self._columns and (points := self._points()):
+            self._columns[POINTS] = ViewColumn.of_points(merged(points))
+        fields = [pa.field(column.name, column.type) for column in self._columns.values()]
+        self.schema = pa.schema([*OWN, *fields])
+        self._parts: dict[str, Part | None] = {}
+        self._chosen = [resolved[one] for one in ids if one in resolved]
+        some = self._chosen[:_SAMPLED]
+        messages = sum(part.messages for part in map(self._part, some) if part is not None)
+        self.size = messages * len(self._chosen) // max(len(some), 1)
+
+    def _part(self, one: Resolved) -> Part | None:
+        """The topic in a recording, as asked; None without messages."""
+        if one.summary.id not in self._parts:
+            self._parts[one.summary.id] = next(self._planner.parts_in(*one), None)
+        return self._parts[one.summary.id]
+
+    def _kinds(self) -> list[Any]:
+        """Types of the messages; recordings with equal definitions have equal ones."""
+        channels = self._planner.examples
+        if all(map(_is_fixed, channels)):
+            return [channel.arrow_type() for channel in channels if channel.codec.indexed]
+        found = []
+        for part in self._planner.split():
+            table = self._planner.tabled(part)
+            if table is not None:
+                found += table.table.whole_types()
+            else:
+                found += (one.type for one in self._decoded(part))
+        return found
+
+    def _points(self) -> list[Any]:
+        """Types of the points of clouds, of a topic whose tables have them."""
+        if self.topic not in self._session.directory.settings.arrays:
+            return []
+        found = []
+        for part in self._planner.split():
+            table = self._planner.tabled(part)
+            if table is not None and table.table.points is not None:
+                found.append(table.table.points)
+            elif any(is_cloud(channel.channel) for channel in part.channels):
+                clouds = (_with_points(one).type for one in self._decoded(part))
+                found += islice(
+                    (one.field(POINTS).type for one in clouds if POINTS in one.names), 1
+                )
+        return found
+
+    def _decoded(self, part: Part) -> Iterator[Any]:
+        """The fields of messages in chunks."""
+        return ViewRows(self._session, pa.schema([]), {}, Reading()).fields(part)
+
+    def rows(self, schema: pa.Schema, limits: Limits, reading: Reading) -> Iterator[pa.RecordBatch]:
+        """Rows for a query, with those columns."""
+        if self._reason is not None:
+            reading.undefined[self.topic] = self._reason
+        read = ViewRows(self._session, schema, self._columns, reading)
+        low, high = limits.span
+        for one in self._chosen:
+            summary, (begin, end) = one.summary, one.summary.extent
+            is_beside = begin < end and (begin >= high or end <= low)
+            names = limits.recordings
+            if is_beside or (names is not None and summary.name not in names):
+                continue
+            reading.recordings[summary.id] = self._session.entry_of(summary)
+            reading.topics.add(self.topic)
+            part = self._part(one)
+            if part is not None:
+                span = Limits(part.bounds or (BEGIN, END)).common(limits).span
+                bounds = None if span == (BEGIN, END) else span
+                yield from read.read(replace(part, bounds=bounds))
+
+
+def _is_fixed(channel: RecordedChannel) -> bool:
+    """True if a definition fixes the fields of all messages."""
+    return (
+        channel.codec.reason is not None
+        or channel.encoding in FIXED
+        # The keys of a map of protobuf are fields, which no definition knows.
+        or (channel.encoding == "protobuf" and not has_empty(channel.arrow_type()))
+    )
+
+
+class TopicDataset(ds.Dataset, PyArrowDatasetSource):  # type: ignore[misc] # without types
+    """A topic as DuckDB reads it. It relies on the source for the filters that are accepted.
+
+    DuckDB takes the number of rows, and asks which filters are applied, by a class that is no
+    part of its documented interface; so the version of its package is bounded.
+    """
+
+    def __init__(self, view: TopicView, reading: Callable[[], Reading]) -> None:
+        PyArrowDatasetSource.__init__(self, self)
+        self._view = view
+        self._reading = reading
+
+    @property
+    def schema(self) -> Any:
+        """All columns."""
+        return self._view.schema
+
+    def rows(self) -> int:
+        """Number of rows, nearly."""
+        return self._view.size
+
+    def accepts(self, predicate: Any) -> bool:
+        """True for a filter that limits times or recordings alone; DuckDB applies the others."""
+        return _limits(predicate) is not None
+
+    def stream(self, columns: Sequence[int] | None, filters: Sequence[Node]) -> tuple[object, bool]:
+        """The rows for which the filters hold, as a stream of record batches."""
+        schema, reading = self.schema, self._reading()
+        if columns is not None:
+            schema = pa.schema([schema.field(place) for place in columns])
+        limits = reduce(Limits.common, filter(None, map(_limits, filters)), Limits())
+        rows = _told(self._view.rows(schema, limits, reading), reading)
+        reader = pa.RecordBatchReader.from_batches(schema, rows)
+        return reader.__arrow_c_stream__(), columns is not None
+
+
+def _limits(node: Node) -> Limits | None:
+    """The rows for which a filter holds; None of one about anything but times and recordings."""
+    match node:
+        case Binary(op="AND", left=left, right=right):
+            one, other = _limits(left), _limits(right)
+            return None if one is None or other is None else one.common(other)
+        case Binary(op=op, left=Col(parts=(name,)), right=Lit(value=int(value))) if name in _UNITS:
+            begin, end = (number * _UNITS[name] for number in (value, value + 1))
+            if begin > BEGIN and end < END:
+                spans = {"<": (BEGIN, begin), "<=": (BEGIN, end), "=": (begin, end)}
+                spans |= {">=": (begin, END), ">": (end, END)}
+                return Limits(spans[op]) if op in spans else None
+        case Binary(op="=", left=Col(parts=("recording",)), right=Lit(value=str(value))):
+            return Limits(recordings=[value])
+        case In(operand=Col(parts=("recording",)), values=values):
+            return Limits(recordings=[str(one.value) for one in values if isinstance(one, Lit)])
+    return None
+
+
+def _told(batches: Iterator[pa.RecordBatch], reading: Reading) -> Iterator[pa.RecordBatch]:
+    """The batches; their first error is noted."""
+    try:
+        yield from batches
+    except Exception as error:
+        reading.error = reading.error or error
+        raise
+
+
+class ViewRows(Rows):
+    """Reads some columns of a view."""
+
+    def __init__(
+        self,
+        session: Session,
+        schema: pa.Schema,
+        fields: Mapping[str, ViewColumn],
+        reading: Reading,
+    ) -> None:
+        super().__init__(session, reading.counters)
+        self._schema = schema
+        self._reading = reading
+        self._fields = {name: fields[name] for name in schema.names if name in fields}
+        leaves = (leaf for column in self._fields.values() for leaf in column.leaves())
+        used = [leaf for path, leaf in leaves if reading.names(path)]
+        self._keys = {leaf.key for leaf in used}
+        known = [leaf.source for leaf in used if not leaf.is_points]
+        # A name with a dot of its own is read with all others.
+        is_odd = any("." in name or "[" in name for source in known for name in source)
+        self._paths = None if is_odd else [*dict.fromkeys(map(".".join, known))]
+        self._has_points = any(leaf.is_points for leaf in used)
+        self._arrays = [leaf.source for leaf in used if is_array(leaf.kind) and not leaf.is_summary]
+
+    def read(self, part: Part) -> Iterator[pa.RecordBatch]:
+        """The rows of a topic of a recording, in order."""
+        return (found.records for found in self._lasting(part, self._rows))
+
+    def fields(self, part: Part) -> Iterator[Any]:
+        """All fields of the messages of a part in chunks."""
+        for channel, run in self._by_channel(part):
+            if channel.codec.indexed:
+                yield _fields_of(channel.codec.columns_of(run.batch, None))[0]
+
+    def _rows(self, part: Part) -> Iterator[RowBatch]:
+        found = self.tabled(part)
+        if found is not None and not self._has_all(found.table, part):
+            found = None
+        groups = [] if found is None else found.table.parts
+        own = {*_TABLE_OWN.intersection(self._schema.names), *[POINTS] * self._has_points}
+        for rows, holds in self._in_table(found, self._paths, own):
+            span = np.array([[rows.t[0], rows.t[-1] + 1]])
+            self._reading.groups |= {
+                (one.file.path, one.group) for one in groups if touches(span, one.first, one.last)
+            }
+            columns = {"t": pa.array(rows.t), "seq": pa.array(rows.seq), **rows.own}
+            columns["state"] = pa.repeat(pa.scalar(str(State.WHOLE)), len(rows))
+            columns["error"] = pa.nulls(len(rows), pa.string())
+            records = rows.records
+            if self._has_points:
+                fields = [*records.type, pa.field(POINTS, columns[POINTS].type)]
+                arrays = [*records.flatten(), columns[POINTS]]
+                records = pa.StructArray.from_arrays(arrays, fields=fields)
+            made = self._batch(part.recording, columns, records, records)
+            yield RowBatch(rows.t, rows.seq, holds, made)
+        for channel, run in self._by_channel(part) if found is None else ():
+            made = self._decoded(channel, run)
+            yield RowBatch(run.batch.log_time, run.seq, np.ones(len(run.seq), np.bool_), made)
+
+    def _has_all(self, table: TopicTable, part: Part) -> bool:
+        """True if a table has what is asked for: whole arrays, points, and the states of now."""
+        asks_states = not {"state", "error"}.isdisjoint(self._schema.names)
+        return not (
+            any(map(table.is_cut, self._arrays))
+            or (self._has_points and table.points is None)
+            or (asks_states and any(channel.is_reduced for channel in part.channels))
+        )
+
+    def _decoded(self, channel: RecordedChannel, run: MessageRun) -> pa.RecordBatch:
+        """The rows of messages of one channel."""
+        batch, count, paths = run.batch, len(run.batch), self._paths
+        errors = np.full(count, None, object)
+        whole = summaries = pa.nulls(count, pa.struct([]))
+        if channel.codec.indexed:
+            if paths is not None:
+                paths = [*paths, STAMP, *(NEEDED if self._has_points else ())]
+            decoded = channel.codec.columns_of(batch, paths)
+            self.counters.payload_bytes += batch.payload_bytes * (not channel.is_reduced)
+            for bad in decoded.unreadable:
+                errors[bad.rows] = bad.reason
+            if len(decoded.rows):
+                found = _fields_of(decoded)
+                whole, summaries = (without(one, decoded.rows, count) for one in found)
+                whole = _with_points(whole) if self._has_points else whole
+        stamp, error = stamp_array(whole), pa.array(errors, pa.string())
+        has_no_time = np.full(count, not channel.channel.has_publish_time)
+        topic, unreadable = channel.channel.topic, count - error.null_count
+        if unreadable:
+            self._reading.absent[topic, State.UNREADABLE] += unreadable
+        if channel.is_reduced and (self._arrays or self._has_points):
+            self._reading.absent[topic, channel.state] += count - unreadable
+        own = {
+            "t": pa.array(batch.log_time),
+            "seq": pa.array(run.seq),
+            "pub": pa.array(batch.publish_time, mask=has_no_time),
+            "stamp": pa.nulls(count, pa.int64()) if stamp is None else stamp.view(pa.int64()),
+            "state": pc.if_else(error.is_null(), str(channel.state), State.UNREADABLE.value),
+            "error": error,
+        }
+        return self._batch(channel.recording, own, whole, summaries)
+
+    def _batch(
+        self, recording: RecordingEntry, own: Mapping[str, Any], records: Any, summaries: Any
+    ) -> pa.RecordBatch:
+        """The columns of some rows; those of fields that are not used are null."""
+        arrays, rows = [], len(records)
+        for name, kind in zip(self._schema.names, self._schema.types, strict=True):
+            if name in self._fields:
+                arrays.append(self._fields[name].values(records, summaries, self._keys))
+            elif name == "log_time":
+                arrays.append(pa.array(own["t"].to_numpy() // 1000).view(kind))
+            elif name == "tags":
+                tags = pa.array([list(recording.tags.items())], OWN.field("tags").type)
+                arrays.append(tags.take(pa.array(np.zeros(rows, np.int64))))
+            elif name == "recording":
+                arrays.append(pa.repeat(pa.scalar(recording.name), rows))
+            else:
+                arrays.append(own[name].cast(kind))
+        return pa.RecordBatch.from_arrays(arrays, schema=self._schema)
+
+
+def _fields_of(decoded: Decoded) -> tuple[Any, Any]:
+    """The fields of decoded messages, and the same with the summaries of arrays that are gone."""
+    if isinstance(decoded.records, LeftFields):
+        return decoded.records.both()
+    found = decoded.arrow()
+    return found, found
+
+
+def _with_points(fields: pa.StructArray) -> pa.StructArray:
+    return PointColumns().with_points(fields, fields)
