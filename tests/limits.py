@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 PLACES = {
-    "align_piece_bytes": "hybridlog.across.topic_reader._PIECE_BYTES",
+    "align_piece_bytes": "hybridlog.across.align._PIECE_BYTES",
     "column_file_open_files": "hybridlog.columns.column_file._OPEN_FILES",
     "shared_file_recordings": "hybridlog.columns.folders.MAX_SHARED_RECORDINGS",
     "shared_file_rows": "hybridlog.columns.folders.MAX_SHARED_ROWS",

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, overload
 import numpy as np
 from msgspec.structs import replace
 
-from hybridlog.across.topic_reader import TopicReader
+from hybridlog.across.align import TopicReader
 from hybridlog.message import messages_in
 from hybridlog.query.answers.completeness import completeness_of
 from hybridlog.query.answers.video import picture_of
@@ -73,10 +73,8 @@ class Synced(Sequence[tuple["Message", ...]]):
         self._sessions: dict[int, Session] = {os.getpid(): session}  # by process
         self.topics = tuple(question.topics[0] for question in questions)
         limit = None if tolerance is None else parse_duration(tolerance)
-        places = set.intersection(*(set(session.chosen(one).tolist()) for one in questions))
-        summaries = session.snapshot().summaries
-        in_range = set.union(*(_in_range(session, question) for question in questions))
-        near = [one for place in sorted(places) if (one := summaries[place].id) in in_range]
+        in_range = [_in_range(session, question) for question in questions]
+        near = [one for one in in_range[0] if all(one in other for other in in_range)]
         asked = (replace(question, recordings=tuple(near)) for question in questions)
         readers = [TopicReader(session, question, clock) for question in asked]
         ids: list[str] = []
@@ -173,11 +171,11 @@ class Synced(Sequence[tuple["Message", ...]]):
         return messages[number]
 
 
-def _in_range(session: Session, question: Question) -> set[str]:
-    """Ids of the recordings that a question's range touches."""
+def _in_range(session: Session, question: Question) -> list[str]:
+    """Ids of the recordings that a question's range touches, oldest first."""
     with suppress(TimeError):
-        return {one.summary.id for one in RangeResolver(session, question).resolve()}
-    return set()
+        return [one.summary.id for one in RangeResolver(session, question).resolve()]
+    return []
 
 
 def _count(session: Session, question: Question) -> int:

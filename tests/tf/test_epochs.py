@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import hybridlog as hl
-from hybridlog.tf.epochs import Epochs, epochs_of, found_in
+from hybridlog.tf.reader import Epochs, epochs_of, found_in
 from tests.data import DATA, needs_data
 from tests.ros_values import ROS2
 from tests.tf.test_tree import BEGIN, S
