@@ -280,15 +280,15 @@ class TopicReader:
         """Add the columns of the messages that belong to rows at times, ns, with their distance."""
         known, apart = self._moments.time, self.epochs(self._recording).apart
         found = match(times, known, self.how, self.tolerance, apart)
-        table, *after = self._read(
-            *([found.before, found.after] if self.how == "interpolate" else [found.before])
-        )
-        if after:
+        if self.how == "interpolate":
             known = known if len(known) else times
             low, high = (known[np.maximum(rows, 0)] for rows in found[:2])
             length = (high - low).astype(np.float64)
             weight = np.where(length > 0, (times - low) / np.where(length > 0, length, 1), 0)
-            table = interpolated(table, *after, weight, quaternion_paths(self.known))
+            before, after = self._read(found.before, found.after)
+            table = interpolated(before, after, weight, quaternion_paths(self.known))
+        else:
+            (table,) = self._read(found.before)
         missing = found.before < 0
         distance = pa.array(found.distance, DURATION, mask=missing if missing.any() else None)
         columns[free_name(self.prefix + _DISTANCE, columns)] = distance

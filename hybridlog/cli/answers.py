@@ -25,9 +25,8 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from hybridlog.attachments import Extras
-    from hybridlog.formats.answer import Answer, Line
     from hybridlog.formats.slices import Front
-    from hybridlog.formats.writing import Target
+    from hybridlog.formats.writing import Answer, Line, Target
     from hybridlog.message import Message
     from hybridlog.query.answers.completeness import Completeness
     from hybridlog.query.answers.follow import Following
@@ -245,8 +244,8 @@ def _answer_of(
     query: Query, form: str, target: Target, front: Front, extras: Extras | None
 ) -> Answer:
     """The answer in the form that a format takes."""
-    from hybridlog.formats.answer import Answer
     from hybridlog.formats.slices import Front, log_of
+    from hybridlog.formats.writing import Answer
     from hybridlog.query.query import tables_of
 
     content, question = OUTPUTS[form].content, query.question
@@ -287,7 +286,7 @@ def _checked(pieces: Iterable[_T], completeness: Callable[[], Completeness] | No
 
 def write_following(following: Following, form: str) -> None:
     """Print messages as they come in a text format, and flush those that come together."""
-    from hybridlog.formats.answer import Answer
+    from hybridlog.formats.writing import Answer
     from hybridlog.frames.answer import stream
     from hybridlog.frames.lines import lines
 
@@ -298,7 +297,7 @@ def write_following(following: Following, form: str) -> None:
 
 def _rows(tables: Iterable[pa.Table]) -> Answer:
     """Tables as they are, or as lines."""
-    from hybridlog.formats.answer import Answer
+    from hybridlog.formats.writing import Answer
 
     return Answer(lines=chain.from_iterable(map(_lines_of, tables)), tables=tables)
 
@@ -306,7 +305,7 @@ def _rows(tables: Iterable[pa.Table]) -> Answer:
 def _pictures(query: Query, form: str, target: Target, front: Front) -> Answer:
     """The images; messages that are unreadable are left out and told."""
     from hybridlog.arrays.message_arrays import IMAGES
-    from hybridlog.formats.answer import Answer
+    from hybridlog.formats.writing import Answer
     from hybridlog.query.answers.video import frames_in_front
     from hybridlog.schema.states import without_payload
 

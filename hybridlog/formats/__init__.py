@@ -14,9 +14,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
     from pathlib import Path
 
-    from hybridlog.formats.answer import Answer
     from hybridlog.formats.reading import Source
-    from hybridlog.formats.writing import Target
+    from hybridlog.formats.writing import Answer, Target
 
 Content: TypeAlias = Literal["lines", "table", "log", "payloads", "pictures", "video"]
 
@@ -112,7 +111,7 @@ OUTPUTS: Final[dict[str, OutputFormat]] = {
     "csv": OutputFormat("table", "hybridlog.formats.tables:write_csv", (".csv",), is_text=True),
     "parquet": OutputFormat("table", "hybridlog.formats.tables:write_parquet", (".parquet",)),
     "arrow": OutputFormat("table", "hybridlog.formats.tables:write_arrow", (".arrow", ".feather")),
-    "npz": OutputFormat("table", "hybridlog.formats.npz:write_npz", (".npz",)),
+    "npz": OutputFormat("table", "hybridlog.formats.tables:write_npz", (".npz",)),
     "mcap": OutputFormat("log", "hybridlog.formats.mcap.writer:write_mcap", (".mcap",)),
     "bag": OutputFormat("log", "hybridlog.formats.rosbag1.writer:write_bag", (".bag",)),
     "rosbag2": OutputFormat("log", "hybridlog.formats.rosbag2.writer:write_rosbag2", ()),

@@ -24,8 +24,7 @@ import numpy as np
 from hybridlog.arrays.message_arrays import to_numpy
 from hybridlog.arrays.point_arrays import point_columns, positions
 from hybridlog.drawing.images import Picture, picture
-from hybridlog.formats.answer import Answer
-from hybridlog.formats.writing import Sink, Target, Whole, failures, new_directory, path_of
+from hybridlog.formats.writing import Answer, Sink, Target, Whole, failures, new_directory, path_of
 from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.errors import DefinitionError, PayloadError, UsageError
 from hybridlog_storage.mongo.index_documents import collection_of

@@ -18,8 +18,7 @@ import numpy as np
 from hybridlog.arrays import is_video_type
 from hybridlog.arrays.video import VideoDecoder, frame_of, is_key_frame, pyav
 from hybridlog.drawing.images import shown_pixels
-from hybridlog.formats.answer import Answer
-from hybridlog.formats.writing import Sink, Target, Whole, failures, path_of
+from hybridlog.formats.writing import Answer, Sink, Target, Whole, failures, path_of
 from hybridlog.query.times import format_time
 from hybridlog_storage.errors import (
     DefinitionError,

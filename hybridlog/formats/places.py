@@ -9,8 +9,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from hybridlog.formats.answer import Answer
-from hybridlog.formats.writing import Sink, Target
+from hybridlog.formats.writing import Answer, Sink, Target
 from hybridlog.wording import counted
 from hybridlog_storage.errors import UsageError
 

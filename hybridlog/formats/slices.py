@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from msgspec import Struct
 
-from hybridlog.formats.answer import Answer
+from hybridlog.formats.writing import Answer
 from hybridlog.query.planner import Planner
 
 if TYPE_CHECKING:

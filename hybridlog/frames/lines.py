@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, Final
 import pyarrow as pa
 from pyarrow import types
 
-from hybridlog.formats.answer import Line
 from hybridlog.formats.jsonl import json_line, json_rows
+from hybridlog.formats.writing import Line
 from hybridlog.frames.answer import Decoder, leaves_of, text_column
 from hybridlog.frames.names import arranged, free_name
 from hybridlog.index.indexing import rows_by_channel

@@ -65,6 +65,11 @@ class _Pose(NamedTuple):
     covariance: str = ""
     is_vector: bool = False
 
+    def numbers(self) -> list[str]:
+        """The paths of its numbers."""
+        paths = [f"{self.position}.{axis}" for axis in "xyz"]
+        return paths + [f"{self.rotation}.{axis}" for axis in "xyzw" * bool(self.rotation)]
+
 
 def stream(planner: Planner, known: Known | None = None) -> Iterator[pa.Table]:
     """The tables of an answer, see `frames.answer.stream`; in the frame of the question, if any.
@@ -91,12 +96,77 @@ def has_places(planner: Planner) -> bool:
     return has_points(planner) or _places_in(planner) is not None
 
 
+class _Looked:
+    """Looks up transforms to the frame of a question, and counts what is missing."""
+
+    def __init__(
+        self,
+        session: Session,
+        question: Question,
+        counters: Counters,
+        known: Known | None = None,
+    ) -> None:
+        self.session = session
+        self.question = question
+        self.counters = counters
+        self._trees: Known = {} if known is None else known
+
+    def _of(self, recording: str) -> Trees | TopicError:
+        """The trees of a recording, or why the frame asked for is not there."""
+        if recording not in self._trees:
+            snapshot, topic = self.session.look([recording]), self.question.topics[0]
+            summary = snapshot.summaries[snapshot.by_id[recording]]
+            trees = Trees(self.session, [summary], self.question.tf_topics)
+            try:
+                trees.check(topic, str(self.question.frame))
+                self._trees[recording] = trees
+                self.counters.of_frames += tuple(trees.tree(topic).remarks)
+            except TopicError as error:
+                self._trees[recording] = error
+        return self._trees[recording]
+
+    def transforms(
+        self,
+        recordings: Sequence[str],
+        frames: Sequence[str],
+        times: NDArray[np.int64],
+        log_time: NDArray[np.int64],
+    ) -> Transform:
+        """The transforms from some frames at some times; NaN where there are none.
+
+        A frame that no recording has is refused.
+        """
+        made, missing = unknown(len(times)), Counter[str]()
+        target, topic = str(self.question.frame), self.question.topics[0]
+        pairs = [*zip(recordings, frames, strict=True)]
+        for pair in dict.fromkeys(pairs):
+            trees = self._of(pair[0])
+            rows = np.flatnonzero([one == pair for one in pairs])
+            if isinstance(trees, TopicError):
+                chosen = self.session.summaries_of(self.question)
+                if all(isinstance(self._of(one.id), TopicError) for one in chosen):
+                    raise trees
+                missing["no such frame in the recording"] += len(rows)
+                continue
+            try:
+                found = trees.lookup(topic, target, pair[1], times[rows], log_time[rows])
+            except TopicError:
+                missing[f"no frame {pair[1]!r} among the transforms"] += len(rows)
+                continue
+            made.translation[rows], made.rotation[rows] = found.translation, found.rotation
+            missing.update(found.missing)
+        self.counters.no_transform += tuple(
+            (f"to {target}: {why}", count) for why, count in missing.items()
+        )
+        return made
+
+
 def points_of(session: Session, question: Question, counters: Counters) -> Iterator[Points]:
     """The points of messages in the frame of the question, in order.
 
     Messages that cannot be arrays are left out; `counters.unreadable` counts them.
     """
-    return _points_of(_Looked(session, question, counters, None))
+    return _points_of(_Looked(session, question, counters))
 
 
 def _points_of(looked: _Looked) -> Iterator[Points]:
@@ -115,11 +185,13 @@ def _points_of(looked: _Looked) -> Iterator[Points]:
             stamp = decoded_time(_first_of(fields, _STAMPS))
             stamp = message.log_time_ns if stamp is None else stamp
             found.append((Points(message, stamp, array), fields))
-        times = np.array([one.stamp for one, _ in found], np.int64)
-        frames = [str(_first_of(fields, _FRAMES) or "") for _, fields in found]
-        recordings = [one.message.recording for one, _ in found]
-        log_time = np.array([one.message.log_time_ns for one, _ in found], np.int64)
-        poses = looked.transforms(recordings, frames, times, log_time)
+        messages = [one.message for one, _ in found]
+        poses = looked.transforms(
+            [one.recording for one in messages],
+            [str(_first_of(fields, _FRAMES) or "") for _, fields in found],
+            np.array([one.stamp for one, _ in found], np.int64),
+            np.array([one.log_time_ns for one in messages], np.int64),
+        )
         for row, (one, fields) in enumerate(found):
             pose = Transform(poses.translation[row], poses.rotation[row])
             own = fields.get("pose")  # of the points, in Foxglove's messages
@@ -128,68 +200,29 @@ def _points_of(looked: _Looked) -> Iterator[Points]:
             yield one._replace(points=_moved(one.points, pose))
 
 
-class _Looked:
-    """Looks up transforms to the frame of a question, and counts what is missing."""
+def _moved(array: NDArray[Any], pose: Transform) -> NDArray[Any]:
+    """The points of an array, moved; other fields stay."""
+    others = [name for name in array.dtype.names or () if name not in _XYZ]
+    fields: list[Any] = [(axis, np.float64) for axis in _XYZ]
+    made = np.empty(array.shape, fields + [(name, array.dtype[name]) for name in others])
+    with np.errstate(invalid="ignore"):  # ranges without an echo are infinite
+        there = pose.apply(positions(array))
+    for place, axis in enumerate(_XYZ):
+        made[axis] = there[..., place]
+    for name in others:
+        made[name] = array[name]
+    return made
 
-    def __init__(
-        self, session: Session, question: Question, counters: Counters, known: Known | None
-    ) -> None:
-        self.session = session
-        self.question = question
-        self.counters = counters
-        self._target, self._topic = str(question.frame), question.topics[0]
-        self._trees: Known = {} if known is None else known
 
-    def _of(self, recording: str) -> Trees | TopicError:
-        """The trees of a recording, or why the frame asked for is not there."""
-        if recording not in self._trees:
-            snapshot = self.session.look([recording])
-            summary = snapshot.summaries[snapshot.by_id[recording]]
-            trees = Trees(self.session, [summary], self.question.tf_topics)
-            try:
-                trees.check(self._topic, self._target)
-                self._trees[recording] = trees
-                self.counters.of_frames += tuple(trees.tree(self._topic).remarks)
-            except TopicError as error:
-                self._trees[recording] = error
-        return self._trees[recording]
-
-    def _refuse(self, error: TopicError) -> None:
-        """Refuse a frame that no recording has."""
-        chosen = self.session.summaries_of(self.question)
-        if all(isinstance(self._of(one.id), TopicError) for one in chosen):
-            raise error
-
-    def transforms(
-        self,
-        recordings: Sequence[str],
-        frames: Sequence[str],
-        times: NDArray[np.int64],
-        log_time: NDArray[np.int64],
-    ) -> Transform:
-        """The transforms from some frames at some times; NaN where there are none."""
-        made = unknown(len(times))
-        missing: Counter[str] = Counter()
-        pairs = [*zip(recordings, frames, strict=True)]
-        for pair in dict.fromkeys(pairs):
-            recording, frame = pair
-            trees = self._of(recording)
-            rows = np.flatnonzero([one == pair for one in pairs])
-            if isinstance(trees, TopicError):
-                self._refuse(trees)
-                missing["no such frame in the recording"] += len(rows)
-                continue
-            try:
-                found = trees.lookup(self._topic, self._target, frame, times[rows], log_time[rows])
-            except TopicError:
-                missing[f"no frame {frame!r} among the transforms"] += len(rows)
-                continue
-            made.translation[rows], made.rotation[rows] = found.translation, found.rotation
-            missing.update(found.missing)
-        self.counters.no_transform += tuple(
-            (f"to {self._target}: {why}", count) for why, count in missing.items()
-        )
-        return made
+def _first_of(fields: Mapping[str, Any], paths: Sequence[str]) -> Any:
+    """The value of the first of some paths that the fields of a message have."""
+    for path in paths:
+        value: Any = fields
+        for name in path.split("."):
+            value = value.get(name) if isinstance(value, dict) else None
+        if value is not None:
+            return value
+    return None
 
 
 def _tables_of_points(planner: Planner, looked: _Looked) -> Iterator[pa.Table]:
@@ -198,7 +231,7 @@ def _tables_of_points(planner: Planner, looked: _Looked) -> Iterator[pa.Table]:
         raise UsageError("Points in a frame have the fields of their points: leave out fields.")
     several = question.names_recording or len(planner.session.chosen(question)) > 1
     names = {one.id: one.name for one in planner.session.snapshot().summaries}
-    given = False
+    table = None
     for message, time, points in _points_of(looked):
         own = {
             "log_time": pa.array([message.log_time_ns], _TIME),
@@ -211,9 +244,8 @@ def _tables_of_points(planner: Planner, looked: _Looked) -> Iterator[pa.Table]:
             for name, values in point_columns(points).items()
             if name not in own
         }
-        yield pa.table(own)
-        given = True
-    if not given:
+        yield (table := pa.table(own))
+    if table is None:
         yield pa.table({"log_time": pa.array([], _TIME)})
 
 
@@ -225,78 +257,6 @@ def _places_in(planner: Planner) -> tuple[Sequence[_Pose], str, str] | None:
     stamp = next((name for name in _STAMPS if name in known), None)
     frame = next((name for name in _FRAMES if name in known), None)
     return None if not poses or stamp is None or frame is None else (poses, stamp, frame)
-
-
-def _tables_of_poses(planner: Planner, looked: _Looked) -> Iterator[pa.Table]:
-    session, question, places = planner.session, planner.question, _places_in(planner)
-    if places is None:
-        raise UsageError(
-            f"{question.topics[0]} has no points or poses with a frame and a time of their own, "
-            "so it cannot be in another frame."
-        )
-    poses, stamp, frame = places
-    several = question.names_recording or len(session.chosen(question)) > 1
-    plain = replace(question, frame=None, names_recording=True)
-    hidden = set() if several else {"recording"}
-    if question.fields is not None:
-        parts = [(one.position, "xyz") for one in poses]
-        parts += [(one.rotation, "xyzw") for one in poses if one.rotation]
-        used = [stamp, frame, *(f"{path}.{axis}" for path, axes in parts for axis in axes)]
-        added = [
-            path
-            for path in used
-            if not any(path == one or path.startswith(f"{one}.") for one in question.fields)
-        ]
-        hidden |= {*added}
-        plain = replace(plain, fields=(*question.fields, *added))
-    ids = session.snapshot().ids_called()
-    for table in answer.stream(Planner(session, plain, planner.counters)):
-        names = table["recording"].to_pylist()
-        if not ids.keys() >= {*names}:
-            raise TopicError("Two of these recordings have one name: ask about one by its id.")
-        frames = [str(name or "") for name in table[frame].to_pylist()]
-        times = table[stamp].cast(pa.int64()).fill_null(0).to_numpy()
-        log_time = table["log_time"].cast(pa.int64()).to_numpy()
-        columns = {name: table[name].combine_chunks() for name in table.column_names}
-        moved = looked.transforms([ids[name] for name in names], frames, times, log_time)
-        for pose in poses:
-            columns |= _pose_in_frame(columns, pose, moved)
-        columns[frame] = pa.array([question.frame] * table.num_rows, pa.string())
-        yield pa.table({name: column for name, column in columns.items() if name not in hidden})
-
-
-def _pose_in_frame(
-    columns: Mapping[str, Any], pose: _Pose, moved: Transform
-) -> dict[str, pa.Array[Any]]:
-    """New columns of a pose; null where there is no transform."""
-    made: dict[str, pa.Array[Any]] = {}
-    lost = ~moved.is_known
-    given = _numbers(columns, pose.position, "xyz")
-    zero = Transform(np.zeros_like(moved.translation), moved.rotation)
-    place = (zero if pose.is_vector else moved).apply(given)
-    if pose.rotation:
-        own = Transform(given, _numbers(columns, pose.rotation, "xyzw"))
-        for axis, values in zip("xyzw", (moved @ own).rotation.T, strict=True):
-            made[f"{pose.rotation}.{axis}"] = pa.array(values, mask=lost)
-    for axis, values in zip("xyz", place.T, strict=True):
-        made[f"{pose.position}.{axis}"] = pa.array(values, mask=lost)
-    if pose.covariance in columns:
-        found = columns[pose.covariance]
-        turn = np.zeros((len(lost), 6, 6))
-        turn[:, :3, :3] = turn[:, 3:, 3:] = moved.matrix()[:, :3, :3]
-        turned = np.full_like(turn, np.nan)
-        there = found.is_valid().to_numpy(zero_copy_only=False)
-        turned[there] = found.flatten().to_numpy().reshape(-1, 6, 6)
-        turned = turn @ turned @ turn.transpose(0, 2, 1)
-        made[pose.covariance] = pa.FixedSizeListArray.from_arrays(
-            turned.reshape(-1), 36, mask=pa.array(lost)
-        )
-    return made
-
-
-def _numbers(columns: Mapping[str, Any], path: str, axes: str) -> NDArray[np.float64]:
-    found = (columns[f"{path}.{axis}"].cast(pa.float64()) for axis in axes)
-    return np.stack([one.to_numpy(zero_copy_only=False) for one in found], axis=1)
 
 
 def _poses_among(paths: Mapping[str, str]) -> Iterator[_Pose]:
@@ -312,28 +272,69 @@ def _poses_among(paths: Mapping[str, str]) -> Iterator[_Pose]:
             yield _Pose(word, is_vector=word == "vector")
 
 
-def _moved(array: NDArray[Any], pose: Transform) -> NDArray[Any]:
-    """The points of an array, moved; other fields stay."""
-    names = array.dtype.names or ()
-    fields: list[Any] = [(axis, np.float64) for axis in _XYZ]
-    fields += [(name, array.dtype[name]) for name in names if name not in _XYZ]
-    made = np.empty(array.shape, fields)
-    with np.errstate(invalid="ignore"):  # ranges without an echo are infinite
-        there = pose.apply(positions(array))
-    for place, axis in enumerate(_XYZ):
-        made[axis] = there[..., place]
-    for name in names:
-        if name not in _XYZ:
-            made[name] = array[name]
+def _tables_of_poses(planner: Planner, looked: _Looked) -> Iterator[pa.Table]:
+    session, question, places = planner.session, planner.question, _places_in(planner)
+    if places is None:
+        raise UsageError(
+            f"{question.topics[0]} has no points or poses with a frame and a time of their own, "
+            "so it cannot be in another frame."
+        )
+    poses, stamp, frame = places
+    several = question.names_recording or len(session.chosen(question)) > 1
+    hidden = set() if several else {"recording"}
+    plain = replace(question, frame=None, names_recording=True)
+    if (asked := question.fields) is not None:
+        used = [stamp, frame, *(path for one in poses for path in one.numbers())]
+        added = [path for path in used if not any(f"{path}.".startswith(f"{o}.") for o in asked)]
+        hidden |= {*added}
+        plain = replace(plain, fields=(*asked, *added))
+    ids = session.snapshot().ids_called()
+    for table in answer.stream(Planner(session, plain, planner.counters)):
+        names = table["recording"].to_pylist()
+        if not ids.keys() >= {*names}:
+            raise TopicError("Two of these recordings have one name: ask about one by its id.")
+        moved = looked.transforms(
+            [ids[name] for name in names],
+            [str(name or "") for name in table[frame].to_pylist()],
+            table[stamp].cast(pa.int64()).fill_null(0).to_numpy(),
+            table["log_time"].cast(pa.int64()).to_numpy(),
+        )
+        columns = {name: table[name].combine_chunks() for name in table.column_names}
+        for pose in poses:
+            columns |= _pose_in_frame(columns, pose, moved)
+        columns[frame] = pa.array([question.frame] * table.num_rows, pa.string())
+        yield pa.table({name: column for name, column in columns.items() if name not in hidden})
+
+
+def _pose_in_frame(
+    columns: Mapping[str, Any], pose: _Pose, moved: Transform
+) -> dict[str, pa.Array[Any]]:
+    """New columns of a pose; null where there is no transform."""
+    lost = ~moved.is_known
+    given = np.stack([_doubles(columns[path]) for path in pose.numbers()], axis=1)
+    zero = Transform(np.zeros_like(moved.translation), moved.rotation)
+    found = (zero if pose.is_vector else moved).apply(given[:, :3])
+    if pose.rotation:
+        turned = (moved @ Transform(given[:, :3], given[:, 3:])).rotation
+        found = np.concatenate([found, turned], axis=1)
+    made: dict[str, pa.Array[Any]] = {
+        path: pa.array(values, mask=lost)
+        for path, values in zip(pose.numbers(), found.T, strict=True)
+    }
+    if pose.covariance in columns:
+        covariance = columns[pose.covariance]
+        turn = np.zeros((len(lost), 6, 6))
+        turn[:, :3, :3] = turn[:, 3:, 3:] = moved.matrix()[:, :3, :3]
+        own = np.full_like(turn, np.nan)
+        there = covariance.is_valid().to_numpy(zero_copy_only=False)
+        own[there] = covariance.flatten().to_numpy().reshape(-1, 6, 6)
+        own = turn @ own @ turn.transpose(0, 2, 1)
+        made[pose.covariance] = pa.FixedSizeListArray.from_arrays(
+            own.reshape(-1), 36, mask=pa.array(lost)
+        )
     return made
 
 
-def _first_of(fields: Mapping[str, Any], paths: Sequence[str]) -> Any:
-    """The value of the first of some paths that the fields of a message have."""
-    for path in paths:
-        value: Any = fields
-        for name in path.split("."):
-            value = value.get(name) if isinstance(value, dict) else None
-        if value is not None:
-            return value
-    return None
+def _doubles(column: pa.Array[Any]) -> NDArray[np.float64]:
+    found: NDArray[np.float64] = column.cast(pa.float64()).to_numpy(zero_copy_only=False)
+    return found

@@ -17,8 +17,8 @@ from PIL import Image
 import hybridlog as hl
 from hybridlog.cli.answers import write_answer
 from hybridlog.formats import OUTPUTS
-from hybridlog.formats.answer import Answer
 from hybridlog.formats.mp4 import _Video
+from hybridlog.formats.writing import Answer
 from hybridlog.maintenance.keep import expire
 from hybridlog.message import Message
 from hybridlog.query.query import Query

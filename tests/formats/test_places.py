@@ -15,8 +15,8 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.formats import OUTPUTS
-from hybridlog.formats.answer import Answer
 from hybridlog.formats.files import ply_of
+from hybridlog.formats.writing import Answer
 from hybridlog.query.query import tables_of
 from hybridlog_storage.errors import UsageError
 from tests.data import DATA, needs_data

@@ -16,11 +16,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybridlog.formats.answer import Answer
-from hybridlog.formats.json_text import json_column
-from hybridlog.formats.jsonl import json_line, write_jsonl
-from hybridlog.formats.npz import write_npz
-from hybridlog.formats.tables import write_arrow, write_csv, write_parquet
+from hybridlog.formats.jsonl import json_column, json_line, write_jsonl
+from hybridlog.formats.tables import write_arrow, write_csv, write_npz, write_parquet
+from hybridlog.formats.writing import Answer
 from hybridlog_storage.errors import UsageError
 from tests.limits import Limit
 

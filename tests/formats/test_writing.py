@@ -18,8 +18,7 @@ from msgspec.structs import replace
 
 import hybridlog.formats
 from hybridlog.formats import OUTPUTS, formats_of
-from hybridlog.formats.answer import Answer
-from hybridlog.formats.writing import Sink
+from hybridlog.formats.writing import Answer, Sink
 from hybridlog_storage.disk import unfinished
 from hybridlog_storage.disk.unfinished import (
     beside,

@@ -7,8 +7,7 @@ from typing import IO, TYPE_CHECKING, Any, cast
 
 from mcap.writer import CompressionType, Writer
 
-from hybridlog.formats.answer import Answer, LogWriter
-from hybridlog.formats.writing import Sink, Target
+from hybridlog.formats.writing import Answer, LogWriter, Sink, Target
 from hybridlog_storage.segments.segment_format import OUR_NAMES
 
 if TYPE_CHECKING:

@@ -13,9 +13,8 @@ from rosbags.rosbag1.writer import Header, WriteChunk
 from rosbags.rosbag1.writer import Writer as RosbagsWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from hybridlog.formats.answer import Answer, LogWriter
 from hybridlog.formats.mcap.writer import source_metadata
-from hybridlog.formats.writing import Target, destination, failures, path_of
+from hybridlog.formats.writing import Answer, LogWriter, Target, destination, failures, path_of
 from hybridlog_storage.disk.unfinished import beside
 from hybridlog_storage.errors import UsageError
 
