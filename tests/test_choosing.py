@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 import hybridlog as hl
-from hybridlog.frames.lines import json_lines
 from hybridlog.live import LiveOptions
 from hybridlog.recordings import Recordings
 from hybridlog.snapshot import Snapshot
@@ -25,6 +24,7 @@ from hybridlog_storage.errors import (
 from hybridlog_storage.messages import Channel, Schema
 from tests.cli.running import run
 from tests.cli.within import Answer, answer
+from tests.every_output import written
 from tests.independent import write_mcap
 from tests.test_snapshot import summary
 
@@ -262,7 +262,7 @@ def test_tables_name_recordings(store: hl.Store) -> None:
     query = store.topic("/scan", "/imu")
     frame = query.to_pandas()
     assert list(frame.columns) == ["topic", "recording", "n", "robot"]
-    rows = [json.loads(line) for line in json_lines(query)]
+    rows = [json.loads(line) for line in written(query, "jsonl").splitlines()]
     assert list(rows[0]) == ["log_time_ns", "topic", "recording", "n", "robot"]
     assert [row["recording"] for row in rows] == frame["recording"].tolist()
 

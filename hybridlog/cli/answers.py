@@ -251,17 +251,16 @@ def _answer_of(
     content, question = OUTPUTS[form].content, query.question
     if content in {"pictures", "video"}:
         return _pictures(query, form, target, front)
-    if question.frame is not None and content == "payloads":
+    if content == "points":
         from hybridlog.tf.in_frame import points_of
 
         query.counters.reset()
         found = points_of(query.source.now(), question, query.counters)
-        return Answer(
-            points=(
-                (one.points, one.message.topic, one.message.type, one.message.log_time_ns)
-                for one in found
-            )
+        rows = (
+            (one.points, one.message.topic, one.message.type, one.message.log_time_ns)
+            for one in found
         )
+        return Answer(points=rows)
     if content in {"log", "payloads"}:
         return log_of(query, front if content == "log" else Front(latched=False), extras)
     if question.frame is not None:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from hybridlog.formats.reading import Source
     from hybridlog.formats.writing import Answer, Target
 
-Content: TypeAlias = Literal["lines", "table", "log", "payloads", "pictures", "video"]
+Content: TypeAlias = Literal["lines", "table", "log", "payloads", "points", "pictures", "video"]
 
 
 class LogFormat(Struct, frozen=True):
@@ -83,8 +83,8 @@ class OutputFormat(Struct, frozen=True):
 
     Attributes:
         content: What it takes of an `Answer`: `lines` of JSON; tables (`table`); batches of
-            messages for a `log`, or for a file a payload (`payloads`); messages that are
-            images, for `pictures` or a `video`.
+            messages for a `log`, or for a file a payload (`payloads`); `points` of clouds and
+            scans; messages that are images, for `pictures` or a `video`.
         writer: Writes an answer, as `module:name`. Called with an `Answer` and a path or a
             binary stream.
         suffixes: Suffixes of file names, the usual one first; none if it writes a directory.
@@ -125,7 +125,7 @@ OUTPUTS: Final[dict[str, OutputFormat]] = {
         is_text=True,
         is_of_places=True,
     ),
-    "ply": OutputFormat("payloads", "hybridlog.formats.files:write_ply", ()),
+    "ply": OutputFormat("points", "hybridlog.formats.files:write_ply", ()),
     "raw": OutputFormat("payloads", "hybridlog.formats.files:write_raw", ()),
     "png": OutputFormat("pictures", "hybridlog.formats.files:write_png", (".png",)),
     "jpg": OutputFormat("pictures", "hybridlog.formats.files:write_jpg", (".jpg", ".jpeg")),

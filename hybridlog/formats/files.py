@@ -15,17 +15,14 @@ import re
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
-from hybridlog.arrays.message_arrays import to_numpy
 from hybridlog.arrays.point_arrays import point_columns, positions
 from hybridlog.drawing.images import Picture, picture
 from hybridlog.formats.writing import Answer, Sink, Target, Whole, failures, new_directory, path_of
-from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.errors import DefinitionError, PayloadError, UsageError
 from hybridlog_storage.mongo.index_documents import collection_of
 
@@ -33,8 +30,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.message import Message
-    from hybridlog.schema.codec import Codec
-    from hybridlog_storage.messages import Buffer, Channel
+    from hybridlog_storage.messages import Buffer
 
 INDEX = "index.jsonl"
 """The file that describes each file. No topic's directory has a dot."""
@@ -194,21 +190,9 @@ _NO_WORD: Final = re.compile(r"\W", re.ASCII)
 def write_ply(answer: Answer, target: Target) -> None:
     """Write a directory with a PLY file a message."""
     with Directory(path_of(target, "ply", "a directory")) as folder:
-        for points, topic, kind, time in chain(answer.points, _points(answer)):
+        for points, topic, kind, time in answer.points:
             about = {"topic": topic, "type": kind, "log_time_ns": time, "points": points.size}
             folder.add(ply_of(points), ".ply", about)
-
-
-def _points(answer: Answer) -> Iterator[tuple[NDArray[Any], str, str, int]]:
-    codecs: dict[Channel, Codec] = {}
-    for batch, channels in answer.batches:
-        for row in range(len(batch)):
-            channel = channels[int(batch.channel[row])]
-            if channel not in codecs:
-                codecs[channel] = codec_for(channel)
-            name = channel.schema.name if channel.schema else ""
-            points = to_numpy(name, codecs[channel].decode(batch.payload(row)))
-            yield points, channel.topic, name, int(batch.log_time[row])
 
 
 def ply_of(points: NDArray[Any]) -> bytes:

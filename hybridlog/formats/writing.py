@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from numpy.typing import NDArray
 
-    from hybridlog.attachments import Extras
     from hybridlog.message import Message
     from hybridlog_storage.messages import Batch, Buffer, Channel
     from hybridlog_storage.segments.segment_format import Attachment
@@ -66,7 +65,7 @@ class Answer(Struct, kw_only=True):
         batches: Messages as they came, and the channels that `batch.channel` indexes.
         points: Points, their topic, type and log time (ns), a message at a time.
         messages: Messages that are images.
-        extras: What a log has beside its messages.
+        extras: What a log has beside its messages: `Extras`, or None.
         profile: MCAP profile of the messages.
         is_live: Rows are written as they come.
         notes: Gets sentences about what is left out: damaged extras, rows without a place.
@@ -79,7 +78,7 @@ class Answer(Struct, kw_only=True):
     batches: Iterable[tuple[Batch, Sequence[Channel]]] = ()
     points: Iterable[tuple[NDArray[Any], str, str, int]] = ()
     messages: Iterable[Message] = ()
-    extras: Extras | None = None
+    extras: Any = None
     profile: str = ""
     is_live: bool = False
     notes: list[str] = field(default_factory=list)

@@ -10,15 +10,7 @@ import numpy as np
 import pyarrow as pa
 
 from hybridlog.columns.left_rows import LeftFields
-from hybridlog.frames.names import (
-    FIELD,
-    arranged,
-    free_name,
-    is_part,
-    is_summary,
-    own_columns,
-    summary_of,
-)
+from hybridlog.frames.names import FIELD, arranged, free_name, is_part, own_columns, summary_of
 from hybridlog.index.indexing import rows_by_channel
 from hybridlog.query.rows import summaries_in
 from hybridlog.schema.arrow_columns import OFFSET_LIMIT, TIME, numbers, structs
@@ -34,10 +26,10 @@ from hybridlog.schema.arrow_types import (
     statistic,
     with_values,
 )
-from hybridlog.schema.codec import stamp_array
+from hybridlog.schema.codec import no_messages, stamp_array
 from hybridlog.schema.column import STAMP
 from hybridlog_storage.errors import DefinitionError
-from hybridlog_storage.messages import Batch, order_of
+from hybridlog_storage.messages import order_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -47,6 +39,7 @@ if TYPE_CHECKING:
     from hybridlog.query.question import Part, Question, RecordedChannel
     from hybridlog.query.rows import RowBatch
     from hybridlog.schema.codec import Decoded
+    from hybridlog_storage.messages import Batch
 
 
 _BLOCK_ROWS = 65_536
@@ -136,10 +129,9 @@ class Decoder:
 
     def empty(self) -> Iterator[Block]:
         """A block without rows for each example: columns exist even without messages."""
-        none = np.empty(0, np.int64)
-        batch = Batch(b"", none, none, np.empty(0, np.int32), none, none, none.astype(np.uint32))
         for channel in self._examples:
-            yield self.block(channel, batch, none, self.decoded(channel, batch))
+            batch = no_messages()
+            yield self.block(channel, batch, batch.log_time, self.decoded(channel, batch))
 
     def blocks(self, run: MessageRun) -> Iterator[Block]:
         """The messages of a run, by channel."""
@@ -159,21 +151,22 @@ class Decoder:
             order = found.seq + self._ranks[part.recording.key]
             yield Block(part.topic, found.log_time, order, own, found.records.cast(kind), 0)
 
+    def _summaries(self, channel: RecordedChannel) -> set[str]:
+        """The requested paths that are summaries of arrays."""
+        return summaries_in(self._chosen, {path.path: path.type for path in channel.codec.paths()})
+
     def decoded(self, channel: RecordedChannel, batch: Batch) -> Decoded:
         """The fields of messages of one channel; those that cannot be read are counted."""
         fields = None
         if self._chosen is not None:
             # Arrays of which summaries are asked for, too.
-            known = {path.path: path.type for path in channel.codec.paths()}
-            arrays = (path.rpartition(".")[0] for path in summaries_in(self._chosen, known))
-            stamp = [STAMP] if "stamp" in self.own else []
-            fields = frozenset([*self._chosen, *arrays, *stamp])
+            arrays = {path.rpartition(".")[0] for path in self._summaries(channel)}
+            fields = frozenset(arrays).union(self._chosen, {STAMP} if "stamp" in self.own else ())
         found = channel.codec.columns_of(batch, fields)
         self._counters.unreadable += len(batch) - len(found.rows)
         if isinstance(found.records, LeftFields):
-            requested = {path.replace("[]", "") for path in self._chosen or ()}
-            summarised = {path.rpartition(".")[0] for path in requested} - requested
-            self._counters.lacking += int(found.records.lacking(summarised).sum())
+            alone = () if fields is None else arrays.difference(self._chosen or ())
+            self._counters.lacking += int(found.records.lacking(alone).sum())
         return found
 
     def block(
@@ -181,31 +174,22 @@ class Decoder:
     ) -> Block:
         """The readable messages of one channel."""
         records, good = decoded.arrow(), decoded.rows
-        stamps = stamp_array(records) if "stamp" in self.own else None
         if len(good) < len(batch):
             batch, seq = batch.take(good), seq[good]
-        own = self.own_columns(channel, batch, seq, stamps)
+        own = self.own_columns(channel, batch, seq, records)
         order = seq + self._ranks.get(channel.recording.key, 0)  # examples have no messages
-        topic = channel.channel.topic
-        values = decoded.records
-        summaries = self._summaries(values, channel) if isinstance(values, LeftFields) else {}
-        return Block(topic, batch.log_time, order, own, records, batch.payload_bytes, summaries)
-
-    def _summaries(self, records: LeftFields, channel: RecordedChannel) -> dict[str, pa.Array[Any]]:
-        """The requested summaries of arrays of expired messages."""
-        known = {path.path: path.type for path in channel.codec.paths()}
-        requested = (path.replace("[]", "") for path in self._chosen or ())
-        return records.statistics(path for path in requested if is_summary(path, known))
+        left, summaries = decoded.records, {}
+        if isinstance(left, LeftFields):
+            summaries = left.statistics(self._summaries(channel))
+        topic, size = channel.channel.topic, batch.payload_bytes
+        return Block(topic, batch.log_time, order, own, records, size, summaries)
 
     def own_columns(
-        self,
-        channel: RecordedChannel,
-        batch: Batch,
-        seq: NDArray[np.int64],
-        stamps: pa.Array[Any] | None = None,
+        self, channel: RecordedChannel, batch: Batch, seq: NDArray[np.int64], records: Any = None
     ) -> dict[str, pa.Array[Any]]:
         """Built-in columns of messages of one channel, without the log time."""
         rows, is_known = len(batch), channel.channel.has_publish_time
+        stamps = stamp_array(records) if records is not None and "stamp" in self.own else None
         made: dict[str, Callable[[], pa.Array[Any]]] = {
             "topic": lambda: text_column(channel.channel.topic, rows),
             "recording": lambda: text_column(channel.recording.name, rows),
@@ -276,63 +260,46 @@ def table_of(blocks: list[Block], fields: Sequence[str] | None = None) -> pa.Tab
     definition fixes their length and list otherwise.
     """
     blocks.sort(key=_beginning)
-    order = _order(blocks)
-    times = [numbers(block.log_time, "time") for block in blocks]
-    names = [pa.field("log_time", TIME)]
-    columns = [_ordered(times, TIME, order)]
+    timed = [block for block in blocks if len(block.log_time)]
+    order = None
+    if timed:
+        times = np.concatenate([block.log_time for block in timed])
+        order = order_of(times, np.concatenate([block.order for block in timed]))
+
+    def add(name: str, arrays: Sequence[pa.Array[Any]], kind: Any, path: str = "") -> None:
+        column = pa.chunked_array([array for array in arrays if len(array)], type=kind)
+        columns[name] = column if order is None else in_order(column, order)
+        of = {FIELD: path} if path not in {"", name} else None
+        fields_of.append(pa.field(name, kind, metadata=of))
+
+    columns: dict[str, pa.ChunkedArray[Any]] = {}
+    fields_of: list[pa.Field[Any]] = []
+    add("log_time", [numbers(block.log_time, "time") for block in blocks], TIME)
     for name in dict.fromkeys(name for block in blocks for name in block.own):
         arrays = [block.own[name] for block in blocks]
-        columns.append(_ordered(arrays, common_type(arrays), order))
-        names.append(pa.field(name, columns[-1].type))
-    parts = _flat(blocks, fields)
+        add(name, arrays, common_type(arrays))
+    topics: dict[str, list[pa.StructArray]] = {}
+    for block in blocks:
+        topics.setdefault(block.topic, []).append(block.records)
+    kinds = {topic: common_type(records) for topic, records in topics.items()}
+    parts = [leaves_of(converted(b.records, kinds[b.topic]), fields, b.summaries) for b in blocks]
     lengths = [len(block.log_time) for block in blocks]
     blocks.clear()  # the columns below take their memory
-    taken = {field.name for field in names}
+    topics.clear()
     for path in dict.fromkeys(path for part in parts for path in part):
-        name = free_name(path, taken)
-        taken.add(name)
         found = [part.pop(path, None) for part in parts]
         kind = common_type([array for array in found if array is not None])
         arrays = [
             pa.nulls(rows, kind) if array is None else converted(array, kind)
             for array, rows in zip(found, lengths, strict=True)
         ]
-        columns.append(_ordered(arrays, kind, order))
-        of = {FIELD: path} if name != path else None
-        names.append(pa.field(name, kind, metadata=of))
-    table = pa.Table.from_arrays(columns, schema=pa.schema(names))
+        add(free_name(path, columns), arrays, kind, path)
+    table = pa.Table.from_arrays([*columns.values()], schema=pa.schema(fields_of))
     return table.select(arranged(table.column_names, fields))
-
-
-def _flat(blocks: Sequence[Block], fields: Sequence[str] | None) -> list[dict[str, pa.Array[Any]]]:
-    """The leaves of each block, with one type for each topic."""
-    topics: dict[str, list[pa.StructArray]] = {}
-    for block in blocks:
-        topics.setdefault(block.topic, []).append(block.records)
-    kinds = {topic: common_type(records) for topic, records in topics.items()}
-    return [
-        leaves_of(converted(one.records, kinds[one.topic]), fields, one.summaries) for one in blocks
-    ]
 
 
 def _beginning(block: Block) -> tuple[int, int]:
     return (int(block.log_time[0]), int(block.order[0])) if len(block.log_time) else (-1, -1)
-
-
-def _order(blocks: Sequence[Block]) -> NDArray[np.intp] | None:
-    """The order of the rows by log time; None if they are in order."""
-    blocks = [block for block in blocks if len(block.log_time)]
-    if not blocks:
-        return None
-    time = np.concatenate([block.log_time for block in blocks])
-    return order_of(time, np.concatenate([block.order for block in blocks]))
-
-
-def _ordered(
-    arrays: Sequence[pa.Array[Any]], kind: pa.DataType, order: NDArray[np.intp] | None
-) -> pa.ChunkedArray[Any]:
-    column = pa.chunked_array([array for array in arrays if len(array)], type=kind)
-    return column if order is None else in_order(column, order)
 
 
 # Nested messages as flat columns: `pose.position.x`.

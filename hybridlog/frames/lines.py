@@ -14,7 +14,6 @@ from hybridlog.formats.writing import Line
 from hybridlog.frames.answer import Decoder, leaves_of, text_column
 from hybridlog.frames.names import arranged, free_name
 from hybridlog.index.indexing import rows_by_channel
-from hybridlog.query.planner import Planner
 from hybridlog.query.times import format_duration, format_time
 from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.arrow_types import (
@@ -30,7 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from hybridlog.query.chunk_scan import MessageRun
-    from hybridlog.query.query import Query
+    from hybridlog.query.planner import Planner
 
 
 def lines(planner: Planner) -> Iterator[list[Line]]:
@@ -42,13 +41,6 @@ def lines(planner: Planner) -> Iterator[list[Line]]:
     decoder = Decoder(planner)
     for run in planner.runs():
         yield _lines_of(run, decoder, planner.question.fields)
-
-
-def json_lines(query: Query) -> Iterator[str]:
-    """The answer of a query as lines of JSON, in order."""
-    planner = Planner(query.source.now(), query.question, query.counters)
-    for line in (line for batch in lines(planner) for line in batch):
-        yield line if isinstance(line, str) else "".join(line)
 
 
 def _lines_of(run: MessageRun, decoder: Decoder, fields: Sequence[str] | None) -> list[Line]:

@@ -42,11 +42,12 @@ Known: TypeAlias = "dict[str, Trees | TopicError]"
 
 
 class Points(NamedTuple):
-    """The points of a message in the frame.
+    """The points of a message.
 
     Attributes:
         stamp: Its header stamp, or its log time without one, ns.
-        points: Records with `x`, `y`, `z` (float64), and its further fields; any shape.
+        points: Records with the fields of its points; any shape. In a frame that was asked for,
+            `x`, `y` and `z` (float64) come first.
     """
 
     message: Message
@@ -162,9 +163,10 @@ class _Looked:
 
 
 def points_of(session: Session, question: Question, counters: Counters) -> Iterator[Points]:
-    """The points of messages in the frame of the question, in order.
+    """The points of messages in order, in the frame of the question, if any.
 
-    Messages that cannot be arrays are left out; `counters.unreadable` counts them.
+    Messages that cannot be arrays are left out; `counters.unreadable` counts them. Messages of
+    other types are refused.
     """
     return _points_of(_Looked(session, question, counters))
 
@@ -174,6 +176,8 @@ def _points_of(looked: _Looked) -> Iterator[Points]:
     for run in Planner(looked.session, replace(looked.question, frame=None), counters).runs():
         found: list[tuple[Points, dict[str, object]]] = []
         for message in messages_in(run):
+            if plain_type(message.type) not in POINT_MAKERS:
+                raise UsageError(f"{message.topic} has no clouds or scans: {message.type}.")
             if message.is_reduced:
                 counters.leave_out(1, message.state)
                 continue
@@ -185,6 +189,9 @@ def _points_of(looked: _Looked) -> Iterator[Points]:
             stamp = decoded_time(_first_of(fields, _STAMPS))
             stamp = message.log_time_ns if stamp is None else stamp
             found.append((Points(message, stamp, array), fields))
+        if looked.question.frame is None:
+            yield from (one for one, _ in found)
+            continue
         messages = [one.message for one, _ in found]
         poses = looked.transforms(
             [one.recording for one in messages],

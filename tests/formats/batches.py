@@ -58,11 +58,3 @@ def many(count: int, *, channels: int = 3, start: int = 10**18) -> Batch:
         [start + row // 2 for row in range(count)],
         [start + row // 2 - 5 for row in range(count)],
     )
-
-
-def clouds(count: int) -> tuple[Batch, list[Channel]]:
-    """Clouds of one point, in JSON."""
-    payload = b'{"points": [{"x": 1.5, "y": 2, "z": 3}], "channels": []}'
-    schema = Schema("sensor_msgs/PointCloud", "jsonschema", b"{}")
-    times = list(range(1, count + 1))
-    return batch([payload] * count, [0] * count, times), [Channel("/cloud", "json", schema)]

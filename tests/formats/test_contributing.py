@@ -32,7 +32,7 @@ LINES = '{"log_time_ns": 1000000001, "topic": "/a", "x": 1.5}\nno line\n' + "".j
 HALF = """
 import json, sys
 import hybridlog as hl
-from hybridlog.frames.lines import json_lines
+from tests.every_output import written
 from tests.independent import write_mcap
 from hybridlog_storage.messages import Channel, Schema
 
@@ -43,7 +43,7 @@ with hl.open(sys.argv[1], create=True) as store:
     ((x, r),) = store.sql("select max(x), sum(list_sum(r)) from half").rows()
     (asof,) = half.resample("1s").to_arrow()["x"].to_pylist()
     print(json.dumps({"where": where, "x": x, "r": r, "asof": asof}))
-    print([*json_lines(half.limit(2))][1])
+    print(written(half.limit(2), "jsonl").decode().splitlines()[1])
 """
 
 

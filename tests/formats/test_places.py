@@ -14,6 +14,7 @@ import pyarrow as pa
 import pytest
 
 import hybridlog as hl
+from hybridlog.cli.answers import write_answer
 from hybridlog.formats import OUTPUTS
 from hybridlog.formats.files import ply_of
 from hybridlog.formats.writing import Answer
@@ -61,8 +62,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
 @needs_data
 def test_clouds_have_all_fields(store: hl.Store, tmp_path: Path) -> None:
     query = store.topic("/cloud_radar_rawtarget")
-    batches = ((batch, [one.channel for one in channels]) for batch, channels in query.batches())
-    OUTPUTS["ply"].write(Answer(batches=batches), tmp_path / "out")
+    write_answer(query, "ply", tmp_path / "out")
     index = [json.loads(line) for line in (tmp_path / "out/index.jsonl").read_text().splitlines()]
     messages = [*query]
     assert len(index) == len(messages)

@@ -12,6 +12,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pytest
 from msgspec.structs import replace
@@ -27,12 +28,13 @@ from hybridlog_storage.disk.unfinished import (
 )
 from hybridlog_storage.errors import DiskFullError, UsageError
 from tests.calls import Calls
-from tests.formats.batches import clouds, many, ros1_channels
+from tests.formats.batches import many, ros1_channels
 
-WRITERS = formats_of("lines", "table", "log", "payloads")
+WRITERS = formats_of("lines", "table", "log", "payloads", "points")
 DIRECTORIES = [name for name in WRITERS if not OUTPUTS[name].suffixes]
 FILES = [name for name in WRITERS if name not in DIRECTORIES]
 POSE = ("x", "y", "z", "qx", "qy", "qz", "qw", "latitude", "longitude")
+POINTS = np.zeros(5, [(axis, np.float32) for axis in "xyz"])
 TABLE = pa.table(
     {
         "log_time": pa.array([1, 2], pa.timestamp("ns", "UTC")),
@@ -57,7 +59,8 @@ def write(name: str, target: object, messages: int = 300, error: type | None = N
     answer = Answer(
         tables=pieces(TABLE),
         lines=pieces(['{"x": 1}'] * 100),
-        batches=pieces(clouds(messages) if name == "ply" else (many(messages), channels)),
+        batches=pieces((many(messages), channels)),
+        points=pieces(*((POINTS, "/cloud", "Cloud", n) for n in range(messages))),
     )
     OUTPUTS[name].write(answer, target)  # type: ignore[arg-type]
 

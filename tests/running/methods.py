@@ -15,10 +15,10 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.attachments import Extras, extras_of
-from hybridlog.frames.lines import json_lines
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.query import at_time, channels_of, field_types, narrowed, spans_of, tables_of
 from hybridlog_storage.errors import HybridlogError, IncompleteError, PayloadError
+from tests.every_output import written
 from tests.running.sequence import CHANNELS, MS, SECOND, START, STEP, Known, Sent
 
 LABEL = "live"
@@ -213,7 +213,7 @@ def ranged(known: Known, topic: str, clock: str, begin: int | None, end: int | N
 
 
 def _json_lines(query: Any) -> list[tuple[int, int]]:
-    found = [json.loads(line) for line in json_lines(query)]
+    found = [json.loads(line) for line in written(query, "jsonl").splitlines()]
     return [(one["n"], one["big"]) for one in found]
 
 

@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterator
 import pytest
 
 import hybridlog as hl
-from hybridlog.frames.lines import json_lines
 from hybridlog.query.query import Query, tables_of
+from tests.every_output import written
 from tests.running.methods import EXEMPT_METHODS, LABEL, METHODS, STORE, same
 from tests.running.running import NO_MONGODB, Running, begun
 from tests.running.sequence import Known
@@ -105,7 +105,9 @@ CALLS: dict[str, Callable[[hl.Store], list[int]]] = {
     "tables": lambda s: [
         n for table in tables_of(s.topic("said")) for n in table.column("n").to_pylist()
     ],
-    "lines": lambda s: [json.loads(line)["n"] for line in json_lines(s.topic("said"))],
+    "lines": lambda s: [
+        json.loads(line)["n"] for line in written(s.topic("said"), "jsonl").splitlines()
+    ],
     "count": lambda s: [*range(s.topic("said").count())],
     "count where": lambda s: [*range(s.topic("said").where("n >= 0").count())],
     "count in time": lambda s: [*range(s.topic("said").between("start", "end").count())],
