@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from importlib import import_module
+from math import inf
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -120,36 +121,28 @@ class Worker:
         self._cursor = cursor
         self._timeout = timeout
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="hybridlog-sql")
-        self._until = None if timeout is None else time.monotonic() + timeout
+        self._until = time.monotonic() + (inf if timeout is None else timeout)
 
     def run(self, call: Callable[[], _T]) -> _T:
         """The result of a call; an error when the time is over, or it was stopped."""
         with at_safe_points():
             future: Future[_T] = self._pool.submit(call)
             try:
-                self._wait(future)
+                while not wait([future], _POLL_S).done:
+                    safe_point()  # Ctrl-C
+                    if time.monotonic() >= self._until:
+                        raise HybridlogError(
+                            f"The query was stopped after {self._timeout:g} s: narrow it down, or "
+                            "allow more."
+                        )
             except BaseException:
-                self._stop(future)
+                # A call that has not reached DuckDB yet does not notice.
+                while not future.done():
+                    with suppress(KeyboardInterrupt):  # pressed again
+                        self._cursor.interrupt()
+                        wait([future], _POLL_S)
                 raise
             return future.result()
-
-    def _wait(self, future: Future[_T]) -> None:
-        while not future.done():
-            safe_point()  # Ctrl-C
-            left = _POLL_S if self._until is None else self._until - time.monotonic()
-            if left <= 0:
-                raise HybridlogError(
-                    f"The query was stopped after {self._timeout:g} s: narrow it down, or allow "
-                    "more."
-                )
-            wait([future], min(left, _POLL_S))
-
-    def _stop(self, future: Future[_T]) -> None:
-        # A call that has not reached DuckDB yet does not notice.
-        while not future.done():
-            with suppress(KeyboardInterrupt):  # pressed again
-                self._cursor.interrupt()
-                wait([future], _POLL_S)
 
     def close(self) -> None:
         """End the thread."""
