@@ -273,7 +273,7 @@ def table_of(blocks: list[Block], fields: Sequence[str] | None = None) -> pa.Tab
         fields_of.append(pa.field(name, kind, metadata=of))
 
     columns: dict[str, pa.ChunkedArray[Any]] = {}
-    fields_of: list[pa.Field[Any]] = []
+    fields_of: list[Any] = []
     add("log_time", [numbers(block.log_time, "time") for block in blocks], TIME)
     for name in dict.fromkeys(name for block in blocks for name in block.own):
         arrays = [block.own[name] for block in blocks]
