@@ -371,10 +371,7 @@ def _rows_of(
 
 def nanoseconds(column: pa.ChunkedArray[Any]) -> NDArray[np.int64]:
     """Times of a column as integers; `UNKNOWN` for null."""
-    if column.null_count:
-        column = column.cast(pa.int64()).fill_null(UNKNOWN)
-    whole = column.chunk(0) if column.num_chunks == 1 else column
-    times: NDArray[np.int64] = whole.to_numpy().view(np.int64)
+    times: NDArray[np.int64] = column.cast(pa.int64()).fill_null(UNKNOWN).to_numpy()
     return times
 
 
@@ -398,8 +395,6 @@ class Aligned:
 
     Attributes:
         rows: Number of rows of the last answer.
-        empty: Numbers of rows that are empty in the last answer, by reason: by topic where it
-            has no message for the row, by column where that has no value.
     """
 
     def __init__(
@@ -415,7 +410,18 @@ class Aligned:
         self._readers = [*([base] if isinstance(base, TopicReader) else []), *beside]
         self._how = how
         self.rows = 0
-        self.empty: dict[str, dict[str, int]] = {}
+        self._empty: Empty = Counter()
+
+    @property
+    def empty(self) -> dict[str, dict[str, int]]:
+        """Numbers of rows that are empty in the last answer, by reason.
+
+        They are by topic where it has no message for the row, by column where that has no value.
+        """
+        found: dict[str, dict[str, int]] = {}
+        for (name, reason), rows in (+self._empty).items():
+            found.setdefault(name, {})[reason] = rows
+        return found
 
     @property
     def counters(self) -> Counters:
@@ -430,8 +436,7 @@ class Aligned:
         rows = counted(self.rows, "row")
         lines = [
             f"{name}: {number} of {rows} {'is' if number == 1 else 'are'} empty: {reason}."
-            for name, reasons in self.empty.items()
-            for reason, number in reasons.items()
+            for (name, reason), number in (+self._empty).items()
         ]
         if len(lines) > _MAX_NAMES:
             more = counted(len(lines) - _MAX_NAMES, "more column")
@@ -458,7 +463,7 @@ class Aligned:
         """
         for reader in self._readers:
             reader.counters.reset()
-        self.rows, self.empty = 0, {}
+        self.rows, self._empty = 0, Counter()
         base = self._base
         several = len(self._session.chosen(base.question)) > 1
         chosen = RangeResolver(self._session, base.question).resolve()
@@ -484,17 +489,13 @@ class Aligned:
     def _rows(self, times: NDArray[np.int64], own: pa.Table, recording: str | None) -> pa.Table:
         """Some rows with what is beside them."""
         self.rows += len(times)
-        empty: Empty = Counter()
         columns: dict[str, Any] = {TIME: own[TIME]}
         if recording is not None:
             columns[RECORDING] = text_column(recording, len(times))
         if isinstance(self._base, TopicReader):
-            self._base.put(columns, own, empty)
+            self._base.put(columns, own, self._empty)
         for one in self._beside:
-            one.add(columns, times, empty)
-        for (name, reason), rows in (+empty).items():
-            reasons = self.empty.setdefault(name, {})
-            reasons[reason] = reasons.get(reason, 0) + rows
+            one.add(columns, times, self._empty)
         return pa.table(columns)
 
     def batches(self) -> Iterator[pa.RecordBatch]:
@@ -579,13 +580,11 @@ def side_by_side(
             f"The rows are the messages of one topic, not of {len(base.topics)}: name one of "
             f"{listed(base.topics)}."
         )
-    near = _checked(how, tolerance)
-    chosen: Clock = clock  # type: ignore[assignment]
+    settings = {**_checked(how, tolerance), "clock": clock}
     (prefix, one), *named = _named([base, *others])
-    rows = TopicReader(session, one, chosen, prefix=prefix)
-    apart = across_recordings
+    rows = TopicReader(session, one, prefix=prefix, **settings)
     beside = [
-        TopicReader(session, one, chosen, how=how, tolerance=near, prefix=prefix, is_apart=apart)
+        TopicReader(session, one, prefix=prefix, is_apart=across_recordings, **settings)
         for prefix, one in named
     ]
     return Aligned(session, rows, beside, how)
@@ -600,19 +599,19 @@ def resampled(
 ) -> Aligned:
     """An alignment of topics to regular times; see `Query.resample`."""
     times = RegularTimes(session, replace(question, predicate=None), parse_duration(step))
-    near, named = _checked(how, tolerance), _named([question])
+    settings, named = _checked(how, tolerance), _named([question])
     beside = [
-        TopicReader(session, one, how=how, tolerance=near, prefix=prefix if len(named) > 1 else "")
+        TopicReader(session, one, prefix=prefix if len(named) > 1 else "", **settings)
         for prefix, one in named
     ]
     return Aligned(session, times, beside, how)
 
 
-def _checked(how: str, tolerance: DurationLike | None) -> int | None:
-    """The tolerance, ns, of one of the ways to match."""
+def _checked(how: str, tolerance: DurationLike | None) -> dict[str, Any]:
+    """One of the ways to match, and its tolerance, ns."""
     if how not in HOWS:
         raise UsageError(f"Unknown way {how!r}; choose {', '.join(HOWS)}.")
-    return None if tolerance is None else parse_duration(tolerance)
+    return {"how": how, "tolerance": None if tolerance is None else parse_duration(tolerance)}
 
 
 def _named(questions: Sequence[Question]) -> list[tuple[str, Question]]:

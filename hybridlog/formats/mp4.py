@@ -73,7 +73,8 @@ class _Video(Whole):
         self._source = ("", "")
         self._form = ""
         self._decoder: VideoDecoder | None = None
-        self._begin = self._last = self._tick = 0
+        self._begin: int | None = None
+        self._last = self._tick = 0
         self._step = _ONLY_STEP
 
     def write(self, message: Message) -> None:
@@ -103,7 +104,9 @@ class _Video(Whole):
         if form == "av1":
             message.to_numpy()  # the frames themselves do not tell that one is lost
         time = message.log_time_ns
-        opened: Any = self._stream(form, data) if is_key else contextlib.nullcontext()
+        opened: Any = contextlib.nullcontext()
+        if is_key:
+            opened = self._av.open(io.BytesIO(data), format=_STREAMS[form])
         with opened as stream:
             is_between = is_key and stream.streams.video[0].codec_context.has_b_frames
             pictures = [] if is_between else self._decoder.take(form, data)
@@ -112,22 +115,16 @@ class _Video(Whole):
                 raise UsageError(self._changed(what, time))
             if len(pictures) != 1:
                 raise PayloadError("a frame of video has no picture")
-            size = pictures[0].width, pictures[0].height
             if self._track is None:
                 self._copied = form
                 template = stream.streams.video[0]
-                track = self._file.add_stream_from_template(template, opaque=True)
-                self._start(track, size, time)
+                self._track = self._file.add_stream_from_template(template, opaque=True)
         if form != self._copied:
             raise UsageError(self._changed(f"{self._copied}, then other frames", time))
-        self._check_size(size, time)
         packet = self._av.Packet(data)
-        packet.pts = packet.dts = self._tick_at(time)
+        packet.pts = packet.dts = self._tick_at(time, (pictures[0].width, pictures[0].height))
         packet.is_keyframe = is_key
         self._mux(packet)
-
-    def _stream(self, form: str, data: bytes) -> Any:
-        return self._av.open(io.BytesIO(data), format=_STREAMS[form])
 
     def _encode(self, pixels: NDArray[np.uint8], time: int) -> None:
         height, width = pixels.shape[:2]
@@ -136,11 +133,11 @@ class _Video(Whole):
         pixels = np.ascontiguousarray(np.pad(pixels, even, mode="edge"))
         size = (pixels.shape[1], pixels.shape[0])
         if self._track is None:
-            self._start(self._encoder(size), size, time)
-        self._check_size(size, time)
+            self._track = self._encoder(size)
         form = "gray" if pixels.ndim == 2 else "rgb24"
+        tick = self._tick_at(time, size)
         frame = self._av.VideoFrame.from_ndarray(pixels, format=form).reformat(format="yuv420p")
-        frame.pts, frame.time_base = self._tick_at(time), Fraction(1, _TICKS)
+        frame.pts, frame.time_base = tick, Fraction(1, _TICKS)
         for packet in self._track.encode(frame):
             self._mux(packet)
 
@@ -156,16 +153,17 @@ class _Video(Whole):
         context.colorspace = _BT601
         return track
 
-    def _start(self, track: Any, size: tuple[int, int], time: int) -> None:
-        self._track, self._size = track, size
-        self._begin = self._last = time
-        track.time_base = Fraction(1, _TICKS)
-        moment = datetime.fromtimestamp(time // 10**9, UTC)
-        self._file.metadata["creation_time"] = f"{moment:%Y-%m-%dT%H:%M:%SZ}"
-        self._file.metadata["comment"] = f"log_time_ns={time}"
-
-    def _tick_at(self, time: int) -> int:
-        """The time of the next picture in the file."""
+    def _tick_at(self, time: int, size: tuple[int, int]) -> int:
+        """The time of the next picture in the file, which begins with the first one."""
+        if self._begin is None:
+            self._begin = self._last = time
+            self._size, self._track.time_base = size, Fraction(1, _TICKS)
+            moment = datetime.fromtimestamp(time // 10**9, UTC)
+            self._file.metadata["creation_time"] = f"{moment:%Y-%m-%dT%H:%M:%SZ}"
+            self._file.metadata["comment"] = f"log_time_ns={time}"
+        if size != self._size:
+            sizes = [f"{width} x {height}" for width, height in (self._size, size)]
+            raise UsageError(self._changed(f"pictures of {sizes[0]}, then of {sizes[1]}", time))
         if time < self._last:
             raise UsageError("An MP4 is in the order of time: leave out --reverse.")
         tick = (time - self._begin + 500) // 1000
@@ -181,11 +179,6 @@ class _Video(Whole):
         packet.stream, packet.time_base = self._track, Fraction(1, _TICKS)
         packet.duration = self._step  # of the last one; that of others is known by the next one
         self._file.mux_one(packet)
-
-    def _check_size(self, size: tuple[int, int], time: int) -> None:
-        if size != self._size:
-            sizes = [f"{width} x {height}" for width, height in (self._size, size)]
-            raise UsageError(self._changed(f"pictures of {sizes[0]}, then of {sizes[1]}", time))
 
     def _changed(self, what: str, time: int) -> str:
         return (

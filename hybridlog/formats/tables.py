@@ -83,7 +83,7 @@ def write_parquet(answer: Answer, target: Target) -> None:
     Columns of floats have no statistics: readers skip row groups by them, and some then
     lose rows where there are NaN among the values.
     """
-    _write(answer, target, "parquet", _open_parquet, _without_empty_structs)
+    _write(answer, target, "parquet", _open_parquet)
 
 
 def write_arrow(answer: Answer, target: Target) -> None:
@@ -119,14 +119,12 @@ def _write(
     target: Target,
     form: str,
     open_file: Callable[[Sink, pa.Table], _ArrowFile],
-    prepared: Callable[[pa.Table], pa.Table] = lambda table: table,
 ) -> None:
     """Write tables."""
     with Sink(target) as sink:
         try:
             file: _ArrowFile | None = None
-            for group in groups(answer, form):
-                table = prepared(group)
+            for table in groups(answer, form):
                 file = file or open_file(sink, table)
                 file.write_table(table)
                 if answer.is_live:
@@ -151,7 +149,6 @@ def groups(answer: Answer, form: str) -> Iterator[pa.Table]:
         return pa.concat_tables([_fitted(one, schema, form, 0) for one in pieces])
 
     for table in answer.tables:
-        _check_names(table.schema)
         pieces.append(table if schema is None else _fitted(table, schema, form, written + rows))
         size += table.nbytes
         rows += table.num_rows
@@ -211,14 +208,6 @@ def _open_parquet(sink: Sink, table: pa.Table) -> _ArrowFile:
     return file
 
 
-def _without_empty_structs(table: pa.Table) -> pa.Table:
-    # Parquet has no empty group, so messages without fields are omitted.
-    for index, field in enumerate(table.schema):
-        if pa.types.is_struct(field.type) and field.type.num_fields == 0:
-            table = table.set_column(index, field.name, pa.nulls(table.num_rows))
-    return table
-
-
 class _CsvFile:
     """Rows as text, long ones cell by cell and in pieces."""
 
@@ -271,35 +260,26 @@ def _row_pieces(row: pa.Table) -> Iterator[bytes]:
 
 def _as_text(table: pa.Table) -> pa.Table:
     """The table with columns that a CSV file can have."""
-    for index, field in enumerate(table.schema):
-        kind = field.type
-        if kind == pa.json_():
-            chunks = [chunk.storage for chunk in table.column(index).chunks]
-            column = pa.chunked_array(chunks, pa.string())
-        elif pa.types.is_null(kind) or pa.types.is_dictionary(kind):
-            column = table.column(index).cast(
-                pa.string() if pa.types.is_null(kind) else kind.value_type
-            )
-        elif is_bytes(kind):
-            chunks = [base64_column(chunk) for chunk in table.column(index).chunks]
-            column = pa.chunked_array(chunks, pa.string())
-        elif pa.types.is_nested(kind):
-            chunks = []
-            for array in table.column(index).chunks:
-                text = json_column(array)
-                chunks.append(pc.if_else(array.is_valid(), text, pa.scalar(None, pa.string())))
-            column = pa.chunked_array(chunks, pa.string())
-        else:
-            continue
-        table = table.set_column(index, field.name, column)
-    return table
+    columns = [
+        pa.chunked_array(map(_text, column.chunks), _text(pa.nulls(0, column.type)).type)
+        for column in table.columns
+    ]
+    return pa.Table.from_arrays(columns, table.column_names)
 
 
-def _check_names(schema: pa.Schema) -> None:
-    names = schema.names
-    if len(set(names)) != len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise UsageError(f"there are two columns {twice!r}; leave one out with --fields")
+def _text(array: pa.Array) -> pa.Array:
+    kind = array.type
+    if kind == pa.json_():
+        return array.storage
+    if pa.types.is_null(kind):
+        return array.cast(pa.string())
+    if pa.types.is_dictionary(kind):
+        return array.dictionary_decode()
+    if is_bytes(kind):
+        return base64_column(array)
+    if pa.types.is_nested(kind):
+        return pc.if_else(array.is_valid(), json_column(array), pa.scalar(None, pa.string()))
+    return array
 
 
 def write_npz(answer: Answer, target: Target) -> None:

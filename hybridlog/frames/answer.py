@@ -266,26 +266,26 @@ def table_of(blocks: list[Block], fields: Sequence[str] | None = None) -> pa.Tab
         times = np.concatenate([block.log_time for block in timed])
         order = order_of(times, np.concatenate([block.order for block in timed]))
 
+    made: dict[str, pa.ChunkedArray[Any]] = {}
+    schema_fields: list[Any] = []
+
     def add(name: str, arrays: Sequence[pa.Array[Any]], kind: Any, path: str = "") -> None:
         column = pa.chunked_array([array for array in arrays if len(array)], type=kind)
-        columns[name] = column if order is None else in_order(column, order)
+        made[name] = column if order is None else in_order(column, order)
         of = {FIELD: path} if path not in {"", name} else None
-        fields_of.append(pa.field(name, kind, metadata=of))
+        schema_fields.append(pa.field(name, kind, metadata=of))
 
-    columns: dict[str, pa.ChunkedArray[Any]] = {}
-    fields_of: list[Any] = []
     add("log_time", [numbers(block.log_time, "time") for block in blocks], TIME)
     for name in dict.fromkeys(name for block in blocks for name in block.own):
         arrays = [block.own[name] for block in blocks]
         add(name, arrays, common_type(arrays))
-    topics: dict[str, list[pa.StructArray]] = {}
-    for block in blocks:
-        topics.setdefault(block.topic, []).append(block.records)
-    kinds = {topic: common_type(records) for topic, records in topics.items()}
+    kinds = {
+        topic: common_type([b.records for b in blocks if b.topic == topic])
+        for topic in {b.topic for b in blocks}
+    }
     parts = [leaves_of(converted(b.records, kinds[b.topic]), fields, b.summaries) for b in blocks]
     lengths = [len(block.log_time) for block in blocks]
     blocks.clear()  # the columns below take their memory
-    topics.clear()
     for path in dict.fromkeys(path for part in parts for path in part):
         found = [part.pop(path, None) for part in parts]
         kind = common_type([array for array in found if array is not None])
@@ -293,8 +293,8 @@ def table_of(blocks: list[Block], fields: Sequence[str] | None = None) -> pa.Tab
             pa.nulls(rows, kind) if array is None else converted(array, kind)
             for array, rows in zip(found, lengths, strict=True)
         ]
-        add(free_name(path, columns), arrays, kind, path)
-    table = pa.Table.from_arrays([*columns.values()], schema=pa.schema(fields_of))
+        add(free_name(path, made), arrays, kind, path)
+    table = pa.Table.from_arrays([*made.values()], schema=pa.schema(schema_fields))
     return table.select(arranged(table.column_names, fields))
 
 

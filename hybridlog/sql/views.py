@@ -119,7 +119,6 @@ class TopicView:
             self._columns[POINTS] = ViewColumn.of_points(merged(points))
         fields = [pa.field(column.name, column.type) for column in self._columns.values()]
         self.schema = pa.schema([*OWN, *fields])
-        self._parts: dict[str, Part | None] = {}
         self._chosen = [resolved[one] for one in ids if one in resolved]
         some = self._chosen[:_SAMPLED]
         messages = sum(part.messages for part in map(self._part, some) if part is not None)
@@ -127,9 +126,7 @@ class TopicView:
 
     def _part(self, one: Resolved) -> Part | None:
         """The topic in a recording, as asked; None without messages."""
-        if one.summary.id not in self._parts:
-            self._parts[one.summary.id] = next(self._planner.parts_in(*one), None)
-        return self._parts[one.summary.id]
+        return next(self._planner.parts_in(*one), None)
 
     def _kinds(self) -> list[Any]:
         """Types of the messages; recordings with equal definitions have equal ones."""
@@ -166,7 +163,16 @@ class TopicView:
         return ViewRows(self._session, pa.schema([]), {}, Reading()).fields(part)
 
     def rows(self, schema: pa.Schema, limits: Limits, reading: Reading) -> Iterator[pa.RecordBatch]:
-        """Rows for a query, with those columns."""
+        """Rows for a query, with those columns; their first error is noted."""
+        try:
+            yield from self._rows(schema, limits, reading)
+        except Exception as error:
+            reading.error = reading.error or error
+            raise
+
+    def _rows(
+        self, schema: pa.Schema, limits: Limits, reading: Reading
+    ) -> Iterator[pa.RecordBatch]:
         if self._reason is not None:
             reading.undefined[self.topic] = self._reason
         read = ViewRows(self._session, schema, self._columns, reading)
@@ -227,7 +233,7 @@ class TopicDataset(ds.Dataset, PyArrowDatasetSource):  # type: ignore[misc] # wi
         if columns is not None:
             schema = pa.schema([schema.field(place) for place in columns])
         limits = reduce(Limits.common, filter(None, map(_limits, filters)), Limits())
-        rows = _told(self._view.rows(schema, limits, reading), reading)
+        rows = self._view.rows(schema, limits, reading)
         reader = pa.RecordBatchReader.from_batches(schema, rows)
         return reader.__arrow_c_stream__(), columns is not None
 
@@ -249,15 +255,6 @@ def _limits(node: Node) -> Limits | None:
         case In(operand=Col(parts=("recording",)), values=values):
             return Limits(recordings=[str(one.value) for one in values if isinstance(one, Lit)])
     return None
-
-
-def _told(batches: Iterator[pa.RecordBatch], reading: Reading) -> Iterator[pa.RecordBatch]:
-    """The batches; their first error is noted."""
-    try:
-        yield from batches
-    except Exception as error:
-        reading.error = reading.error or error
-        raise
 
 
 class ViewRows(Rows):
