@@ -4,25 +4,26 @@ from __future__ import annotations
 
 import time
 from contextlib import ExitStack, suppress
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 from weakref import WeakSet
 
 from hybridlog.index.access import IndexAccess
 from hybridlog.session import Session
 from hybridlog.shared import Shared
 from hybridlog.snapshot import Snapshot
-from hybridlog_storage.errors import DatabaseError, HybridlogError
+from hybridlog_storage.errors import HybridlogError
 
 if TYPE_CHECKING:
     from hybridlog.maintenance.report import Progress
     from hybridlog.record.recorder import RecordReport
     from hybridlog_storage.disk.directory import StoreDirectory
 
-_LIST_EVERY_S = 1.0  # between two comparisons of ids: tools that copy may write manifests later
+_LIST_EVERY_S: Final = 1.0
+"""Between two comparisons of ids: tools that copy may write manifests later."""
 
 
 class OpenStore(Shared):
-    """An open store. Thread safe for reading."""
+    """An open store, of which a `Session` is one moment. Thread safe for reading."""
 
     index: IndexAccess
 
@@ -31,11 +32,11 @@ class OpenStore(Shared):
     ) -> None:
         super().__init__(directory)
         self.index = IndexAccess(self, mongo, progress)
-        self._latest: Session | None = None
+        self.live: WeakSet[Any] = WeakSet()  # recordings that were started by it
+        self._latest: Snapshot | None = None
         self._changed = 0  # as of the latest state, see `StoreDirectory.changed`
         self._names: list[str] = []  # ids of recordings
         self._listed_at = 0.0  # when they were compared last, by `monotonic`
-        self.live: WeakSet[Any] = WeakSet()  # recordings that were started by it
 
     def now(self) -> Session:
         """The store at this moment, for one question; no file is read if nothing has changed."""
@@ -43,8 +44,7 @@ class OpenStore(Shared):
         latest = self._latest
         if latest is None or self._has_names_changed():
             latest = self.catch_up()
-        # What running recordings have flushed since is for this question to see.
-        return latest.again() if latest.snapshot().unfinished else latest
+        return Session(self, latest)
 
     def _has_names_changed(self) -> bool:
         """True if recordings have come or gone since the latest state."""
@@ -57,31 +57,30 @@ class OpenStore(Shared):
         self._changed = now if is_same else 0
         return not is_same
 
-    def replace_latest(self, before: Snapshot, now: Session) -> None:
+    def replace_latest(self, before: Snapshot, now: Snapshot) -> None:
         """Let later questions begin with what one has seen, unless there is a newer state."""
-        if self._latest is not None and self._latest.snapshot() is before:
-            self._latest = now.again()
+        if self._latest is before:
+            self._latest = now
 
-    def catch_up(self, *recordings: str) -> Session:
+    def catch_up(self, *recordings: str) -> Snapshot:
         """See which recordings came or went, and how some others are now; at first, all.
 
         All else that was read stays, so this costs little in a store of thousands.
         """
         with self.following:
-            before = Snapshot((), {}) if self._latest is None else self._latest.snapshot()
+            before = self._latest or Snapshot((), {})
             changed, names = self.directory.changed(), self.directory.ids()
             known = before.by_id.keys()
             ids = (known ^ {*names}) | self.repairs.unreadable.keys() | ({*recordings} & known)
             if self._latest is not None and not ids:
                 return self._latest
-            self._latest = latest = Session(self, self._files.look(before, ids))
+            self._latest = latest = self._files.look(before, ids)
             self._changed, self._names = changed, names
             self.index.note_changes()
             for recording in ids & known:
                 self.channels.pop(recording, None)
-                self.entries.pop(recording, None)
+                self._entries.pop(recording, None)
             self._drop_files()
-            self._look_again_for_tables()
             return latest
 
     def newest(self) -> Snapshot:
@@ -99,11 +98,11 @@ class OpenStore(Shared):
         with self.following:
             self._latest = None
             self.index.note_changes()
-            self.entries = {}
+            self._entries = {}
         self.channels.clear()
-        self._drop_files()
         self.cache.drop("column")
         vars(self).pop("tables", None)
+        self._drop_files()
 
     def recover(self) -> None:
         """Finish what crashes and killed commands have left, before this process changes things.
@@ -112,7 +111,7 @@ class OpenStore(Shared):
         """
         with self.following:
             self.check_process()
-            known = self.catch_up().look().summaries
+            known = Session(self, self.catch_up()).look().unfinished
             done = self._files.recover([one.id for one in known if one.status == "unfinished"])
             for recording in done:
                 self._running.pop(recording, None)
@@ -120,22 +119,12 @@ class OpenStore(Shared):
                 self.catch_up(*done)
 
     def recorded(self, report: RecordReport) -> None:
-        """See a recording that has ended; if MongoDB is available again, index the rest."""
+        """See a recording that has ended."""
         self.catch_up(report.entry.id)
         from hybridlog.schema.codecs import unindexed  # loads numpy
 
         with suppress(HybridlogError):  # its files may have gone already
             report.not_indexed = unindexed(self.now().definitions(report.entry))
-        if report.failure is None:
-            return
-        self.index.disconnect()
-        try:
-            self.index.connect()
-        except HybridlogError as error:
-            report.failure = error if isinstance(error, DatabaseError) else report.failure
-            return
-        report.entry = self.now().entry(report.entry.id)
-        report.indexed, report.missed, report.failure = report.entry.documents, 0, None
 
     def close(self) -> None:
         """End live recordings, close files and connections. May be called more than once."""
@@ -145,11 +134,8 @@ class OpenStore(Shared):
                 held.push(one)
 
     def _close(self) -> None:
-        with self._opening:
-            for reader in self._segments.values():
-                reader.close()
+        vars(self).pop("tables", None)
         self._drop_files()
         self.index.disconnect()
-        vars(self).pop("tables", None)
         self.is_closed = True
         self.catalog.close()

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, overload
 
 from hybridlog.query.query import Query
-from hybridlog.query.question import Question
 from hybridlog.wording import listed
 from hybridlog_storage.errors import TopicError
 
@@ -118,4 +117,4 @@ class Recordings(Sequence["RecordingEntry"]):
         """
         session = self._source.now()
         ids = self.check().ids
-        return Query(self._source, Question(*session.having(session.topics_of(ids), ids)))
+        return Query(self._source, session.about(session.topics_of(ids), ids))

@@ -12,17 +12,18 @@ from collections.abc import (
     Sequence,
 )
 from contextlib import suppress
+from functools import partial
 from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import numpy as np
 
-from hybridlog.entries import put_entry, schemas_in, summary_of
+from hybridlog.entries import put_entry, schemas_in, summary_of, topic_types
 from hybridlog.query.chunk_columns import PARTS, ChunkColumns, log_bounds
 from hybridlog.query.question import Question, RecordedChannel, field_types
 from hybridlog.query.topics import resolve
 from hybridlog.record.losses import lost_spans
 from hybridlog.record.marks import MARKS
-from hybridlog.snapshot import UNFINISHED
+from hybridlog.snapshot import UNFINISHED, differing
 from hybridlog.wording import counted, listed
 from hybridlog_storage.catalog import WHOLE, file_of
 from hybridlog_storage.disk.directory import gone
@@ -52,12 +53,9 @@ if TYPE_CHECKING:
     from hybridlog_storage.segments.segment_reader import SegmentReader
     from hybridlog_storage.summary import RecordingSummary
 
-_MAX_NAMES = 5  # recordings in a message
 _ROW_BYTES = 44  # of a message's columns in a chunk
 
 _T = TypeVar("_T")
-_Topics = tuple[tuple[str, ...], tuple[str, ...] | None]
-"""Topics, and the ids of the recordings that have any; None for all."""
 
 
 class Asked(Protocol):
@@ -90,10 +88,6 @@ class Session:
         self.shared.check_process()
         return self
 
-    def again(self) -> Session:
-        """The same recordings, of which nothing was asked yet."""
-        return Session(self.shared, self._recordings)
-
     @property
     def tables(self) -> Tables:
         """Parquet tables of topics."""
@@ -107,102 +101,88 @@ class Session:
 
     def look(self, recordings: Collection[str] | None = None) -> Snapshot:
         """See what running recordings, some or all, have flushed; returns all recordings."""
-        snapshot = self._recordings
-        for place in snapshot.unfinished:
-            summary = snapshot.summaries[place]
+        for summary in self._recordings.unfinished:
             if recordings is None or summary.id in recordings:
-                self._followed(summary.id)
+                self.find(summary.id)
         return self._recordings
 
-    def _followed(self, recording: str) -> RecordingEntry | None:
-        """The entry of a running recording with what is flushed; None if it is gone."""
-        shared = self.shared
-        with shared.following:
-            if recording in self._entries:
-                return self._entries[recording]
-            snapshot = self._recordings
-            summary = snapshot.summaries[snapshot.by_id[recording]]
-            running = shared.followed(summary)
-            entry = running.entry
-            if entry is None:
-                return None
-            self._entries[recording] = entry
-            now = summary_of(entry, summary.look)
-            if now != summary:
-                self._recordings = snapshot.with_changes([now], {now.topics: running.topics})
-                shared.replace_latest(snapshot, self)
-            return entry
+    def find(self, recording: str) -> RecordingEntry | None:
+        """The entry of a recording, by its id, compared with its files once; None if it is gone.
+
+        That of a running one has what is flushed when it is first asked for.
+        """
+        summary = self._recordings.by_id.get(recording)
+        if recording in self._entries or summary is None:
+            return self._entries.get(recording)
+        if summary.status in UNFINISHED:
+            return self._followed(summary)
+        found = self.shared.entry(summary)
+        if found is not None:
+            self._entries[recording] = found
+        return found
+
+    def _followed(self, summary: RecordingSummary) -> RecordingEntry | None:
+        with self.shared.following:
+            if summary.id in self._entries:
+                return self._entries[summary.id]
+            found = self.shared.followed(summary)
+            if found is not None:
+                self._entries[summary.id] = found
+                before, now = self._recordings, summary_of(found, summary.look)
+                if now != summary:
+                    topics = {now.topics: topic_types(found)}
+                    self._recordings = before.with_changes([now], topics)
+                    self.shared.replace_latest(before, self._recordings)
+            return found
 
     def entries(self, summaries: Iterable[RecordingSummary]) -> Iterator[RecordingEntry]:
         """The entries of some recordings, without those that were removed meanwhile."""
-        for summary in summaries:
-            entry = self._entry_of(summary)
-            if entry is not None:
-                yield entry
+        return (found for one in summaries if (found := self.find(one.id)) is not None)
 
     def entry_of(self, summary: RecordingSummary) -> RecordingEntry:
-        """The entry of a recording, compared with its files once."""
-        found = self._entry_of(summary)
+        """The entry of a recording; a `TopicError` if it was removed meanwhile."""
+        found = self.find(summary.id)
         if found is None:
             raise gone(summary.name)
-        return found
-
-    def _entry_of(self, summary: RecordingSummary) -> RecordingEntry | None:
-        if summary.id in self._entries:
-            return self._entries[summary.id]
-        place = self._recordings.by_id.get(summary.id)
-        if place is not None and self._recordings.summaries[place].status in UNFINISHED:
-            return self._followed(summary.id)
-        found = self.shared.entry(summary)
-        if found is not None:
-            self._entries[summary.id] = found
         return found
 
     def show(self, entry: RecordingEntry) -> None:
         """Let an entry stand for its recording at this moment."""
         self._entries[entry.id] = entry
 
-    def entry_if_there(self, recording: str) -> RecordingEntry | None:
-        """The entry of a recording, by its id; None if it is gone."""
-        place = self._recordings.by_id.get(recording)
-        return None if place is None else self._entry_of(self._recordings.summaries[place])
-
     def entry(self, recording: str) -> RecordingEntry:
         """The entry of a recording, by its id, its name, or the beginning of one of these."""
         (found,) = self.select([recording])
         return found
 
-    def chosen(self, question: Question) -> NDArray[np.intp]:
-        """Positions in the snapshot of the recordings of a question, oldest first."""
-        snapshot = self.look(question.recordings)
-        if question.recordings is None:
-            return snapshot.having(question.topics)
-        places = [snapshot.by_id.get(recording, -1) for recording in question.recordings]
-        gone = places.count(-1)
+    def some(self, recordings: Collection[str] | None) -> list[RecordingSummary]:
+        """Recordings by id, None for all, in short, oldest first; refuses those that are gone."""
+        snapshot = self.look(recordings)
+        if recordings is None:
+            return snapshot.summaries
+        gone = sum(one not in snapshot.by_id for one in recordings)
         if gone:
             raise TopicError(
                 f"{gone} of the recordings asked about were removed from the store. Make the "
                 "query again."
             )
-        return np.array(sorted(places), np.intp)
+        return snapshot.some(recordings)
 
     def summaries_of(self, question: Question) -> list[RecordingSummary]:
         """The recordings of a question in short, oldest first."""
-        places = self.chosen(question).tolist()
-        return [self._recordings.summaries[place] for place in places]
+        known = self.some(question.recordings)
+        if question.recordings is not None:
+            return known
+        return self._recordings.having(question.topics)
 
     def doubtful(self, question: Question) -> list[RecordingEntry]:
         """The recordings of a question that may lack messages, oldest first."""
-        found = []
-        for summary in self.summaries_of(question):
-            entry = self._entries.get(summary.id) or self.shared.entries.get(summary.id)
-            is_complete = not summary.has_losses and summary.status == "complete"
-            if entry is None and is_complete:
-                continue
-            entry = entry or self.entry_of(summary)
-            if entry.status != "complete" or entry.losses:
-                found.append(entry)
-        return found
+        return [
+            entry
+            for one in self.summaries_of(question)
+            if one.has_losses or one.status != "complete" or one.id in self._entries
+            if (entry := self.entry_of(one)).status != "complete" or entry.losses
+        ]
 
     @property
     def when_empty(self) -> str:
@@ -216,30 +196,56 @@ class Session:
         """Recordings by name, id, or the beginning of one of these; None for all."""
         if names is None:
             return [*self.entries(self._recordings.summaries)]
-        snapshot = self._recordings
-        return [self.entry_of(snapshot.summaries[place]) for place in self.named(names)]
+        return [self.entry_of(one) for one in self.named(names)]
 
-    def named(self, names: Iterable[str | RecordingEntry]) -> list[int]:
-        """Positions of recordings in the snapshot, each once, in the order of the names."""
-        snapshot = self._recordings
-        chosen: dict[int, None] = {}
+    def named(self, names: Iterable[str | RecordingEntry]) -> list[RecordingSummary]:
+        """Recordings in short, each once, in the order of the names."""
+        chosen: dict[str, RecordingSummary] = {}
         for given in names:
             name = given if isinstance(given, str) else given.id
-            found = snapshot.named(name)
+            found = self._recordings.named(name)
             if len(found) != 1:
-                raise self._unclear(name, found)
-            chosen[found[0]] = None
-        return list(chosen)
+                known = [one.name for one in found or self._recordings.summaries]
+                if len({*known}) < len(found):  # copied by hand
+                    known = [one.id for one in found]
+                problem = "is ambiguous" if found else "is not in the store"
+                raise TopicError(f"Recording {name!r} {problem}. There are: {listed(known)}.")
+            chosen[found[0].id] = found[0]
+        return [*chosen.values()]
 
-    def _unclear(self, name: str, found: Sequence[int]) -> TopicError:
-        """The error for a name that means no recording, or several."""
-        summaries = self.snapshot().summaries
-        several = [summaries[place] for place in found]
-        names = [one.name for one in several or summaries]
-        if len({*names}) < len(several):  # copied by hand
-            names = [one.id for one in several]
-        problem = "is ambiguous" if found else "is not in the store"
-        return TopicError(f"Recording {name!r} {problem}. There are: {listed(names)}.")
+    # Topics.
+
+    def topics_of(self, recordings: Collection[str] | None = None) -> list[str]:
+        """Names of all topics of the recordings with some ids, or of all, sorted.
+
+        They include those whose messages are all lost.
+        """
+        found = self.some(recordings)
+        return self._recordings.topics_of(found)
+
+    def resolve_in(self, names: Sequence[str], recordings: Collection[str] | None) -> list[str]:
+        """The topics of some recordings that patterns match."""
+        return resolve(names, self.topics_of(recordings))
+
+    def question(self, names: Sequence[str], recordings: Collection[str] | None = None) -> Question:
+        """The question about the topics that patterns match, in recordings by their ids, or all."""
+        if not names:
+            known = self.topics_of(recordings)
+            there = f"There are: {listed(known)}." if known else self.when_empty
+            raise TopicError(f"Name a topic. {there}")
+        return self.about(self.resolve_in(names, recordings), recordings)
+
+    def about(self, topics: Sequence[str], recordings: Collection[str] | None = None) -> Question:
+        """The question about topics in the recordings, of some by their ids or all, that have any.
+
+        A `TopicError` if none has.
+        """
+        self.some(recordings)
+        having = self._recordings.having(topics, recordings)
+        if topics and not having:
+            raise TopicError(f"No recording chosen has {', '.join(sorted(set(topics)))}.")
+        ids = None if recordings is None else tuple(one.id for one in having)
+        return Question(tuple(topics), ids)
 
     def channels_of(
         self, recording: RecordingEntry, topics: Collection[str]
@@ -249,22 +255,17 @@ class Session:
         Where a topic has messages, its channels without any are left out: they must not change
         the columns of an answer.
         """
-        by_topic = self._channels_by_topic(recording)
-        found = [channel for topic in topics for channel in by_topic.get(topic, ())]
-        return sorted(found, key=lambda channel: channel.channel_id)
-
-    def _channels_by_topic(self, recording: RecordingEntry) -> dict[str, list[RecordedChannel]]:
         known = self.shared.channels.get(recording.id)
-        if known is not None and known[0] is recording:
-            return known[1]
-        counts, definitions = recording.messages_by_topic(), self.definitions(recording)
-        found: dict[str, list[RecordedChannel]] = defaultdict(list)
-        for own in recording.channels:
-            if not counts[own.topic] or own.stats.messages:
-                one = RecordedChannel(recording, own.id, definitions[own.id], own.stats)
-                found[own.topic].append(one)
-        self.shared.channels[recording.id] = recording, found
-        return found
+        if known is None or known[0] is not recording:
+            counts, definitions = recording.messages_by_topic(), self.definitions(recording)
+            by_topic: dict[str, list[RecordedChannel]] = defaultdict(list)
+            for own in recording.channels:
+                if not counts[own.topic] or own.stats.messages:
+                    one = RecordedChannel(recording, own.id, definitions[own.id], own.stats)
+                    by_topic[own.topic].append(one)
+            known = self.shared.channels[recording.id] = recording, by_topic
+        found = [channel for topic in topics for channel in known[1].get(topic, ())]
+        return sorted(found, key=lambda channel: channel.channel_id)
 
     def field_types(
         self, topics: Collection[str], recordings: Collection[str] | None
@@ -273,56 +274,14 @@ class Session:
 
         Recordings are ids; None for all.
         """
-        snapshot = self.look(recordings)
-        places = snapshot.having(topics, recordings)
         # Recordings with equal topics and types have equal fields.
         return field_types(
             tuple(
                 channel
-                for summary in snapshot.differing(places)
+                for summary in differing(self.look(recordings).having(topics, recordings))
                 for channel in self.channels_of(self.entry_of(summary), set(topics))
             )
         )
-
-    def having(
-        self, topics: Sequence[str], recordings: Iterable[str | RecordingEntry] | None = None
-    ) -> _Topics:
-        """Topics, and the ids of the recordings, of some or all, that have any of them."""
-        ids = None
-        if recordings is not None:
-            known = self._recordings.summaries
-            ids = [known[place].id for place in self.named(recordings)]
-        snapshot = self.look(ids)
-        places = snapshot.having(topics, ids)
-        if topics and not len(places):
-            raise TopicError(f"No recording chosen has {', '.join(sorted(set(topics)))}.")
-        if recordings is None:
-            return tuple(topics), None
-        return tuple(topics), tuple(snapshot.summaries[place].id for place in places.tolist())
-
-    def question(self, names: Sequence[str], recordings: Sequence[str] | None = None) -> Question:
-        """The question about the topics that patterns match, in recordings by their ids, or all."""
-        known = self.topics_of(recordings)
-        if not names:
-            there = f"There are: {listed(known)}." if known else self.when_empty
-            raise TopicError(f"Name a topic. {there}")
-        found = self.having(self.resolve_in(names, recordings), recordings)
-        return Question(*found)
-
-    def topics_of(self, recordings: Sequence[str] | None = None) -> list[str]:
-        """Names of all topics of the recordings with some ids, or of all, sorted.
-
-        They include those whose messages are all lost.
-        """
-        snapshot = self.look(recordings)
-        if recordings is None:
-            return snapshot.topics
-        places = [snapshot.by_id[one] for one in recordings if one in snapshot.by_id]
-        return snapshot.topics_at(np.array(places, np.intp))
-
-    def resolve_in(self, names: Sequence[str], recordings: Sequence[str] | None) -> list[str]:
-        """The topics of some recordings that patterns match."""
-        return resolve(names, self.topics_of(recordings))
 
     def predicate(
         self,
@@ -347,11 +306,7 @@ class Session:
         known = self.shared.schemas
         wanted = {c.schema: c for c in recording.channels if c.schema is not None}
         if not wanted.keys() <= known.keys():
-            known |= self.catalog.schemas(wanted.keys() - known.keys())
-        if not wanted.keys() <= known.keys():
-            found = schemas_in(self.directory, recording)
-            known |= found
-            self.catalog.put_schemas(found.values())
+            known |= schemas_in(self.directory, recording)
         missing = wanted.keys() - known.keys()
         if any(c.schema in missing and c.stats.messages for c in recording.channels):
             for number in recording.logs:
@@ -382,29 +337,26 @@ class Session:
         if clock == "header" and bounds is not None and recording.is_decoded:
             stats = [c.stats for c in recording.channels if c.id in channels]
             bounds, clock = log_bounds(bounds, stats), "log"
-        for number, first, last in recording.spans_with(channels):
-            is_beside = bounds is not None and not (
-                min(first, END - 1) < bounds[1] and last >= bounds[0]
-            )
-            if clock == "log" and is_beside:
-                continue
-            columns = self._chunk_columns(recording, number, channels)
+        near = bounds if clock == "log" else None
+        for columns in self._chunk_columns(recording, channels, near):
             found += columns.chunks(columns.within(bounds, clock, timed=timed))
         return found
 
     def _chunk_columns(
-        self, recording: RecordingEntry, number: int, channels: Collection[int]
-    ) -> ChunkColumns:
-        """The chunks of a segment with some channels."""
-        table = self.chunk_table(recording, number)
-        return self.cache.made(
-            "chunks",
-            table,
-            number,
-            frozenset(channels),
-            make=lambda: ChunkColumns(number, table, channels),
-            size_of=lambda made: 2 * made.parts.nbytes + table.parts.nbytes,
-        )
+        self, recording: RecordingEntry, channels: Collection[int], span: tuple[int, int] | None
+    ) -> Iterator[ChunkColumns]:
+        """The chunks with some channels, by segment, of those that may reach into a log time."""
+        for number, first, last in recording.spans_with(channels):
+            if span is None or (min(first, END - 1) < span[1] and last >= span[0]):
+                table = self.chunk_table(recording, number)
+                yield self.cache.made(
+                    "chunks",
+                    table,
+                    number,
+                    frozenset(channels),
+                    make=partial(ChunkColumns, number, table, channels),
+                    size_of=lambda made: made.nbytes,
+                )
 
     def chunk_table(self, recording: RecordingEntry, number: int) -> ChunkTable:
         """The chunks of a recording's segment; a `ChangedError` if its file is another one."""
@@ -419,10 +371,9 @@ class Session:
     ) -> NDArray[np.void]:
         """The `ChunkColumns.parts` that may lie in a range `[begin, end)` of log time, ns."""
         found = [np.empty(0, np.dtype(PARTS))]
-        for number, first, last in recording.spans_with(channels):
-            if min(first, END - 1) < span[1] and last >= span[0]:
-                rows = self._chunk_columns(recording, number, channels).parts
-                found.append(rows[(placed(rows["first"]) < span[1]) & (rows["last"] >= span[0])])
+        for columns in self._chunk_columns(recording, channels, span):
+            rows = columns.parts
+            found.append(rows[(placed(rows["first"]) < span[1]) & (rows["last"] >= span[0])])
         return np.concatenate(found)
 
     def times(
@@ -440,7 +391,12 @@ class Session:
             return found
 
         key = recording.id, segment, chunk, place.offset, file_of(recording, segment)
-        return self.cache.made("times", *key, make=read, size_of=_size_of_times)
+        return self.cache.made(
+            "times",
+            *key,
+            make=read,
+            size_of=lambda own: sum(one.nbytes for one in own.values()),
+        )
 
     def chunk(
         self,
@@ -459,7 +415,12 @@ class Session:
             return chunk
 
         key = recording.id, segment, place.number, place.offset, file_of(recording, segment)
-        return self.cache.made("chunk", *key, make=read, size_of=_size_of)
+        return self.cache.made(
+            "chunk",
+            *key,
+            make=read,
+            size_of=lambda one: len(one.batch.buffer) + _ROW_BYTES * len(one.batch),
+        )
 
     def segment(self, recording: str, number: int) -> SegmentReader:
         """The reader of a segment of a recording, by its id. Thread safe.
@@ -510,8 +471,8 @@ class Session:
         Later questions to this moment are about the newer files. With a problem of its summary it
         is noted as lost, which counts as another file, too.
         """
-        place = self._recordings.by_id.get(entry.id)
-        look = None if place is None else self._recordings.summaries[place].look
+        summary = self._recordings.by_id.get(entry.id)
+        look = None if summary is None else summary.look
         if self.directory.looks([entry.id]).get(entry.id) == look or (problem and look == ""):
             if not problem:
                 return
@@ -519,7 +480,7 @@ class Session:
             self.catalog.put_damage(entry.id, {**known, (number, WHOLE): problem})
             put_entry(self.directory, self.catalog, entry.id)
         self.shared.catch_up(entry.id)
-        now: RecordingEntry | None = self.shared.now().entry_if_there(entry.id)
+        now = self.shared.now().find(entry.id)
         if now is None:
             raise gone(entry.name)
         is_there = str(number) in now.digests or number in now.flushed
@@ -550,11 +511,3 @@ def _changed(recording: RecordingEntry) -> ChangedError:
     return ChangedError(
         f"Files of recording {recording.name!r} were replaced while it was read. Ask again."
     )
-
-
-def _size_of(chunk: StoredChunk) -> int:
-    return len(chunk.batch.buffer) + _ROW_BYTES * len(chunk.batch)
-
-
-def _size_of_times(times: Mapping[int, NDArray[np.int64]]) -> int:
-    return sum(own.nbytes for own in times.values())

@@ -1,12 +1,12 @@
-"""All that moments of an open store share: the catalog, open files, caches."""
+"""What moments of an open store share: the catalog, open files, caches."""
 
 from __future__ import annotations
 
 import os
 import threading
-from abc import ABC, abstractmethod
-from functools import partial
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from functools import lru_cache, partial
+from typing import TYPE_CHECKING, Any, Final
 
 from hybridlog.columns.recording_logs import RecordingRows
 from hybridlog.entries import with_marks
@@ -22,51 +22,54 @@ from hybridlog_storage.messages import schema_hash
 from hybridlog_storage.segments.segment_reader import open_log
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from hybridlog.columns.tables import Tables
     from hybridlog.query.question import RecordedChannel
     from hybridlog.record.running import RunningRecording
-    from hybridlog.snapshot import Snapshot
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.segments.segment_reader import SegmentReader
     from hybridlog_storage.summary import RecordingSummary
 
-_MAX_OPEN_SEGMENTS = 256
+_MAX_OPEN_SEGMENTS: Final = 256
 
 
-class Shared(ABC):
+class Shared:
     """All that questions to one open store share. Thread safe for reading.
 
     Attributes:
-        index: The index in MongoDB, an `IndexAccess`.
         repairs: Repairs made when the store was opened.
         cache: What was read or worked out; chunks of single messages are a kind of it.
         schemas: Schemas by hash.
-        entries: Entries of ended recordings that were compared with their files, by id.
-        following: Held while running recordings are looked at, and while the newest state changes.
         channels: Channels of recordings by id and topic, and the entry that they are of.
         epochs: Where header stamps of recordings start again, by id, and the entry they are of.
+        following: Held while running recordings are looked at, and while the newest state changes.
+        index, now, catch_up, replace_latest, recover: As of `OpenStore`.
     """
 
     index: Any
+    now: Callable[[], Any]
+    catch_up: Callable[..., Any]
+    replace_latest: Callable[..., None]
+    recover: Callable[[], None]
 
     def __init__(self, directory: StoreDirectory) -> None:
         self._process = os.getpid()
         self.is_closed = False
         self.directory = directory
+        self.catalog = Catalog(directory.path, directory.cells)
         self.repairs = RepairReport()
+        self._files = StoreFiles(directory, self.catalog, self.repairs)
         self.cache = Cache()
-        self.following = threading.RLock()
-        self._running: dict[str, RunningRecording] = {}
-        self.entries: dict[str, RecordingEntry] = {}
         self.schemas = {schema_hash(MARK_SCHEMA): MARK_SCHEMA}
         self.channels: dict[str, tuple[RecordingEntry, dict[str, list[RecordedChannel]]]] = {}
         self.epochs: dict[str, tuple[RecordingEntry, Any]] = {}
-        self._segments: dict[tuple[str, str], SegmentReader] = {}
-        self._rows: dict[tuple[Path, frozenset[tuple[str, ...]]], RecordingRows] = {}
-        self._opening = threading.Lock()
+        self.following = threading.RLock()
+        self._running: dict[str, RunningRecording] = {}
+        self._entries: dict[str, RecordingEntry] = {}  # of ended ones, compared with their files
+        most = files.most_open(_MAX_OPEN_SEGMENTS)
+        # A file is closed when the last thread that reads from it drops it, too.
+        self._opened = lru_cache(most)(self._open)
+        self._rows = lru_cache(most)(lambda path, _: RecordingRows(path, cache=self.cache))
 
     @property
     def is_inherited(self) -> bool:
@@ -84,53 +87,16 @@ class Shared(ABC):
             )
 
     @lazy
-    def catalog(self) -> Catalog:
-        """Recordings, channels, chunks and schemas."""
-        return Catalog(self.directory.path, self.directory.cells)
-
-    @lazy
     def tables(self) -> Tables:
         """Parquet tables of topics; pyarrow is loaded for them."""
         from hybridlog.columns.tables import Tables
 
         return Tables(self.directory.path, self.cache)
 
-    @lazy
-    def _files(self) -> StoreFiles:
-        return StoreFiles(self.directory, self.catalog, self.repairs)
-
-    # Moments, of which a `Session` is one.
-
-    @abstractmethod
-    def now(self) -> Any:
-        """The store at this moment."""
-
-    @abstractmethod
-    def catch_up(self, *recordings: str) -> Any:
-        """See which recordings came or went, and how some others are now."""
-
-    @abstractmethod
-    def recover(self) -> None:
-        """Finish what crashes and killed commands have left."""
-
-    @abstractmethod
-    def replace_latest(self, before: Snapshot, now: Any) -> None:
-        """Let later questions begin with what one has seen, unless there is a newer state."""
-
-    def _look_again_for_tables(self) -> None:
-        if "tables" in vars(self):
-            self.tables.look_again()
-
-    def _drop_files(self) -> None:
-        with self._opening:
-            self._rows.clear()
-            self._segments.clear()  # each is closed by the last thread that reads from it
-        self.cache.drop("chunk")
-
     # Recordings.
 
-    def followed(self, summary: RecordingSummary) -> RunningRecording:
-        """A running recording with what is flushed by now; `following` is held."""
+    def followed(self, summary: RecordingSummary) -> RecordingEntry | None:
+        """A running recording with what is flushed by now, None if gone; `following` is held."""
         from hybridlog.record.running import RunningRecording
 
         running = self._running.get(summary.id)
@@ -143,12 +109,12 @@ class Shared(ABC):
         entry = running.entry
         if entry is None or entry.status not in UNFINISHED:
             del self._running[summary.id]
-            self._look_again_for_tables()  # it may have some now
-        return running
+            self._drop_files()  # it may have tables now
+        return entry
 
     def entry(self, summary: RecordingSummary) -> RecordingEntry | None:
         """The entry of what is sealed of a recording, compared with its files once."""
-        found = None if summary.status in UNFINISHED else self.entries.get(summary.id)
+        found = None if summary.status in UNFINISHED else self._entries.get(summary.id)
         if found is None:
             seen = self._files.see(summary.id)
             if seen is None:
@@ -157,37 +123,20 @@ class Shared(ABC):
                 self.index.note_changes()
             found = with_marks(seen.entry)
             if found.status not in UNFINISHED:
-                found = self.entries.setdefault(summary.id, found)
+                found = self._entries.setdefault(summary.id, found)
         return found
-
-    # Files.
 
     def segment(self, entry: RecordingEntry, number: int) -> SegmentReader:
         """The reader of a sealed segment."""
-        with self._opening:
-            name = file_of(entry, number)
-            key = entry.id, name
-            reader = self._segments.get(key)
-            if reader is None:
-                _make_room(self._segments)
-                path = self.directory.recording(entry.id)
-                reader = self._segments[key] = open_log(path / name, number, self._rows_of(entry))
-            return reader
+        return self._opened(entry.id, number, file_of(entry, number), entry.manifest.changes)
 
-    def _rows_of(self, entry: RecordingEntry) -> RecordingRows:
-        gone = frozenset((name, entry.digests[number]) for number, name in entry.files.items())
-        key = self.directory.recording(entry.id), gone
-        found = self._rows.get(key)
-        if found is None:
-            _make_room(self._rows)
-            found = self._rows[key] = RecordingRows(key[0], cache=self.cache)
-        return found
+    def _open(self, recording: str, number: int, name: str, changes: int) -> SegmentReader:
+        path = self.directory.recording(recording)
+        return open_log(path / name, number, self._rows(path, changes))
 
-
-def _make_room(opened: dict[Any, Any]) -> None:
-    """Drop the file that was opened first, if many are open.
-
-    It is closed when the last thread that reads from it also drops it.
-    """
-    if len(opened) >= files.most_open(_MAX_OPEN_SEGMENTS):
-        del opened[next(iter(opened))]
+    def _drop_files(self) -> None:
+        self._opened.cache_clear()
+        self._rows.cache_clear()
+        self.cache.drop("chunk")
+        if "tables" in vars(self):
+            self.tables.look_again()

@@ -306,7 +306,7 @@ class Store:
     def all_topics(self) -> Query:
         """Make a query about all topics."""
         session = self.session
-        return Query(self._source, Question(*session.having(session.topics_of())))
+        return Query(self._source, session.about(session.topics_of()))
 
     def query(self, topics: Sequence[str], recordings: Names | None = None) -> Query:
         """A question about topics by their full names, in some recordings or all.
@@ -315,7 +315,9 @@ class Store:
         """
         if isinstance(topics, str):
             raise UsageError(f"query takes a list of names; topic({topics!r}) takes a name.")
-        return Query(self._source, Question(*self.session.having(topics, recordings)))
+        session = self.session
+        ids = None if recordings is None else [one.id for one in session.named(recordings)]
+        return Query(self._source, session.about(topics, ids))
 
     def tf(
         self, recording: Texts = None, *, of: str | None = None, topics: Sequence[str] = ()

@@ -8,13 +8,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import pytest
 
 import hybridlog as hl
 from hybridlog.live import LiveOptions
+from hybridlog.query.choice import overlaps
 from hybridlog.recordings import Recordings
-from hybridlog.snapshot import Snapshot
 from hybridlog_storage.errors import (
     TimeError,
     TopicError,
@@ -278,16 +277,14 @@ def test_one_recording_is_named_on_request(store: hl.Store) -> None:
 def test_a_running_recording_reaches_until_now() -> None:
     now = 100
     made = [
-        summary(1, (5, 9), ["/a"], status="open", created=4),
-        summary(2, None, ["/a"], status="open", created=50),
-        summary(3, (5, 9), ["/a"]),
-        summary(4, None, ["/a"], created=50),
+        summary(1, (5, 9), ["/a"], status="open", created=4)[0],
+        summary(2, None, ["/a"], status="open", created=50)[0],
+        summary(3, (5, 9), ["/a"])[0],
+        summary(4, None, ["/a"], created=50)[0],
     ]
-    snapshot = Snapshot([one for one, _ in made], {made[0][0].topics: ()})
 
     def chosen(begin: int, end: int) -> set[str]:
-        found = snapshot.during(np.arange(4), begin, end, now)
-        return {snapshot.summaries[place].name for place in found.tolist()}
+        return {one.name for one in made if overlaps(one, begin, end, now)}
 
     assert chosen(20, 30) == {"r1"}
     assert chosen(60, 70) == {"r1", "r2"}

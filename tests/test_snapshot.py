@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 import hybridlog as hl
 from hybridlog.maintenance.opening import StoreFiles
-from hybridlog.snapshot import Snapshot
+from hybridlog.snapshot import Snapshot, differing
 from hybridlog_storage.cells import CATALOG, Cells
 from hybridlog_storage.errors import TopicError
 from hybridlog_storage.manifest import replace
@@ -81,9 +81,10 @@ def test_recordings_are_chosen_by_topic(
     assert snapshot.topics == sorted({topic for _, held in found for topic in held})
     having = snapshot.having(topics)
     wanted = [n for n in order if set(found[n][1]) & set(topics)]
-    assert [snapshot.summaries[place].name for place in having] == [f"r{n}" for n in wanted]
-    examples = snapshot.differing(having)
-    assert {frozenset(snapshot.topics_of(one)) for one in examples} == {
+    assert [one.name for one in having] == [f"r{n}" for n in wanted]
+    assert snapshot.having(topics, [one.id for one in having]) == having
+    examples = differing(having)
+    assert {frozenset(snapshot.topics_of([one])) for one in examples} == {
         frozenset(found[n][1]) for n in wanted
     }
     assert len(examples) == len({frozenset(found[n][1]) for n in wanted})

@@ -233,8 +233,8 @@ class TopicReader:
 
     def is_elsewhere(self, recording: str) -> bool:
         """True if no message can be beside a recording's rows: they are of other recordings."""
-        place = self._session.snapshot().by_id[recording]
-        return not self.is_apart and place not in self._session.chosen(self.question)
+        known = (one.id for one in self._session.summaries_of(self.question))
+        return not self.is_apart and recording not in known
 
     def _beside(self, recording: str) -> Question:
         """The question about the messages that may be beside the rows of a recording."""
@@ -465,7 +465,7 @@ class Aligned:
             reader.counters.reset()
         self.rows, self._empty = 0, Counter()
         base = self._base
-        several = len(self._session.chosen(base.question)) > 1
+        several = len(self._session.summaries_of(base.question)) > 1
         chosen = RangeResolver(self._session, base.question).resolve()
         for summary, bounds, _ in chosen if limit != 0 else ():
             span = None if summary.status in UNFINISHED else summary.extent

@@ -126,8 +126,7 @@ def _completed(context: click.Context, param: click.Parameter, incomplete: str) 
             snapshot = shared.now().look()
             names = [one.name for one in snapshot.summaries]
             if kind == "TOPIC":
-                kinds = {one.topics: one for one in snapshot.summaries}.values()
-                names = sorted({topic for one in kinds for topic in snapshot.topics_of(one)})
+                names = snapshot.topics
     except (HybridlogError, OSError):
         return []
     return [name for name in names if name.startswith(incomplete)]

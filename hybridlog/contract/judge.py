@@ -16,7 +16,6 @@ from hybridlog.query.answers.completeness import completeness_of
 from hybridlog.query.answers.marks import marks_in
 from hybridlog.query.planner import log_times
 from hybridlog.query.query import Query, tables_of
-from hybridlog.query.question import Question
 from hybridlog.query.times import format_duration
 from hybridlog.record.losses import topics_of
 from hybridlog.record.marks import CONTRACT
@@ -65,7 +64,7 @@ def _verdicts(
     known = topics_of(session.entry_of(summary))
 
     def about(*topics: str) -> Query:
-        return Query(session, Question(*session.having(topics, [summary.id])))
+        return Query(session, session.about(topics, [summary.id]))
 
     if contract.lost is not None:
         complete = completeness_of(session, about(*sorted(known)).question)

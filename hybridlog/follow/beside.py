@@ -168,7 +168,7 @@ class _Beside:
         is_last = False
         while not is_last:
             is_last, started = self._ended.is_set(), time.monotonic()
-            session = shared.now().again() if watched else session
+            session = shared.now() if watched else session
             for trigger, one in zip(self._triggers, watched, strict=True):
                 runs, _ = one.look(session)
                 for run in runs:

@@ -211,7 +211,7 @@ def _own(planner: Planner) -> list[str]:
     added = []
     if len(question.topics) > 1:
         added.append("topic")
-    if question.names_recording or len(planner.session.chosen(question)) > 1:
+    if question.names_recording or len(planner.session.summaries_of(question)) > 1:
         added.append("recording")
     return [name for name in dict.fromkeys([*added, *requested]) if name != "log_time"]
 

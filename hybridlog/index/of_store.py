@@ -85,7 +85,7 @@ class Index:
             raise next(iter(left.values()))
         shared.invalidate()
         now = shared.now()
-        found = (now.entry_if_there(entry.id) for entry in chosen if entry.id not in left)
+        found = (now.find(entry.id) for entry in chosen if entry.id not in left)
         return [entry for entry in found if entry is not None]
 
     @again_if_lost
@@ -170,9 +170,7 @@ class Index:
                     raise
                 names[name] = None
         session = shared.now()
-        snapshot = session.snapshot()
-        places = snapshot.having([*names]).tolist()
-        entries = [session.entry_of(snapshot.summaries[place]) for place in places]
+        entries = [*map(session.entry_of, session.snapshot().having([*names]))]
         return index_arrays(
             shared.directory,
             shared.catalog,

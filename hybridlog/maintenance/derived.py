@@ -70,7 +70,7 @@ class StoreIndex(Struct, frozen=True):
         directory, state = self.directory, IndexState(self.database)
         behind = [one for one in snapshot.summaries if one.indexed_by != index]
         known = state.of([one.key for one in behind]) if behind else {}
-        is_other = state.count() - len(known) != len(snapshot) - len(behind)
+        is_other = state.count() - len(known) != len(snapshot.summaries) - len(behind)
         if is_other:
             behind, known = snapshot.summaries, state.of()
             if removes:
@@ -189,7 +189,7 @@ def _differs(known: Tables, entry: RecordingEntry, topic: str, *, off: bool) -> 
 def bring_tables(source: Shared, target: RemoteDirectory, recordings: Collection[str]) -> None:
     """Bring the tables of recordings that were copied into a bucket; messages answer without."""
     for recording in recordings:
-        entry = source.now().entry_if_there(recording)
+        entry = source.now().find(recording)
         if entry is not None and entry.status not in UNFINISHED:
             _bring_tables(source, target, entry)
 

@@ -7,9 +7,8 @@ other conditions.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
-from itertools import chain
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 from msgspec import Struct
@@ -23,13 +22,11 @@ from hybridlog.query.times import (
     parse_range,
 )
 from hybridlog.query.topics import fitting, split_topic
+from hybridlog.snapshot import differing
 from hybridlog.wording import listed, meant
 from hybridlog_storage.errors import TimeError, TopicError, UsageError
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from hybridlog.query.question import Question
     from hybridlog.query.times import DurationLike, TimeLike
     from hybridlog.session import Session
@@ -41,9 +38,9 @@ Tags: TypeAlias = "str | Sequence[str] | Mapping[str, str | None] | None"
 """`"robot=7"`, `"robot"`, several of these, or values by key."""
 During: TypeAlias = "tuple[TimeLike | None, TimeLike | None] | None"
 """Begin and end of a range of log time; None leaves a side open."""
-_Step: TypeAlias = tuple[Iterable[int], str, str, Sequence[str]]
-"""Positions of the recordings that satisfy a condition; this in words; and, for a hint where there
-is none, the name that was wanted and those that there are."""
+_Step: TypeAlias = "tuple[Sequence[RecordingSummary], str, str, Collection[str]]"
+"""Recordings that satisfy a condition; this in words; and, for a hint where there is none, the name
+that was wanted and those that there are."""
 Answering: TypeAlias = "Callable[[Session, Question], set[str]]"
 """Returns the ids of the recordings that have a message in an answer."""
 _GLOB = frozenset("*?[")
@@ -139,14 +136,14 @@ def choose(session: Session, choice: Choice, answering: Answering | None = None)
     if not choosing.left and not choice.is_everything:
         return Chosen([], session.when_empty)
     conditions: list[str] = []
-    for places, condition, wanted, known in choosing.steps(choice):
+    for found, condition, wanted, known in choosing.steps(choice):
         conditions.append(condition)
-        remaining = {*places}
-        choosing.left = [place for place in choosing.left if place in remaining]
+        remaining = {one.id for one in found}
+        choosing.left = [one for one in choosing.left if one.id in remaining]
         if not choosing.left:
             problem = f"There is no recording {', '.join(conditions)}"
             return Chosen([], f"{problem}; {meant(wanted, known)}" if known else f"{problem}.")
-    return Chosen(choosing.summaries, "")
+    return Chosen(choosing.left, "")
 
 
 def topics_of_types(session: Session, types: Sequence[str], recordings: Sequence[str]) -> list[str]:
@@ -155,11 +152,9 @@ def topics_of_types(session: Session, types: Sequence[str], recordings: Sequence
     Raises:
         TopicError: There is none.
     """
-    snapshot = session.look(recordings)
-    places = snapshot.having(session.topics_of(recordings), recordings)
     found = {
         channel.topic: channel.type
-        for summary in snapshot.differing(places)
+        for summary in differing(session.look(recordings).some(recordings))
         for channel in session.entry_of(summary).channels
     }
     chosen = [topic for topic, name in found.items() if any(_is_type(name, one) for one in types)]
@@ -169,19 +164,6 @@ def topics_of_types(session: Session, types: Sequence[str], recordings: Sequence
     return sorted(chosen)
 
 
-def placed(session: Session, names: Iterable[str]) -> dict[int, None]:
-    """Positions of recordings by names and globs."""
-    snapshot = session.snapshot()
-    found: dict[int, None] = {}
-    for name in names:
-        if _GLOB & set(name) and not snapshot.called(name):
-            fitting = snapshot.matching(name) or snapshot.named(name)
-            found.update(dict.fromkeys(fitting))
-        else:
-            found.update(dict.fromkeys(session.named([name])))
-    return found
-
-
 class _Choosing:
     """Narrows down the recordings of a store, one condition after the other."""
 
@@ -189,57 +171,46 @@ class _Choosing:
         self._session = session
         self._answering = answering
         self._snapshot = session.snapshot()
-        self.left: list[int] = [*range(len(self._snapshot))]
-
-    @property
-    def summaries(self) -> list[RecordingSummary]:
-        """Those that are left. Positions are of the snapshot at hand: a later one sorts anew."""
-        return [self._snapshot.summaries[place] for place in self.left]
-
-    @property
-    def _places(self) -> NDArray[np.intp]:
-        import numpy as np  # the choices of a command need none
-
-        return np.array(self.left, np.intp)
-
-    @property
-    def _topics(self) -> list[str]:
-        """The topics of those that are left."""
-        return self._snapshot.topics_at(self._places)
+        self.left = self._snapshot.summaries
 
     def steps(self, choice: Choice) -> Iterator[_Step]:
         """Each condition, to be applied before the next one is asked for."""
         if choice.name:
             names = [one.name for one in self._snapshot.summaries]
             words = f"named {' or '.join(map(repr, choice.name))}"
-            yield placed(self._session, choice.name), words, choice.name[0], names
+            yield [*self._named(choice.name)], words, choice.name[0], names
         # See what those that go on have flushed.
-        ids = [summary.id for summary in self.summaries]
+        ids = [summary.id for summary in self.left]
         self._snapshot = self._session.look(ids)
-        self.left = sorted(self._snapshot.by_id[one] for one in ids)
-        tags = self._snapshot.tags
+        self.left = self._snapshot.some(ids)
         for key, value in choice.tag:
-            found = tags.get(key, {})
-            places = chain.from_iterable(
-                own for one, own in found.items() if value is None or one == value
-            )
+            tags = (item for one in self._snapshot.summaries for item in one.tags.items())
+            tagged = [
+                one for one in self.left if key in one.tags and value in {None, one.tags[key]}
+            ]
             words = key if value is None else f"{key}={value}"
-            known = [f"{name}={one}" for name, values in tags.items() for one in values]
-            yield places, f"with the tag {words}", words, known
+            yield tagged, f"with the tag {words}", words, {f"{k}={own}" for k, own in tags}
         for pattern in choice.has:
-            topics = fitting(pattern, self._topics)
-            having = self._snapshot.having(topics).tolist()
-            yield having, f"with the topic {pattern!r}", pattern, self._topics
+            topics = self._snapshot.topics_of(self.left)
+            having = self._snapshot.having(fitting(pattern, topics))
+            yield having, f"with the topic {pattern!r}", pattern, topics
         for name in choice.type:
-            types = self._snapshot.types
-            having = self._snapshot.with_types({one for one in types if _is_type(one, name)})
-            yield having.tolist(), f"with messages of the type {name!r}", name, [*types]
+            types = {one.type for one in self._snapshot.kinds} - {""}
+            typed = self._snapshot.with_types({one for one in types if _is_type(one, name)})
+            yield typed, f"with messages of the type {name!r}", name, types
         if choice.during is not None:
             yield self._in_time(*choice.during)
         if choice.older_than is not None:
             yield self._of_age(choice.older_than)
         for condition in choice.where:
             yield self._of_content(condition)
+
+    def _named(self, names: Iterable[str]) -> Iterator[RecordingSummary]:
+        for name in names:
+            if _GLOB & {*name}:
+                yield from self._snapshot.named(name, is_pattern=True)
+            else:
+                yield from self._session.named([name])
 
     def _in_time(self, begin: TimeLike | None, end: TimeLike | None) -> _Step:
         for moment in (begin, end):
@@ -249,14 +220,15 @@ class _Choosing:
                     "such as 2025-06-03, seconds since the epoch, `now`, `start` or `end`."
                 )
         low, high = parse_range(begin, end, start=0, end=TIME_LIMIT - 1)
-        places = self._snapshot.during(self._places, low, high, time.time_ns())
-        return places.tolist(), f"with messages from {begin or 'start'} to {end or 'end'}", "", ()
+        now = time.time_ns()
+        found = [one for one in self.left if overlaps(one, low, high, now)]
+        return found, f"with messages from {begin or 'start'} to {end or 'end'}", "", ()
 
     def _of_age(self, age: DurationLike) -> _Step:
         latest = time.time_ns() - parse_duration(age)
         old = [
-            place
-            for place, one in zip(self.left, self.summaries, strict=True)
+            one
+            for one in self.left
             if one.status != "open" and one.extent[0] < one.extent[1] <= latest + 1
         ]
         return old, f"whose last message is from {format_time(latest)} or before", "", ()
@@ -267,12 +239,12 @@ class _Choosing:
             raise UsageError(
                 f"Write TOPIC: PREDICATE, such as 'scan: ranges.min < 0.5', not {condition!r}."
             )
-        known = self._topics
+        known = self._snapshot.topics_of(self.left)
         topics = tuple(fitting(pattern, known))
-        there = sorted({*self._snapshot.having(topics).tolist()} & {*self.left})
-        found: list[int] = []
+        there = self._snapshot.having(topics, [one.id for one in self.left])
+        found: list[RecordingSummary] = []
         if there:
-            ids = tuple(self._snapshot.summaries[place].id for place in there)
+            ids = tuple(one.id for one in there)
             from hybridlog.query.question import Question
 
             question = Question(topics, ids)
@@ -283,9 +255,21 @@ class _Choosing:
                 question = replace(question, predicate=checked)
             assert self._answering is not None
             having = self._answering(self._session, question)
-            found = [self._snapshot.by_id[one] for one in having]
+            found = [one for one in there if one.id in having]
         words = f"with a message for which {condition!r} holds"
         return found, words, pattern, () if there else known
+
+
+def overlaps(one: RecordingSummary, low: int, high: int, now: int) -> bool:
+    """True if a recording has log times in `[low, high)`, ns.
+
+    One that is being written begins with its first known message, or when it was started, and
+    reaches until now.
+    """
+    begin, end = one.extent
+    if one.status == "open":
+        begin, end = begin if begin < end else one.created, max(end, now)
+    return begin < end and begin < high and end > low
 
 
 def _is_type(name: str, pattern: str) -> bool:

@@ -47,6 +47,7 @@ class ChunkColumns:
         number: int64[n], numbers of the chunks.
         first: int64[n], least log time of the channels, ns.
         last: int64[n], greatest log time, ns.
+        nbytes: Bytes in memory, about.
     """
 
     def __init__(
@@ -62,6 +63,7 @@ class ChunkColumns:
         self.parts["chunk"] = numbers[self._rows]
         for name in ("channel", "messages", "first", "last"):
             self.parts[name] = table.parts[name][self._rows]
+        self.nbytes = 2 * self.parts.nbytes + table.parts.nbytes
         self._starts = run_starts(self.parts["chunk"])
         self.number: NDArray[np.int64] = self.parts["chunk"][self._starts]
         self.first = placed(np.minimum.reduceat(self.parts["first"], self._starts))

@@ -19,7 +19,7 @@ from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.rows import RowBatch, Rows
 from hybridlog.schema.column import STAMP
 from hybridlog.schema.states import GONE
-from hybridlog.snapshot import UNFINISHED
+from hybridlog.snapshot import UNFINISHED, differing
 from hybridlog_storage.cache import lazy
 from hybridlog_storage.errors import TopicError, UsageError
 from hybridlog_storage.times import END
@@ -90,8 +90,7 @@ class Planner(Rows):
 
         The others have the same types, so these say what columns an answer has.
         """
-        places = self.session.chosen(self.question)
-        return self._channels_of(self.session.snapshot().differing(places))
+        return self._channels_of(differing(self.session.summaries_of(self.question)))
 
     def _channels_of(self, summaries: Iterable[RecordingSummary]) -> list[RecordedChannel]:
         wanted = set(self.question.topics)

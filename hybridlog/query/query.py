@@ -276,8 +276,7 @@ class Query:
         if chosen.problem:
             raise TopicError(chosen.problem)
         ids = [summary.id for summary in chosen.summaries]
-        topics, recordings = self.source.now().having(self.topics, ids)
-        return self._with(topics=topics, recordings=recordings)
+        return self._with(recordings=self.source.now().about(self.topics, ids).recordings)
 
     def during(self, intervals: Intervals) -> Query:
         """Only messages whose log time is in one of some intervals of their recording.
@@ -291,7 +290,9 @@ class Query:
         Raises:
             TopicError: an interval is of a recording that is not in the store.
         """
-        intervals = intervals.by_id(self.source.now().snapshot().ids_called())
+        session = self.source.now()
+        ids = {name: session.named([name])[0].id for name in intervals.recordings}
+        intervals = intervals.by_id(ids)
         return Query(self.source, self.question.within(intervals), conditions=self.conditions)
 
     def windows(self, before: DurationLike = 0, after: DurationLike = 0) -> Intervals:
@@ -643,9 +644,11 @@ def narrowed(query: Query, *topics: str) -> Query:
     If the question is about several recordings, tables of each topic name them.
     """
     session, question = query.source.now(), query.question
-    several = question.names_recording or len(session.chosen(question)) > 1
-    names, chosen = session.having(topics, question.recordings)
-    question = replace(question, topics=names, recordings=chosen, names_recording=several)
+    several = question.names_recording or len(session.summaries_of(question)) > 1
+    about = session.about(topics, question.recordings)
+    question = replace(
+        question, topics=topics, recordings=about.recordings, names_recording=several
+    )
     return Query(query.source, question, conditions=query.conditions)
 
 
@@ -661,8 +664,7 @@ def at_time(query: Query, moment: TimeLike) -> Query:
     only: dict[str, Any] = {"recordings": (found.recording,), "bounds": span_of(time, time)}
     only |= {"clock": "log", "reverse": True, "limit": 1, "every": 1}
     question = replace(query.question, **only)
-    snapshot = now.source.now().snapshot()
-    start, end = snapshot.summaries[snapshot.by_id[found.recording]].extent
+    start, end = now.source.now().snapshot().by_id[found.recording].extent
     latest = max(parse_time(moment, start=start, end=end), time)
     since = Query(query.source, replace(question, bounds=(time, latest + 1)))
     return Query(query.source, question, conditions=(*query.conditions, since))

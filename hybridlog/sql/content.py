@@ -12,7 +12,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
 import pyarrow as pa
 from msgspec.structs import replace
 
@@ -61,11 +60,8 @@ class StoreContent:
         self.session = session
         self.scope = scope
         self.snapshot = session.look()
-        places = np.arange(len(self.snapshot))
-        if scope.recordings is not None:
-            places = session.chosen(scope)
-        self.summaries = [self.snapshot.summaries[place] for place in places.tolist()]
-        topics = self.snapshot.topics_at(places)
+        self.summaries = session.some(scope.recordings)
+        topics = self.snapshot.topics_of(self.summaries)
         found = RangeResolver(session, replace(scope, topics=tuple(topics))).resolve()
         self.resolved = {one.summary.id: one for one in found}
         # Of names that differ in case, the one in lower case stays as it is.
@@ -103,8 +99,7 @@ class StoreContent:
 
     def summaries_of(self, topic: str) -> list[RecordingSummary]:
         """Recordings that have a topic, oldest first."""
-        places = self.snapshot.having([topic], self.scope.recordings)
-        return [self.snapshot.summaries[place] for place in places.tolist()]
+        return self.snapshot.having([topic], self.scope.recordings)
 
     def view(self, name: str) -> TopicView | None:
         """The view of a name; None if there is none."""

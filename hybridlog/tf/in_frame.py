@@ -115,9 +115,8 @@ class _Looked:
     def _of(self, recording: str) -> Trees | TopicError:
         """The trees of a recording, or why the frame asked for is not there."""
         if recording not in self._trees:
-            snapshot, topic = self.session.look([recording]), self.question.topics[0]
-            summary = snapshot.summaries[snapshot.by_id[recording]]
-            trees = Trees(self.session, [summary], self.question.tf_topics)
+            topic = self.question.topics[0]
+            trees = Trees(self.session, self.session.some([recording]), self.question.tf_topics)
             try:
                 trees.check(topic, str(self.question.frame))
                 self._trees[recording] = trees
@@ -236,7 +235,7 @@ def _tables_of_points(planner: Planner, looked: _Looked) -> Iterator[pa.Table]:
     question = planner.question
     if question.fields is not None:
         raise UsageError("Points in a frame have the fields of their points: leave out fields.")
-    several = question.names_recording or len(planner.session.chosen(question)) > 1
+    several = question.names_recording or len(planner.session.summaries_of(question)) > 1
     names = {one.id: one.name for one in planner.session.snapshot().summaries}
     table = None
     for message, time, points in _points_of(looked):
@@ -287,7 +286,7 @@ def _tables_of_poses(planner: Planner, looked: _Looked) -> Iterator[pa.Table]:
             "so it cannot be in another frame."
         )
     poses, stamp, frame = places
-    several = question.names_recording or len(session.chosen(question)) > 1
+    several = question.names_recording or len(session.summaries_of(question)) > 1
     hidden = set() if several else {"recording"}
     plain = replace(question, frame=None, names_recording=True)
     if (asked := question.fields) is not None:
@@ -295,13 +294,13 @@ def _tables_of_poses(planner: Planner, looked: _Looked) -> Iterator[pa.Table]:
         added = [path for path in used if not any(f"{path}.".startswith(f"{o}.") for o in asked)]
         hidden |= {*added}
         plain = replace(plain, fields=(*asked, *added))
-    ids = session.snapshot().ids_called()
+    known = session.summaries_of(question)
+    ids = {one.name: one.id for one in known}
+    if len(ids) < len(known):
+        raise TopicError("Two of these recordings have one name: ask about one by its id.")
     for table in answer.stream(Planner(session, plain, planner.counters)):
-        names = table["recording"].to_pylist()
-        if not ids.keys() >= {*names}:
-            raise TopicError("Two of these recordings have one name: ask about one by its id.")
         moved = looked.transforms(
-            [ids[name] for name in names],
+            [ids[name] for name in table["recording"].to_pylist()],
             [str(name or "") for name in table[frame].to_pylist()],
             table[stamp].cast(pa.int64()).fill_null(0).to_numpy(),
             table["log_time"].cast(pa.int64()).to_numpy(),

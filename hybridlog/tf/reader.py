@@ -95,8 +95,7 @@ def epochs_of(session: Session, recording: str) -> Epochs:
     They begin where `/clock` goes back; without it, where most topics fall behind their greatest
     stamp together. No message is read if no topic's stamps fall behind log time.
     """
-    snapshot = session.look([recording])
-    summary = snapshot.summaries[snapshot.by_id[recording]]
+    (summary,) = session.some([recording])
     entry = session.entry_of(summary)
     known = session.shared.epochs.get(recording)
     if known is not None and known[0] is entry:

@@ -147,7 +147,6 @@ class Model:
 
     def put(self, catalog: Catalog, *, decoded: bool = True) -> None:
         catalog.put([(self.summary, topic_types(self.entry))])
-        catalog.put_schemas(one for one in SCHEMAS.values() if one is not None)
         if decoded:
             for number, decoded in enumerate(decoded_by(self)):
                 catalog.put_decoded(self.id, number, self.entry.digests[str(number)], decoded)
@@ -311,10 +310,7 @@ class Truth:
         assert not summaries
         for one in catalog.summaries():  # or unreadable chunks would be forgotten
             assert one.indexed_by == ("an index" if catalog.damage(one.id) else "")
-        known = {schema_hash(s): s for s in SCHEMAS.values() if s is not None}
-        found_schemas = catalog.schemas(known)
-        assert found_schemas.items() <= known.items()
-        return complete and found_schemas == known
+        return complete
 
 
 @pytest.fixture(scope="module")

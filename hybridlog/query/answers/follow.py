@@ -61,12 +61,11 @@ class Arrivals(Planner):
     def look(self, session: Session) -> tuple[Iterator[MessageRun], bool]:
         """The messages that have come since the last look, and whether more will."""
         self.session = session
-        places = session.chosen(self.question)
-        snapshot = session.snapshot()
-        new = [t for t in snapshot.topics_at(places) if t not in self.question.topics]
+        summaries = session.summaries_of(self.question)
+        known = session.snapshot().topics_of(summaries)
+        new = [t for t in known if t not in self.question.topics]
         topics = (*self.question.topics, *filter(self._takes, new))
         self.question = replace(self.question, topics=topics)
-        summaries = [snapshot.summaries[place] for place in places.tolist()]
         parts: list[Part] = []
         for one in summaries:
             entry = session.entry_of(one)
@@ -140,7 +139,6 @@ class Following(Arrivals, Iterator["Message"]):
         session = source.now()
         if session is source:
             raise UsageError("In a snapshot nothing new is seen: follow in the store itself.")
-        session = session.again()
         running = [
             session.entry_of(one)
             for one in session.look(wanted).summaries
@@ -171,7 +169,7 @@ class Following(Arrivals, Iterator["Message"]):
         goes_on = True
         while goes_on:
             started = time.monotonic()
-            runs, goes_on = self.look(self._source.now().again())
+            runs, goes_on = self.look(self._source.now())
             for run in runs:
                 yield run
                 safe_point()

@@ -105,11 +105,11 @@ class IntervalQueries:
         if parse_duration(before) == parse_duration(after) == 0 and not are_marks:
             raise UsageError("A window needs a length: give before, after or both.")
         found = [*(self._lasting() if are_marks else self._moments())]
-        snapshot = self._session.snapshot()
-        known = {name: snapshot.summaries[snapshot.by_id[name]] for name, _ in found}
+        known = self._session.snapshot().by_id
         # Windows that begin together are in the order of the recordings' keys.
         ordered = sorted(found, key=lambda item: known[item[0]].key)
-        whole = {name: (0, END) if one.span is None else one.extent for name, one in known.items()}
+        chosen = [(name, known[name]) for name, _ in found]
+        whole = {name: (0, END) if one.span is None else one.extent for name, one in chosen}
         return Intervals(ordered).widened(before, after).within(whole)
 
     def _lasting(self) -> Iterator[tuple[str, NDArray[np.int64]]]:

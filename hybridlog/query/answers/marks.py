@@ -43,8 +43,8 @@ class Mark(NamedTuple):
 
 def mark_topics(session: Session, recordings: Collection[str] | None = None) -> tuple[str, ...]:
     """Full names of the topics with marks in some recordings (ids), or in all."""
-    snapshot = session.look(recordings)
-    return snapshot.topics_with([n for n in snapshot.types if plain_type(n) in {MARK, EVENT}])
+    known = session.look(recordings).kinds
+    return tuple(sorted({one.topic for one in known if plain_type(one.type) in {MARK, EVENT}}))
 
 
 def marks(session: Session, question: Question, counters: Counters | None = None) -> Iterator[Mark]:
@@ -66,8 +66,7 @@ def marks(session: Session, question: Question, counters: Counters | None = None
 def marks_in(session: Session, recordings: Collection[str]) -> Iterator[Mark]:
     """All marks of some recordings, in order of log time."""
     topics = mark_topics(session, recordings)
-    places = session.snapshot().having(topics)
-    having = {session.snapshot().summaries[place].id for place in places.tolist()}
+    having = {one.id for one in session.snapshot().having(topics)}
     chosen = tuple(one for one in recordings if one in having)
     if chosen:
         yield from marks(session, Question(topics, chosen))
