@@ -430,7 +430,7 @@ class Session:
         entry = self.entry(recording)
         if number in entry.flushed:
             return entry.flushed[number].reader
-        if str(number) not in entry.digests and self._has_let_go(recording, number):
+        if number not in entry.logs:
             raise _changed(entry)
         try:
             return self.shared.segment(entry, number)
@@ -443,16 +443,10 @@ class Session:
 
         A `ChangedError` says that one has been let go.
         """
-        numbers = [*map(int, recording.digests)]
-        has_let_go = len(numbers) <= max(numbers, default=-1)
+        has_let_go = len(recording.logs) <= max(recording.logs, default=-1)
         if recording.status in UNFINISHED and has_let_go:
             for number in segments:
                 self.segment(recording.id, number)
-
-    def _has_let_go(self, recording: str, number: int) -> bool:
-        """True if a ring has let a segment go."""
-        now = self.directory.manifests.find(recording)
-        return now is not None and number not in now.logs and now.has_let_go(number)
 
     def read_chunk(self, recording: str, number: int, place: ChunkPlace) -> StoredChunk:
         """Read a chunk of a segment of a recording, by its id."""
@@ -473,9 +467,7 @@ class Session:
         """
         summary = self._recordings.by_id.get(entry.id)
         look = None if summary is None else summary.look
-        if self.directory.looks([entry.id]).get(entry.id) == look or (problem and look == ""):
-            if not problem:
-                return
+        if problem and look in {"", self.directory.looks([entry.id]).get(entry.id)}:
             known = self.catalog.damage(entry.id)
             self.catalog.put_damage(entry.id, {**known, (number, WHOLE): problem})
             put_entry(self.directory, self.catalog, entry.id)
@@ -483,10 +475,8 @@ class Session:
         now = self.shared.now().find(entry.id)
         if now is None:
             raise gone(entry.name)
-        is_there = str(number) in now.digests or number in now.flushed
-        if not problem and not is_there and not self._has_let_go(entry.id, number):
-            return  # it is lost: the caller's own error says so
-        if _file_in(now, number) != _file_in(entry, number):
+        was_flushed = number in entry.flushed
+        if now.logs.get(number) != entry.logs.get(number) or was_flushed != (number in now.flushed):
             self._entries[entry.id] = now
             raise _changed(entry)
 
@@ -499,12 +489,6 @@ class Session:
         if recording.status in UNFINISHED or has_marks or any(True for _ in lost_spans(recording)):
             return None
         return self.tables.of(recording, topic)
-
-
-def _file_in(entry: RecordingEntry, number: int) -> tuple[object, ...]:
-    """Tells a segment of a recording from a later file of its number."""
-    key = str(number)
-    return entry.digests.get(key), entry.files.get(key), number in entry.flushed
 
 
 def _changed(recording: RecordingEntry) -> ChangedError:

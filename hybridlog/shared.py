@@ -104,9 +104,8 @@ class Shared:
             running = self._running[summary.id] = RunningRecording(
                 self.directory, summary.id, partial(self.entry, summary)
             )
-        running.follow()
+        entry = running.follow()
         self.schemas |= running.schemas
-        entry = running.entry
         if entry is None or entry.status not in UNFINISHED:
             del self._running[summary.id]
             self._drop_files()  # it may have tables now

@@ -6,16 +6,15 @@ the rest is read from the open segments, each byte once.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from msgspec.structs import replace
 
-from hybridlog.entries import loss_values, topic_types
+from hybridlog.entries import loss_values
 from hybridlog.record.losses import Cause, joined
 from hybridlog.snapshot import UNFINISHED
-from hybridlog_storage.catalog import ChannelEntry, channel_entry, channel_totals
+from hybridlog_storage.catalog import channel_entry, channel_totals
 from hybridlog_storage.disk.directory import is_stable
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.manifest import Loss
@@ -26,7 +25,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.messages import Schema
-    from hybridlog_storage.summary import TopicType
 
 
 class RunningRecording:
@@ -35,11 +33,9 @@ class RunningRecording:
     Args:
         directory: The store.
         recording: Id of the recording.
-        sealed: Returns its entry by the catalog, with what is sealed; None if it is gone.
+        sealed: Returns its entry with what is sealed; None if it is gone.
 
     Attributes:
-        entry: The recording at the last look; None if it is gone.
-        topics: Its topics and their types.
         schemas: Schemas of segments that are not sealed, by hash.
     """
 
@@ -49,80 +45,68 @@ class RunningRecording:
         recording: str,
         sealed: Callable[[], RecordingEntry | None],
     ) -> None:
-        self._directory = directory
-        self._recording = recording
-        self._read_sealed = sealed
-        self._sealed: RecordingEntry | None = None
+        self._directory, self._recording, self._read_sealed = directory, recording, sealed
         self._state = "", False  # the look of its directory, and whether it is being written
+        self._sealed: RecordingEntry | None = None
+        self._entry: RecordingEntry | None = None
         self._segments: dict[int, Walk] = {}
         self._unreadable: dict[int, str] = {}  # why, by number of the segment
-        self.entry: RecordingEntry | None = None
-        self.topics: frozenset[TopicType] = frozenset()
         self.schemas: dict[str, Schema] = {}
 
-    def follow(self) -> bool:
-        """See what was flushed, sealed or begun since.
-
-        Returns:
-            True if the entry has changed.
+    def follow(self) -> RecordingEntry | None:
+        """The recording with what was flushed, sealed or begun since; None if it is gone.
 
         Raises:
             StoreError: Its files cannot be read.
         """
         look = self._directory.looks([self._recording]).get(self._recording, "")
         state = look, self._directory.is_recorded(self._recording)
-        is_same = state == self._state
-        if not is_same:
+        is_new = state != self._state
+        if is_new:
             self._begin()
-        before = dict(self._unreadable)
-        is_new = False
         for number, segment in self._segments.items():
-            with self._noting(number):
+            before = self._unreadable.pop(number, "")
+            try:
                 is_new |= segment.follow()
-        if is_same and not is_new and before == self._unreadable:
-            return False
-        # What is created within a tick of the file system's clock leaves the look as it is.
-        self._state = state if is_stable(look) else ("", False)
-        self.entry = None if self._sealed is None else self._with_flushed(self._sealed)
-        self.topics = frozenset() if self.entry is None else topic_types(self.entry)
-        return True
-
-    @contextmanager
-    def _noting(self, number: int) -> Iterator[None]:
-        """Note why a segment cannot be read; the other ones answer."""
-        try:
-            yield
-            self._unreadable.pop(number, None)
-        except SegmentError as error:
-            self._unreadable[number] = str(error)
+            except SegmentError as error:  # the other ones answer
+                self._unreadable[number] = str(error)
+            is_new |= self._unreadable.get(number, "") != before
+        if is_new:
+            # What is created within a tick of the file system's clock leaves the look as it is.
+            self._state = state if is_stable(look) else ("", False)
+            self._entry = None if self._sealed is None else self._with_flushed(self._sealed)
+        return self._entry
 
     def _begin(self) -> None:
         """Read again what is sealed, and open the segments that are not."""
         # Listed first: what is sealed meanwhile is then in neither, or in both.
         opened = self._directory.listing(self._recording).open
-        self._sealed = self._read_sealed()
-        before, self._segments = self._segments, {}
-        self._unreadable.clear()
-        if self._sealed is None or self._sealed.status not in UNFINISHED:
+        sealed = self._sealed = self._read_sealed()
+        before, self._segments, self._unreadable = self._segments, {}, {}
+        if sealed is None or sealed.status not in UNFINISHED:
             return
         path = self._directory.recording(self._recording)
         for number in opened:
-            if str(number) in self._sealed.digests:
-                continue
-            with self._noting(number):
-                self._segments[number] = before.get(number) or Walk.opened(path, number)
+            if str(number) not in sealed.digests:
+                try:
+                    self._segments[number] = before.get(number) or Walk.opened(path, number)
+                except SegmentError as error:
+                    self._unreadable[number] = str(error)
 
     def _with_flushed(self, sealed: RecordingEntry) -> RecordingEntry:
         """The entry with what is flushed besides."""
-        channels = {channel.id: replace(channel) for channel in sealed.channels}
+        channels = {one.id: replace(one, stats=replace(one.stats)) for one in sealed.channels}
         found = replace(sealed, spans=list(sealed.spans), flushed=dict(sealed.flushed))
         for number, segment in self._segments.items():
             found.flushed[number] = segment.flushed
             table, attachments, metadata, _ = segment.flushed
-            self._add_channels(channels, segment)
-            for channel_id, stats in channel_totals(table).items():
-                total = channels[channel_id].stats = replace(channels[channel_id].stats)
-                total.add(stats)
+            for own, channel in segment.channels.items():
+                if own not in channels:
+                    channels[own] = one = channel_entry(own, channel)
+                    if channel.schema is not None and one.schema is not None:
+                        self.schemas[one.schema] = channel.schema
+            for own, stats in channel_totals(table).items():
+                channels[own].stats.add(stats)
             if len(table.parts):
                 span = int(table.parts["first"].min()), int(table.parts["last"].max())
                 found.spans.append((number, *span))
@@ -133,35 +117,26 @@ class RunningRecording:
             found.attachments += len(attachments)
             found.metadata_records += len(metadata)
         found.channels = [channels[number] for number in sorted(channels)]
-        found.losses = list(_losses(sealed, self._segments, self._unreadable))
+        found.losses = self._losses(sealed.losses)
         return found
 
-    def _add_channels(self, channels: dict[int, ChannelEntry], segment: Walk) -> None:
-        for number, channel in segment.channels.items():
-            if number not in channels:
-                channels[number] = found = channel_entry(number, channel)
-                if channel.schema is not None and found.schema is not None:
-                    self.schemas[found.schema] = channel.schema
+    def _losses(self, sealed: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+        """The loss ledger: what sealed segments and flushed records say, and what is damaged."""
+        flushed = [loss_values(row) for one in self._segments.values() for row in one.losses]
+        damaged: list[tuple[int, str, int | None, int | None]] = [
+            (number, damage.reason, damage.offset, damage.length)
+            for number, segment in self._segments.items()
+            for damage in segment.damaged
+        ]
+        damaged += [(number, reason, None, None) for number, reason in self._unreadable.items()]
+        return [
+            *joined([*(row for row in sealed if row["cause"] != Cause.SEGMENT), *flushed]),
+            *(row for row in sealed if row["cause"] == Cause.SEGMENT),
+            *(_damaged(*one) for one in damaged),
+        ]
 
 
-def _losses(
-    sealed: RecordingEntry, segments: Mapping[int, Walk], unreadable: Mapping[int, str]
-) -> Iterator[dict[str, Any]]:
-    """The loss ledger: what sealed segments and flushed records say, and what is damaged."""
-    rows = [row for row in sealed.losses if row["cause"] != Cause.SEGMENT]
-    flushed = (loss_values(row) for one in segments.values() for row in one.losses)
-    yield from joined([*rows, *flushed])
-    yield from (row for row in sealed.losses if row["cause"] == Cause.SEGMENT)
-    for number, segment in segments.items():
-        for damage in segment.damaged:
-            yield _damaged(number, damage.reason, damage.offset, damage.length)
-    for number, reason in unreadable.items():
-        yield _damaged(number, reason)
-
-
-def _damaged(
-    number: int, reason: str, offset: int | None = None, length: int | None = None
-) -> dict[str, Any]:
+def _damaged(number: int, reason: str, offset: int | None, length: int | None) -> dict[str, Any]:
     """A row for an unknown number of messages at unknown times."""
     file = f"{number:06d}{OPEN_SUFFIX}"
     return loss_values(Loss(Cause.SEGMENT, reason=reason, file=file, offset=offset, length=length))
