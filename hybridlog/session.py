@@ -28,7 +28,6 @@ from hybridlog.wording import counted, listed
 from hybridlog_storage.catalog import WHOLE, file_of
 from hybridlog_storage.disk.directory import gone
 from hybridlog_storage.errors import (
-    CatalogError,
     ChangedError,
     SegmentError,
     StoreError,
@@ -362,7 +361,7 @@ class Session:
         """The chunks of a recording's segment; a `ChangedError` if its file is another one."""
         try:
             return self.catalog.table(recording, number)
-        except CatalogError as error:
+        except SegmentError as error:
             self._check_same(recording, number, str(error))
             raise StoreError(f"{error} Ask again.") from error
 

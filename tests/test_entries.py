@@ -32,7 +32,7 @@ from hybridlog_storage.catalog import WHOLE, Catalog, RecordingEntry
 from hybridlog_storage.cells import Cells
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import Listing, StoreDirectory
-from hybridlog_storage.errors import CatalogError, ManifestError, SegmentError
+from hybridlog_storage.errors import ManifestError, SegmentError
 from hybridlog_storage.manifest import File, Loss, Manifest, Note, Part, Source, new_id, with_rows
 from hybridlog_storage.manifest import replace as changed
 from hybridlog_storage.manifests import MANIFEST_OLD
@@ -439,7 +439,7 @@ def test_chunks_of_another_segment_are_refused(made: Made) -> None:
         entry = made.entry()
         assert len(empty.table(entry, 0).chunks)
         changed = replace(entry, files={"0": "000001.mcap"})
-        with pytest.raises(CatalogError, match="has changed"):
+        with pytest.raises(SegmentError, match="has changed"):
             empty.table(changed, 0)
-        with pytest.raises(CatalogError, match="cannot be opened"):
+        with pytest.raises(SegmentError, match="cannot be opened"):
             empty.table(entry, 99)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import random
 import resource
 import shutil
 import signal
@@ -29,7 +30,6 @@ from hybridlog_storage.errors import (
 from hybridlog_storage.mongo.database import Database
 from tests.calls import Calls
 from tests.cli.running import run
-from tests.damage import OF_MONGOD
 from tests.indexed import EVERYTHING, misindexed
 from tests.servers.mongods import Mongod, free_port
 from tests.some import in_turn
@@ -41,7 +41,6 @@ TOPICS = ["/imu/data", "/base/scan", "/joint_states"]
 IMU, SCAN = TOPICS[:2]
 WHERE = "header.seq >= 100"
 NOWHERE = "mongodb://127.0.0.1:1/none?serverSelectionTimeoutMS=1"
-REPLACED = "The data files of the embedded MongoDB were damaged, and were replaced.\n"
 
 
 @pytest.fixture(scope="module")
@@ -87,32 +86,24 @@ def documents(store: hl.Store) -> list[int]:
 # --- damaged data files ---
 
 
-@pytest.mark.parametrize("way", ["turtle garbled", "collection removed"])
-def test_a_damaged_index_is_made_again(store: Path, way: str) -> None:
-    OF_MONGOD[way](store / "mongod" / "data")
-    said = "".join(run("index", "rebuild", store=store).err for _ in range(2))
-    assert said == REPLACED
-
-
-def test_the_running_question_is_answered(store: Path) -> None:
-    """mongod ends when it reads the damaged file; the answer says what the new index lacks."""
+def test_damaged_data_files_are_told_and_what_is_removed_is_made_again(store: Path) -> None:
     with hl.open(store) as opened:
         want = documents(opened)
-        scans = [m.seq for m in opened.topic(SCAN).where(WHERE)]
     ended(store)
-    OF_MONGOD["collection garbled"](store / "mongod" / "data")
-    with hl.open(store, require_database=True) as opened:
-        asked = opened.topic(IMU).where(EVERYTHING)
-        assert asked.count() + asked.counters.unindexed == want[0]
-        assert [m.seq for m in opened.topic(SCAN).where(WHERE)] == scans
-        opened.shared.index.connect()
-        assert documents(opened) == want
-        assert len(opened.shared.repairs.damage) == 1
-        assert sorted(opened.shared.repairs.indexed) == ["one", "two"]
-    ended(store)
+    garble(store / "mongod" / "data")
+    said = run("index", "rebuild", store=store, code=6).err
+    assert f"remove {store / 'mongod'}, and the index is made again" in said
+    assert hl.open(store).topic(IMU).where(WHERE).count() > 0
+    shutil.rmtree(store / "mongod")
+    run("index", "rebuild", store=store)
     with hl.open(store) as opened:
         assert documents(opened) == want
-        assert not opened.shared.repairs.damage
+
+
+def garble(data: Path) -> None:
+    """mongod does not start then."""
+    turtle = data / "WiredTiger.turtle"
+    turtle.write_bytes(random.Random(1).randbytes(turtle.stat().st_size))
 
 
 def test_a_foreign_mongodb_is_only_told_about(store: Path, tmp_path: Path) -> None:
@@ -122,7 +113,7 @@ def test_a_foreign_mongodb_is_only_told_about(store: Path, tmp_path: Path) -> No
         data = tmp_path / "other"
         assert want
     shutil.copytree(data, tmp_path / "kept")
-    OF_MONGOD["turtle garbled"](data)
+    garble(data)
     before = sorted(p.name for p in data.iterdir())
     with hl.open(store, mongo=f"{uri}&serverSelectionTimeoutMS=300") as opened:
         with pytest.raises(DatabaseError, match="does not answer"):
@@ -178,7 +169,6 @@ def test_work_goes_on_though_its_mongod_was_killed(
         WORK[work](opened, template.parent / "one.bag")
         assert misindexed(opened) == {}
         assert opened.shared.index.unavailable is None
-        assert not opened.shared.repairs.damage
         assert not opened.shared.repairs.indexed
         if work == "ask":
             assert documents(opened) == want

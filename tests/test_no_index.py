@@ -76,7 +76,8 @@ def test_every_rebuild_keeps_it(store: hl.Store) -> None:
     assert documents(store) == INDEXED
     store.index.rebuild(["log"])
     assert documents(store) == INDEXED
-    store.shared.index.database_for("this test").drop_all()
+    database = store.shared.index.database_for("this test")
+    database.run(lambda db: db.client.drop_database(db.name))
     path = store.directory.path
     store.close()
     (path / CATALOG).unlink()

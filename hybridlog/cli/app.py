@@ -164,11 +164,8 @@ def _repairs(store: Store, doing: str, *, verifies: bool) -> list[str]:
     directory = store.directory
     if not (directory.is_writable or directory.is_remote or directory.read_only):
         found.append(f"The store {store.directory.path} is read-only; its segments answer.")
-    if repairs.damage:
-        found.append("The data files of the embedded MongoDB were damaged, and were replaced.")
     reason = store.shared.index.unavailable
     is_wanted = reason is not None and not isinstance(reason, WithoutMongoError)
     if doing and is_wanted and store.directory.is_writable:
         found.append(f"MongoDB is unavailable, {doing}: {reason}")
-    repairs.damage.clear()
     return found

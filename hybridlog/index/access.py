@@ -47,7 +47,7 @@ _REST_S = 10.0
 def again_if_lost(work: Callable[_P, _T]) -> Callable[_P, _T]:
     """Do something once more if the connection to MongoDB was lost.
 
-    The new connection has started a MongoDB that had ended, and replaced damaged data files.
+    The new connection has started a MongoDB that had ended.
     """
 
     @wraps(work)
@@ -255,13 +255,10 @@ class IndexAccess:
         if self._mongod is None:
             self._mongod = EmbeddedMongod(self._directory.mongod)
         try:
-            uri = self._mongod.start()
+            return self._mongod.start()
         except StoreError as error:
             # A read-only store has no embedded MongoDB, but its segments can be read.
             raise DatabaseError(str(error)) from error
-        if self._mongod.damage is not None:
-            self._shared.repairs.damage.append(self._mongod.damage)
-        return uri
 
     def _connect(self, *, brings: bool) -> Database:
         from hybridlog.maintenance.derived import StoreIndex
@@ -304,7 +301,8 @@ class IndexAccess:
         if owner is not None and owner.store != store_id:
             if self._named != EMBEDDED:
                 raise other_store(database)
-            database.drop_all()  # the store is a copy that has an id of its own now
+            # The store is a copy that has an id of its own now.
+            database.run(lambda db: db.client.drop_database(db.name))
             owner = None
         if owner is None and self.may_write:
             owner = self.claim(database)

@@ -108,9 +108,10 @@ class Index:
         database = self._shared.index.database_for("An index", writes=True)
         query.fields(*(name for name in fields if name not in _OWN_FIELDS))
         keys = _keys(fields)
-        for name in map(collection_of, query.topics):
+        names = [*map(collection_of, query.topics)]
+        for name in names:
             database.ensure_collection(name)
-            database.create_index(name, keys)
+        database.run(lambda db: [db[name].create_index(keys) for name in names])
         return _indexes(database, query.topics)
 
     @again_if_lost
@@ -123,7 +124,11 @@ class Index:
         query = self._about(topic)
         database = self._shared.index.database_for("An index", writes=True)
         keys = _keys(fields)
-        return sum(database.drop_index(collection_of(name), keys) for name in query.topics)
+        names = [*map(collection_of, query.topics)]
+        names = [name for name in names if tuple(keys) in database.indexes(name)]
+        for name in names:
+            database.run(lambda db, name=name: db[name].drop_index(keys))  # type: ignore[misc]
+        return len(names)
 
     @again_if_lost
     def list(self, *topics: str) -> _FieldIndexes:

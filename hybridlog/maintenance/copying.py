@@ -31,7 +31,7 @@ from hybridlog_storage.errors import (
     UsageError,
 )
 from hybridlog_storage.manifest import free_name
-from hybridlog_storage.manifests import RECORDINGS
+from hybridlog_storage.manifests import MANIFESTS, RECORDINGS
 from hybridlog_storage.remote import address_of
 
 if TYPE_CHECKING:
@@ -193,7 +193,7 @@ class Copying:
             return False  # nothing of it can be deleted
         try:
             with self._source.marked() as mark:
-                return self._place.sees(mark)
+                return mark in self._place.sizes(MANIFESTS)
         except StoreError:
             if self.options.then_expire:
                 raise

@@ -95,7 +95,7 @@ class StoreFiles(Struct):
             self._left.add(recording)  # its removal was interrupted
             return None
         except StoreError:
-            if self.directory.has(recording):
+            if recording in self.directory.looks([recording]):
                 raise
             return None  # another process has just removed it
         if seen.has_left:

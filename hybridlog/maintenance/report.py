@@ -44,14 +44,12 @@ class RepairReport(Struct):
         indexed: Recordings whose index was behind, and the number of missing chunks.
         removed: Recordings whose removal was finished, or whose files are gone.
         unreadable: Ids of recordings that could not be repaired, and the reason.
-        damage: Reasons why data files of the embedded MongoDB were replaced by empty ones.
     """
 
     recovered: dict[str, list[Recovered]] = field(default_factory=dict)
     indexed: dict[str, int] = field(default_factory=dict)
     removed: list[str] = field(default_factory=list)
     unreadable: dict[str, str] = field(default_factory=dict)
-    damage: list[str] = field(default_factory=list)
 
 
 class ArraysOfTopic(Struct):

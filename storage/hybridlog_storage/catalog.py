@@ -20,7 +20,7 @@ from msgspec.structs import replace
 
 from hybridlog_storage.cache import Cache
 from hybridlog_storage.cells import Cells, drop, put
-from hybridlog_storage.errors import CatalogError, SegmentError
+from hybridlog_storage.errors import SegmentError, StoreError
 from hybridlog_storage.manifest import File, Manifest
 from hybridlog_storage.manifests import RECORDINGS
 from hybridlog_storage.messages import EXPIRED_IDS, Channel, schema_hash
@@ -89,9 +89,12 @@ class ChannelStats(Struct):
         for name in _COUNTS:
             setattr(self, name, getattr(self, name) + getattr(other, name))
         for name in ("first", "first_stamp", "skew_min"):
-            setattr(self, name, _least(getattr(self, name), getattr(other, name)))
+            setattr(self, name, min(self._both(other, name), default=None))
         for name in ("last", "last_stamp", "skew_max"):
-            setattr(self, name, _greatest(getattr(self, name), getattr(other, name)))
+            setattr(self, name, max(self._both(other, name), default=None))
+
+    def _both(self, other: ChannelStats, name: str) -> list[int]:
+        return [value for one in (self, other) if (value := getattr(one, name)) is not None]
 
 
 class ChannelEntry(Struct):
@@ -293,7 +296,7 @@ class Catalog:
         """A set of topics and their types, by its hash, which a summary has."""
         found = self._set(digest)
         if found is None:
-            raise CatalogError(f"The catalog of {self._store} has lost topics. Ask again.")
+            raise StoreError(f"The catalog of {self._store} has lost topics. Ask again.")
         return found
 
     def _set(self, digest: str) -> tuple[TopicType, ...] | None:
@@ -326,7 +329,7 @@ class Catalog:
     # Chunks.
 
     def table(self, entry: RecordingEntry, number: int) -> ChunkTable:
-        """The chunks of a segment, from its footer; `CatalogError` if that is another one."""
+        """The chunks of a segment, from its footer; `SegmentError` if that is another one."""
         if number in entry.flushed:
             return entry.flushed[number].table
         digest = entry.digests.get(str(number), "")
@@ -341,15 +344,12 @@ class Catalog:
 
     def _read_table(self, entry: RecordingEntry, number: int, digest: str) -> ChunkTable:
         path = self._store / RECORDINGS / entry.id / file_of(entry, number)
-        try:
-            with open_log(path, number) as reader:
-                is_ours = not isinstance(reader, GoneLog) or digest == reader.digest()
-                summary = reader.summary()
-        except SegmentError as error:
-            raise CatalogError(str(error)) from error
+        with open_log(path, number) as reader:
+            is_ours = not isinstance(reader, GoneLog) or digest == reader.digest()
+            summary = reader.summary()
         channels = {one.id: (one.topic, one.schema) for one in entry.channels}
         if not is_ours or not is_of(summary, entry.id, entry.logs.get(number), channels, number):
-            raise CatalogError(f"Segment {path} has changed since the store was opened.")
+            raise SegmentError(f"Segment {path} has changed since the store was opened.")
         return summary.table
 
 
@@ -423,11 +423,3 @@ def channel_entry(channel_id: int, channel: Channel) -> ChannelEntry:
         has_publish_time=channel.has_publish_time,
         is_indexed=channel.is_indexed,
     )
-
-
-def _least(a: int | None, b: int | None) -> int | None:
-    return b if a is None else a if b is None else min(a, b)
-
-
-def _greatest(a: int | None, b: int | None) -> int | None:
-    return b if a is None else a if b is None else max(a, b)

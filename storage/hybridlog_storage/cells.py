@@ -35,7 +35,6 @@ _TABLE: Final = (
 )
 _SELECT: Final = "SELECT kind, key, number, body, crc FROM cells WHERE kind = ? AND"
 _AMONG: Final = "key IN (SELECT value FROM json_each(?))"
-_ASIDE: Final = ("-journal", "-wal", "-shm")  # what SQLite would read or write, too
 _WAIT_S: Final = 0.1  # for other processes, once: then memory takes the place of the file
 _MAX_BYTES: Final = 1 << 28  # of a cell
 _ERRORS: Final = (sqlite3.DatabaseError, UnicodeDecodeError, OSError)
@@ -52,13 +51,6 @@ def put(kind: str, key: str, body: bytes, number: int = 0) -> Statement:
 def drop(kind: str, key: str) -> Statement:
     """A statement that removes the cells of a kind and key, whatever their number."""
     return "DELETE FROM cells WHERE kind = ? AND key = ?", (kind, key)
-
-
-def _is_trouble(error: Exception) -> bool:
-    """True for a fault of the disk or of other processes: the file may be whole."""
-    if isinstance(error, sqlite3.OperationalError):
-        return error.sqlite_errorcode != sqlite3.SQLITE_ERROR  # such as an unknown format
-    return isinstance(error, OSError)
 
 
 def _checksum(kind: bytes, key: bytes, number: int, body: bytes) -> int:
@@ -92,46 +84,28 @@ class Cells:
     # The file.
 
     def _use(self) -> sqlite3.Connection:
-        """The database to ask: the file, or memory in its place."""
-        if self._db is None:
-            self._db = self._in_memory() if self._path is None else self._opened(self._path)
-        return self._db
-
-    def _opened(self, path: Path) -> sqlite3.Connection:
-        """The file, made if it does not exist."""
-        for suffix in ("", *_ASIDE):
-            place = path.with_name(path.name + suffix)
-            with suppress(FileNotFoundError):
-                if suffix or not stat.S_ISREG(files.status(place).st_mode):
-                    files.remove_tree(place)
-        with suppress(FileExistsError):
-            os.close(files.open_file(path, os.O_RDWR | os.O_CREAT | os.O_EXCL))
-        opened = _connected(f"file:{quote(os.fsencode(path.absolute()))}?mode=rw")
+        """The database to ask: the file, made if it does not exist, or memory in its place."""
+        if self._db is not None:
+            return self._db
+        opened = _connected(":memory:" if self._path is None else _cleared(self._path))
         try:
             if not self._is_ours(opened):
                 with _transaction(opened):
                     if not opened.execute("SELECT 1 FROM sqlite_master").fetchall():  # it is new
-                        self._fill(opened)
+                        opened.execute(_TABLE)
+                        opened.execute(f"PRAGMA user_version = {self._owner}")
             if not self._is_ours(opened):
                 raise sqlite3.DatabaseError("it is of another store or version")
         except BaseException:
             opened.close()
             raise
+        self._db = opened
         return opened
 
     def _is_ours(self, opened: sqlite3.Connection) -> bool:
         (version,) = opened.execute("PRAGMA user_version").fetchone()
         found = opened.execute("SELECT sql FROM sqlite_master").fetchall()
         return version == self._owner and found == [(_TABLE.encode(),)]
-
-    def _fill(self, made: sqlite3.Connection) -> None:
-        made.execute(_TABLE)
-        made.execute(f"PRAGMA user_version = {self._owner}")
-
-    def _in_memory(self) -> sqlite3.Connection:
-        made = _connected()
-        self._fill(made)
-        return made
 
     def _run(self, work: Callable[[sqlite3.Connection], _T]) -> _T:
         """Do something with the file, or else in memory."""
@@ -141,8 +115,12 @@ class Cells:
                     return work(self._use())
                 except _ERRORS as error:
                     self.close()
-                    if self._path is None or _is_trouble(error):
-                        break
+                    code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_ERROR)
+                    is_busy = (
+                        isinstance(error, sqlite3.OperationalError) and code != sqlite3.SQLITE_ERROR
+                    )
+                    if self._path is None or is_busy or isinstance(error, OSError):
+                        break  # by the disk or other processes: the file may be whole
                     with suppress(OSError):
                         files.remove_tree(self._path)
             self._path = None
@@ -196,7 +174,19 @@ def _transaction(opened: sqlite3.Connection) -> Iterator[None]:
         raise
 
 
-def _connected(address: str = ":memory:") -> sqlite3.Connection:
+def _cleared(path: Path) -> str:
+    """The address of the file, which is there, without what SQLite would read or write, too."""
+    for suffix in ("", "-journal", "-wal", "-shm"):
+        place = path.with_name(path.name + suffix)
+        with suppress(FileNotFoundError):
+            if suffix or not stat.S_ISREG(files.status(place).st_mode):
+                files.remove_tree(place)
+    with suppress(FileExistsError):
+        os.close(files.open_file(path, os.O_RDWR | os.O_CREAT | os.O_EXCL))
+    return f"file:{quote(os.fsencode(path.absolute()))}?mode=rw"
+
+
+def _connected(address: str) -> sqlite3.Connection:
     made = sqlite3.connect(
         address, uri=True, timeout=_WAIT_S, isolation_level=None, check_same_thread=False
     )

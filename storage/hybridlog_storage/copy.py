@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING, Final
 
 from msgspec import Struct, field
 
-from hybridlog_storage.copy_places import RefusedError, Sending
+from hybridlog_storage.copy_places import RefusedError, Sending, folder_of
 from hybridlog_storage.errors import RecordingExistsError, StoreError
 from hybridlog_storage.manifest import File, Manifest, replace
-from hybridlog_storage.manifests import MANIFEST_LOCK, MANIFEST_OLD, RECORDINGS, WRITER_LOCK
+from hybridlog_storage.manifests import MANIFEST_LOCK, MANIFEST_OLD, WRITER_LOCK
 from hybridlog_storage.stopping import pause, safe_point
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Mapping
+    from collections.abc import Callable, Collection
     from contextlib import AbstractContextManager
 
     from hybridlog_storage.copy_places import Place, Source
@@ -83,9 +83,8 @@ def copy(source: Source, target: Place, recording: str, how: How | None = None) 
     """
     for attempt in range(_TRIES):
         here = source.manifests.read(recording)
-        work = _Copy(source, target, here, how or How())
         try:
-            return work.known() or work.run()
+            return _Copy(source, target, here, how or How()).run()
         except RefusedError:  # a file that has expired meanwhile is no damage
             if attempt + 1 == _TRIES or source.manifests.read(recording) == here:
                 raise
@@ -97,118 +96,99 @@ class _Copy:
 
     def __init__(self, source: Source, target: Place, here: Manifest, how: How) -> None:
         self._source, self._target, self._here, self._how = source, target, here, how
-        self._own = {*here.present}
-        self._others = source  # has the files that are not in `_own`
+        self._others = source  # has the files that are not here
         self._must_prove = how.check or how.proved is not None
         self._done = self._total = 0
-        self._sent_bytes = 0
         self._due = 0.0  # time from which more may be sent
-        self._new: set[str] = set()  # paths of files that the manifest there did not list
         self._proved: dict[str, str] = {}  # digests by path
-
-    def known(self) -> Copied | None:
-        """The result if there is nothing to copy, found without a lock; None if there is."""
-        here, target = self._here, self._target
-        if self._must_prove:
-            return None
-        there = target.manifests.find(here.id)
-        check_origin(here, there)
-        if there is None or there.status == "unproven" or self._wanted(there):
-            return None
-        sizes = target.sizes(here.id)
-        if any(sizes.get(name) != one.bytes for name, one in there.present.items()):
-            return None
-        return Copied(there, lacking=_lacking(here, there))
+        self._sizes: dict[str, int] = {}  # of the files that are there
 
     def run(self) -> Copied:
         here, target = self._here, self._target
+        there = self._look()
+        if there is not None and self._is_known(there):
+            return Copied(there, lacking=_lacking(here, there))  # found without a lock
         if here.status == "unproven":
             raise RefusedError(
                 f"{here.name} is not copied: its manifest was lost and made again, so nothing "
                 f"says that it is whole. Copy it from a store that has lost nothing of it."
             )
         with target.working(here.id), ExitStack() as stack:
-            sizes = target.sizes(here.id)
-            there = self._find(sizes)
-            check_origin(here, there)
+            there = self._look()
+            if there is None:
+                self._check_lost()
             logs = self._wanted(there)
             if logs and self._how.prepare is not None:
                 here, self._others = stack.enter_context(self._how.prepare(here, logs))
                 logs = [here.logs[log.number] for log in logs]
-            copied = Copied(here, there is None, lacking=_lacking(here, there))
-            self._bring(here, there, logs, sizes, copied)
-            copied.manifest = self._publish(here, there, {log.number for log in logs})
-            self._clear(there, copied.manifest, sizes)
+            numbers = {log.number for log in logs}
+            self._copied = Copied(here, there is None, lacking=_lacking(here, there))
+            self._bring(here, there, numbers)
+            self._copied.manifest = now = self._publish(here, there, numbers)
+            self._clear(there, now)
             if self._how.proved is not None:
                 self._how.proved(self._proved_logs(here))
-        return copied
+        return self._copied
+
+    def _look(self) -> Manifest | None:
+        there = self._target.manifests.find(self._here.id)
+        check_origin(self._here, there)
+        self._sizes = self._target.sizes(folder_of(self._here.id))
+        return there
 
     def _wanted(self, there: Manifest | None) -> list[File]:
         return wanted(self._here, there, awaited=self._how.prepare is None)
 
-    def _is_whole(self, file: File, sizes: Mapping[str, int]) -> bool:
-        reads = file.name not in self._new
-        is_there = sizes.get(file.name) == file.bytes
-        return is_there and self._target.is_whole(self._sending(file), reads=reads)
+    def _is_known(self, there: Manifest) -> bool:
+        """True if there is nothing to copy, and nothing to prove."""
+        if self._must_prove or there.status == "unproven" or self._wanted(there):
+            return False
+        return all(self._sizes.get(name) == one.bytes for name, one in there.present.items())
 
-    def _find(self, sizes: Mapping[str, int]) -> Manifest | None:
-        """The manifest there; a recording that has lost more than is known here is left alone."""
-        there, lost = self._target.manifests.find(self._here.id), ""
-        if there is None and MANIFEST_OLD in sizes:
+    def _check_lost(self) -> None:
+        """Raise if a recording has lost its manifest, and may have more than is known here."""
+        here, sizes, lost = self._here, self._sizes, ""
+        logs = {f"{number:06d}": log.bytes for number, log in here.logs.items() if log.is_here}
+        paths = sorted(path for path in sizes if path.endswith(".mcap"))
+        more = [path for path in paths if sizes[path] > logs.get(path[:6], -1)]
+        if MANIFEST_OLD in sizes:
             lost = ": run `hybridlog verify --repair` there, then copy again"
-        is_begun = WRITER_LOCK in sizes and MANIFEST_LOCK not in sizes  # by a stopped copy
-        if there is None and not is_begun and (more := self._more(sizes)):
+        elif more and (WRITER_LOCK not in sizes or MANIFEST_LOCK in sizes):  # or it was begun
             lost = f", and has payloads that are not here, in {', '.join(more)}. It stays as it is"
         if lost:
-            name, address = self._here.name, self._target.address
-            raise RefusedError(f"{name} in {address} has lost its manifest{lost}.")
-        return there
+            raise RefusedError(
+                f"{here.name} in {self._target.address} has lost its manifest{lost}."
+            )
 
-    def _more(self, sizes: Mapping[str, int]) -> list[str]:
-        """Logs there that are larger than those of their numbers here."""
-        logs = self._here.logs.items()
-        here = {f"{number:06d}": log.bytes for number, log in logs if log.is_here}
-        return sorted(
-            path
-            for path, size in sizes.items()
-            if path.endswith(".mcap") and size > here.get(path[:6], -1)
-        )
-
-    def _bring(
-        self,
-        here: Manifest,
-        there: Manifest | None,
-        logs: list[File],
-        sizes: Mapping[str, int],
-        copied: Copied,
-    ) -> None:
+    def _bring(self, here: Manifest, there: Manifest | None, numbers: Collection[int]) -> None:
         """Send what is lacking, or lost, and prove what has to be."""
-        target = self._target
-        ours = here.present
+        ours, copied, sizes = here.present, self._copied, self._sizes
         listed = {} if there is None else there.present
-        numbers = {log.number for log in logs}
-        new = [one for one in ours.values() if one.number in numbers]
-        kept = merged(here, there, numbers)
-        old = [listed[name] for name in kept.present if name in listed]
-        self._new = {one.name for one in new}
-        doubtful = [one for one in old if self._must_prove or sizes.get(one.name) != one.bytes]
-        self._total = sum(one.bytes for one in (*new, *doubtful))
-        for one in (*new, *doubtful):
-            if self._is_whole(one, sizes):
-                self._count(one.bytes, False)
-            elif one.name in ours and ours[one.name].digest == one.digest:
-                target.send(self._sending(one))
-                copied.sent.append(one.name)
-            else:
-                copied.lost.append(one.name)
+        kept = merged(here, there, numbers).present
+        old = [listed[name] for name in kept if name in listed]
+        wanted = [one for one in ours.values() if one.number in numbers]
+        wanted += [one for one in old if self._must_prove or sizes.get(one.name) != one.bytes]
+        copied.bytes = self._total = sum(one.bytes for one in wanted)
+        for one in wanted:
+            is_there = sizes.get(one.name) == one.bytes
+            sent, target = self._sending(one), self._target
+            if one.name not in ours or ours[one.name].digest != one.digest:
+                if is_there:  # nothing here tells more of it than its size
+                    self._count(one.bytes, False)
+                else:
+                    copied.lost.append(one.name)
                 continue
+            if is_there and target.has(sent.name, sent):
+                self._count(one.bytes, False)
+            else:
+                target.send(sent)
+                copied.sent.append(one.name)
             self._proved[one.name] = one.digest
-        copied.bytes, copied.sent_bytes = self._total, self._sent_bytes
 
     def _sending(self, file: File) -> Sending:
-        source = self._source if file.name in self._own else self._others
-        about = file.name, file.bytes, file.digest
-        return Sending(source, self._here.id, *about, self._count)
+        source = self._source if file.name in self._here.present else self._others
+        folder = folder_of(self._here.id)
+        return Sending(source, folder, file.name, file.bytes, file.digest, self._sizes, self._count)
 
     def _count(self, size: int, is_sent: bool) -> None:  # noqa: FBT001 - as of Sending
         """Note bytes that were sent, or were there; wait as long as the limit of the rate asks."""
@@ -216,42 +196,36 @@ class _Copy:
         self._done += size
         self._how.progress(min(self._done, self._total), self._total)
         if is_sent:
-            self._sent_bytes += size
+            self._copied.sent_bytes += size
         if is_sent and self._how.limit_rate is not None:
             now = time.monotonic()
             self._due = max(self._due, now) + size / self._how.limit_rate
             pause(max(self._due - now, 0.0))
 
-    def _publish(self, here: Manifest, there: Manifest | None, brought: set[int]) -> Manifest:
-        manifests = self._target.manifests
-        self._check_files()
+    def _publish(
+        self, here: Manifest, there: Manifest | None, brought: Collection[int]
+    ) -> Manifest:
+        manifests, target = self._target.manifests, self._target
+        new = {one.name for one in here.present.values() if one.number in brought}
+        if new and not new <= target.sizes(folder_of(here.id)).keys():
+            raise StoreError(  # a removal that ends takes them along
+                f"Files of {here.name} have gone from {target.address} meanwhile. Copy again."
+            )
         if there is None:
             # Another process may be faster.
             with suppress(RecordingExistsError), manifests.creating() as create:
-                made = merged(here, there, brought)
-                made = replace(made, name=self._how.named(made.name))
+                made = replace(here, name=self._how.named(here.name))
                 create(made)
                 return made
         return manifests.change(here.id, lambda now: merged(here, now, brought))
 
-    def _check_files(self) -> None:
-        """Raise if files are no longer there: a removal that ends takes them along."""
-        if self._new and not self._new <= self._target.sizes(self._here.id).keys():
-            raise StoreError(
-                f"Files of {self._here.name} have gone from {self._target.address} meanwhile. "
-                "Copy again."
-            )
-
-    def _clear(self, there: Manifest | None, now: Manifest, sizes: Mapping[str, int]) -> None:
-        """Delete files that others have replaced, and what has arrived of those not to come."""
-        listed = now.present.keys()
-        left = set() if there is None else there.present.keys() - listed
-        if self._how.prepare is None:  # or else the next copy goes on with them
-            arrived = {path for path in sizes if path.endswith(".part")}
-            all_else = sizes.keys() - {MANIFEST_LOCK, WRITER_LOCK} - listed
-            left |= all_else if there is None else arrived
-        for path in left:
-            self._target.drop(f"{RECORDINGS}/{now.id}/{path}")
+    def _clear(self, there: Manifest | None, now: Manifest) -> None:
+        """Delete files that others have replaced, and what was left of stopped copies."""
+        known = self._sizes.keys() - {MANIFEST_LOCK, WRITER_LOCK}
+        left = {path for path in known if path.endswith(".part")}
+        left |= known if there is None else there.present.keys()
+        for path in left - now.present.keys():
+            self._target.drop(f"{folder_of(now.id)}/{path}")
 
     def _proved_logs(self, here: Manifest) -> set[int]:
         """Numbers of logs whose copies were proved, and that are still listed there."""

@@ -1,12 +1,13 @@
 """Places that recordings are copied to and from, and the first one: the directory of a store.
 
 A place makes a file visible under its name only when all of it has arrived and is proved: its
-bytes were read back, or the server has told their checksum. In a directory it grows beside, as
-`.DIGEST.part`, where the next copy goes on. Others are in `remote.store` and `server`.
+bytes were read back, or the server has told their checksum. In a directory and on a server it grows
+beside, as `.DIGEST.part`, where the next copy goes on. Others are in `remote.store` and `server`.
 """
 
 from __future__ import annotations
 
+import hashlib
 import os
 import secrets
 import stat
@@ -41,32 +42,51 @@ class Sending(Struct, frozen=True):
     """A file that is sent.
 
     Attributes:
-        file: Its path below its recording.
+        folder: Of its recording, below a store.
         digest: Of all its bytes, as the manifest has it.
+        sizes: Bytes of the files that are in the folder there, by name.
         count: Told of bytes that were sent, or were there already; waits if that is too fast, and
             is a safe point.
     """
 
     source: Source
-    recording: str
+    folder: str
     file: str
     size: int
     digest: str
+    sizes: dict[str, int] = {}
     count: Callable[[int, bool], None] = lambda *_: None
 
     @property
     def name(self) -> str:
         """Its path below a store."""
-        return f"{RECORDINGS}/{self.recording}/{self.file}"
+        return f"{self.folder}/{self.file}"
 
     @property
     def part(self) -> str:
         """The same, while it arrives."""
-        return f"{RECORDINGS}/{self.recording}/.{self.digest[:32]}.part"
+        return f"{self.folder}/.{self.digest[:32]}.part"
+
+    def begins(self) -> list[int]:
+        """Bytes to begin at: behind the part that arrived; if that is damaged, at 0."""
+        there = self.sizes.get(self.part.rpartition("/")[2], 0)
+        return [there, 0] if 0 < there <= self.size else [0]
 
     def again(self, at: int = 0) -> Iterator[bytes]:
-        """Its bytes from one on; `RefusedError` if it cannot be read, or has another size."""
-        return self.source.pieces(self.name, at, self.size)
+        """Its bytes from one on.
+
+        `RefusedError` if it cannot be read, has another size, or, once all were read, another
+        digest.
+        """
+        found = hasher()
+        for piece in self.source.pieces(self.name, at, self.size):
+            found.update(piece)
+            yield piece
+        if not at and found.hexdigest() != self.digest:
+            raise RefusedError(
+                f"{self.source.address}/{self.name} is damaged: its bytes do not have the digest "
+                "that the manifest states. `hybridlog verify` shows where."
+            )
 
     def pieces(self, at: int = 0) -> Iterator[bytes]:
         """The same, as fast as they may go; they are counted."""
@@ -74,34 +94,17 @@ class Sending(Struct, frozen=True):
             yield piece
             self.count(len(piece), True)
 
-    def checked(self) -> Iterator[bytes]:
-        """The same; the last ones only if all have the digest, else `RefusedError`."""
-        found, last = hasher(), b""
-        for piece in self.pieces():
+    def sha256(self) -> str:
+        """SHA-256 of its bytes, in hexadecimal digits; errors as of `again`."""
+        found = hashlib.sha256()
+        for piece in self.again():
             found.update(piece)
-            if last:
-                yield last
-            last = piece
-        if found.hexdigest() != self.digest:
-            raise self.damaged()
-        yield last
-
-    def begins(self, there: int) -> list[int]:
-        """Bytes to begin at: behind the part that arrived; if that is damaged, at 0."""
-        return [there, 0] if 0 < there <= self.size else [0]
+        return found.hexdigest()
 
     def not_arrived(self, place: Place) -> RefusedError:
         """The error for one that has another digest there, because it has one here, or not."""
-        if digest_of(self.again()) != self.digest:
-            return self.damaged()
+        self.sha256()
         return RefusedError(f"{place.address}/{self.name} did not arrive as it was sent.")
-
-    def damaged(self) -> RefusedError:
-        """The error for one whose bytes have another digest than the manifest states."""
-        return RefusedError(
-            f"{self.source.address}/{self.name} is damaged: its bytes do not have the digest that "
-            "the manifest states. `hybridlog verify` shows where."
-        )
 
 
 class Place(ABC):
@@ -115,31 +118,39 @@ class Place(ABC):
         """Copy into a recording; where there are locks, `HeldError` if another process does."""
         yield
 
-    def sees(self, name: str) -> bool:
-        """True if a file that another store has made in `manifests` is here, too."""
-        return False
-
     @abstractmethod
-    def sizes(self, recording: str) -> dict[str, int]:
-        """Bytes of each ordinary file of a recording, by path below it."""
+    def sizes(self, folder: str) -> dict[str, int]:
+        """Bytes of each ordinary file of a folder, by name; none if there is no folder."""
 
-    @abstractmethod
     def send(self, sent: Sending) -> None:
         """Bring a file, and prove it; it takes the place of one of its name.
 
         A file that is damaged at the source raises `RefusedError`.
         """
+        for at in sent.begins():
+            sent.count(at, False)
+            self._grow(sent, at)
+            if self.has(sent.part, sent):
+                self._publish(sent)
+                return
+        self.drop(sent.part)
+        raise sent.not_arrived(self)
+
+    def _grow(self, sent: Sending, at: int) -> None:
+        """Write the part of a file from a byte on."""
+        raise NotImplementedError
+
+    def _publish(self, sent: Sending) -> None:
+        """Give a part that is on the disk its name."""
+        raise NotImplementedError
+
+    @abstractmethod
+    def has(self, name: str, sent: Sending) -> bool:
+        """True if a file of this name is there and has the digest; it is on the disk then."""
 
     @abstractmethod
     def drop(self, name: str) -> None:
         """Delete what has arrived of a file that is no longer to come."""
-
-    @abstractmethod
-    def is_whole(self, sent: Sending, *, reads: bool = False) -> bool:
-        """True if a file that is there has the digest; it is on the disk then.
-
-        `reads`: believe no checksum that was worked out when the file arrived.
-        """
 
 
 class Source(Place):
@@ -164,15 +175,9 @@ class Directory(Source):
         with StoreDirectory(self._path).writing(recording, wait_s=LOCK_WAIT_S, makes=True):
             yield
 
-    def sees(self, name: str) -> bool:
+    def sizes(self, folder: str) -> dict[str, int]:
         """As of `Place`."""
-        with suppress(FileNotFoundError):
-            return name in files.names(self._path / MANIFESTS)
-        return False
-
-    def sizes(self, recording: str) -> dict[str, int]:
-        """As of `Place`."""
-        path = self._path / RECORDINGS / recording
+        path = self._path / folder
         try:
             found = files.names(path)
         except FileNotFoundError:
@@ -181,51 +186,36 @@ class Directory(Source):
             raise unreadable(error, path) from error
         return {name: one.st_size for name, one in found.items() if stat.S_ISREG(one.st_mode)}
 
-    def send(self, sent: Sending) -> None:
-        """As of `Place`; goes on behind the last byte that is there."""
-        final, part = self._path / sent.name, self._path / sent.part
-        with files.explained(final, "copying into"):
-            fd = files.open_file(part, os.O_RDWR | os.O_CREAT)
-            try:
-                about = os.fstat(fd)
-                if not stat.S_ISREG(about.st_mode):
-                    raise OSError(0, "it is not an ordinary file")
-                if not any(self._grown(fd, at, sent) for at in sent.begins(about.st_size)):
-                    files.system.truncate(fd, 0)
-                    raise sent.not_arrived(self)
-            finally:
-                os.close(fd)
-            files.publish(part, final)
+    def _grow(self, sent: Sending, at: int) -> None:
+        path = self._path / sent.part
+        with files.explained(path, "copying into"), _file(path, os.O_RDWR | os.O_CREAT) as fd:
+            files.system.truncate(fd, at)
+            os.lseek(fd, at, os.SEEK_SET)
+            for piece in sent.pieces(at):
+                files.write_all(fd, [piece])
 
-    def _grown(self, fd: int, at: int, sent: Sending) -> bool:
-        """Write a file from a byte on; True if it is on the disk, with its digest."""
-        files.system.truncate(fd, at)
-        sent.count(at, False)
-        os.lseek(fd, at, os.SEEK_SET)
-        for piece in sent.pieces(at):
-            files.write_all(fd, [piece])
-        files.system.sync(fd)
-        return digest_of(read(fd, 0, sent.size)) == sent.digest
+    def _publish(self, sent: Sending) -> None:
+        with files.explained(self._path / sent.name, "copying into"):
+            files.publish(self._path / sent.part, self._path / sent.name)
+
+    def has(self, name: str, sent: Sending) -> bool:
+        """As of `Place`."""
+        path = self._path / name
+        try:
+            with _file(path, os.O_RDONLY) as fd:
+                files.system.sync(fd)
+                found = digest_of(read(fd, 0, sent.size))
+            files.sync_folder(path.parent)
+        except FileNotFoundError:
+            return False
+        except OSError as error:
+            raise files.explain(error, path, "copying into") from error
+        return found == sent.digest
 
     def drop(self, name: str) -> None:
         """As of `Place`."""
         with suppress(OSError):
             files.unlink(self._path / name)
-
-    def is_whole(self, sent: Sending, *, reads: bool = False) -> bool:
-        """As of `Place`."""
-        path = self._path / sent.name
-        try:
-            with _file(path) as fd:
-                if digest_of(read(fd, 0, sent.size)) != sent.digest:
-                    return False
-                files.system.sync(fd)
-            files.sync_folder(path.parent)
-        except FileNotFoundError:
-            return False
-        except OSError as error:
-            raise unreadable(error, path) from error
-        return True
 
     def pieces(self, name: str, at: int, size: int) -> Iterator[bytes]:
         """As of `Source`; what cannot be read of it is refused, too."""
@@ -234,7 +224,7 @@ class Directory(Source):
             try:
                 for folder in path.relative_to(self._path).parents:
                     stack.enter_context(files.folder(self._path / folder))  # none may be a link
-                fd = stack.enter_context(_file(path))
+                fd = stack.enter_context(_file(path, os.O_RDONLY))
                 found = os.fstat(fd).st_size
                 if found != size:
                     raise RefusedError(
@@ -247,20 +237,23 @@ class Directory(Source):
     @contextmanager
     def marked(self) -> Iterator[str]:
         """Make a small file in `manifests`, for a moment; gives its name."""
-        path = self._path / MANIFESTS / f"{MARK}{secrets.token_hex(8)}"
-        with files.explained(path, "copying from"):
-            os.close(files.open_file(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL))
+        name = f"{MARK}{secrets.token_hex(8)}"
+        path = self._path / MANIFESTS / name
+        with (
+            files.explained(path, "copying from"),
+            _file(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL),
+        ):
+            pass
         try:
-            yield path.name
+            yield name
         finally:
-            with suppress(OSError):
-                files.unlink(path)
+            self.drop(f"{MANIFESTS}/{name}")
 
 
 @contextmanager
-def _file(path: Path) -> Iterator[int]:
+def _file(path: Path, flags: int) -> Iterator[int]:
     """A handle of an ordinary file."""
-    fd = files.open_file(path, os.O_RDONLY)
+    fd = files.open_file(path, flags)
     try:
         if not stat.S_ISREG(os.fstat(fd).st_mode):
             raise OSError(0, "it is not an ordinary file")
@@ -274,3 +267,8 @@ def read(fd: int, at: int, end: int) -> Iterator[bytes]:
     while at < end and (piece := files.pread(fd, min(_PIECE, end - at), at)):
         yield piece
         at += len(piece)
+
+
+def folder_of(recording: str) -> str:
+    """The folder of a recording below a store."""
+    return f"{RECORDINGS}/{recording}"

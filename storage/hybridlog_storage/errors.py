@@ -137,10 +137,6 @@ class RecordingGoneError(StoreError):
     """A recording that is not in the store, or no longer."""
 
 
-class CatalogError(StoreError):
-    """A segment is not the one that the catalog knows. Its files are read again."""
-
-
 class DatabaseError(HybridlogError):
     """MongoDB does not answer, refuses, or has ended."""
 

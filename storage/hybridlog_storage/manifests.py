@@ -359,47 +359,35 @@ def _present(manifest: Manifest) -> Manifest:
 
 @contextmanager
 def _locked(path: Path) -> Iterator[None]:
-    """Hold a file's lock. If the file was deleted meanwhile, the one of its name is locked."""
-    end = time.monotonic() + WAIT_S
-    while True:
-        fd = _opened(path, os.O_RDWR)
+    """Hold a file's lock."""
+    with ExitStack() as held:
         try:
-            try:
-                files.lock(fd, max(end - time.monotonic(), 0))
-            except BlockingIOError:
-                message = f"Another process has held {path} for {WAIT_S:.0f} s; end it."
-                raise HeldError(message) from None
-            except OSError as error:
-                if error.errno not in _NO_LOCKS:
-                    raise
-                raise StoreError(
-                    f"The file system of {path.parent} has no locks (flock), so the store can "
-                    "only be read there. Copy it to another one to change it."
-                ) from error
-            if files.is_at(fd, path):
-                yield
-                return
-        finally:
-            os.close(fd)
+            with _plainly(path, "locking"):
+                held.enter_context(files.locked_file(path, os.O_RDWR, WAIT_S))
+        except BlockingIOError:
+            message = f"Another process has held {path} for {WAIT_S:.0f} s; end it."
+            raise HeldError(message) from None
+        yield
 
 
 def _make_file(path: Path) -> None:
-    os.close(_opened(path, os.O_RDWR | os.O_CREAT))
-
-
-def _opened(path: Path, flags: int) -> int:
     with _plainly(path, "locking"):
-        return files.open_file(path, flags)
+        os.close(files.open_file(path, os.O_RDWR | os.O_CREAT))
 
 
 @contextmanager
 def _plainly(path: Path, changing: str = "") -> Iterator[None]:
-    """Say why the system refuses something of a file; not that it is missing."""
+    """Say why the system refuses something of a file; not that it is missing, or locked."""
     try:
         yield
-    except FileNotFoundError:
+    except (FileNotFoundError, BlockingIOError):
         raise
     except OSError as error:
+        if error.errno in _NO_LOCKS:
+            raise StoreError(
+                f"The file system of {path.parent} has no locks (flock), so the store can only be "
+                "read there. Copy it to another one to change it."
+            ) from error
         if error.errno in _ODD:
             raise ManifestError(
                 f"{path} is a link, or of another kind than a store has there: move it out of the "

@@ -19,7 +19,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from typing import IO, TYPE_CHECKING, Final, Self
 from urllib.parse import unquote, urlsplit
 
-from hybridlog_storage.copy_places import Place, RefusedError
+from hybridlog_storage.copy_places import Place, folder_of
 from hybridlog_storage.disk.directory import LOCK, LOCK_WAIT_S
 from hybridlog_storage.errors import (
     HeldError,
@@ -29,7 +29,7 @@ from hybridlog_storage.errors import (
     StoreError,
     UsageError,
 )
-from hybridlog_storage.manifest import MAX_BYTES, Manifest, digest_of, encode, hasher
+from hybridlog_storage.manifest import MAX_BYTES, Manifest, encode
 from hybridlog_storage.manifests import (
     MANIFEST_LOCK,
     MANIFEST_OLD,
@@ -43,7 +43,7 @@ from hybridlog_storage.settings import NAME as SETTINGS
 from hybridlog_storage.stopping import pause, safe_point
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Iterable, Iterator
 
     from hybridlog_storage.copy_places import Sending
 
@@ -57,7 +57,6 @@ _SILENT: Final = "it says nothing; the login needs a shell, with flock and sha25
 _SHARED_S: Final = 15  # a connection without users stays for so long
 _SIZE: Final = re.compile("[0-9]{1,18}")
 _MAX_SAID: Final = 80 << 20  # bytes that a script may print
-_PIECE: Final = 8 << 20
 
 
 class Server(Place):
@@ -72,7 +71,6 @@ class Server(Place):
         self._host, options, self._root = _parts(url)
         self._ssh = [*shlex.split(ssh or DEFAULT_SSH), *options]
         self._held = ExitStack()
-        self._found: dict[str, int] = {}  # by name, of the folder that was listed last
 
     def __enter__(self) -> Self:
         scratch = self._held.enter_context(tempfile.TemporaryDirectory(prefix="hl-"))
@@ -101,7 +99,7 @@ class Server(Place):
     @contextmanager
     def working(self, recording: str) -> Iterator[None]:
         """As of `Place`; the lock of the recording goes with the connection, too."""
-        folder = f"{RECORDINGS}/{recording}"
+        folder = folder_of(recording)
         locks = f"exec flock -w {LOCK_WAIT_S:.0f} {folder}/{LOCK} sh -c 'echo locked; cat'"
         with self._running(f"mkdir -p {folder} {MANIFESTS} && {locks}") as (process, said, errors):
             while not os.fstat(said.fileno()).st_size:
@@ -129,17 +127,8 @@ class Server(Place):
         new = settings_text(StoreSettings(secrets.token_hex(16)))
         self.run(f"cat > .{SETTINGS} && mv .{SETTINGS} {SETTINGS}", [new])
 
-    def sees(self, name: str) -> bool:
+    def sizes(self, folder: str) -> dict[str, int]:
         """As of `Place`."""
-        return name in self.listed(MANIFESTS)
-
-    def sizes(self, recording: str) -> dict[str, int]:
-        """As of `Place`."""
-        self._found = self.listed(f"{RECORDINGS}/{recording}")
-        return dict(self._found)
-
-    def listed(self, folder: str) -> dict[str, int]:
-        """Bytes of the ordinary files of a folder by name; none if there is no folder."""
         said = self.run(f"test ! -d {folder} || ls -lna {folder}").decode(errors="replace")
         rows = (row.split(maxsplit=8) for row in said.splitlines())
         return {
@@ -165,41 +154,21 @@ class Server(Place):
                 return None
             raise
 
-    def send(self, sent: Sending) -> None:
-        """As of `Place`; goes on at the last byte that is there."""
-        part = shlex.quote(sent.part)
-        for at in sent.begins(self._found.pop(sent.part.rpartition("/")[2], 0)):
-            sent.count(at, False)
-            sha256, digest = hashlib.sha256(), hasher()
-            pieces = _summed(sent, at, sha256.update, digest.update)
-            self.run(f"cat {'>>' if at else '>'} {part}", pieces)
-            if digest.hexdigest() != sent.digest:
-                break
-            if self._sha256(part) == sha256.hexdigest():
-                self.run(f"mv -f {part} {shlex.quote(sent.name)}")
-                return
-        self.drop(sent.part)
-        raise sent.not_arrived(self)
+    def _grow(self, sent: Sending, at: int) -> None:
+        self.run(f"cat {'>>' if at else '>'} {shlex.quote(sent.part)}", sent.pieces(at))
+
+    def _publish(self, sent: Sending) -> None:
+        self.run(f"mv -f {shlex.quote(sent.part)} {shlex.quote(sent.name)}")
+
+    def has(self, name: str, sent: Sending) -> bool:
+        """As of `Place`; what is damaged here proves nothing, and raises `RefusedError`."""
+        path = shlex.quote(name)
+        said = self.run(f"sync {path} && sha256sum < {path} || true")
+        return said[:64] == sent.sha256().encode()
 
     def drop(self, name: str) -> None:
         """As of `Place`."""
         self.run(f"rm -f {shlex.quote(name)}")
-
-    def is_whole(self, sent: Sending, *, reads: bool = False) -> bool:
-        """As of `Place`."""
-        path, sha256, digest = shlex.quote(sent.name), hashlib.sha256(), hasher()
-        with suppress(RefusedError):
-            for _ in _summed(sent, sent.size, sha256.update, digest.update):
-                pass
-            if digest.hexdigest() == sent.digest:
-                return self._sha256(path) == sha256.hexdigest()
-        begins = range(0, sent.size, _PIECE)  # what is not here can only be read there
-        parts = (self.run(f"tail -c +{at + 1} {path} | head -c {_PIECE}") for at in begins)
-        return digest_of(parts) == sent.digest
-
-    def _sha256(self, path: str) -> str:
-        """SHA-256 of a file there, which is on the disk then; empty if there is none."""
-        return self.run(f"sync {path} && sha256sum < {path} || true")[:64].decode(errors="replace")
 
     def run(self, script: str, given: Iterable[bytes] = ()) -> bytes:
         """What a script prints that runs in the folder of the store, and is given some bytes."""
@@ -307,21 +276,6 @@ class _ExitError(StoreError):
     def __init__(self, code: int, text: str) -> None:
         super().__init__(text)
         self.code = code
-
-
-def _summed(sent: Sending, at: int, *adds: Callable[[bytes], object]) -> Iterator[bytes]:
-    """Bytes of a file from one on; all of them are added to sums."""
-    left = at
-    for piece in sent.again() if at else ():
-        for add in adds:
-            add(piece[:left])
-        left -= len(piece)
-        if left <= 0:
-            break
-    for piece in sent.pieces(at):
-        for add in adds:
-            add(piece)
-        yield piece
 
 
 def _reason(errors: IO[bytes]) -> str:

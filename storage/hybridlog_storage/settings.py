@@ -6,7 +6,6 @@ password, and a URI in it counts only for its owner.
 
 from __future__ import annotations
 
-import errno
 import json
 import os
 import re
@@ -72,14 +71,7 @@ def read_settings(path: Path) -> StoreSettings:
             f"{path} is not a hybridlog store: {reason}. `hybridlog record FILE --store {path}` "
             "makes one; --store or HYBRIDLOG_STORE says where to look."
         ) from None
-    except NotADirectoryError:
-        raise StoreError(f"{path} is a file; a store is a directory.") from None
     except OSError as error:
-        if error.errno == errno.ELOOP:
-            raise StoreError(
-                f"{file} is a symlink, and none inside a store is followed. Put the file itself "
-                "there."
-            ) from error
         raise unreadable(error, file) from error
 
 

@@ -157,7 +157,7 @@ def test_a_removal_deletes_all_objects(here: Path, address: str, proxy: Proxy, l
 
         proxy.spoil = cut
         if left:
-            with pytest.raises(HybridlogError, match="refuses access"):
+            with pytest.raises(HybridlogError, match="AWS_ACCESS_KEY_ID"):
                 store.remove("short-0")
         else:
             store.remove("short-0")
@@ -209,19 +209,14 @@ def test_lost_objects(here: Path, address: str, tmp_path: Path, how: str) -> Non
     with hl.open(address) as store:
         assert store.topic("/scan").count() == whole + 20
         lose(address, "000001.mcap", run, how)
-        with suppress(StoreError):  # it is missed, and the next answers do without
+        with pytest.raises(StoreError, match=r"000001\.mcap .*is missing or was changed"):
             list(store.topic("/scan"))
-        assert 20 < sum(1 for _ in store.topic("/scan")) < whole + 20
-        assert store.topic("/scan").completeness().has_losses
     files.mounted.clear()
-    with hl.open(address) as store:
-        left = sum(1 for _ in store.topic("/scan")) - 20
-        assert 0 < left < whole
+    with hl.open(address) as store:  # its end cannot be read: answers do without
+        assert 0 < sum(1 for _ in store.topic("/scan")) - 20 < whole
+        assert store.topic("/scan").completeness().has_losses
         (row,) = store.sql("select count(x) as n from arm").to_arrow().to_pylist()
         assert row["n"] == store.topic("/arm").count() == whole + 20
-        question = store.topic("/scan")
-        assert question.count() == left + 20
-        assert question.completeness().has_losses
         found = store.verify()
         assert [(one.recording, one.place) for one in found.findings] == [("run", "000001.mcap")]
         assert "hybridlog copy" in found.findings[0].cure
@@ -310,12 +305,10 @@ def test_what_cannot_be_reached_is_told_in_words(
     with hl.open(address) as store:
         store.remove("short-0")
     assert f"`hybridlog copy {address}` fills it" in answer("ls", store=Path(address)).err
-    roles = "Error performing PUT http://169.254.169.254/latest/api/token"
-    assert "Set AWS_ACCESS_KEY_ID" in Bucket(address)._problem("lists", roles)
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
-    assert "http://127.0.0.1:9 does not answer" in told(lambda: hl.open(address))
+    assert "http://127.0.0.1:9" in told(lambda: hl.open(address))
     monkeypatch.delenv("AWS_ALLOW_HTTP")
-    assert "Set AWS_ALLOW_HTTP=true" in told(lambda: hl.open(address))
+    assert "AWS_ALLOW_HTTP=true for one without TLS" in told(lambda: hl.open(address))
 
 
 def test_hostile_catalogs(published: str, proxy: Proxy) -> None:

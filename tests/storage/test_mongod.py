@@ -150,16 +150,6 @@ def kept(uri: str) -> int:
         return client.test.kept.count_documents({})
 
 
-def used_once(directory: Path) -> EmbeddedMongod:
-    """One that has data files, and has ended."""
-    with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
-        keep(user.start())
-        assert user.damage is None
-        processes = pids(directory)
-    gone(*processes)
-    return user
-
-
 # --- a life ---
 
 
@@ -374,87 +364,6 @@ def test_a_mongod_that_never_answers(
     with pytest.raises(DatabaseError, match="did not answer within 1 s"):
         EmbeddedMongod(directory, linger_s=LINGER_S).start()
     wait_for(lambda: not working_below(directory, ""))
-
-
-def marked(directory: Path) -> Path:
-    """Data files that no mongod has written, and that a fake one does not look at."""
-    data = directory / "data"
-    data.mkdir(parents=True)
-    (data / "WiredTiger.turtle").write_bytes(b"old")
-    return data
-
-
-def inside(directory: Path) -> list[str]:
-    return sorted(p.name for p in directory.iterdir() if not p.name.endswith(".lock"))
-
-
-def test_data_files_are_replaced_once_and_then_the_log_is_told(
-    directory: Path, fake: Callable[[str], None], tmp_path: Path
-) -> None:
-    starts = tmp_path / "starts"
-    script = f"""ls {directory}/data | tr '\\n' ' ' >> {starts}; echo >> {starts}
-echo '{{"s":"F","msg":"oh","attr":{{"error":"WT_PANIC"}}}}'; kill -6 $$"""
-    fake(script)
-    marked(directory)
-    user = EmbeddedMongod(directory, linger_s=LINGER_S)
-    with pytest.raises(DatabaseError, match=r"oh .*WT_PANIC"):
-        user.start()
-    assert starts.read_text().split("\n") == ["WiredTiger.turtle ", "", ""], "old, new"
-    assert inside(directory) == ["data", "mongod.log"]
-
-
-@pytest.mark.parametrize(
-    ("words", "end", "error"),
-    [
-        ("24: Too many open files", "exit 14", DatabaseError),
-        ("std::bad_alloc", "kill -6 $$", DatabaseError),
-        ("11: Resource temporarily unavailable", "kill -6 $$", DatabaseError),
-        ("No space left on device", "exit 14", DiskFullError),
-        ("16: already being managed by another process", "exit 14", DatabaseError),
-        ("Permission denied", "exit 100", DatabaseError),
-    ],
-)
-def test_other_causes_leave_the_data_files_alone(
-    directory: Path,
-    fake: Callable[[str], None],
-    tmp_path: Path,
-    words: str,
-    end: str,
-    error: type[Exception],
-) -> None:
-    starts = tmp_path / "starts"
-    script = f"""echo x >> {starts}; echo '{{"s":"F","msg":"wiredtiger: {words}"}}'; {end}"""
-    fake(script)
-    data = marked(directory)
-    with pytest.raises(error, match=f"wiredtiger: {words}.*Remove the cause"):
-        EmbeddedMongod(directory, linger_s=LINGER_S).start()
-    assert starts.read_text() == "x\n"
-    assert (data / "WiredTiger.turtle").read_bytes() == b"old"
-
-
-FATAL = '{"s":"F","msg":"Fatal assertion","attr":{"file":"wiredtiger_util.cpp"}}'
-NO_DAMAGE = [
-    '{"s":"I","msg":"Fatal assertion","attr":{"file":"wiredtiger_util.cpp"}}',
-    '{"s":"F","msg":"Fatal assertion","attr":{"file":"query.cpp"}}',
-    '{"s":"F","msg":"wiredtiger: Too many open files"}',
-]
-
-
-@pytest.mark.parametrize(("said", "replaced"), [(FATAL, True), ("\n".join(NO_DAMAGE), False)])
-def test_damage_that_the_last_mongod_noticed_late(
-    directory: Path, said: str, *, replaced: bool
-) -> None:
-    """A file that is opened only for a question: mongod has started well, and ends then."""
-    user = used_once(directory)
-    with user.log.open("a") as log:
-        log.write(f"{said}\nhybridlog: mongod ended by itself, with status -6\n")
-    with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
-        assert (user.damage is not None) == replaced
-        assert kept(user.start()) == (not replaced)
-        processes = pids(directory)
-    gone(*processes)
-    with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
-        assert user.damage is None, "that run is over"
 
 
 @pytest.mark.parametrize("name", ["users.lock", "mongod.log", "data/link", "data"])

@@ -37,14 +37,12 @@ from hybridlog_storage.segments.segment_file import (
 )
 from hybridlog_storage.settings import NAME as SETTINGS
 from hybridlog_storage.settings import StoreSettings, read_settings, write_settings
-from hybridlog_storage.stopping import pause
 
 LOCK: Final = WRITER_LOCK
 LOCK_WAIT_S: Final = 10.0
 """Seconds that a command waits for another one that holds its recording."""
 _OF_MANIFEST: Final = frozenset({MANIFEST_LOCK, MANIFEST_OLD})
 _TICK_NS: Final = 50_000_000
-_POLL_S = 0.02
 _RECORDER_WAIT_S = 0.5  # a reader's look at a lock must not pass for a recorder
 _HOLDER = 32  # bytes of the line in a lock
 
@@ -57,6 +55,9 @@ class Holder(Struct, frozen=True):
 
     name: str
     is_recording: bool
+
+
+_ANOTHER: Final = Holder("another process", is_recording=False)
 
 
 class Listing(Struct, frozen=True):
@@ -253,25 +254,9 @@ class StoreDirectory:
             raise unreadable(error, self.path, f"The store {self.path}") from error
         return found
 
-    def _look_of(self, recording: str) -> str:
-        """The look of one recording; empty if there is none."""
-        return self.looks([recording]).get(recording, "")
-
     def drop(self, recording: str, names: Collection[str]) -> None:
         """Remove files of a recording, if they are there."""
         files.remove(self.recording(recording), names)
-
-    def has(self, recording: str) -> bool:
-        """True if there is a manifest or a folder of a recording."""
-        for path in (self.path / MANIFESTS / f"{recording}.json", self.recording(recording)):
-            try:
-                files.status(path)
-            except FileNotFoundError:
-                continue
-            except OSError:
-                pass
-            return True
-        return False
 
     def look_closely(self, recording: str) -> None:
         """Look which files of a recording are there, and read all anew. Here each question does."""
@@ -279,7 +264,7 @@ class StoreDirectory:
     def listing(self, recording: str) -> Listing:
         """Read the content of a recording's directory."""
         path = self.recording(recording)
-        look = self._look_of(recording)
+        look = self.looks([recording]).get(recording, "")
         found = {}
         try:
             with suppress(FileNotFoundError):
@@ -301,7 +286,7 @@ class StoreDirectory:
                 if name not in _OF_MANIFEST:
                     others.append(name)
                 continue
-            sizes[name] = _size(about)
+            sizes[name] = about.st_size if stat.S_ISREG(about.st_mode) else -1
         return Listing(sealed, opened, tuple(others), sizes, look)
 
     @contextmanager
@@ -331,50 +316,38 @@ class StoreDirectory:
         `wait_s` is for another command that holds it. A recorder may hold it for hours, so it is
         not waited for. With `makes` it is a new one: its folder is made.
         """
-        begun, path = time.monotonic(), self.recording(recording) / LOCK
-        while True:
+        path = self.recording(recording) / LOCK
+        if wait_s and self.is_recorded(recording):
+            wait_s = min(wait_s, _RECORDER_WAIT_S)
+        fd = -1
+        with ExitStack() as held:
+            while fd < 0:
+                try:
+                    fd = held.enter_context(files.locked_file(path, os.O_RDWR | os.O_CREAT, wait_s))
+                except FileNotFoundError as error:
+                    if not makes and recording not in self.looks([recording]):
+                        raise gone(name or recording) from error
+                    with files.explained(path.parent, "making"):  # copies leave out empty ones
+                        files.make_folders(path.parent)
+                        files.sync_folder(self.path)
+                        files.sync_folder(self.recordings)
+                except BlockingIOError:
+                    holder = self.holder(recording) or _ANOTHER
+                    what = "being written" if holder.is_recording else "being changed"
+                    raise HeldError(
+                        f"Recording {name or recording!r} is {what} by {holder.name}. Wait until "
+                        "it is done, or stop it."
+                    ) from None
+                except OSError as error:
+                    raise files.explain(error, path, "locking") from error
+            line = b"%d %d" % (os.getpid(), records)
+            with suppress(OSError):  # a full disk must not keep it from being removed
+                files.system.pwritev(fd, [memoryview(line.ljust(_HOLDER))], 0)
             try:
-                fd = files.open_file(path, os.O_RDWR | os.O_CREAT)
-            except FileNotFoundError as error:
-                if not makes and recording not in self.looks([recording]):
-                    raise gone(name or recording) from error
-                with files.explained(path.parent, "making"):  # copies leave out empty ones
-                    files.make_folders(path.parent)
-                    files.sync_folder(self.path)
-                    files.sync_folder(self.recordings)
-                continue
-            except OSError as error:
-                raise files.explain(error, path, "locking") from error
-            is_mine = False
-            try:
-                with suppress(BlockingIOError):
-                    fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    is_mine = True
-                with files.explained(path, "locking"):
-                    is_there = files.is_at(fd, path)
-                if not is_there:
-                    continue  # it was removed, and perhaps created again
-                if is_mine:
-                    line = b"%d %d" % (os.getpid(), records)
-                    with suppress(OSError):  # a full disk must not keep it from being removed
-                        files.system.pwritev(fd, [memoryview(line.ljust(_HOLDER))], 0)
-                    try:
-                        yield
-                    finally:
-                        with suppress(OSError):
-                            files.system.truncate(fd, 0)
-                    return
-                holder = _read_holder(fd)
+                yield
             finally:
-                os.close(fd)
-            most = min(wait_s, _RECORDER_WAIT_S) if holder.is_recording else wait_s
-            if time.monotonic() - begun >= most:
-                what = "being written" if holder.is_recording else "being changed"
-                raise HeldError(
-                    f"Recording {name or recording!r} is {what} by {holder.name}. Wait until it "
-                    "is done, or stop it."
-                )
-            pause(_POLL_S)
+                with suppress(OSError):
+                    files.system.truncate(fd, 0)
 
     def holder(self, recording: str) -> Holder | None:
         """The process that holds a recording's lock at this moment."""
@@ -400,7 +373,7 @@ def _read_holder(fd: int) -> Holder:
     """The last holder of a lock, from its line; the store may come from another user."""
     found = re.fullmatch(rb"([0-9]{1,19}) ([01]) *", os.pread(fd, _HOLDER, 0))
     if found is None:
-        return Holder("another process", is_recording=False)
+        return _ANOTHER
     return Holder(f"process {int(found[1])}", is_recording=found[2] == b"1")
 
 
@@ -416,11 +389,6 @@ def _folder_look(recording: str, folders: int) -> str:
     except FileNotFoundError:
         return "0 0 0"
     return f"{about.st_ino} {about.st_mtime_ns} {about.st_ctime_ns}"
-
-
-def _size(about: os.stat_result) -> int:
-    """Bytes of an ordinary file; -1 of all else."""
-    return about.st_size if stat.S_ISREG(about.st_mode) else -1
 
 
 def _file_look(about: os.stat_result) -> str:

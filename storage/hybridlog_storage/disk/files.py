@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, cast
 
 from hybridlog_storage.errors import NO_SPACE, DiskFullError, HybridlogError, StoreError, exhausted
+from hybridlog_storage.stopping import pause
 
 if TYPE_CHECKING:
     from hybridlog_storage.messages import Buffer
@@ -163,12 +164,29 @@ def write_file(
 def locked_folder(path: Path, wait_s: float = math.inf) -> Iterator[None]:
     """Lock a folder against other processes; `BlockingIOError` after `wait_s`."""
     with folder(path) as fd:
-        lock(fd, wait_s)
+        _lock(fd, wait_s)
         yield
 
 
-def lock(fd: int, wait_s: float = math.inf) -> None:
-    """Lock an open file or folder against other processes; errors as of `locked_folder`."""
+@contextmanager
+def locked_file(path: Path, flags: int, wait_s: float) -> Iterator[int]:
+    """Lock a file, and give its handle; errors as of `locked_folder`.
+
+    If it was deleted meanwhile, the one of its name is locked.
+    """
+    end = time.monotonic() + wait_s
+    while True:
+        fd = open_file(path, flags)
+        try:
+            _lock(fd, end - time.monotonic())
+            if is_at(fd, path):
+                yield fd
+                return
+        finally:
+            os.close(fd)
+
+
+def _lock(fd: int, wait_s: float) -> None:
     end = time.monotonic() + wait_s
     while True:
         try:
@@ -176,7 +194,7 @@ def lock(fd: int, wait_s: float = math.inf) -> None:
         except BlockingIOError:
             if time.monotonic() >= end:
                 raise
-            time.sleep(random.uniform(0, _POLL_S))  # noqa: S311 - no secret
+            pause(random.uniform(0, _POLL_S))  # noqa: S311 - no secret
         else:
             return
 

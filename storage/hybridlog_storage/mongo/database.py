@@ -42,8 +42,6 @@ _T = TypeVar("_T")
 
 BATCH_DOCUMENTS = 5000
 """Most documents in one insert command; more make the server slower, not faster."""
-OLDEST_SERVER = (5, 3)
-"""The first MongoDB with clustered collections."""
 
 _MAX_QUESTIONS_PER_COMMAND = 100
 _MAX_COMMAND_BYTES = 4 << 20
@@ -75,7 +73,7 @@ class Database:
 
     @classmethod
     def connect(cls, uri: str, *, timeout_s: float = 5.0) -> Self:
-        """Connect and check that the server answers and is new enough.
+        """Connect and check that the server answers.
 
         `timeout_s` is the wait for the server, now and in every later operation; 20 seconds more
         for a replica set, which may elect a primary. The URI may name the database, and a
@@ -111,12 +109,7 @@ class Database:
             raise DatabaseError(f"MongoDB at {address} cannot be found: {error}") from error
         self = cls(client, name, address)
         try:
-            version = self._again(client.server_info)
-            if tuple(version["versionArray"][:2]) < OLDEST_SERVER:
-                raise DatabaseError(
-                    f"MongoDB at {address} has version {version['version']}; hybridlog needs "
-                    f"{'.'.join(map(str, OLDEST_SERVER))} or newer (clustered collections)."
-                )
+            self.run(lambda _: client.server_info())
         except BaseException:
             client.close()
             raise
@@ -136,8 +129,10 @@ class Database:
         with timeout(_GONE_S):
             self._client.close()
 
-    def _again(self, command: Callable[[], _T], *, question: bool = False) -> _T:
-        """Run a command, again if its connection breaks."""
+    def run(
+        self, command: Callable[[PymongoDatabase[Document]], _T], *, question: bool = False
+    ) -> _T:
+        """Run a command on the database as pymongo has it, again if its connection breaks."""
         from pymongo.errors import AutoReconnect, CursorNotFound, ServerSelectionTimeoutError
 
         left = _TRIES
@@ -145,7 +140,7 @@ class Database:
             with _mapped(self.address, question=question):
                 while True:
                     try:
-                        return command()
+                        return command(self._database)
                     except (AutoReconnect, CursorNotFound) as error:
                         left -= 1
                         if not left or isinstance(error, ServerSelectionTimeoutError):
@@ -158,10 +153,13 @@ class Database:
         """False if the user of this connection may not change the database."""
         from pymongo import WriteConcern
 
-        # Without a majority of a replica set, there is nothing to wait for.
-        of = self._database["hybridlog.store"].with_options(write_concern=WriteConcern(1))
+        def delete(database: PymongoDatabase[Document]) -> None:
+            # Without a majority of a replica set, there is nothing to wait for.
+            of = database.get_collection("hybridlog.store", write_concern=WriteConcern(1))
+            of.delete_one({"_id": ""})  # which is never there
+
         try:
-            self._again(lambda: of.delete_one({"_id": ""}))  # which is never there
+            self.run(delete)
         except ConnectionLostError:
             raise
         except DatabaseError:
@@ -172,9 +170,9 @@ class Database:
         """Create a clustered collection (`_id` is its only key) unless it exists."""
         from pymongo.errors import OperationFailure
 
-        def create() -> None:
+        def create(database: PymongoDatabase[Document]) -> None:
             try:
-                self._database.create_collection(
+                database.create_collection(
                     name,
                     check_exists=False,
                     clusteredIndex={"key": {"_id": 1}, "unique": True},
@@ -183,7 +181,7 @@ class Database:
                 if error.code != _NAMESPACE_EXISTS:
                     raise
 
-        self._again(create)
+        self.run(create)
 
     def insert_raw(self, collection: str, documents: Sequence[bytes]) -> None:
         """Insert BSON documents as they are.
@@ -196,13 +194,15 @@ class Database:
 
         for first in range(0, len(documents), BATCH_DOCUMENTS):
             parts = [*map(RawBSONDocument, documents[first : first + BATCH_DOCUMENTS])]
-            self._again(partial(self._insert_batch, collection, parts))
+            self.run(partial(self._insert_batch, collection, parts))
 
-    def _insert_batch(self, collection: str, documents: Sequence[RawBSONDocument]) -> None:
+    def _insert_batch(
+        self, name: str, documents: Sequence[RawBSONDocument], database: PymongoDatabase[Document]
+    ) -> None:
         from pymongo.errors import BulkWriteError
 
         try:
-            self._database[collection].insert_many(documents, ordered=False)
+            database[name].insert_many(documents, ordered=False)
         except BulkWriteError as error:
             found = error.details or {}
             for one in (*found.get("writeErrors", ()), *found.get("writeConcernErrors", ())):
@@ -237,15 +237,13 @@ class Database:
             ]
             for where, stages in others:
                 pipeline.append({"$unionWith": {"coll": where, "pipeline": stages}})
-            of = self._database[collection]
 
-            def ask(of: Any = of, pipeline: Any = pipeline) -> bytes:
+            def ask(database: Any, name: str = collection, pipeline: Any = pipeline) -> bytes:
                 # As many as fit 16 MiB; by default the server's first batch has 101 documents.
-                return b"".join(
-                    of.aggregate_raw_batches(pipeline, batchSize=1 << 30, allowDiskUse=True)
-                )
+                options = {"batchSize": 1 << 30, "allowDiskUse": True}
+                return b"".join(database[name].aggregate_raw_batches(pipeline, **options))
 
-            yield self._again(ask, question=True)
+            yield self.run(ask, question=True)
 
     def find(
         self,
@@ -256,9 +254,10 @@ class Database:
         limit: int = 0,
     ) -> list[Document]:
         """Find documents, for small answers; none in a missing collection. `limit` 0 is all."""
-        of, shape = self._database[collection], None if projection is None else dict(projection)
-        return self._again(
-            lambda: list(of.find(dict(filter or {}), shape, limit=limit)), question=True
+        shape = None if projection is None else dict(projection)
+        return self.run(
+            lambda db: list(db[collection].find(dict(filter or {}), shape, limit=limit)),
+            question=True,
         )
 
     def count(
@@ -271,10 +270,9 @@ class Database:
         Without a filter this is the collection's own count. It costs nothing, but is an estimate
         after a server was killed.
         """
-        of = self._database[collection]
         if not filter:
-            return self._again(of.estimated_document_count)
-        return self._again(lambda: of.count_documents(dict(filter)), question=True)
+            return self.run(lambda db: db[collection].estimated_document_count())
+        return self.run(lambda db: db[collection].count_documents(dict(filter)), question=True)
 
     def count_each(self, questions: Sequence[tuple[str, Mapping[str, object]]]) -> list[int]:
         """Number of documents that each question finds."""
@@ -301,48 +299,29 @@ class Database:
 
         With `upsert` a document is made if none matches.
         """
-        of = self._database[collection]
-        self._again(lambda: of.update_many(dict(filter), dict(change), upsert=upsert))
+        values = dict(filter), dict(change)
+        self.run(lambda db: db[collection].update_many(*values, upsert=upsert))
 
     def delete(self, collection: str, filter: Mapping[str, object]) -> None:  # noqa: A002
         """Delete every matching document; `{}` deletes all."""
-        of = self._database[collection]
-        self._again(lambda: of.delete_many(dict(filter)))
-
-    def drop_all(self) -> None:
-        """Remove the whole database."""
-        self._again(lambda: self._client.drop_database(self.name))
+        self.run(lambda db: db[collection].delete_many(dict(filter)))
 
     def list_collections(self) -> list[str]:
         """Names of all collections, sorted, without MongoDB's own."""
-        names = self._again(self._database.list_collection_names)
+        names = self.run(lambda db: db.list_collection_names())
         return sorted(name for name in names if not name.startswith("system."))
-
-    def create_index(self, collection: str, keys: Sort) -> None:
-        """Create an index on fields unless it exists."""
-        of = self._database[collection]
-        self._again(lambda: of.create_index(list(keys)))
 
     def indexes(self, collection: str) -> list[tuple[tuple[str, int], ...]]:
         """Fields of all indexes but the one on `_id`, each with 1 or -1, sorted."""
-        of = self._database[collection]
         found = [
             tuple((str(field), int(order)) for field, order in about["key"].items())
-            for about in self._again(lambda: list(of.list_indexes()))
+            for about in self.run(lambda db: list(db[collection].list_indexes()))
         ]
         return sorted(keys for keys in found if [field for field, _ in keys] != ["_id"])
 
-    def drop_index(self, collection: str, keys: Sort) -> bool:
-        """Drop the index with these keys; return whether it existed."""
-        if tuple(keys) not in self.indexes(collection):
-            return False
-        of = self._database[collection]
-        self._again(lambda: of.drop_index(list(keys)))
-        return True
-
     def size(self, collection: str) -> int:
         """Bytes of a collection on the disk, with its indexes."""
-        found = self._again(lambda: self._database.command("collStats", collection))
+        found = self.run(lambda db: db.command("collStats", collection))
         return int(found.get("totalSize", 0))
 
 

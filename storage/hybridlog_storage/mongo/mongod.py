@@ -10,10 +10,8 @@ state, and the kernel releases the locks of killed processes:
 * `keeper.lock`: held by the process that starts a keeper, and inherited by the keeper and by
   mongod, so it is free only when both have ended.
 
-A process locks `users.lock` before it looks for a mongod, so none is ended under it. If the
-data files are damaged, the last words in mongod's log are of its storage; the next start then
-removes them, and the index is built again. mongod would follow symlinks, so it is not started
-on a directory with any.
+A process locks `users.lock` before it looks for a mongod, so none is ended under it. mongod would
+follow symlinks, so it is not started on a directory with any.
 """
 
 from __future__ import annotations
@@ -60,25 +58,17 @@ _OTHER_WAYS = (
 
 def find_mongod() -> Path:
     """Path of the mongod to run: HYBRIDLOG_MONGOD, the wheel's, or the one on the PATH."""
-    named = os.environ.get("HYBRIDLOG_MONGOD")
-    if named:
-        found = shutil.which(Path(named).expanduser())
-        if found is None:
-            raise MissingDependencyError(
-                f"HYBRIDLOG_MONGOD says {named!r}, which is not a program that can be run. "
-                f"Correct or unset it. {_OTHER_WAYS}"
-            )
-        return Path(found).absolute()
+    named, folders = os.environ.get("HYBRIDLOG_MONGOD"), [os.environ.get("PATH", os.defpath)]
     # The wheel shares its top package with a very large one, so it is not imported.
     with contextlib.suppress(ImportError, ValueError):
         spec = importlib.util.find_spec("fiftyone")
-        for place in (spec.submodule_search_locations or ()) if spec else ():
-            program = Path(place, "db", "bin", "mongod")
-            if os.access(program, os.X_OK) and program.is_file():
-                return program
-    found = shutil.which("mongod")
+        own = (spec.submodule_search_locations or ()) if spec else ()
+        folders = [*(f"{folder}/db/bin" for folder in own), *folders]
+    program = Path(named).expanduser() if named else "mongod"
+    found = shutil.which(program, path=os.pathsep.join(folders))
     if found is None:
-        raise MissingDependencyError(f"No mongod was found for the store's index. {_OTHER_WAYS}")
+        problem = f"HYBRIDLOG_MONGOD says {named!r}, which" if named else "No mongod"
+        raise MissingDependencyError(f"{problem} was not found, or cannot be run. {_OTHER_WAYS}")
     return Path(found).absolute()
 
 
@@ -93,9 +83,6 @@ class EmbeddedMongod:
             existing parent. If it belongs to another user, `<name>-<uid>` beside it is used.
         linger_s: Seconds for which mongod runs after its last use; None takes
             HYBRIDLOG_MONGOD_LINGER_S, or 5. The process that starts mongod decides.
-
-    Attributes:
-        damage: The reason why the last start replaced the data files; None if it did not.
     """
 
     def __init__(self, directory: Path, *, linger_s: float | None = None) -> None:
@@ -108,22 +95,14 @@ class EmbeddedMongod:
             raise UsageError(f"HYBRIDLOG_MONGOD_LINGER_S is {text!r}; give seconds.") from None
         self._mutex = threading.Lock()
         self._users: int | None = None
-        self.damage: str | None = None
 
     @property
     def log(self) -> Path:
         """The log file of mongod and its keeper."""
         return self._directory / "mongod.log"
 
-    @property
-    def _data(self) -> Path:
-        return self._directory / "data"
-
     def start(self) -> str:
-        """Return the URI of a running mongod; start one if none runs, or it has ended.
-
-        Damaged data files are replaced by empty ones.
-        """
+        """Return the URI of a running mongod; start one if none runs, or it has ended."""
         with self._mutex:
             try:
                 if self._users is not None and os.fstat(self._users).st_nlink == 0:
@@ -190,13 +169,14 @@ class EmbeddedMongod:
         """The URI of a running mongod; `users` is the open and locked `users.lock`."""
         path = str(_socket_of(users))
         began, has_started = time.monotonic(), False
-        self.damage = None
         while time.monotonic() - began <= START_LIMIT_S:
             keeper = self._open("keeper.lock")
             try:
                 if _try_lock(keeper, fcntl.LOCK_EX):
-                    self._launch(path, keeper, has_started=has_started)
-                    began, has_started = time.monotonic(), True
+                    if has_started:
+                        raise self._failure()
+                    self._launch(path, keeper)
+                    has_started = True
                 elif _answers(path):
                     return f"mongodb://{quote(path, safe='')}/?directConnection=true"
             finally:
@@ -204,24 +184,11 @@ class EmbeddedMongod:
             time.sleep(0.01)
         raise self._hangs("did not answer")
 
-    def _launch(self, path: str, keeper: int, *, has_started: bool) -> None:
-        """Start a keeper, which starts mongod; both inherit the lock of `keeper`, `keeper.lock`.
-
-        `has_started`: one was started already, and has ended.
-        """
+    def _launch(self, path: str, keeper: int) -> None:
+        """Start a keeper, which starts mongod; both inherit the lock of `keeper`, `keeper.lock`."""
         program = find_mongod()
         _refuse_odd_files(self._directory)
-        _make_folder(self._data)
-        has_data, log = bool(files.names(self._data)), self._last_run()
-        if has_data and self.damage is None and _is_damage(log):
-            files.remove_tree(self._data)
-            _make_folder(self._data)
-            self.damage = "; ".join(_telling_lines(log))
-        elif has_started:
-            raise self._failure(log)
-        self._spawn(program, path, keeper)
-
-    def _spawn(self, program: Path, path: str, keeper: int) -> None:
+        _make_folder(self._directory / "data")
         script = str(Path(__file__).with_name("mongod_keeper.py"))
         own = [script, str(self._linger_s), path, str(keeper)]
         log = self._open(self.log.name, os.O_APPEND)
@@ -250,7 +217,7 @@ class EmbeddedMongod:
     def _command(self, program: Path, path: str) -> list[str]:
         return [
             str(program),
-            *("--dbpath", str(self._data)),
+            *("--dbpath", str(self._directory / "data")),
             # A path as address, and no default socket: no TCP port is opened.
             *("--bind_ip", path),
             "--nounixsocket",
@@ -267,43 +234,24 @@ class EmbeddedMongod:
             *("--journalCommitInterval", "500"),
         ]
 
-    def _last_run(self) -> str:
-        """The end of the log since the last start of mongod; empty if it cannot be read."""
-        try:
-            with os.fdopen(files.open_file(self.log, os.O_RDONLY), "rb") as file:
-                file.seek(max(0, file.seek(0, os.SEEK_END) - _LOG_TAIL))
-                return file.read().rpartition(_START_LINE)[2].decode(errors="replace")
-        except OSError:
-            return ""
-
-    def _failure(self, log: str) -> HybridlogError:
-        """The error after mongod was started and has ended, in its own words."""
+    def _failure(self) -> HybridlogError:
+        """The error after mongod was started and has ended, in its own last words."""
+        with os.fdopen(files.open_file(self.log, os.O_RDONLY), "rb") as file:
+            file.seek(max(0, file.seek(0, os.SEEK_END) - _LOG_TAIL))
+            log = file.read().rpartition(_START_LINE)[2].decode(errors="replace")
+        lines = [line for line in map(str.strip, log.splitlines()) if line]
+        errors = [line for line in lines if not re.search(r'"s":"[DIW]', line)]  # or not mongod's
+        shown = [re.sub(r'^{.*?"msg":"(.*?)",?(.*)}$', r"\1 \2", one)[:500] for one in errors[-4:]]
         kind = DiskFullError if any(sign in log for sign in _FULL) else DatabaseError
-        said = "; ".join(_telling_lines(log)) or "it logged nothing"
         return kind(
-            f"mongod for {self._directory} did not come up: {said}. The whole log is {self.log}. "
-            "Remove the cause, or use a running server with --mongo URI, or none with --mongo none."
+            f"mongod for {self._directory} did not come up: {'; '.join(shown)}. The whole log is "
+            f"{self.log}. Remove the cause; if its data files are damaged, remove "
+            f"{self._directory}, and the index is made again. Or use a running server with --mongo "
+            "URI, or none with --mongo none."
         )
 
 
-_STORAGE = ("/storage/", "wiredtiger", "WT_PANIC", "data corruption")
-"""Words in the last lines of a mongod that ended because of its data files."""
 _FULL = ("No space left on device", "Disk quota exceeded")
-_OTHER_CAUSES = (
-    *_FULL,
-    *("DBPathInUse", "mongod instance is already running", "managed by another process"),
-    *("Too many open files", "Cannot allocate memory", "bad_alloc", "ut of memory"),
-    *("Resource temporarily unavailable", "Permission denied", "Attempted to create a lock file"),
-    *("Operation not permitted", "Read-only file system"),
-)
-"""Words of a mongod that ended for want of something else, and left its data files whole."""
-
-
-def _is_damage(log: str) -> bool:
-    """True if mongod ended because its data files are damaged."""
-    fatal = [line for line in log.splitlines() if '"s":"F"' in line]
-    is_of_storage = any(word in line for line in fatal for word in _STORAGE)
-    return is_of_storage and not any(sign in log for sign in _OTHER_CAUSES)
 
 
 def _socket_of(users: int) -> Path:
@@ -393,12 +341,3 @@ def _answers(path: str) -> bool:
     with socket.socket(socket.AF_UNIX) as connection:
         connection.settimeout(1.0)
         return connection.connect_ex(path) == 0
-
-
-def _telling_lines(log: str) -> list[str]:
-    """Log lines that explain why mongod ended: a cause, its errors, or the last; at most four."""
-    lines = [line for line in map(str.strip, log.splitlines()) if line]
-    causes = [line for line in lines if any(sign in line for sign in _OTHER_CAUSES)]
-    errors = [line for line in lines if not re.search(r'"s":"[DIW]', line)]  # or not mongod's
-    shown = (causes or errors or lines)[-4:]
-    return [re.sub(r'^{.*?"msg":"(.*?)",?(.*)}$', r"\1 \2", line)[:500] for line in shown]

@@ -58,31 +58,27 @@ class CachedFile(int):
 
     def fetch(self, ranges: Iterable[tuple[int, int]]) -> None:
         """Fetch the missing blocks of some ranges of bytes."""
-        size = self._about.size
-        wanted: set[int] = set()
+        size, wanted = self._about.size, set[int]()
         for begin, end in ranges:
-            first, last = begin, min(end, size)
-            if first < last:
-                if last > size - BLOCK:
-                    first = min(first, max(size - _TAIL, 0))
-                wanted.update(range(first // BLOCK, -(-last // BLOCK)))
+            if begin < min(end, size):
+                first = begin if end <= size - BLOCK else min(begin, max(size - _TAIL, 0))
+                wanted.update(range(first // BLOCK, -(-min(end, size) // BLOCK)))
         with self._lock:
             wanted -= self._proved
-            if wanted:
-                self._fetch(sorted(wanted))
-
-    def _fetch(self, wanted: list[int]) -> None:
-        with self._cache.writing():
-            sums = _opened(self._cache.paths(self._bucket, self._about)[1])
-        try:
+            if not wanted:
+                return
             with self._cache.writing():
-                missing = [number for number in wanted if not self._is_there(sums, number)]
-            with ThreadPoolExecutor(_PARALLEL) as pool:
-                for _ in pool.map(lambda piece: self._bring(sums, *piece), _pieces(missing)):
-                    pass
+                sums = _opened(self._cache.paths(self._bucket, self._about)[1])
+                try:
+                    missing = [n for n in sorted(wanted) if not self._is_there(sums, n)]
+                    with ThreadPoolExecutor(_PARALLEL) as pool:
+                        for _ in pool.map(
+                            lambda piece: self._bring(sums, *piece), _pieces(missing)
+                        ):
+                            pass
+                finally:
+                    os.close(sums)
             self._proved.update(wanted)
-        finally:
-            os.close(sums)
 
     def _bring(self, sums: int, first: int, last: int) -> None:
         """Fetch blocks, the last one with them."""
@@ -91,16 +87,14 @@ class CachedFile(int):
         try:
             data = memoryview(bucket.read(about.name, begin, end, about.size))
         except (FileNotFoundError, ObjectChangedError) as error:
-            bucket.lost.add(about.name)
             self._cache.forget(bucket, about)  # so that others notice it when they begin to read
             raise OSError(errno.EIO, LOST, f"{bucket.address}/{about.name}") from error
+        done = 0
+        while done < len(data):
+            done += os.pwrite(self, data[done:], begin + done)
         sizes = range(0, len(data), BLOCK)
         marks = b"".join(_MARK.pack(1, crc32(data[at : at + BLOCK])) for at in sizes)
-        with self._cache.writing():
-            done = 0
-            while done < len(data):
-                done += os.pwrite(self, data[done:], begin + done)
-            os.pwrite(sums, marks, first * _MARK.size)
+        os.pwrite(sums, marks, first * _MARK.size)
         self._cache.added(len(data))
 
     def _is_there(self, sums: int, number: int) -> bool:
@@ -144,10 +138,12 @@ class BlockCache:
 
     @contextmanager
     def writing(self) -> Iterator[None]:
-        """Name the cure if the cache cannot be written: no object is damaged by that."""
+        """Name the cure if the cache cannot be written; an object that is lost is no such error."""
         try:
             yield
         except OSError as error:
+            if error.strerror == LOST:
+                raise
             raise ResourceError(
                 f"The cache {self.path} cannot be written: {error.strerror}. Make room there, or "
                 "set XDG_CACHE_HOME to another directory."

@@ -23,7 +23,6 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from msgspec import Struct
 
-from hybridlog_storage.cache import lazy
 from hybridlog_storage.errors import (
     BucketError,
     MissingDependencyError,
@@ -41,7 +40,6 @@ except ImportError as error:
 
 if TYPE_CHECKING:
     from obstore import GetOptions, PutMode
-    from obstore.store import ObjectStore
 
     from hybridlog_storage.messages import Buffer
 
@@ -50,20 +48,20 @@ PART_BYTES: Final = 64 << 20
 _PART: Final = 16 << 20
 _PAGE: Final = 1000  # names that servers list at once
 _TRIES: Final = 4
-_READ_S: Final = 60
-_WRITE_S: Final = 900
+_REQUEST_S: Final = 300  # of 16 MiB at 0.5 Mbit/s
 _RETRY_S: Final = 60
 _CUT = re.compile(r"(?i)body|reset|closed|incomplete|timed? ?out|eof|sending request")
 _NO_BUCKET = re.compile(r"NoSuchBucket|ContainerNotFound|bucket does not exist")
-_ROLES = re.compile(r"169\.254\.|metadata\.google")  # asked if the environment has no key
-_MD5: Final = re.compile(r"[0-9a-f]{32}(-[0-9]{1,5})?")  # of the whole, or of parts
-_HOST = re.compile(r"https?://[^/\s]+")
 _SECRETS = re.compile(r"(?i)(signature|credential|token|sig|key)=[^&\s\"]+")
+_CURE: Final = (
+    "Credentials and the address of a server of one's own come from the environment, such as "
+    "AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, AWS_ENDPOINT_URL, and AWS_ALLOW_HTTP=true for one "
+    "without TLS."
+)
 
 
 _T = TypeVar("_T")
-_users: Final[dict[str, int]] = {}
-"""The process that has used the library first."""
+_PROCESS: Final = os.getpid()
 
 
 class Object(Struct, frozen=True):
@@ -76,45 +74,45 @@ class Object(Struct, frozen=True):
     size: int
     version: str
 
-    def has_md5_of(self, pieces: Iterable[Buffer]) -> bool:
-        """True if its version is the MD5 of some bytes, as most servers that speak S3 have it."""
-        tag = self.version.strip('"')
-        if not _MD5.fullmatch(tag):
-            return False
-        sums, now, room = [], hashlib.md5(usedforsecurity=False), _PART
+    def has_md5_of(self, pieces: Iterable[bytes]) -> bool:
+        """True if its version is the MD5 of some bytes, as most servers that speak S3 have it.
+
+        Of what was sent in parts it is one of their MD5s; no piece may belong to two of them.
+        """
+        tag, parts, left = self.version.strip('"'), [], 0
         for piece in pieces:
-            view = memoryview(piece)
-            while "-" in tag and len(view) > room:
-                now.update(view[:room])
-                sums.append(now.digest())
-                view, now, room = view[room:], hashlib.md5(usedforsecurity=False), _PART
-            now.update(view)
-            room -= len(view)
+            if left <= 0:
+                parts.append(hashlib.md5(usedforsecurity=False))
+                left = _PART if "-" in tag else self.size
+            parts[-1].update(piece)
+            left -= len(piece)
+        whole = b"".join(part.digest() for part in parts)
         if "-" not in tag:
-            return tag == now.hexdigest()
-        sums.append(now.digest())
-        whole = hashlib.md5(b"".join(sums), usedforsecurity=False)
-        return tag == f"{whole.hexdigest()}-{len(sums)}"
+            return tag == whole.hex()
+        return tag == f"{hashlib.md5(whole, usedforsecurity=False).hexdigest()}-{len(parts)}"
 
 
 class Bucket:
-    """The objects below an address, such as `s3://lab/store`.
-
-    `lost` has the names of objects that were looked for, and are missing or have another size.
-    """
+    """The objects below an address, such as `s3://lab/store`."""
 
     def __init__(self, address: str) -> None:
         found = address_of(address)
         if found is None:
             raise UsageError(f"{address!r} is not the address of a bucket, as s3://lab/store is.")
         self.address = found
-        self.lost: set[str] = set()
         self._honoured: set[type] = set()  # kinds of conditions
-        self._reading = _opened(found, _READ_S)
-
-    @lazy
-    def _writing(self) -> ObjectStore:
-        return _opened(self.address, _WRITE_S)
+        _check_process(found)
+        try:
+            self._store = obstore.store.from_url(
+                found,
+                client_options={
+                    "timeout": timedelta(seconds=_REQUEST_S),
+                    "allow_http": _allows_http(),
+                },
+                retry_config={"max_retries": 6, "retry_timeout": timedelta(seconds=_RETRY_S)},
+            )
+        except (exceptions.BaseError, ValueError) as error:
+            raise UsageError(f"{found} cannot be opened: {_reason(error)}") from error
 
     def objects(self, prefix: str = "") -> list[Object]:
         """All objects whose names begin with a folder's name, in order; 1,000 a request.
@@ -123,7 +121,7 @@ class Bucket:
         """
 
         def listed() -> list[Object]:
-            pages = obstore.list(self._reading, prefix or None, chunk_size=_PAGE)
+            pages = obstore.list(self._store, prefix or None, chunk_size=_PAGE)
             return [_object(about, str(about["path"])) for page in pages for about in page]
 
         return self._again(prefix, listed)
@@ -141,7 +139,7 @@ class Bucket:
 
     def _get(self, name: str, options: GetOptions, most: int) -> tuple[Object, bytes]:
         def read() -> tuple[Object, bytes]:
-            answer = obstore.get(self._reading, name, options=options)
+            answer = obstore.get(self._store, name, options=options)
             data = bytes(next(iter(answer.stream(most + 1)), b""))
             return _object(answer.meta, name), data[: most + 1]
 
@@ -175,7 +173,7 @@ class Bucket:
         if size <= PART_BYTES:
             return Object(name, size, self._put(name, b"".join(pieces), "overwrite"))
         with self._explained(name):
-            made = obstore.put(self._writing, name, pieces, chunk_size=_PART, max_concurrency=4)
+            made = obstore.put(self._store, name, pieces, chunk_size=_PART, max_concurrency=4)
             return Object(name, size, _version(made))
 
     def delete(self, names: Sequence[str]) -> None:
@@ -183,7 +181,7 @@ class Bucket:
         if not names:
             return
         try:
-            self._again(names[0], partial(obstore.delete, self._writing, names))
+            self._again(names[0], partial(obstore.delete, self._store, names))
         except FileNotFoundError:  # some servers stop there
             for name in names if len(names) > 1 else ():
                 self.delete([name])
@@ -195,20 +193,18 @@ class Bucket:
         """
         if type(mode) in self._honoured:
             return
-        name, is_made = f"probe-{secrets.token_hex(8)}", mode == "create"
+        made, name = [], f"probe-{secrets.token_hex(8)}"
         try:
-            if is_made:
-                self._put(name, b"1", mode)
-            self._put(name, b"2", mode)  # the name is taken, or there is nothing to replace
-            is_made = True
+            for each in (mode, mode) if mode == "create" else (mode,):
+                self._put(name, b"1", each)  # at last it is taken, or there is none
+                made.append(name)
         except (FileNotFoundError, ObjectChangedError, ObjectExistsError):
             self._honoured.add(type(mode))
             return
         except exceptions.NotSupportedError:
             pass
         finally:
-            if is_made:
-                self.delete([name])
+            self.delete(made[:1])
         raise BucketError(
             f"The server of {self.address} ignores conditions of writers (If-None-Match, "
             "If-Match), so two writers would lose data in silence. Use a server that honours "
@@ -216,7 +212,7 @@ class Bucket:
         )
 
     def _put(self, name: str, content: bytes, mode: PutMode) -> str:
-        put = partial(obstore.put, self._writing, name, content, mode=mode, use_multipart=False)
+        put = partial(obstore.put, self._store, name, content, mode=mode, use_multipart=False)
         return self._again(name, lambda: _version(put()))
 
     def _again(self, name: str, work: Callable[[], _T]) -> _T:
@@ -255,53 +251,19 @@ class Bucket:
             raise ObjectChangedError(f"{self._place(name)} was changed meanwhile.") from error
         except exceptions.AlreadyExistsError as error:
             raise ObjectExistsError(f"{self._place(name)} exists.") from error
-        except (exceptions.PermissionDeniedError, exceptions.UnauthenticatedError) as error:
-            raise BucketError(
-                f"{self.address}: the server refuses access. Credentials come from the "
-                "environment, such as AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY."
-            ) from error
         except exceptions.NotSupportedError:
             raise
         except (exceptions.BaseError, ValueError) as error:
-            raise BucketError(self._problem(name, _reason(error))) from error
-
-    def _problem(self, name: str, reason: str) -> str:
-        """An error of the library in words, with what cures it."""
-        host = _HOST.search(reason)
-        if _ROLES.search(reason):
-            return (
-                f"{self.address}: there are no credentials. Set AWS_ACCESS_KEY_ID and "
-                "AWS_SECRET_ACCESS_KEY, or what your provider has in their place."
-            )
-        if "builder error" in reason and not _allows_http():
-            return f"{self.address}: its server has no TLS. Set AWS_ALLOW_HTTP=true to allow that."
-        if host is not None and "error sending request" in reason:
-            return (
-                f"{self.address}: the server {host[0]} does not answer. Is it running, and is "
-                "AWS_ENDPOINT_URL its address?"
-            )
-        return f"{self._place(name)}: {reason}"
+            raise BucketError(f"{self._place(name)}: {_reason(error)}. {_CURE}") from error
 
 
 def _check_process(address: str) -> None:
     """Raise in a process that was forked: the library's threads are in its parent alone."""
-    if _users.setdefault("first", os.getpid()) != os.getpid():
+    if os.getpid() != _PROCESS:
         raise BucketError(
             f"{address} cannot be read here: this process was forked from one that has read from "
             "a bucket. Start it by `spawn` instead, as multiprocessing_context='spawn' does."
         )
-
-
-def _opened(address: str, timeout_s: int) -> ObjectStore:
-    _check_process(address)
-    try:
-        return obstore.store.from_url(
-            address,
-            client_options={"timeout": timedelta(seconds=timeout_s), "allow_http": _allows_http()},
-            retry_config={"max_retries": 6, "retry_timeout": timedelta(seconds=_RETRY_S)},
-        )
-    except (exceptions.BaseError, ValueError) as error:
-        raise UsageError(f"{address} cannot be opened: {_reason(error)}") from error
 
 
 def _allows_http() -> bool:
@@ -326,4 +288,4 @@ def _reason(error: Exception) -> str:
     lines = str(error).partition("Debug source")[0].split("\n")
     text = " ".join(" ".join(lines).split())
     printable = "".join(one for one in text if one.isprintable())
-    return _SECRETS.sub(r"\1=…", printable)[:400]
+    return _SECRETS.sub(r"\1=…", printable)[:400].rstrip(".: ")

@@ -49,7 +49,7 @@ from hybridlog_storage.manifest import (
     encode,
 )
 from hybridlog_storage.manifests import MANIFESTS, RECORDINGS, Manifests, decoded, ids_of
-from hybridlog_storage.remote.blocks import LOST, BlockCache, inode_of
+from hybridlog_storage.remote.blocks import BlockCache, inode_of
 from hybridlog_storage.remote.bucket import Bucket, Object
 from hybridlog_storage.settings import MAX_SETTINGS, NONE, StoreSettings, settings_of, settings_text
 from hybridlog_storage.settings import NAME as SETTINGS
@@ -80,11 +80,11 @@ class BucketManifests(Manifests):
         self.place, self._bucket, self._cells = bucket.address, bucket, cells
         self._known: dict[str, tuple[Manifest, str]] = {}
         self._look_at = 0.0
-        self._lock = threading.RLock()
+        self._lock, self._looking = threading.RLock(), threading.RLock()
 
     def look(self, *, now: bool = False) -> None:
         """See what others have changed, `now` or if the last look is a while ago."""
-        with self._lock:
+        with self._looking:
             if self.number and not now and time.monotonic() < self._look_at:
                 return
             found = {one.name: one for one in self._bucket.objects(f"{MANIFESTS}/")}
@@ -97,8 +97,6 @@ class BucketManifests(Manifests):
             }
             if changed or not self.number:
                 self.number += 1
-                lost = [*self._bucket.lost]  # which other threads add to
-                self._bucket.lost -= {name for name in lost if name.split("/")[1] in changed}
                 self._fetch(changed & self.objects.keys())
             self._look_at = time.monotonic() + LOOK_EVERY_S * (1 + len(found) // 1000)
 
@@ -108,15 +106,12 @@ class BucketManifests(Manifests):
         versions = {one: cell.partition(b"\n")[0].decode() for one, cell in known.items()}
         new = [one for one in changed if versions.get(one) != self.objects[one].version]
 
-        def read(recording: str) -> tuple[Object, bytes] | None:
+        def get(recording: str) -> None:
             with suppress(FileNotFoundError):  # it was removed just now
-                return self._bucket.read_whole(_name_of(recording), MAX_BYTES)
-            return None
+                self._get(recording)
 
         with ThreadPoolExecutor(_PARALLEL) as pool:
-            for recording, found in zip(new, pool.map(read, new), strict=True):
-                if found is not None:
-                    self._note(recording, found[1], found[0].version)
+            [*pool.map(get, new)]
 
     def ids(self) -> list[str]:
         """Ids of all recordings, sorted; also of those being removed."""
@@ -149,17 +144,15 @@ class BucketManifests(Manifests):
 
     def _seen(self, recording: str) -> tuple[Manifest, str]:
         with self._lock:
-            known = self._known.get(recording) or self._catalogued(recording)
-            if known is None or known[1] != _version(self.objects.get(recording)):
-                known = self._read(recording)
-            self._known[recording] = known
-            return known
-
-    def _catalogued(self, recording: str) -> tuple[Manifest, str] | None:
-        version, _, data = (self._cells.read(_MANIFEST, recording) or b"").partition(b"\n")
-        with suppress(ValueError):
-            return decoded(recording, data), version.decode()
-        return None
+            version, known = _version(self.objects.get(recording)), self._known.get(recording)
+            if known is None or known[1] != version:
+                noted, _, data = (self._cells.read(_MANIFEST, recording) or b"").partition(b"\n")
+                known = None
+                if noted == version.encode():
+                    with suppress(ValueError):
+                        known = decoded(recording, data), version
+            self._known[recording] = known or self._read(recording)
+            return self._known[recording]
 
     def _get(self, recording: str) -> tuple[bytes, str]:
         about, data = self._bucket.read_whole(_name_of(recording), MAX_BYTES)
@@ -228,9 +221,9 @@ class BucketStore(Source):
                 about = next((one for one in listed if one.name == "/".join(inner)), None)
         elif len(inner) == 3 and inner[0] == TABLES:
             about = self.tables().get(inner[1], {}).get(inner[2])
-        if about is None or about.name in self.bucket.lost:
-            problem = "there is no such object" if about is None else LOST
-            raise FileNotFoundError(errno.ENOENT, problem, "/".join([self.address, *inner]))
+        if about is None:
+            place = "/".join([self.address, *inner])
+            raise FileNotFoundError(errno.ENOENT, "there is no such object", place)
         return self.cache.open(self.bucket, about)
 
     def names(self, inner: tuple[str, ...]) -> tuple[int, dict[str, os.stat_result]]:
@@ -246,17 +239,16 @@ class BucketStore(Source):
     @property
     def number(self) -> int:
         """Changes with what was seen of the store."""
-        return self.manifests.number + len(self.bucket.lost)
+        return self.manifests.number
 
     def tables(self) -> dict[str, dict[str, Object]]:
-        """The objects of tables by folder and name, without those that were lost."""
+        """The objects of tables by folder and name."""
         number = self.number
         if self._tables[0] != number:
             found: dict[str, dict[str, Object]] = {}
             for one in tables_of(self.bucket):
-                if one.name not in self.bucket.lost:
-                    _, folder, name = one.name.split("/")
-                    found.setdefault(folder, {})[name] = one
+                _, folder, name = one.name.split("/")
+                found.setdefault(folder, {})[name] = one
             self._tables = number, found
         return self._tables[1]
 
@@ -266,31 +258,29 @@ class BucketStore(Source):
         self.bucket.delete(sorted({*there}.difference(names)))
         self._tables = -1, {}
 
-    def sizes(self, recording: str) -> dict[str, int]:
+    def sizes(self, folder: str) -> dict[str, int]:
         """As of `Place`; 1,000 a request."""
-        folder = f"{RECORDINGS}/{recording}/"
-        found = {one.name: one for one in self.bucket.objects(folder)}
+        found = {one.name: one for one in self.bucket.objects(f"{folder}/")}
         self._found |= found
-        return {name.removeprefix(folder): one.size for name, one in found.items()}
+        return {name.removeprefix(f"{folder}/"): one.size for name, one in found.items()}
 
     def send(self, sent: Sending) -> None:
         """As of `Place`; from its first byte on."""
-        self._found[sent.name] = self.bucket.put(sent.name, sent.size, sent.checked())
-        if not self.is_whole(sent):
+        self._found[sent.name] = self.bucket.put(sent.name, sent.size, sent.pieces())
+        if not self.has(sent.name, sent):
             raise sent.not_arrived(self)
+
+    def has(self, name: str, sent: Sending) -> bool:
+        """As of `Place`: by the checksum of the server, or it is read."""
+        if self._found[name].has_md5_of(sent.again()):
+            return True
+        with suppress(RefusedError):
+            return digest_of(self.pieces(name, 0, sent.size)) == sent.digest
+        return False
 
     def drop(self, name: str) -> None:
         """As of `Place`."""
         self.bucket.delete([name])
-
-    def is_whole(self, sent: Sending, *, reads: bool = False) -> bool:
-        """As of `Place`: by the checksum of the server, or it is read."""
-        with suppress(RefusedError):  # what is damaged here may be whole there
-            if not reads and self._found[sent.name].has_md5_of(sent.again()):
-                return True
-        with suppress(RefusedError):
-            return digest_of(self.pieces(sent.name, 0, sent.size)) == sent.digest
-        return False
 
     def pieces(self, name: str, at: int, size: int) -> Iterator[bytes]:
         """As of `Source`."""
@@ -350,12 +340,7 @@ class RemoteDirectory(StoreDirectory):
     @classmethod
     def create_in(cls, address: str) -> RemoteDirectory:
         """The store at an address; made if there is none."""
-        try:
-            return cls(address)
-        except StoreError as error:
-            if not isinstance(error.__cause__, FileNotFoundError):
-                raise
-        with suppress(ObjectExistsError):  # another process makes it, too
+        with suppress(ObjectExistsError):  # it is there, or another process makes it, too
             new = StoreSettings(secrets.token_hex(16), mongo=NONE)
             mount(address).bucket.create(SETTINGS, settings_text(new))
         return cls(address)
@@ -378,49 +363,27 @@ class RemoteDirectory(StoreDirectory):
         return self.source.number
 
     def looks(self, ids: Sequence[str]) -> dict[str, str]:
-        """The look of each recording, by id: the version of its manifest, and what was lost."""
-        return {one: self._look_of(one) for one in ids if one in self.manifests.objects}
-
-    def _look_of(self, recording: str) -> str:
-        about = self.manifests.objects.get(recording)
-        return "" if about is None else f"{about.version} {sorted(self._lost(recording))}"
-
-    def _lost(self, recording: str) -> list[str]:
-        """Paths of the files of a recording that were found to be missing."""
-        place = f"{RECORDINGS}/{recording}/"
-        names = [*self.bucket.lost]  # which other threads add to
-        return [one.removeprefix(place) for one in names if one.startswith(place)]
-
-    def has(self, recording: str) -> bool:
-        """True if there is a manifest of a recording."""
-        return recording in self.manifests.objects
+        """The look of each recording, by id: the version of its manifest."""
+        known = self.manifests.objects
+        return {one: known[one].version for one in ids if one in known}
 
     def look_closely(self, recording: str) -> None:
-        """Look which objects of a recording are lost; the others are read from the server again."""
-        place = f"{RECORDINGS}/{recording}/"
-        there = {one.name: one.size for one in self.bucket.objects(place)}
-        lost = {one for one in self.bucket.lost if not one.startswith(place)}
+        """Have the objects of a recording read from the server again."""
         with suppress(StoreError):  # it is named where it is asked about
             for about in objects_of(self.manifests.read(recording)):
-                if there.get(about.name) != about.size:
-                    lost.add(about.name)
                 self.source.cache.forget(self.bucket, about)
-        self.bucket.lost = lost
 
     def listing(self, recording: str) -> Listing:
-        """As of a directory: what the manifest lists, without what was lost."""
-        look, lost = self._look_of(recording), sorted(self._lost(recording))
-        manifest = self.manifests.find(recording)
+        """As of a directory: what the manifest lists."""
+        look, manifest = self.looks([recording]), self.manifests.find(recording)
         if manifest is None:
             raise ManifestError(
                 f"{recording} has no manifest. `hybridlog copy` from a store that has it brings "
                 "it back."
             )
         sealed = {n: one.name for n, one in sorted(manifest.logs.items()) if one.is_here}
-        sealed = {number: name for number, name in sealed.items() if name not in lost}
-        here = manifest.present.items()
-        sizes = {name: one.bytes for name, one in here if name not in lost}
-        return Listing(sealed, {}, (), sizes, look)
+        sizes = {name: one.bytes for name, one in manifest.present.items()}
+        return Listing(sealed, {}, (), sizes, look.get(recording, ""))
 
     @contextmanager
     def writing(
@@ -436,7 +399,7 @@ class RemoteDirectory(StoreDirectory):
         self.check_changes()
         if makes:
             self.check_writable()
-        if not self.has(recording):
+        if recording not in self.manifests.objects:
             raise gone(name or recording)
         yield
 
