@@ -13,8 +13,8 @@ import json
 import os
 import sqlite3
 import stat
-from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Collection
+from contextlib import suppress
 from pathlib import Path
 from threading import RLock
 from typing import Any, Final, TypeVar
@@ -88,17 +88,14 @@ class Cells:
         if self._db is not None:
             return self._db
         opened = _connected(":memory:" if self._path is None else _cleared(self._path))
-        try:
-            if not self._is_ours(opened):
-                with _transaction(opened):
-                    if not opened.execute("SELECT 1 FROM sqlite_master").fetchall():  # it is new
-                        opened.execute(_TABLE)
-                        opened.execute(f"PRAGMA user_version = {self._owner}")
-            if not self._is_ours(opened):
-                raise sqlite3.DatabaseError("it is of another store or version")
-        except BaseException:
-            opened.close()
-            raise
+        if not self._is_ours(opened):
+            with opened:
+                opened.execute("BEGIN IMMEDIATE")
+                if not opened.execute("SELECT 1 FROM sqlite_master").fetchall():  # it is new
+                    opened.execute(_TABLE)
+                    opened.execute(f"PRAGMA user_version = {self._owner}")
+        if not self._is_ours(opened):
+            raise sqlite3.DatabaseError("it is of another store or version")
         self._db = opened
         return opened
 
@@ -155,23 +152,12 @@ class Cells:
         """Change cells; meanwhile no other process changes any."""
 
         def work(opened: sqlite3.Connection) -> None:
-            with _transaction(opened):
+            with opened:
+                opened.execute("BEGIN IMMEDIATE")
                 for statement in statements:
                     opened.execute(*statement)
 
         self._run(work)
-
-
-@contextmanager
-def _transaction(opened: sqlite3.Connection) -> Iterator[None]:
-    try:
-        opened.execute("BEGIN IMMEDIATE")
-        yield
-        opened.execute("COMMIT")
-    except BaseException:
-        with suppress(sqlite3.Error):
-            opened.rollback()
-        raise
 
 
 def _cleared(path: Path) -> str:
@@ -190,19 +176,15 @@ def _connected(address: str) -> sqlite3.Connection:
     made = sqlite3.connect(
         address, uri=True, timeout=_WAIT_S, isolation_level=None, check_same_thread=False
     )
-    try:
-        made.text_factory = bytes  # damaged text is no error
-        made.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _MAX_BYTES)
-        for setting in (
-            "trusted_schema = OFF",
-            "cell_size_check = ON",
-            "synchronous = OFF",
-            "journal_mode = MEMORY",
-        ):
-            made.execute(f"PRAGMA {setting}")
-    except BaseException:
-        made.close()
-        raise
+    made.text_factory = bytes  # damaged text is no error
+    made.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _MAX_BYTES)
+    for setting in (
+        "trusted_schema = OFF",
+        "cell_size_check = ON",
+        "synchronous = OFF",
+        "journal_mode = MEMORY",
+    ):
+        made.execute(f"PRAGMA {setting}")
     return made
 
 

@@ -147,17 +147,20 @@ class _Copy:
 
     def _check_lost(self) -> None:
         """Raise if a recording has lost its manifest, and may have more than is known here."""
-        here, sizes, lost = self._here, self._sizes, ""
+        here, sizes = self._here, self._sizes
         logs = {f"{number:06d}": log.bytes for number, log in here.logs.items() if log.is_here}
-        paths = sorted(path for path in sizes if path.endswith(".mcap"))
-        more = [path for path in paths if sizes[path] > logs.get(path[:6], -1)]
-        if MANIFEST_OLD in sizes:
-            lost = ": run `hybridlog verify --repair` there, then copy again"
-        elif more and (WRITER_LOCK not in sizes or MANIFEST_LOCK in sizes):  # or it was begun
-            lost = f", and has payloads that are not here, in {', '.join(more)}. It stays as it is"
-        if lost:
+        is_begun = WRITER_LOCK in sizes and MANIFEST_LOCK not in sizes  # by a stopped copy
+        more = [
+            path
+            for path in sorted(sizes)
+            if path == MANIFEST_OLD
+            or (not is_begun and path.endswith(".mcap") and sizes[path] > logs.get(path[:6], -1))
+        ]
+        if more:
             raise RefusedError(
-                f"{here.name} in {self._target.address} has lost its manifest{lost}."
+                f"{here.name} in {self._target.address} has lost its manifest, and may have what "
+                f"is not here, in {', '.join(more)}. It stays as it is: run `hybridlog verify "
+                "--repair` there, then copy again."
             )
 
     def _bring(self, here: Manifest, there: Manifest | None, numbers: Collection[int]) -> None:

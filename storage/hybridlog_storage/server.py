@@ -51,8 +51,6 @@ DEFAULT_SSH: Final = "ssh -o ServerAliveInterval=15"
 """Notices within a minute that a connection is dead."""
 _POLL_S: Final = 0.05
 _NOT_REACHED: Final = 255  # exit code of ssh
-_MISSING: Final = 8  # exit codes of our scripts
-_CHANGED: Final = 9
 _SILENT: Final = "it says nothing; the login needs a shell, with flock and sha256sum"
 _SHARED_S: Final = 15  # a connection without users stays for so long
 _SIZE: Final = re.compile("[0-9]{1,18}")
@@ -116,7 +114,7 @@ class Server(Place):
     def begin(self) -> None:
         """Make a store where there is none."""
         content = self.fetched(SETTINGS, MAX_SETTINGS)
-        if content is not None:
+        if content:
             settings_of(content, self.address)
             return
         if self.run("ls -A"):
@@ -144,15 +142,9 @@ class Server(Place):
         said = self.run(f"{whole} -exec grep -hao '{pattern}' {{}} + || true")
         return {json.loads(row + b"}")["name"] for row in said.splitlines()}
 
-    def fetched(self, name: str, most: int) -> bytes | None:
-        """A file, and at most one byte more than it may have; None if there is none."""
-        script = f"test -e {name} || exit {_MISSING}; head -c {most + 1} {name}"
-        try:
-            return self.run(script)
-        except _ExitError as error:
-            if error.code == _MISSING:
-                return None
-            raise
+    def fetched(self, name: str, most: int) -> bytes:
+        """A file, and at most one byte more than it may have; nothing if there is none."""
+        return self.run(f"test ! -e {name} || head -c {most + 1} {name}")
 
     def _grow(self, sent: Sending, at: int) -> None:
         self.run(f"cat {'>>' if at else '>'} {shlex.quote(sent.part)}", sent.pieces(at))
@@ -186,8 +178,7 @@ class Server(Place):
                     raise StoreError(f"{self.address} says more than any store has to say.")
             self._check_reached(process, errors)
             if process.returncode:
-                why = f"{self.address}: {_reason(errors) or _SILENT}."
-                raise _ExitError(process.returncode, why)
+                raise StoreError(f"{self.address}: {_reason(errors) or _SILENT}.")
             said.seek(0)
             return said.read()
 
@@ -231,7 +222,7 @@ class _ServerManifests(Manifests):
 
     def _get(self, recording: str) -> tuple[bytes, str]:
         data = self._server.fetched(f"{MANIFESTS}/{recording}.json", MAX_BYTES)
-        if data is None:
+        if not data:
             raise FileNotFoundError
         return data, hashlib.sha256(data).hexdigest()
 
@@ -250,32 +241,19 @@ class _ServerManifests(Manifests):
         sync = f"{{ sync {folder} {RECORDINGS} {MANIFESTS} || sync; }}"
         is_same = f'test "$(sha256sum 2> /dev/null < {final})" = "{version and version + "  -"}"'
         script = (
-            f"{sync} && {{ {is_same} || exit {_CHANGED}; : >> {folder}/{MANIFEST_LOCK}; "
-            f"ln -f {final} {folder}/{MANIFEST_OLD} 2> /dev/null; "
+            f"{sync} && {{ {is_same} || {{ echo changed; exit; }}; "
+            f": >> {folder}/{MANIFEST_LOCK}; ln -f {final} {folder}/{MANIFEST_OLD} 2> /dev/null; "
             f"mv {new} {final}; }} && {sync}"
         )
+        why = f"{lock} is held by another process, or cannot be written"
         locked = f"flock -w {WAIT_S:.0f} {lock} sh -c {shlex.quote(script)}"
-        try:
-            self._server.run(f"cat > {new} && {locked}; code=$?; rm -f {new}; exit $code", [data])
-        except _ExitError as error:
-            if error.code == _CHANGED:
-                raise changed from None
-            raise StoreError(
-                f"{error} A manifest cannot be written, or another process has held {lock} for "
-                f"{WAIT_S:.0f} s."
-            ) from error
+        ends = f"|| {{ echo '{why}' >&2; false; }}; code=$?; rm -f {new}; exit $code"
+        if self._server.run(f"cat > {new} && {locked} {ends}", [data]):
+            raise changed
 
 
 _Running = tuple["subprocess.Popen[bytes]", "IO[bytes]", "IO[bytes]"]
 """A process, and files with its output and its errors: pipes would stay open with the login."""
-
-
-class _ExitError(StoreError):
-    """A script has ended with an exit code."""
-
-    def __init__(self, code: int, text: str) -> None:
-        super().__init__(text)
-        self.code = code
 
 
 def _reason(errors: IO[bytes]) -> str:

@@ -17,6 +17,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from queue import Empty, SimpleQueue
 from types import FrameType
 from typing import NoReturn
@@ -72,42 +73,42 @@ def at_safe_points() -> Iterator[None]:
     if _block is not None or threading.current_thread() is not threading.main_thread():
         yield
         return
-    with _delayed_interrupt():
-        block = _block = _Block()
-        try:
-            yield
-        finally:
-            _block = None
-            if block.action is not None:
-                block.action()
+    handler, block = signal.getsignal(signal.SIGINT), _Block()
+    if handler is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _delay_interrupt)
+    _block = block
+    try:
+        yield
+    finally:
+        _block = None
+        if handler is signal.default_int_handler:
+            signal.signal(signal.SIGINT, handler)
+        if block.action is not None:
+            block.action()
 
 
 class GivenUpError(BaseException):
     """Nobody waits for the answer. It is no `Exception`, so that nothing takes it for damage."""
 
 
-class _Answer(threading.local):
-    """The answer that a thread works out."""
-
-    given_up: threading.Event | None = None
-
-
-_answer = _Answer()
+_given_up: ContextVar[threading.Event | None] = ContextVar("given_up", default=None)
+"""Set once nobody waits for the answer that this thread works out."""
 
 
 @contextmanager
 def until_given_up(given_up: threading.Event) -> Iterator[None]:
     """Work out an answer in this thread until the event is set: then `GivenUpError` is raised."""
-    _answer.given_up = given_up
+    before = _given_up.set(given_up)
     try:
         yield
     finally:
-        _answer.given_up = None
+        _given_up.reset(before)
 
 
 def check_wanted() -> None:
     """Raise `GivenUpError` if nobody waits for the answer of this thread."""
-    if _answer.given_up is not None and _answer.given_up.is_set():
+    given_up = _given_up.get()
+    if given_up is not None and given_up.is_set():
         raise GivenUpError
 
 
@@ -156,22 +157,10 @@ def postpone(action: Action) -> bool:
     return True
 
 
-@contextmanager
-def _delayed_interrupt() -> Iterator[None]:
-    """Delay Python's own answer to Ctrl-C."""
-    if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
-        yield
-        return
-
-    def stop(number: int, frame: FrameType | None) -> None:
-        if not postpone(_interrupt):
-            signal.default_int_handler(number, frame)
-
-    signal.signal(signal.SIGINT, stop)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+def _delay_interrupt(number: int, frame: FrameType | None) -> None:
+    """In the place of Python's own answer to Ctrl-C."""
+    if not postpone(_interrupt):
+        signal.default_int_handler(number, frame)
 
 
 def _interrupt() -> NoReturn:

@@ -331,7 +331,7 @@ def test_payloads_that_are_only_there_are_not_replaced(make: Makes) -> None:
     expire(source)
     target.delete(f"manifests/{RECORDING}.json")
     before = target.names()
-    with pytest.raises(RefusedError, match=r"are not here, in 000001\.mcap"):
+    with pytest.raises(RefusedError, match=r"is not here, in 000001\.mcap"):
         copy(source.source, target.place, RECORDING)
     assert {*before} - {*target.names()} == set()
 

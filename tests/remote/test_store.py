@@ -246,10 +246,7 @@ def test_lost_fields_and_manifests(here: Path, address: str, proxy: Proxy) -> No
     lose(address, f"{run}.json")
     files.mounted.clear()
     with hl.open(address) as store:
-        (finding,) = store.verify().findings
-        assert (finding.recording, finding.place) == (run, "manifest")
-        assert "hybridlog copy" in finding.cure
-        assert "has no manifest" in store.shared.repairs.unreadable[run]
+        assert [one.name for one in store.recordings()] == ["short-0"]
     with hl.open(here, mongo="none") as source:
         assert not source.copy(address, ["run"]).refused
     files.mounted.clear()

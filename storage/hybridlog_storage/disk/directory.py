@@ -157,27 +157,22 @@ class StoreDirectory:
                 path.mkdir(parents=True, exist_ok=True)
                 # Of several processes, one creates the store and the others open it.
                 with files.locked_folder(path):
-                    settings = StoreSettings(secrets.token_hex(16), mongo=mongo)
-                    cls._make(path, settings)
+                    # A temporary settings file left by a crash here does not count.
+                    names = {entry.name for entry in path.iterdir()}
+                    if SETTINGS not in names:
+                        if any(not name.startswith(f".{SETTINGS}.") for name in names):
+                            raise StoreError(
+                                f"{path} holds files and is not a hybridlog store. Choose an empty "
+                                "or a new directory with --store."
+                            )
+                        settings = StoreSettings(secrets.token_hex(16), mongo=mongo)
+                        write_settings(path, settings)
             store = cls(path)
             for folder in (MANIFESTS, RECORDINGS):
                 with suppress(FileExistsError):
                     files.make_folder(path / folder)
                     files.sync_folder(path)
         return store
-
-    @staticmethod
-    def _make(path: Path, settings: StoreSettings) -> None:
-        names = {entry.name for entry in path.iterdir()}
-        if SETTINGS in names:
-            return
-        # A temporary settings file left by a crash here does not count.
-        if any(not name.startswith(f".{SETTINGS}.") for name in names):
-            raise StoreError(
-                f"{path} holds files and is not a hybridlog store. "
-                "Choose an empty or a new directory with --store."
-            )
-        write_settings(path, settings)
 
     @property
     def cells(self) -> Cells:
@@ -271,23 +266,19 @@ class StoreDirectory:
                 found = files.names(path)
         except OSError as error:
             raise unreadable(error, path) from error
-        sealed: dict[int, str] = {}
-        opened: dict[int, str] = {}
-        sizes: dict[str, int] = {}
-        others = []
-        for name, about in sorted(found.items()):
-            number, kind = _numbered(name)
-            if kind == OPEN_SUFFIX:
-                opened[number] = name
-                continue
-            if kind == SEALED_SUFFIX:
-                sealed[number] = name
-            elif not is_rows(name):
-                if name not in _OF_MANIFEST:
-                    others.append(name)
-                continue
-            sizes[name] = about.st_size if stat.S_ISREG(about.st_mode) else -1
-        return Listing(sealed, opened, tuple(others), sizes, look)
+        kinds = {name: _numbered(name) for name in sorted(found.keys() - _OF_MANIFEST)}
+        sizes = {
+            name: found[name].st_size if stat.S_ISREG(found[name].st_mode) else -1
+            for name, (_, kind) in kinds.items()
+            if kind == SEALED_SUFFIX or is_rows(name)
+        }
+        return Listing(
+            {number: name for name, (number, kind) in kinds.items() if kind == SEALED_SUFFIX},
+            {number: name for name, (number, kind) in kinds.items() if kind == OPEN_SUFFIX},
+            tuple(name for name, (_, kind) in kinds.items() if not kind and name not in sizes),
+            sizes,
+            look,
+        )
 
     @contextmanager
     def retaining(self) -> Iterator[None]:
@@ -358,7 +349,11 @@ class StoreDirectory:
         try:
             fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except BlockingIOError:
-            return _read_holder(fd)
+            # By its line; the store may come from another user.
+            found = re.fullmatch(rb"([0-9]{1,19}) ([01]) *", os.pread(fd, _HOLDER, 0))
+            if found is None:
+                return _ANOTHER
+            return Holder(f"process {int(found[1])}", is_recording=found[2] == b"1")
         finally:
             os.close(fd)
         return None
@@ -367,14 +362,6 @@ class StoreDirectory:
         """True if a process records into a directory at this moment."""
         holder = self.holder(recording)
         return holder is not None and holder.is_recording
-
-
-def _read_holder(fd: int) -> Holder:
-    """The last holder of a lock, from its line; the store may come from another user."""
-    found = re.fullmatch(rb"([0-9]{1,19}) ([01]) *", os.pread(fd, _HOLDER, 0))
-    if found is None:
-        return _ANOTHER
-    return Holder(f"process {int(found[1])}", is_recording=found[2] == b"1")
 
 
 def gone(name: str) -> TopicError:

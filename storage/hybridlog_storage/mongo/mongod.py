@@ -189,6 +189,8 @@ class EmbeddedMongod:
         program = find_mongod()
         _refuse_odd_files(self._directory)
         _make_folder(self._directory / "data")
+        with files.folder(self._directory / "data"):
+            pass  # or it is none
         script = str(Path(__file__).with_name("mongod_keeper.py"))
         own = [script, str(self._linger_s), path, str(keeper)]
         log = self._open(self.log.name, os.O_APPEND)

@@ -118,16 +118,6 @@ class BucketManifests(Manifests):
         self.look()
         return sorted(self.objects)
 
-    def without(self) -> list[str]:
-        """Ids of recordings that the catalog has, and that have files and no manifest."""
-        found = []
-        for one in sorted(self._cells.each(_MANIFEST).keys() - self.objects.keys()):
-            if any(self._bucket.objects(f"{RECORDINGS}/{one}/")):
-                found.append(one)
-            else:
-                self._cells.write([drop(_MANIFEST, one)])
-        return found
-
     def remove(
         self, recording: str, check: Callable[[Manifest], object] = lambda _: None
     ) -> Manifest:
