@@ -35,7 +35,6 @@ from hybridlog_storage.disk.directory import (
     gone,
 )
 from hybridlog_storage.errors import (
-    ManifestError,
     ObjectChangedError,
     ObjectExistsError,
     RecordingExistsError,
@@ -80,11 +79,11 @@ class BucketManifests(Manifests):
         self.place, self._bucket, self._cells = bucket.address, bucket, cells
         self._known: dict[str, tuple[Manifest, str]] = {}
         self._look_at = 0.0
-        self._lock, self._looking = threading.RLock(), threading.RLock()
+        self._lock = threading.RLock()
 
     def look(self, *, now: bool = False) -> None:
         """See what others have changed, `now` or if the last look is a while ago."""
-        with self._looking:
+        with self._lock:
             if self.number and not now and time.monotonic() < self._look_at:
                 return
             found = {one.name: one for one in self._bucket.objects(f"{MANIFESTS}/")}
@@ -103,15 +102,18 @@ class BucketManifests(Manifests):
     def _fetch(self, changed: Collection[str]) -> None:
         """Read manifests that the catalog does not have, several at once."""
         known = self._cells.each(_MANIFEST, changed) if changed else {}
-        versions = {one: cell.partition(b"\n")[0].decode() for one, cell in known.items()}
-        new = [one for one in changed if versions.get(one) != self.objects[one].version]
+        heads = {one: f"{self.objects[one].version}\n".encode() for one in changed}
+        new = [one for one in changed if not known.get(one, b"").startswith(heads[one])]
 
-        def get(recording: str) -> None:
+        def read(recording: str) -> tuple[Object, bytes] | None:
             with suppress(FileNotFoundError):  # it was removed just now
-                self._get(recording)
+                return self._bucket.read_whole(_name_of(recording), MAX_BYTES)
+            return None
 
         with ThreadPoolExecutor(_PARALLEL) as pool:
-            [*pool.map(get, new)]
+            for recording, found in zip(new, pool.map(read, new), strict=True):
+                if found is not None:
+                    self._note(recording, found[1], found[0].version)
 
     def ids(self) -> list[str]:
         """Ids of all recordings, sorted; also of those being removed."""
@@ -124,12 +126,9 @@ class BucketManifests(Manifests):
         """Remove a recording with all its objects, and those of others whose removal was cut."""
         removed = super().remove(recording, check)
         for one in self.ids():
-            try:
-                self.find(one)
-            except RecordingGoneError:
-                super().remove(one)
-            except ManifestError:
-                continue  # it is told where it is asked about
+            with suppress(StoreError):  # it is told where it is asked about
+                if self._seen(one)[0].status == "removed":
+                    super().remove(one)
         return removed
 
     def _seen(self, recording: str) -> tuple[Manifest, str]:
@@ -365,12 +364,7 @@ class RemoteDirectory(StoreDirectory):
 
     def listing(self, recording: str) -> Listing:
         """As of a directory: what the manifest lists."""
-        look, manifest = self.looks([recording]), self.manifests.find(recording)
-        if manifest is None:
-            raise ManifestError(
-                f"{recording} has no manifest. `hybridlog copy` from a store that has it brings "
-                "it back."
-            )
+        look, manifest = self.looks([recording]), self.manifests.read(recording)
         sealed = {n: one.name for n, one in sorted(manifest.logs.items()) if one.is_here}
         sizes = {name: one.bytes for name, one in manifest.present.items()}
         return Listing(sealed, {}, (), sizes, look.get(recording, ""))
