@@ -27,8 +27,7 @@ from msgspec.structs import asdict
 import hybridlog as hl
 from benchmarks import page
 from benchmarks.samples import Journal
-from hybridlog.cli.app import app
-from hybridlog.cli.main import EXIT_CODES
+from hybridlog.cli.app import EXIT_CODES, app
 from hybridlog.query import times, topics
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.types import check
@@ -987,8 +986,7 @@ def test_the_specification_names_what_there_is() -> None:
 
 
 def test_the_unit_for_systemd_starts_a_recorder() -> None:
-    from hybridlog.cli.commands.record import record_command
-    from hybridlog.cli.record_choices import RecordChoices
+    from hybridlog.cli.commands.record import RecordChoices, record_command
     from hybridlog.cli.record_live import recorder_options
 
     (unit,) = (fence for fence in fences(DOCS / "robot.md") if fence.language == "ini")
@@ -1014,7 +1012,7 @@ def audit(event, arguments):
             print("network:", event, arguments, file=sys.stderr)
 
 sys.addaudithook(audit)
-import_module("hybridlog.cli.main").main()
+import_module("hybridlog.cli.app").main()
 """
 
 

@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from hybridlog.cli.main import main
+from hybridlog.cli.app import main
 
 __all__ = ["main"]

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar
 import click
 
 from hybridlog.cli import output
-from hybridlog.cli.binder import PATH, option
-from hybridlog.cli.options import AsJson, Forced, Topics
+from hybridlog.cli.options import PATH, AsJson, Forced, Topics, option
 from hybridlog.cli.output import ROWS_AT_ONCE, Bar, Column, print_table
 from hybridlog.formats import OUTPUTS, formats_of, is_directory, suffixes_of
 from hybridlog_storage.errors import PayloadError, UsageError

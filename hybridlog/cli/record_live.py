@@ -16,16 +16,23 @@ from msgspec.structs import asdict, replace
 
 from hybridlog.cli import output
 from hybridlog.cli.app import DIFFERENT
-from hybridlog.cli.commands.top import draw, summary
-from hybridlog.cli.options import parse_tags
-from hybridlog.cli.record_choices import (
+from hybridlog.cli.commands.record import (
+    ENVIRONMENT_MASTER,
     RecordChoices,
     line_of,
     not_indexed,
     remarks_on,
     row_of,
 )
+from hybridlog.cli.commands.top import draw, summary
+from hybridlog.cli.options import parse_tags
 from hybridlog.cli.signals import handled, write_note
+from hybridlog.contract import Contract
+from hybridlog.follow.child import Trigger
+from hybridlog.live.incidents import PINNED
+from hybridlog.live.policy import default_budget, priority_rule, throttle_rule
+from hybridlog.live.recorder import Recorder, RecorderOptions, make_room
+from hybridlog.live.state import summary_of
 from hybridlog.query.answers.lost import coverage, in_words
 from hybridlog.record.losses import Cause, losses_of
 from hybridlog_storage.errors import (
@@ -38,10 +45,7 @@ from hybridlog_storage.errors import (
 from hybridlog_storage.stopping import Flag
 
 if TYPE_CHECKING:
-    from contextlib import AbstractContextManager
-
     from hybridlog.contract.judge import Result
-    from hybridlog.live.recorder import Recorder, RecorderOptions
     from hybridlog.live.sources.base import LiveSource
     from hybridlog.live.state import RecorderState
     from hybridlog.record.recorder import RecordReport
@@ -58,15 +62,11 @@ class _Stop(Flag):
 
     Attributes:
         leave: Called at each; returns whether it ended the waiting for the follower.
+        wait_s: Seconds to wait for the follower; a person can press Ctrl-C again instead.
     """
 
-    number: int = signal.SIGINT
     leave: Callable[[], bool] = staticmethod(lambda: False)
-
-    @property
-    def wait_s(self) -> float | None:
-        """Seconds to wait for the follower; a person can press Ctrl-C again instead."""
-        return None if self.number == signal.SIGINT else _FOLLOWER_S
+    wait_s: float | None = None
 
 
 def record_live(choices: RecordChoices) -> int:
@@ -81,8 +81,6 @@ def record_live(choices: RecordChoices) -> int:
 
 
 def _record(choices: RecordChoices) -> int:
-    from hybridlog.live.recorder import Recorder, make_room
-
     # Wrong options are found before a store is made.
     options = recorder_options(choices)
     sources = sources_of(choices)
@@ -92,16 +90,16 @@ def _record(choices: RecordChoices) -> int:
     with ExitStack() as held:
         for source in sources:
             held.enter_context(source).check()
-        store = held.enter_context(choices.opened_to_record())
+        store = held.enter_context(choices.opened(create=True))
         make_room(store, options.reserve_bytes)
         gc.freeze()  # the collector skips what was there before
         with _stop_flag() as stop:
-            full = ""
             while True:
                 recorder = Recorder(store, sources, options, _say)
                 recorder.start()
                 stop.leave = recorder.leave
-                if full:
+                if reports:
+                    full = reports[-1].entry.name
                     _say(f"the manifest of {full} is full: {recorder.name} goes on")
                 with table or nullcontext(), _pinned_by_signal(recorder):
                     show(recorder.look())
@@ -111,7 +109,7 @@ def _record(choices: RecordChoices) -> int:
                 if stop.is_set or not recorder.is_full:
                     break
                 reports += recorder.stop(_FOLLOWER_S)
-                options, full = recorder.rest, recorder.name
+                options = recorder.rest
                 sources = [held.enter_context(source) for source in sources_of(choices)]
             notify_service("STOPPING=1", "STATUS=writing what is left")
             output.remarks(["hybridlog: writing what is left; Ctrl-C leaves at once"])
@@ -120,8 +118,8 @@ def _record(choices: RecordChoices) -> int:
         if options.contract is not None:
             from hybridlog.contract import judge  # loads pyarrow
 
-            results = (store.judge(options.contract, one.entry.id) for one in reports)
-            broken = judge.broken([one for each in results for one in each])
+            for one in reports:
+                broken += judge.broken(store.judge(options.contract, one.entry.id))
         return _finish(choices, reports, recorder, sources, broken)
 
 
@@ -160,16 +158,15 @@ def _finish(
             "exit_code": code,
         }
         output.print_json({"report": about}, at_once=True)
-    elif not rows:
-        output.remarks(["Nothing was stored."])
     else:
-        entry = reports[-1].entry
-        let_go = [f"{state.let_go} let go by the ring"] if state.let_go else []
-        told = [f"{state.messages} received", coverage(entry, losses_of(entry)), *let_go, reason]
-        output.tell(None, [*map(line_of, rows), "; ".join(told)])
-    silent, unfitting = recorder.silent(), recorder.unfitting()
-    output.remarks(f"{topic}: has a publisher that sent nothing" for topic in silent)
-    output.remarks(f"no topic fits {text}" for text in unfitting)
+        told = [f"{state.messages} received", reason]
+        if rows:
+            entry = reports[-1].entry
+            let_go = [f"{state.let_go} let go by the ring"] if state.let_go else []
+            told[1:1] = [coverage(entry, losses_of(entry)), *let_go]
+        output.tell(None, [*map(line_of, rows or ()), "; ".join(told)])
+    output.remarks(f"{topic}: has a publisher that sent nothing" for topic in recorder.silent())
+    output.remarks(f"no topic fits {text}" for text in recorder.unfitting())
     for report in reports:
         output.remarks(remarks_on(report))
     errors = [
@@ -188,11 +185,6 @@ def _finish(
 
 def recorder_options(choices: RecordChoices) -> RecorderOptions:
     """Options for the recorder from those of the command; patterns are checked."""
-    from hybridlog.contract import Contract
-    from hybridlog.follow.child import Trigger
-    from hybridlog.live.policy import default_budget, priority_rule, throttle_rule
-    from hybridlog.live.recorder import RecorderOptions
-
     chosen, no_index = choices.matchers()
     budget_bytes = choices.budget or default_budget()
     # Each topic of large messages has an open chunk, and all of them are to fit.
@@ -234,7 +226,7 @@ def sources_of(choices: RecordChoices) -> list[LiveSource]:
     if choices.ros1 is not None:
         from hybridlog.live.sources.ros1.source import Ros1Source
 
-        found.append(Ros1Source(choices.master))
+        found.append(Ros1Source(None if choices.ros1 == ENVIRONMENT_MASTER else choices.ros1))
     if choices.ros2:
         from hybridlog.live.sources.ros2.source import Ros2Source
 
@@ -263,27 +255,27 @@ def _stop_flag() -> Iterator[_Stop]:
         if not stopped.leave() and stopped.is_set:
             write_note("\nhybridlog: stopped. Flushed chunks stay; the next command seals them.")
             os._exit(128 + number)
-        stopped.number = number
+        stopped.wait_s = None if number == signal.SIGINT else _FOLLOWER_S
         stopped.set()
 
     with handled(stop):
         yield stopped
 
 
-def _pinned_by_signal(recorder: Recorder) -> AbstractContextManager[object]:
+@contextmanager
+def _pinned_by_signal(recorder: Recorder) -> Iterator[None]:
     """SIGUSR1 marks and pins what is around it."""
 
     def fire(_: int) -> None:
         # Not in the handler: the code it interrupts may hold the locks.
         threading.Thread(target=recorder.fire, args=("SIGUSR1",), daemon=True).start()
 
-    return handled(fire, [signal.SIGUSR1] if hasattr(signal, "SIGUSR1") else [])
+    with handled(fire, [signal.SIGUSR1] if hasattr(signal, "SIGUSR1") else []):
+        yield
 
 
 def _say(text: str) -> None:
     """Print a message of the recorder at once."""
-    from hybridlog.live.incidents import PINNED
-
     if not (output.is_quiet() and PINNED in text):  # which is no problem
         output.note(f"hybridlog: {text}")
 
@@ -298,8 +290,6 @@ def _show(state: RecorderState, table: output.Drawn | None, *, as_json: bool) ->
     if table is not None:
         draw(state, table)
     elif as_json:
-        from hybridlog.live.state import summary_of
-
         with suppress(BrokenPipeError):  # who reads it may go; the recording goes on
             output.print_json({"state": summary_of(state)}, at_once=True)
 

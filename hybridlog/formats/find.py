@@ -34,6 +34,10 @@ class Found(Struct):
     stores: list[Path] = field(default_factory=list)
     problems: list[SourceError] = field(default_factory=list)
 
+    def is_one_log(self, top: Path) -> bool:
+        """True if a directory is the bag, or its parts are all there is below it."""
+        return len(self.logs) == 1 and top in {self.logs[0].path, self.logs[0].path.parent}
+
 
 class _File(NamedTuple):
     """A file, with what changes when it is written."""
@@ -100,9 +104,10 @@ class Watch:
         self._done &= seen
         return found
 
-    def put_back(self, log: LogSet) -> None:
-        """Find a log again at the next look."""
-        self._done = {file for file in self._done if file.path not in log.files}
+    def put_back(self, logs: Sequence[LogSet]) -> None:
+        """Find logs again at the next look."""
+        files = {path for log in logs for path in log.files}
+        self._done = {file for file in self._done if file.path not in files}
 
     def _complete_in(
         self, folder: Path, files: Sequence[_File], problems: list[SourceError]

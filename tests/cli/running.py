@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner
 
 from hybridlog.cli import output
-from hybridlog.cli.main import _run as run_app
+from hybridlog.cli.app import _run as run_app
 from tests import places
 from tests.cli.within import Answer
 

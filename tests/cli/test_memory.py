@@ -17,7 +17,7 @@ from tests.some import in_turn
 from .running import run
 
 SIZE = 16 << 20
-PROGRAM = "from hybridlog.cli.main import main; import sys; sys.exit(main())"
+PROGRAM = "from hybridlog.cli.app import main; import sys; sys.exit(main())"
 
 
 @pytest.fixture(scope="module")

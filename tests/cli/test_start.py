@@ -12,9 +12,8 @@ from typing import cast
 import click
 import pytest
 
-from hybridlog.cli.app import COMMANDS, GROUPS, app
-from hybridlog.cli.binder import PATH
-from hybridlog.cli.main import EXIT_CODES
+from hybridlog.cli.app import COMMANDS, EXIT_CODES, GROUPS, app
+from hybridlog.cli.options import PATH
 from tests.json_schemas import misfit, schema_of, schemas
 
 from .running import COMMAND, complete, environment, run

@@ -79,7 +79,7 @@ STOPS_AT_EACH = """
 import os, select, signal, sys
 from importlib import import_module
 
-main = import_module("hybridlog.cli.main").main
+main = import_module("hybridlog.cli.app").main
 MOMENTS = sys.argv.pop(1).split(",")
 
 def stop(frame, event, argument):

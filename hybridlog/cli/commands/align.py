@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, ClassVar
 import click
 
 from hybridlog.cli.answers import Tabular
-from hybridlog.cli.binder import command, option
-from hybridlog.cli.options import Filtered, InFrame, parse_fields, query_of
+from hybridlog.cli.options import Filtered, InFrame, command, option, parse_fields, query_of
 from hybridlog.cli.output import remarks
 from hybridlog.query.choice import Choice
 from hybridlog_storage.errors import TopicError, UsageError

@@ -11,10 +11,11 @@ from msgspec.structs import asdict
 from hybridlog.cli import output
 from hybridlog.cli.answers import SCREEN, Listing, answering, check_room, write_bytes
 from hybridlog.cli.app import DIFFERENT
-from hybridlog.cli.binder import command, option
 from hybridlog.cli.options import (
     Strict,
     Topics,
+    command,
+    option,
 )
 from hybridlog.cli.output import Column, duration_of, rate_of
 

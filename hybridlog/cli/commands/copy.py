@@ -10,8 +10,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from hybridlog.cli import options, output
-from hybridlog.cli.binder import Amount, argument, command, option
-from hybridlog.cli.options import AsJson, Choosing, InStore, Quiet
+from hybridlog.cli.options import (
+    Amount,
+    AsJson,
+    Choosing,
+    InStore,
+    Quiet,
+    argument,
+    command,
+    option,
+)
 from hybridlog.cli.output import Bar
 from hybridlog.cli.signals import watch
 from hybridlog.wording import parse_size

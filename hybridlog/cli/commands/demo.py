@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from hybridlog import demo
-from hybridlog.cli.binder import Options, argument, command
+from hybridlog.cli.options import Options, argument, command
 from hybridlog_storage.errors import UsageError
 
 BAG, STORE, SLICE = "robot.bag", "robot-logs", "scan.npz"

@@ -7,8 +7,16 @@ from msgspec.structs import asdict
 from hybridlog.cli import output
 from hybridlog.cli.answers import Listing
 from hybridlog.cli.app import DIFFERENT
-from hybridlog.cli.binder import argument, command, option
-from hybridlog.cli.options import Between, InStore, Quiet, one_recording, topics
+from hybridlog.cli.options import (
+    Between,
+    InStore,
+    Quiet,
+    argument,
+    command,
+    one_recording,
+    option,
+    topics,
+)
 from hybridlog.cli.output import Column
 
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from hybridlog.cli import output
-from hybridlog.cli.binder import command, option
-from hybridlog.cli.options import InStore, Quiet, one_recording
+from hybridlog.cli.options import InStore, Quiet, command, one_recording, option
 from hybridlog_storage.errors import UsageError
 
 

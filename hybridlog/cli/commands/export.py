@@ -19,8 +19,7 @@ from hybridlog.cli.answers import (
     write_answer,
     write_bytes,
 )
-from hybridlog.cli.binder import Options, argument, command, option
-from hybridlog.cli.options import Forced, Latched, Topics
+from hybridlog.cli.options import Forced, Latched, Options, Topics, argument, command, option
 from hybridlog.cli.output import Bar
 from hybridlog.formats import OUTPUTS, formats_of, is_directory, suffixes_of
 from hybridlog_storage.disk.unfinished import undone

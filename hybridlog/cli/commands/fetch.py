@@ -20,8 +20,15 @@ from hybridlog.cli.answers import (
     write_answer,
     write_following,
 )
-from hybridlog.cli.binder import command, option
-from hybridlog.cli.options import Filtered, InFrame, NoLatched, parse_fields, query_of
+from hybridlog.cli.options import (
+    Filtered,
+    InFrame,
+    NoLatched,
+    command,
+    option,
+    parse_fields,
+    query_of,
+)
 from hybridlog.formats import OUTPUTS, formats_of
 from hybridlog_storage.errors import TopicError, UsageError
 from hybridlog_storage.stopping import at_safe_points

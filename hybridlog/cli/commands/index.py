@@ -10,8 +10,16 @@ import click
 from msgspec.structs import asdict
 
 from hybridlog.cli import output
-from hybridlog.cli.binder import SOME_SECONDS, argument, command, option
-from hybridlog.cli.options import AsJson, Choosing, InStore, Quiet
+from hybridlog.cli.options import (
+    SOME_SECONDS,
+    AsJson,
+    Choosing,
+    InStore,
+    Quiet,
+    argument,
+    command,
+    option,
+)
 from hybridlog.cli.output import Bar, Column, bytes_of, numbers
 from hybridlog.cli.signals import watch
 from hybridlog.wording import listed

@@ -14,10 +14,18 @@ from msgspec.structs import asdict
 
 from hybridlog.cli import options, output
 from hybridlog.cli.answers import check_room
-from hybridlog.cli.binder import command, option
 from hybridlog.cli.commands.keep import pin_dict
 from hybridlog.cli.commands.ls import recording_dict, status_text
-from hybridlog.cli.options import AsJson, Choosing, Forced, InStore, names_argument, query_of
+from hybridlog.cli.options import (
+    AsJson,
+    Choosing,
+    Forced,
+    InStore,
+    command,
+    names_argument,
+    option,
+    query_of,
+)
 from hybridlog.cli.output import Column, bytes_of, duration_of, print_fields, print_table
 from hybridlog.query.topics import resolve
 from hybridlog.wording import listed

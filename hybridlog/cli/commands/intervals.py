@@ -8,8 +8,7 @@ import click
 
 from hybridlog.cli import output
 from hybridlog.cli.answers import Listing, answering
-from hybridlog.cli.binder import command, option
-from hybridlog.cli.options import Filtered, parse_fields
+from hybridlog.cli.options import Filtered, command, option, parse_fields
 from hybridlog.cli.output import Column, duration_of, time_of
 
 if TYPE_CHECKING:

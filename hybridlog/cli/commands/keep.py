@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 from msgspec.structs import asdict
 
 from hybridlog.cli import output
-from hybridlog.cli.binder import command, option
-from hybridlog.cli.options import AsJson, Choosing, InStore, Quiet, query_of
+from hybridlog.cli.options import AsJson, Choosing, InStore, Quiet, command, option, query_of
 from hybridlog.cli.output import Column, time_of
 from hybridlog.wording import listed
 from hybridlog_storage.errors import UsageError

@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.cli import output
-from hybridlog.cli.binder import command
-from hybridlog.cli.options import AsJson, Choosing, InStore
+from hybridlog.cli.options import AsJson, Choosing, InStore, command
 from hybridlog.cli.output import Column
 
 if TYPE_CHECKING:

@@ -7,8 +7,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 
 from hybridlog.cli import options, output
-from hybridlog.cli.binder import argument, command, option
-from hybridlog.cli.options import InStore, Quiet
+from hybridlog.cli.options import InStore, Quiet, argument, command, option
 from hybridlog_storage.errors import StoreError, UsageError
 
 

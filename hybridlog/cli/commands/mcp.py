@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from hybridlog.cli.binder import command
-from hybridlog.cli.options import Place
+from hybridlog.cli.options import Place, command
 from hybridlog_storage.errors import extra
 
 

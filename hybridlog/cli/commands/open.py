@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Final
 import click
 
 from hybridlog.cli import output
-from hybridlog.cli.binder import command, option
-from hybridlog.cli.options import Filtered, Served
+from hybridlog.cli.options import Filtered, Served, command, option
 from hybridlog.cli.signals import ended_by_signal
 from hybridlog.wording import listed
 from hybridlog_storage.errors import extra

@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import ClassVar
 
 from hybridlog.cli.answers import answering, check_room, form_of, write_bytes
-from hybridlog.cli.binder import command, option
-from hybridlog.cli.options import Filtered, Forced, parse_fields
+from hybridlog.cli.options import Filtered, Forced, command, option, parse_fields
 
 _WIDTH, _HEIGHT = 1200, 400
 

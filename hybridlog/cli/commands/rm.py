@@ -9,9 +9,16 @@ from typing import TYPE_CHECKING
 import click
 
 from hybridlog.cli import output
-from hybridlog.cli.binder import command, option
 from hybridlog.cli.commands.ls import RECORDINGS
-from hybridlog.cli.options import Choosing, InStore, Quiet, names_argument, recordings_of
+from hybridlog.cli.options import (
+    Choosing,
+    InStore,
+    Quiet,
+    command,
+    names_argument,
+    option,
+    recordings_of,
+)
 from hybridlog.cli.output import print_table
 from hybridlog.wording import listed
 from hybridlog_storage.errors import UsageError

@@ -6,8 +6,7 @@ import sys
 
 from hybridlog.cli import output
 from hybridlog.cli.answers import SCREEN, Tabular
-from hybridlog.cli.binder import SECONDS, SIZE, argument, command, option
-from hybridlog.cli.options import Ranged, Strict
+from hybridlog.cli.options import SECONDS, SIZE, Ranged, Strict, argument, command, option
 
 
 class _Given(Strict, Ranged, Tabular):

@@ -7,8 +7,7 @@ from typing import ClassVar
 from msgspec.structs import asdict
 
 from hybridlog.cli.answers import Listing, answering
-from hybridlog.cli.binder import command, option
-from hybridlog.cli.options import Filtered, parse_fields
+from hybridlog.cli.options import Filtered, command, option, parse_fields
 from hybridlog.cli.output import Column
 
 _NAMES = ("count", "nan", "infinite", "min", "max", "mean", "std")

@@ -3,8 +3,16 @@
 from __future__ import annotations
 
 from hybridlog.cli import options, output
-from hybridlog.cli.binder import argument, command, option
-from hybridlog.cli.options import AsJson, Choosing, InStore, Quiet, recordings_of
+from hybridlog.cli.options import (
+    AsJson,
+    Choosing,
+    InStore,
+    Quiet,
+    argument,
+    command,
+    option,
+    recordings_of,
+)
 from hybridlog.query.choice import Choice
 from hybridlog_storage.errors import UsageError
 

@@ -6,8 +6,7 @@ import sys
 from typing import TYPE_CHECKING, ClassVar
 
 from hybridlog.cli.answers import SCREEN, Tabular
-from hybridlog.cli.binder import argument, command, option
-from hybridlog.cli.options import Strict, Topics, tf_topic, topics
+from hybridlog.cli.options import Strict, Topics, argument, command, option, tf_topic, topics
 from hybridlog.cli.output import Column, duration_of, print_table, rate_of, remarks
 from hybridlog.wording import counted, listed
 from hybridlog_storage.errors import IncompleteError, UsageError

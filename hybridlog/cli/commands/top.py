@@ -9,8 +9,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
 from hybridlog.cli import output
-from hybridlog.cli.binder import argument, command, option
-from hybridlog.cli.options import Place
+from hybridlog.cli.options import Place, argument, command, option
 from hybridlog.cli.output import Column, table_lines
 from hybridlog.cli.signals import Stopped
 from hybridlog_storage.stopping import at_safe_points

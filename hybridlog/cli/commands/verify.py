@@ -10,8 +10,16 @@ from typing import TYPE_CHECKING
 from msgspec.structs import asdict, replace
 
 from hybridlog.cli import output
-from hybridlog.cli.binder import command, option
-from hybridlog.cli.options import AsJson, Choosing, InStore, Quiet, names_argument, recordings_of
+from hybridlog.cli.options import (
+    AsJson,
+    Choosing,
+    InStore,
+    Quiet,
+    command,
+    names_argument,
+    option,
+    recordings_of,
+)
 from hybridlog.cli.output import Bar
 from hybridlog.wording import listed
 from hybridlog_storage.errors import TopicError

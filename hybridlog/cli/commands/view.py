@@ -5,8 +5,7 @@ from __future__ import annotations
 import sys
 
 from hybridlog.cli import output
-from hybridlog.cli.binder import command
-from hybridlog.cli.options import AsJson, InStore, Served, one_recording
+from hybridlog.cli.options import AsJson, InStore, Served, command, one_recording
 from hybridlog.cli.signals import ended_by_signal
 from hybridlog_storage.errors import extra
 
