@@ -125,7 +125,7 @@ class Tabular(Forced, AsJson):
             return _print_rows(_checked(tables, completeness), limit, noun)
         answer = _rows(tables)
         answer.schema = schema() if OUTPUTS[form].content == "table" else None
-        return _write(answer, form, self.place, completeness)
+        return _write(answer, form, self.place, completeness) or 0
 
 
 def form_of(path: Path, suffixes: Mapping[str, str]) -> str:
@@ -160,10 +160,11 @@ def _tables_of(rows: Iterator[Mapping[str, Any]]) -> Iterator[pa.Table]:
     import pyarrow as pa
 
     block = [*islice(rows, ROWS_AT_ONCE)]
-    names = [name for row in block[:1] for name in row]
-    yield pa.table({name: _column([row[name] for row in block]) for name in names})
-    while block := [*islice(rows, ROWS_AT_ONCE)]:
+    names = [*block[0]] if block else []
+    while True:
         yield pa.table({name: _column([row[name] for row in block]) for name in names})
+        if not (block := [*islice(rows, ROWS_AT_ONCE)]):
+            return
 
 
 def _column(values: list[Any]) -> pa.Array:
@@ -203,12 +204,12 @@ def write_answer(
     counters, in_frame = query.counters, query.question.frame is not None
     answer = _answer_of(query, form, target, front or IN_FORCE, extras)
     completeness = query.completeness if strict and in_frame else None
-    written = _write(answer, form, target, completeness, settings=settings, counters=counters)
+    rows = _write(answer, form, target, completeness, settings=settings, counters=counters)
     if left_out := len(answer.unreadable):
         many = output.counted(left_out, "message")
         output.note(f"{many} left out; the first: {answer.unreadable[0]}.")
-    if OUTPUTS[form].content in {"lines", "table"} and not in_frame:
-        counters.messages = written + counters.reduced
+    if rows is not None and not in_frame:
+        counters.messages = rows + counters.reduced
 
 
 def _write(
@@ -219,15 +220,15 @@ def _write(
     *,
     settings: Mapping[str, Any] | None = None,
     counters: Counters | None = None,
-) -> int:
-    """Write an answer, all of it or nothing, with progress; gives the number of rows or lines."""
-    rows = 0
+) -> int | None:
+    """Write an answer, all of it or nothing, with progress; gives its rows, if it has such."""
+    has_rows, rows = OUTPUTS[form].content in {"lines", "table"}, 0
 
-    def told(pieces: Iterable[_T]) -> Iterator[_T]:
+    def told(pieces: Iterable[Any]) -> Iterator[Any]:
         nonlocal rows
         for piece in pieces:
             yield piece
-            rows += len(piece) if OUTPUTS[form].content in {"lines", "table"} else 0  # type: ignore[arg-type]
+            rows += len(piece) if has_rows else 0
             if counters is not None:
                 bar(counters.payload_bytes, output.counted(counters.messages, "message"))
 
@@ -236,7 +237,7 @@ def _write(
     with Bar(form, quiet=not isinstance(target, Path)) as bar:
         OUTPUTS[form].write(answer, target, **settings or {})
     output.notes(answer.notes)
-    return rows
+    return rows if has_rows else None
 
 
 def _answer_of(
@@ -268,11 +269,12 @@ def _answer_of(
     from hybridlog.frames.lines import lines
     from hybridlog.query.planner import Planner
 
+    planner = Planner(query.source.now(), question, query.counters)
     if content == "table":
-        schema = schema_of(Planner(query.source.now(), question))
+        schema = schema_of(planner)
         return Answer(tables=tables_of(query), schema=schema)
     query.counters.reset()
-    return Answer(lines=lines(Planner(query.source.now(), question, query.counters)))
+    return Answer(lines=lines(planner))
 
 
 def _checked(pieces: Iterable[_T], completeness: Callable[[], Completeness] | None) -> Iterator[_T]:
@@ -310,7 +312,7 @@ def _pictures(query: Query, form: str, target: Target, front: Front) -> Answer:
     before: list[Message] = []
     if OUTPUTS[form].content == "video" and front.latched:
         before = frames_in_front(query.source.now(), query.question)
-    answer = Answer()
+    answer, counters = Answer(), query.counters
     is_folder = isinstance(target, str | os.PathLike) and is_directory(form, Path(target))
 
     def images() -> Iterator[Message]:
@@ -322,17 +324,16 @@ def _pictures(query: Query, form: str, target: Target, front: Front) -> Answer:
                     "is for images and compressed video, those of ROS and of Foxglove."
                 )
             if message.is_reduced:
-                query.counters.leave_out(1, message.state)
-                missing = without_payload(query.counters.reduced, message.state)
-                continue
-            yield message
-            given += 1
-        if given == len(answer.unreadable):
-            if answer.unreadable:
-                raise answer.unreadable[0]
-            if missing and not is_folder:
-                raise PayloadError(f"{missing}: there is no picture")
-        query.counters.frames += len(before)
+                counters.leave_out(1, message.state)
+                missing = without_payload(counters.reduced, message.state)
+            else:
+                yield message
+                given += 1
+        if answer.unreadable and given == len(answer.unreadable):
+            raise answer.unreadable[0]
+        if missing and not given and not is_folder:
+            raise PayloadError(f"{missing}: there is no picture")
+        counters.frames += len(before)
 
     answer.messages = images()
     return answer
@@ -354,11 +355,10 @@ def _lines_of(table: pa.Table) -> Iterator[list[Line]]:
 
 
 def _limited(tables: Iterable[pa.Table], limit: int) -> Iterator[pa.Table]:
-    left = limit
     for table in tables:
-        yield table.slice(0, left)
-        left -= min(left, table.num_rows)
-        if not left:
+        yield table.slice(0, limit)
+        limit -= min(limit, table.num_rows)
+        if not limit:
             return
 
 
@@ -367,27 +367,23 @@ def _print_rows(tables: Iterable[pa.Table], limit: int | None, noun: str) -> int
     from hybridlog.frames.lines import MAX_CELL, MAX_LINE, cells
     from hybridlog.schema.arrow_types import is_text
 
-    most = SCREEN_ROWS if limit is None else limit
-    read = 0
+    most, read = SCREEN_ROWS if limit is None else limit, 0
 
-    def rows() -> Iterator[tuple[list[tuple[str, bool]], list[str]]]:
+    def rows() -> Iterator[tuple[list[Column], list[str]]]:
         nonlocal read
         for table in tables:
             wanted = table.slice(0, max(most - read, 0))
             read += table.num_rows
-            columns = [(each.name, is_text(each.type)) for each in table.schema]
+            columns = [
+                Column(each.name, n, cut=MAX_CELL if is_text(each.type) else 0)
+                for n, each in enumerate(table.schema)
+            ]
             for row in cells(wanted, most=MAX_LINE):
                 yield columns, row
 
     # Headings are printed again only where the columns change.
     for columns, alike in groupby(rows(), itemgetter(0)):
-        print_table(
-            [
-                Column(name, n, cut=MAX_CELL if is_cut else 0)
-                for n, (name, is_cut) in enumerate(columns)
-            ],
-            map(itemgetter(1), alike),
-        )
+        print_table(columns, map(itemgetter(1), alike))
     if not read:
         output.note(f"No {noun}.")
     if limit is None and read > most:
@@ -420,10 +416,13 @@ def check_room(path: Path, *, force: bool, is_directory: bool = False) -> None:
     """Refuse to overwrite files without --force, and directories with files even with it."""
     if not os.path.lexists(path) or (path.exists() and not path.is_file() and not path.is_dir()):
         return  # there is nothing, or a device
-    if path.is_dir() and not is_directory:
-        raise UsageError(f"{path} is a directory; name a file in it.")
-    if is_directory and not path.is_dir():
-        raise UsageError(f"{path} is a file; messages go into a directory.")
+    if path.is_dir() != is_directory:
+        wrong = (
+            "a file; messages go into a directory"
+            if is_directory
+            else "a directory; name a file in it"
+        )
+        raise UsageError(f"{path} is {wrong}.")
     if is_directory and any(path.iterdir()):
         raise UsageError(f"{path} is not empty: remove it, or name a new directory.")
     if not (is_directory or force):

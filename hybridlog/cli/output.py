@@ -8,11 +8,11 @@ import sys
 import textwrap
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain, islice, zip_longest
-from typing import Any, Final, Literal, Self
+from typing import Any, Final, Self
 
 from msgspec import Struct
 from msgspec.structs import asdict
@@ -127,11 +127,6 @@ def time_text(ns: int | None, step: int = 1) -> str:
     return "-" if ns is None else format_time(ns - ns % step)
 
 
-def short_time(ns: int | None) -> str:
-    """A time in UTC to the second, for lists."""
-    return time_text(ns, 10**9)
-
-
 def short_duration(ns: int) -> str:
     """A length of time, to the ms from a second on, else to the µs."""
     from hybridlog.query.times import format_duration
@@ -230,6 +225,23 @@ ROWS_AT_ONCE = 10_000
 """Rows of a table that are laid out together."""
 _MIN_ROOM = 20  # characters of a folded value
 
+
+def _text(value: Any) -> str:
+    return printable(f"{value:.6g}" if isinstance(value, float) else str(value))
+
+
+_SHOWN: Final[dict[str, Callable[[Any], str]]] = {
+    "text": _text,
+    "number": _text,
+    "bytes": size,
+    "rate": "{:.2f}".format,
+    "duration": lambda ns: short_duration(round(ns)),
+    "time": time_text,
+    "second": lambda ns: time_text(ns, 10**9),
+}
+"""How values of each kind are written: rates in hertz, times and durations of ns."""
+_LEFT: Final = frozenset({"text", "time", "second"})
+
 Get = str | int | Callable[[Any], object]
 
 
@@ -238,9 +250,9 @@ class Column:
     """A column of a table.
 
     Attributes:
-        get: Key or function that gives the value of a row; empty for the name as the key.
-        side: Numbers stand on the right.
-        shown: Writes a value; None is not written.
+        get: Key or function that gives the value of a row; empty for the name as the key. None is
+            not written, but for sizes and times.
+        kind: What the values are; numbers stand on the right.
         cut: Cells may be cut off to so many characters; 0 for no.
         order: Columns are left out in this order where there is no room; 0 for never.
         varies: It is left out where it is the same in all rows.
@@ -248,8 +260,7 @@ class Column:
 
     name: str
     get: Get = ""
-    side: Literal["left", "right"] = "left"
-    shown: Callable[[Any], str] | None = None
+    kind: str = "text"
     cut: int = 0
     order: int = 0
     varies: bool = False
@@ -259,129 +270,75 @@ class Column:
         get = self.get
         value = get(row) if callable(get) else row[self.name if get == "" else get]
         if value is None:
-            return ""
-        if self.shown is not None:
-            return self.shown(value)
-        return printable(f"{value:.6g}" if isinstance(value, float) else str(value))
+            return "-" if self.kind in {"bytes", "time", "second"} else ""
+        return _SHOWN[self.kind](value)
+
+    def aligned(self, cell: str, width: int) -> str:
+        """A cell in a column of that width."""
+        shown = cut(cell, width) if self.cut else cell
+        return f"{shown:{'<' if self.kind in _LEFT else '>'}{width}}"
 
 
-def numbers(*names: str, **how: Any) -> list[Column]:
-    """Columns of numbers whose headings are the keys."""
-    return [Column(name, side="right", **how) for name in names]
+_Fitting = list[tuple[Column, int]]
+"""Columns and their widths."""
 
 
-def bytes_of(name: str, key: str, order: int = 0) -> Column:
-    """A column of sizes; `-` for one that is not known."""
+def _fitting(columns: Sequence[Column], block: Sequence[Any], width: int | None) -> _Fitting | None:
+    """The most columns that fit a screen of that width (None: any); None without.
 
-    def shown(row: Mapping[str, Any]) -> str:
-        return "-" if row[key] is None else size(row[key])
-
-    return Column(name, shown, "right", order=order)
-
-
-def rate_of(name: str, get: Get, order: int = 0) -> Column:
-    """A column of rates, in hertz."""
-    return Column(name, get, "right", "{:.2f}".format, order=order)
-
-
-def duration_of(name: str, get: Get, order: int = 0) -> Column:
-    """A column of lengths of time, of ns."""
-    return Column(name, get, "right", lambda ns: short_duration(round(ns)), order=order)
-
-
-def time_of(name: str, key: str, order: int = 0) -> Column:
-    """A column of times in UTC, of ns."""
-    return Column(name, lambda row: time_text(row[key]), order=order)
-
-
-class _Table:
-    """Some columns, as wide as their cells, or narrower where these may be cut."""
-
-    def __init__(self, columns: Sequence[Column]) -> None:
-        self.columns = columns
-        self.widths = [len(one.name) for one in columns]
-        self._is_narrow = False
-
-    def cells(self, rows: Iterable[Any]) -> list[list[str]]:
-        """The cells of rows; columns become as wide as they are."""
-        found = [[one.cell(row) for one in self.columns] for row in rows]
-        if found and not self._is_narrow:
-            wide = (max(map(len, cells)) for cells in zip(*found, strict=True))
-            self.widths = [*map(max, self.widths, wide)]
-        return found
-
-    def fits(self, width: int) -> bool:
-        """True if it is no wider than that; cells that may be cut are, the last column first."""
-        over = sum(self.widths) + 2 * (len(self.widths) - 1) - width
-        for place, one in reversed([*enumerate(self.columns)]):
-            spare = self.widths[place] - max(len(one.name), one.cut)
-            if one.cut and over > 0 and spare > 0:
-                self.widths[place] -= min(spare, over)
-                over -= spare
-                self._is_narrow = True
-        return over <= 0
-
-    def lines(self, rows: Iterable[Sequence[str]]) -> Iterable[str]:
-        """Rows of cells as text."""
-        for row in rows:
-            aligned = (
-                f"{cut(cell, width):{'>' if one.side == 'right' else '<'}{width}}"
-                for cell, one, width in zip(row, self.columns, self.widths, strict=True)
-            )
-            yield "  ".join(aligned).rstrip()
-
-    @property
-    def heading(self) -> list[str]:
-        return [one.name for one in self.columns]
-
-
-def _fitting(columns: Sequence[Column], block: Sequence[Any], width: int | None) -> _Table | None:
-    """The table with most columns that fits a screen of that width (None: any); None without."""
+    They are as wide as their cells, or narrower where these may be cut, the last column first.
+    """
     left = [*columns]
     for gone in (None, *sorted((one for one in columns if one.order), key=lambda one: one.order)):
         left = [one for one in left if one is not gone]
-        table = _Table(left)
-        table.cells(block)
-        if width is None or table.fits(width):
-            return table
+        widths = [max([len(one.name), *map(len, map(one.cell, block))]) for one in left]
+        over = 0 if width is None else sum(widths) + 2 * (len(widths) - 1) - width
+        for place, one in reversed([*enumerate(left)]):
+            spare = widths[place] - max(len(one.name), one.cut)
+            if one.cut and over > 0 and spare > 0:
+                widths[place] -= min(spare, over)
+                over -= spare
+        if over <= 0:
+            return [*zip(left, widths, strict=True)]
     return None
+
+
+def _lines(fitting: _Fitting, rows: Iterable[Any]) -> Iterator[str]:
+    """Headings, and rows below them."""
+    yield "  ".join(one.aligned(one.name, width) for one, width in fitting).rstrip()
+    for row in rows:
+        yield "  ".join(one.aligned(one.cell(row), width) for one, width in fitting).rstrip()
 
 
 def table_lines(columns: Sequence[Column], rows: Sequence[Any], width: int) -> list[str]:
     """The lines of a table, headings first; they are cut where no table fits the width."""
-    table = _fitting(columns, rows, width) or _Table(columns)
-    cells = table.cells(rows)
-    return [cut(line, width) for line in table.lines([table.heading, *cells])]
+    fitting = _fitting(columns, rows, width) or _fitting(columns, rows, None) or []
+    return [cut(line, width) for line in _lines(fitting, rows)]
 
 
 def print_table(columns: Sequence[Column], rows: Iterable[Any]) -> bool:
     """Print rows under headings; on a terminal that has no room for them, a block for each row.
 
-    Prints nothing without rows, and returns False.
-
-    A long table is printed some rows at a time: memory does not grow with it. Columns become wider
-    where later rows need it.
+    Prints nothing without rows, and returns False. The first rows of a long table say how wide its
+    columns are: memory does not grow with it.
     """
     source = iter(rows)
     block = [*islice(source, ROWS_AT_ONCE)]
-    if len(block) < ROWS_AT_ONCE:
-        columns = [one for one in columns if not one.varies or len({*map(one.cell, block)}) > 1]
     if not block:
         return False
-    table = _fitting(columns, block, screen_width() if sys.stdout.isatty() else None)
-    if table is None:
-        for number, row in enumerate(chain(block, source)):
-            (_, title), *fields = ((one.name, one.cell(row)) for one in columns)
-            if number:
-                say()
-            say(title)
-            print_fields([pair for pair in fields if pair[1]], indent=2)
-        return True
-    cells = [table.heading, *table.cells(block)]
-    while cells:
-        for line in table.lines(cells):
+    if len(block) < ROWS_AT_ONCE:
+        columns = [one for one in columns if not one.varies or len({*map(one.cell, block)}) > 1]
+    fitting = _fitting(columns, block, screen_width() if sys.stdout.isatty() else None)
+    if fitting is not None:
+        for line in _lines(fitting, chain(block, source)):
             print(line)  # noqa: T201
-        cells = table.cells(islice(source, ROWS_AT_ONCE))
+        return True
+    for number, row in enumerate(chain(block, source)):
+        title, *fields = ((one.name, one.cell(row)) for one in columns)
+        if number:
+            say()
+        say(title[1])
+        print_fields([pair for pair in fields if pair[1]], indent=2)
     return True
 
 

@@ -13,9 +13,9 @@ from typing import NamedTuple
 from msgspec import Struct, field
 
 from hybridlog.formats import LOGS
-from hybridlog.formats.log_set import UNKNOWN, LogFile, LogSet, grouped_parts, sniff
+from hybridlog.formats.log_set import UNKNOWN, LogFile, LogSet, grouped_parts
 from hybridlog.formats.reading import cannot_open
-from hybridlog.formats.rosbag2.directory import NAME, BagMetadata, read_metadata
+from hybridlog.formats.rosbag2.directory import NAME, read_metadata
 from hybridlog_storage.errors import SourceError
 from hybridlog_storage.settings import NAME as STORE
 
@@ -28,10 +28,9 @@ _BAG_HEAD = 8192  # bytes; the header record of a bag has 4 KiB
 
 
 class Found(Struct):
-    """Logs by path, stores (which are not searched), and what is unreadable below a directory."""
+    """Logs by path, and what is unreadable below a directory."""
 
     logs: list[LogSet] = field(default_factory=list)
-    stores: list[Path] = field(default_factory=list)
     problems: list[SourceError] = field(default_factory=list)
 
     def is_one_log(self, top: Path) -> bool:
@@ -159,7 +158,6 @@ def _folders(top: Path, found: Found) -> Iterator[tuple[Path, list[_File]]]:
         visited.add((about.st_dev, about.st_ino))
         if is_known or STORE in names:
             below.clear()
-            found.stores += [] if is_known else [folder]
             continue
         below[:] = sorted(name for name in below if not name.startswith("."))
         files = []
@@ -175,19 +173,17 @@ def _folders(top: Path, found: Found) -> Iterator[tuple[Path, list[_File]]]:
 def _log_file(file: _File, problems: list[SourceError]) -> LogFile | None:
     """A log; None for other files. A wrong file with the name of a log is one."""
     is_called = file.path.name.removesuffix(".zstd").endswith(_SUFFIXES)
-    try:
-        log = LogFile(file.path, *sniff(file.path)) if file.size else LogFile(file.path)
-    except SourceError as error:
-        if is_called:
-            problems.append(error)
+    log = LogFile.at(file.path) if file.size else LogFile(file.path)
+    if log.problem is not None:
+        problems += [log.problem] if is_called else []
         return None
     return log if is_called or not (log.format is UNKNOWN or log.format.needs_suffix) else None
 
 
 def _listed(folder: Path, files: Sequence[_File]) -> set[str]:
     """The names that the metadata of the ROS 2 bag in a directory lists; none without."""
-    found = read_metadata(folder) if any(file.path.name == NAME for file in files) else None
-    return {Path(name).name for name in found.files} if isinstance(found, BagMetadata) else set()
+    bag = read_metadata(folder)[0] if any(file.path.name == NAME for file in files) else None
+    return set() if bag is None else {Path(name).name for name in bag.files}
 
 
 def _has_end(file: _File) -> bool:

@@ -16,7 +16,7 @@ from msgspec.structs import replace
 
 from hybridlog.formats import LOGS, LogFormat
 from hybridlog.formats.reading import BATCH_BYTES, Damage, Source, cannot_open, size_of, split
-from hybridlog.formats.rosbag2.directory import NAME, BagMetadata, locate, plain, read_metadata
+from hybridlog.formats.rosbag2.directory import NAME, locate, plain, read_metadata
 from hybridlog.formats.spool import ZSTD_MAGIC, peek, spool
 from hybridlog.wording import listed
 from hybridlog_storage.errors import SourceError
@@ -35,47 +35,43 @@ UNKNOWN: Final = LogFormat("unknown", "", "", (), (), has_end=True)
 """The format of other files."""
 
 
-def sniff(path: Path) -> tuple[LogFormat, bool]:
-    """Detect the format of a file from its first bytes, and whether zstd has compressed it."""
-    try:
-        with path.open("rb") as file:
-            head = file.read(_LONGEST)
-    except OSError as error:
-        raise cannot_open(path, error) from error
-    is_packed = head.startswith(ZSTD_MAGIC)
-    if is_packed:
-        head = peek(path, _LONGEST)
-    found = next((log for log in LOGS if head.startswith(log.beginnings)), UNKNOWN)
-    return found, is_packed
-
-
 class LogFile(Struct, frozen=True):
     """A file of a log.
 
     Attributes:
-        format: Its format; `UNKNOWN` if it is empty, no log or cannot be read.
+        format: Its format, by its first bytes; `UNKNOWN` if it is empty, no log or cannot be read.
         is_packed: Whether it is compressed with zstd.
+        problem: Why it cannot be read.
     """
 
     path: Path
     format: LogFormat = UNKNOWN
     is_packed: bool = False
+    problem: SourceError | None = None
 
     @classmethod
     def at(cls, path: Path) -> LogFile:
         """Look at a file; what is wrong with it is told when it is opened."""
         try:
-            return cls(path, *sniff(path))
-        except SourceError:
-            return cls(path)
+            with path.open("rb") as file:
+                head = file.read(_LONGEST)
+            is_packed = head.startswith(ZSTD_MAGIC)
+            head = peek(path, _LONGEST) if is_packed else head
+        except OSError as error:
+            return cls(path, problem=cannot_open(path, error))
+        except SourceError as error:
+            return cls(path, problem=error)
+        found = next((log for log in LOGS if head.startswith(log.beginnings)), UNKNOWN)
+        return cls(path, found, is_packed)
 
     def open(self, unpacked: Path | None = None) -> Source:
         """Open the file, or what it has been unpacked to."""
+        if self.problem is not None:
+            raise self.problem
         if self.format is not UNKNOWN:
             return self.format.open(unpacked or self.path)
-        _, is_packed = sniff(self.path)
         reason = f"not a log of a known kind; hybridlog reads {kinds()}"
-        if is_packed:
+        if self.is_packed:
             reason = "a zstd file that holds no log, or a damaged one; check it with `zstd -t`"
         elif not size_of(self.path):
             reason = "the file is empty; record or copy it again, there is nothing in it"
@@ -203,7 +199,7 @@ class LogSet(Struct, frozen=True):
     @property
     def size(self) -> int:
         """Bytes of its files that are there."""
-        return sum(path.stat().st_size for path in self.files if path.exists())
+        return sum(map(_bytes_at, self.files))
 
     @property
     def name(self) -> str | None:
@@ -224,61 +220,52 @@ class LogSet(Struct, frozen=True):
 
         Files whose own index does not tell it are read.
         """
-        first, last = 1 << 63, -1
+        times: list[int] = []
         for part in self.parts:
             with suppress(SourceError), LogSet(part.path, (part,)).open() as source:
                 if source.time_range is not None:
-                    first, last = (
-                        min(first, source.time_range[0]),
-                        max(last, source.time_range[1] - 1),
-                    )
+                    times += source.time_range[0], source.time_range[1] - 1
                     continue
                 for batch in source.batches():
-                    first = min(first, int(batch.log_time.min()))
-                    last = max(last, int(batch.log_time.max()))
+                    times += int(batch.log_time.min()), int(batch.log_time.max())
+                    times = [min(times), max(times)]
                     source.extras.clear()
-        return span_of(first, last) if first <= last else None
+        return span_of(min(times), max(times)) if times else None
 
 
 def _in_folder(folder: Path) -> LogSet:
     """The log in a directory; its metadata need not list all parts, nor right names."""
-    metadata = read_metadata(folder)
-    bag = metadata if isinstance(metadata, BagMetadata) else None
-    damage = [metadata] if isinstance(metadata, Damage) else []
+    bag, damage = read_metadata(folder)
     found, missing = ([], []) if bag is None else locate(folder, bag)
-    files = [*map(LogFile.at, found)]
     paths = (path for path in folder.iterdir() if path.name[:1] != "." and path.is_file())
     there = [*map(LogFile.at, sorted(paths, key=natural))]
-    there = [one for one in there if one.format is not UNKNOWN or not size_of(one.path)]
-    if not found:
-        files = [file for file in there if file.format is not UNKNOWN]
-        _check_one(folder, files)
+    logs = [one for one in there if one.format is not UNKNOWN]
+    files = [*map(LogFile.at, found)] if found else logs
+    if not found and (not logs or (len(logs) > 1 and not is_split(logs))):
+        reason = f"a directory without a log; hybridlog reads {kinds()}"
+        if logs:
+            names = listed((log.path.name for log in logs), 5)
+            reason = f"{len(logs)} logs that are not parts of one ({names})"
+        raise SourceError(f"{folder}: {reason}; give the path of a log itself")
     first = next((file for file in files if file.format is not UNKNOWN), None)
-    more: list[LogFile] = []
-    names = {plain(file.path) for file in files}
+    known = {plain(file.path) for file in files}
     for file in (one for one in there if one not in files):
-        is_new = plain(file.path) not in names
-        if is_new and first is not None and is_split([first, file]):
-            more.append(file)
+        is_empty = file.format is UNKNOWN and file.problem is None and not size_of(file.path)
+        is_log = file.format is not UNKNOWN or is_empty
+        is_part = first is not None and is_log and is_split([first, file])
+        if is_part and plain(file.path) not in known:
+            files = sorted([*files, file], key=lambda one: natural(one.path))
         elif file.format is not UNKNOWN:  # the log lacks nothing by that
             reason = "the file is not read: it is no part of this log; record it by its own path"
             damage.append(Damage(file.path, None, None, reason, 0))
-    if more:
-        files = sorted([*files, *more], key=lambda file: natural(file.path))
     damage += missing if found else missing_parts(files) if bag is None else []
     count = None if bag is None else bag.message_count
     return LogSet(folder, tuple(files), count, tuple(damage))
 
 
-def _check_one(folder: Path, logs: Sequence[LogFile]) -> None:
-    """Refuse a directory whose files are not one log."""
-    if len(logs) == 1 or (logs and is_split(logs)):
-        return
-    reason = f"a directory without a log; hybridlog reads {kinds()}"
-    if logs:
-        names = listed((log.path.name for log in logs), 5)
-        reason = f"{len(logs)} logs that are not parts of one ({names})"
-    raise SourceError(f"{folder}: {reason}; give the path of a log itself")
+def _bytes_at(path: Path) -> int:
+    """Bytes of a file, 0 where there is none."""
+    return path.stat().st_size if path.exists() else 0
 
 
 # Reading.
@@ -316,15 +303,13 @@ class _JoinedSource(Source):
 
     def batches(self) -> Iterator[Batch]:
         """Yield the messages of each file in turn."""
-        done = failed = 0
-        first: SourceError | None = None
+        done, failed = 0, list[SourceError]()
         for part in self._log.parts:
-            size = part.path.stat().st_size if part.path.exists() else 0
+            size = _bytes_at(part.path)
             try:
                 inner = self._inner = self._inner or self._open(part)
             except SourceError as error:
-                failed += 1
-                first = first or error
+                failed.append(error)
                 reason = _without_path(error, part.path)
                 self.damage.append(Damage(part.path, 0, size, reason, None))
             else:
@@ -333,8 +318,8 @@ class _JoinedSource(Source):
                 self._inner = None
             done += size
             self.bytes_read = done
-        if first is not None and failed == len(self._log.parts):
-            raise first
+        if len(failed) == len(self._log.parts):
+            raise failed[0]
         if self._log.message_count is not None:
             self.settle(self._log.message_count, self._got, self.path / NAME)
 
@@ -383,8 +368,8 @@ class _JoinedSource(Source):
         more = []
         for channel in inner.channels[len(numbers) :]:
             metadata = tuple(sorted(channel.metadata.items()))
-            own = channel.topic, channel.message_encoding, channel.schema, metadata
-            said = *own, channel.has_publish_time
+            about = channel.topic, channel.message_encoding, channel.schema
+            said = *about, metadata, channel.has_publish_time
             self._alike[said] += 1
             key = self._alike[said], *said
             if key not in self._numbers:

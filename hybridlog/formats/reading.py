@@ -214,32 +214,30 @@ class Fingerprint(NamedTuple):
 def fingerprint(files: Sequence[Path]) -> Fingerprint:
     """Compute the fingerprint of files in their order; their names do not matter.
 
-    It covers the size of each file and its whole content up to `WHOLE` bytes. Larger files
-    are covered by `SAMPLES` evenly spaced samples, the first at the start and the last at
-    the end.
+    That of a file covers its size and its whole content up to `WHOLE` bytes. Larger files are
+    covered by `SAMPLES` evenly spaced samples, the first at the start and the last at the end.
+    That of several files covers those of each.
     """
-    whole, parts = blake2b(digest_size=16), []
+    parts = []
     for path in files:
         part = blake2b(digest_size=16)
         try:
             with path.open("rb", buffering=SAMPLE_BYTES) as file:
                 size = file.seek(0, 2)
-                _add(size.to_bytes(8, "little"), whole, part)
+                part.update(size.to_bytes(8, "little"))
+                last, count = size - SAMPLE_BYTES, SAMPLE_BYTES
+                starts = [last * number // (SAMPLES - 1) for number in range(SAMPLES)]
                 if size <= WHOLE:
                     starts, count = [0], size
-                else:
-                    last = size - SAMPLE_BYTES
-                    starts = [last * number // (SAMPLES - 1) for number in range(SAMPLES)]
-                    count = SAMPLE_BYTES
                 for start in starts:
                     file.seek(start)
-                    _add(file.read(count), whole, part)
+                    part.update(file.read(count))
         except OSError as error:
             raise cannot_open(path, error) from error
         parts.append(part.hexdigest())
-    return Fingerprint(whole.hexdigest(), tuple(parts))
-
-
-def _add(data: bytes, *digests: blake2b) -> None:
-    for digest in digests:
-        digest.update(data)
+    whole = (
+        parts[0]
+        if len(parts) == 1
+        else blake2b("".join(parts).encode(), digest_size=16).hexdigest()
+    )
+    return Fingerprint(whole, tuple(parts))

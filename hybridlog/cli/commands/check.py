@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from msgspec.structs import asdict
 
@@ -17,10 +17,7 @@ from hybridlog.cli.options import (
     command,
     option,
 )
-from hybridlog.cli.output import Column, duration_of, rate_of
-
-if TYPE_CHECKING:
-    from hybridlog.contract.judge import Result
+from hybridlog.cli.output import Column
 
 
 class _Given(Strict, Topics, Listing):
@@ -46,55 +43,55 @@ def check_command(given: _Given) -> int:
     Rate, jitter, longest gap and where it begins, late start, early stop and losses of each
     topic. No message is read.
     """
-    from hybridlog.contract import Contract, contract_of
+    from hybridlog.contract import contract_of
 
-    contract, make = given.contract, given.make
-    for path in filter(None, (make, given.junit)):
+    for path in filter(None, (given.make, given.junit)):
         check_room(path, force=given.force)
-    if contract is not None:
-        rules = Contract.read(contract)
-        with given.opened(snapshot=True) as store:
-            chosen = given.recordings_in(store)
-            results = [one for name in chosen.ids for one in store.judge(rules, name)]
-        return _show_verdict(results, len(chosen), given)
+    if given.contract is not None:
+        return _judge(given, given.contract)
     with answering(given) as query:
         found = query.check()
-        if make is not None:
-            write_bytes(make, contract_of(found).encode())
-            return 0
-        columns = [
-            Column("recording", varies=True),
-            Column("topic"),
-            Column("messages", side="right"),
-            rate_of("Hz", "rate_hz", order=3),
-            duration_of("jitter", "jitter_ns", order=2),
-            duration_of("longest gap", "gap_ns"),
-            Column("from", _gap_begin, "right", order=1),
-            duration_of("late", lambda row: _edge(row, "late_ns"), order=5),
-            duration_of("early", lambda row: _edge(row, "early_ns"), order=4),
-            Column("lost", lambda row: "?" if row["lost"] is None else row["lost"], "right"),
-        ]
-        given.show(map(asdict, found), columns, "No topic.")
+        if given.make is not None:
+            write_bytes(given.make, contract_of(found).encode())
+        else:
+            given.show(map(asdict, found), _COLUMNS, "No topic.")
     return 0
 
 
-def _edge(row: Mapping[str, Any], name: str) -> int | None:
-    return None if row["is_latched"] else row[name]
-
-
-def _gap_begin(row: Mapping[str, Any]) -> str:
+def _gap_begin(row: Mapping[str, Any]) -> str | None:
     begin = row["gap_begin_ns"]
-    return "" if begin is None else f"+{(begin - row['begin_ns']) / 1e9:.3f}s"
+    return None if begin is None else f"+{(begin - row['begin_ns']) / 1e9:.3f}s"
 
 
-def _show_verdict(results: Sequence[Result], recordings: int, given: _Given) -> int:
+_COLUMNS = [
+    Column("recording", varies=True),
+    Column("topic"),
+    Column("messages", kind="number"),
+    Column("Hz", "rate_hz", "rate", order=3),
+    Column("jitter", "jitter_ns", "duration", order=2),
+    Column("longest gap", "gap_ns", "duration"),
+    Column("from", _gap_begin, "number", order=1),
+    Column("late", lambda row: None if row["is_latched"] else row["late_ns"], "duration", order=5),
+    Column(
+        "early", lambda row: None if row["is_latched"] else row["early_ns"], "duration", order=4
+    ),
+    Column("lost", lambda row: "?" if row["lost"] is None else row["lost"], "number"),
+]
+
+
+def _judge(given: _Given, contract: Path) -> int:
+    from hybridlog.contract import Contract
     from hybridlog.contract.judge import broken, junit_of
 
+    rules = Contract.read(contract)
+    with given.opened(snapshot=True) as store:
+        ids = given.recordings_in(store).ids
+        results = [one for name in ids for one in store.judge(rules, name)]
     if given.junit is not None:
         write_bytes(given.junit, junit_of(results).encode())
     bad = broken(results)
     names = ("recording", "topic", "rule", "wanted", "found")
     given.show(map(asdict, bad if given.to_form == SCREEN else results), [*map(Column, names)])
-    rules, where = output.counted(len(results), "rule"), output.counted(recordings, "recording")
-    output.remarks([f"{rules} in {where}: {len(bad) or 'none'} broken."])
+    many, where = output.counted(len(results), "rule"), output.counted(len(ids), "recording")
+    output.remarks([f"{many} in {where}: {len(bad) or 'none'} broken."])
     return DIFFERENT if bad else 0

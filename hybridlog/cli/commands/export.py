@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
-from functools import partial
+from collections import Counter
+from collections.abc import Iterable
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -122,14 +122,13 @@ def export_command(given: _Given) -> None:
 
     `lerobot` makes a training set for robot learning.
     """
-    target, force, split = given.target, given.force, given.split
+    target, split = given.target, given.split
     if str(target) == "-":
         raise UsageError("export writes files; for a pipe: `hybridlog fetch '**' -F mcap -o -`.")
     form = given.form or form_of(target, suffixes_of(_LOGS))
-    settings = {"storage": given.storage} if form == "rosbag2" else {}
-    is_log = form in _LOGS
-    if is_log and split is None:
-        check_room(target, force=force, is_directory=is_directory(form, target))
+    is_folder = form in _LOGS and is_directory(form, target)
+    if form in _LOGS and split is None:
+        check_room(target, force=given.force, is_directory=is_folder)
     with given.opened(snapshot=True) as store:
         query = given.query(store)
         if not query.topics:
@@ -139,26 +138,21 @@ def export_command(given: _Given) -> None:
                 raise UsageError("lerobot has --episodes-by in place of --split-by.")
             _export_set(store, query, target, given)
             return
-        parts: Iterable[tuple[Path, Query]] = [(target, query)]
-        if split is not None:
-            folder = is_directory(form, target) if is_log else None
-            parts = _pieces(query, split, target, force=force, is_directory=folder)
+        parts = [(target, query)] if split is None else _pieces(query, split, target)
+        for path, _ in parts if split is not None and form in _LOGS else ():
+            check_room(path, force=given.force, is_directory=is_folder)
         for path, one in parts:
-            if is_log:
-                _write_log(one, form, path, given, settings)
-            else:
-                _write_tables(one, form, path, given)
+            (_write_log if form in _LOGS else _write_tables)(one, form, path, given)
             output.remarks(one.completeness().sentences)
 
 
-def _write_log(
-    query: Query, form: str, path: Path, given: _Given, settings: Mapping[str, Any]
-) -> None:
+def _write_log(query: Query, form: str, path: Path, given: _Given) -> None:
     from hybridlog.attachments import extras_of
 
     extras = extras_of(query.source.now(), query.question)
     if given.no_attachments:
         extras = extras._replace(attachments=[], left_out=0)
+    settings = {"storage": given.storage} if form == "rosbag2" else {}
     write_answer(query, form, path, front=given.front, extras=extras, settings=settings)
     _print_written(path, query)
     if form == "mcap" or settings.get("storage") == "mcap":
@@ -173,19 +167,23 @@ def _write_tables(query: Query, form: str, directory: Path, given: _Given) -> No
     """Write one file a topic, except topics that do not fit or have no message in the range."""
     from hybridlog.query.query import narrowed
     from hybridlog.query.ranges import RangeResolver
-    from hybridlog_storage.mongo.index_documents import collection_of
 
-    RangeResolver(
-        query.source.now(), query.question
-    ).resolve()  # refuses a range without any message
+    # Refuses a range without any message.
+    RangeResolver(query.source.now(), query.question).resolve()
     topics = _image_topics(query) if OUTPUTS[form].content == "video" else query.topics
-    suffix = OUTPUTS[form].suffixes[0]
-    paths = {topic: directory / f"{collection_of(topic)}{suffix}" for topic in topics}
+    paths = {
+        topic: directory / f"{name}{OUTPUTS[form].suffixes[0]}"
+        for topic, name in _names(topics).items()
+    }
     for path in paths.values():
         check_room(path, force=given.force)
     left_out: list[HybridlogError] = []
-    is_new = not directory.is_dir()
-    with undone(partial(_remove_empty, directory)) if is_new else contextlib.nullcontext():
+
+    def remove() -> None:
+        with suppress(OSError):  # there are files in it
+            directory.rmdir()
+
+    with nullcontext() if directory.is_dir() else undone(remove):
         try:
             directory.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -198,15 +196,23 @@ def _write_tables(query: Query, form: str, directory: Path, given: _Given) -> No
                 output.note(f"{topic}: {error}")
                 left_out.append(error)
                 continue
-            _print_written(path, one)
+            _print_written(path, one, topic)
             query.counters.add(one.counters)
         if len(left_out) == len(paths):
             raise left_out[0]
 
 
-def _remove_empty(directory: Path) -> None:
-    with contextlib.suppress(OSError):  # files were written into it
-        directory.rmdir()
+def _names(topics: Iterable[str]) -> dict[str, str]:
+    """A name of a file for each topic; names that differ in their case alone get a number."""
+    from hybridlog_storage.mongo.index_documents import collection_of
+
+    found, seen = {}, Counter[str]()
+    for topic in topics:
+        name = collection_of(topic)
+        seen[name.casefold()] += 1
+        number = seen[name.casefold()]
+        found[topic] = name if number == 1 else f"{name}~{number}"
+    return found
 
 
 def _image_topics(query: Query) -> list[str]:
@@ -220,44 +226,40 @@ def _image_topics(query: Query) -> list[str]:
     return [topic for topic in query.topics if topic in found]
 
 
-def _print_written(path: Path, query: Query) -> None:
+def _print_written(path: Path, query: Query, topic: str = "") -> None:
     """Print a line about a file."""
     files = path.iterdir() if path.is_dir() else [path]
     size = output.size(sum(one.stat().st_size for one in files))
     many = output.counted(query.counters.messages - query.counters.reduced, "message")
-    output.remarks([f"{path}: {many}{latched(query.counters)}, {size}"])
+    of = f" of {topic}" if topic else ""
+    output.remarks([f"{path}: {many}{of}{latched(query.counters)}, {size}"])
 
 
-def _pieces(
-    query: Query, how: str, target: Path, *, force: bool, is_directory: bool | None
-) -> Iterator[tuple[Path, Query]]:
-    """The parts of an answer that have messages, and where to write each; says which have none.
-
-    Places are checked here unless `is_directory` is None: then by those who write there.
-    """
+def _pieces(query: Query, how: str, target: Path) -> list[tuple[Path, Query]]:
+    """The parts of an answer that have messages, and where to write each; says which have none."""
     from hybridlog.query.pieces import pieces as split
 
     found: list[tuple[Path, Query]] = []
     for piece in split(query, how):
-        count = 0
-        with contextlib.suppress(TimeError):  # the range is outside
-            count = piece.query.count()
-        if count:
-            path = target.with_name(f"{target.stem}-{piece.name}{target.suffix}")
-            found.append((path, piece.query))
-        else:
-            output.note(f"{piece.name}: no messages, so no file.")
+        with suppress(TimeError):  # the range is outside
+            if piece.query.count():
+                path = target.with_name(f"{target.stem}-{piece.name}{target.suffix}")
+                found.append((path, piece.query))
+                continue
+        output.note(f"{piece.name}: no messages, so no file.")
     if not found:
         output.note("No messages, so no file.")
-    for path, _ in found if is_directory is not None else ():
-        check_room(path, force=force, is_directory=bool(is_directory))
-    yield from found
+    return found
 
 
 def _export_set(store: Store, query: Query, target: Path, given: _Given) -> None:
     """Write a training set, or propose a map for one."""
     if given.propose_map:
-        _propose_map(query, target, force=given.force)
+        from hybridlog.training.feature_map import proposed
+
+        check_room(target, force=given.force)
+        write_bytes(target, proposed(query).to_yaml().encode())
+        output.remarks([f"{target}: look at it, then add --map {target}."])
         return
     if given.features is None:
         raise UsageError(
@@ -309,11 +311,3 @@ def _export_set(store: Store, query: Query, target: Path, given: _Given) -> None
     if report.lost:
         lost = f"{counted(report.lost, 'message')} of these topics are lost in the episodes"
         output.note(f"{lost}; meta/hybridlog.json says in which.")
-
-
-def _propose_map(query: Query, target: Path, *, force: bool) -> None:
-    from hybridlog.training.feature_map import proposed
-
-    check_room(target, force=force)
-    write_bytes(target, proposed(query).to_yaml().encode())
-    output.remarks([f"{target}: look at it, then add --map {target}."])

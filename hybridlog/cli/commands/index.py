@@ -20,7 +20,7 @@ from hybridlog.cli.options import (
     command,
     option,
 )
-from hybridlog.cli.output import Bar, Column, bytes_of, numbers
+from hybridlog.cli.output import Bar, Column
 from hybridlog.cli.signals import watch
 from hybridlog.wording import listed
 from hybridlog_storage.errors import StoreError, UsageError
@@ -69,18 +69,21 @@ def add(given: _Fields) -> None:
 @command(_Fields, to=index_command)
 def remove(given: _Fields) -> None:
     """Drop an index, and list those that are left."""
-    topic, field = given.topic, given.field
+    topic, field = given.topic, " ".join(given.field)
     with given.opened(require_database=True) as store:
-        if not store.index.remove(topic, *field):
-            known = listed(" ".join(one.fields) for one in store.index.list(topic))
-            raise UsageError(f"{topic} has no index on {' '.join(field)}. Its indexes: {known}.")
+        was_there = store.index.remove(topic, *given.field)
         found = store.index.list(topic)
+    if not was_there:
+        known = listed(" ".join(one.fields) for one in found)
+        raise UsageError(f"{topic} has no index on {field}. Its indexes: {known}.")
     _show(found, given)
 
 
 def _show(found: list[FieldIndex], given: _Shared, without: str = "") -> None:
-    columns = [Column("topic"), Column("fields", lambda row: " ".join(row["fields"]))]
-    given.show([one._asdict() for one in found], columns, without)
+    given.show([one._asdict() for one in found], _FIELDS, without)
+
+
+_FIELDS = [Column("topic"), Column("fields", lambda row: " ".join(row["fields"]))]
 
 
 @command(_Shared, to=index_command)
@@ -114,14 +117,18 @@ def rebuild(given: _Rebuild) -> None:
         chosen = given.recordings_in(store)
         with Bar("index rebuild") as bar:
             done = store.index.rebuild(None if given.choice.is_everything else chosen, bar.part)
-    rows = [
-        {"recording": one.name, "messages": one.messages, "documents": one.documents}
-        for one in done
-    ]
-    given.show(rows, [Column("recording"), *numbers("messages", "documents")])
-    made = {entry.id for entry in done}
-    if left := [entry.name for entry in chosen.summaries if entry.id not in made]:
+    names = ("messages", "documents")
+    rows = [{"recording": one.name} | {name: getattr(one, name) for name in names} for one in done]
+    given.show(rows, _REBUILT)
+    if left := [one.name for one in chosen.summaries if one.id not in {e.id for e in done}]:
         output.note(f"In use, and left as they are: {listed(left)}.")
+
+
+_REBUILT = [
+    Column("recording"),
+    Column("messages", kind="number"),
+    Column("documents", kind="number"),
+]
 
 
 class _Arrays(_Shared):
@@ -141,17 +148,19 @@ def arrays(given: _Arrays) -> None:
     """
     with given.opened() as store, Bar("index arrays") as bar:
         found = store.index.arrays(*given.topic, off=given.off, progress=bar.part)
-    columns = [
-        Column("topic"),
-        Column("made anew", lambda row: len(row["recordings"]), "right"),
-        bytes_of("tables", "bytes"),
-    ]
-    given.show([asdict(one) for one in found], columns)
+    given.show(map(asdict, found), _ARRAYS)
     if left := {name for one in found for name in one.left}:
         output.note(
             f"Tables of {listed(sorted(left))} stay as they are: the recording is in progress or "
             "cannot be read, or the disk has no room. Run it again later."
         )
+
+
+_ARRAYS = [
+    Column("topic"),
+    Column("made anew", lambda row: len(row["recordings"]), "number"),
+    Column("tables", "bytes", "bytes"),
+]
 
 
 class _Watch(_Shared):

@@ -26,8 +26,10 @@ from hybridlog.cli.options import (
     option,
     query_of,
 )
-from hybridlog.cli.output import Column, bytes_of, duration_of, print_fields, print_table
-from hybridlog.query.topics import resolve
+from hybridlog.cli.output import Column, print_fields, print_table
+from hybridlog.query.times import format_duration
+from hybridlog.query.topics import matcher, resolve
+from hybridlog.record.losses import losses_of
 from hybridlog.wording import listed
 from hybridlog_storage.errors import SegmentError, TopicError, UsageError
 
@@ -37,7 +39,6 @@ if TYPE_CHECKING:
     from hybridlog.query.question import RecordedChannel
     from hybridlog.store import Store
     from hybridlog_storage.catalog import RecordingEntry
-
 
 _MAX_NAMES = 5  # recordings in a note
 _READABLE = {"ros1msg", "ros2msg", "ros2idl", "jsonschema"}
@@ -97,14 +98,13 @@ def info_command(given: _Given) -> None:
 
 
 def _show_recordings(store: Store, given: _Given) -> None:
-    entries = [*given.recordings_in(store)]
-    found = [_as_dict(store, one) for one in entries]
+    found = [(entry, _as_dict(store, entry)) for entry in given.recordings_in(store)]
     if given.as_json:
-        output.print_json(found)
+        output.print_json([about for _, about in found])
         return
-    if not entries:
+    if not found:
         output.note(store.session.when_empty)
-    for number, (entry, about) in enumerate(zip(entries, found, strict=True)):
+    for number, (entry, about) in enumerate(found):
         if number:
             output.say()
         print_fields(_fields(store, entry, about))
@@ -117,7 +117,6 @@ def _as_dict(store: Store, entry: RecordingEntry) -> dict[str, Any]:
     from hybridlog.entries import summary_of
     from hybridlog.query.answers.lost import coverage
     from hybridlog.query.periods import mean_rate
-    from hybridlog.record.losses import losses_of
     from hybridlog.schema.codecs import unindexed
     from hybridlog.schema.states import shown_channels
 
@@ -165,28 +164,21 @@ def _fields(store: Store, entry: RecordingEntry, about: dict[str, Any]) -> list[
     """The lines of a recording: name and value."""
     from hybridlog.entries import summary_of
     from hybridlog.query.answers.lost import line_of
-    from hybridlog.query.times import format_duration
 
-    manifest, status = entry.manifest, status_text(summary_of(entry))
-    source = manifest.source.kind
-    if manifest.source.bytes:
-        source += f", {output.size(manifest.source.bytes)}"
-    if manifest.source.path:
-        source = f"{manifest.source.path} ({source})"
+    manifest, origin = entry.manifest, entry.manifest.source
+    kind = f"{origin.kind}, {output.size(origin.bytes)}" if origin.bytes else origin.kind
     first, last = about["first_ns"], about["last_ns"]
-    segments, chunks = (
-        output.counted(getattr(entry, f"{what}s"), what) for what in ("segment", "chunk")
-    )
+    files = (output.counted(about[f"{what}s"], what) for what in ("segment", "chunk"))
     return [
         ("recording", entry.name),
         ("id", entry.id),
-        ("status", status),
-        ("source", source),
+        ("status", status_text(summary_of(entry))),
+        ("source", f"{origin.path} ({kind})" if origin.path else kind),
         ("start", output.time_text(first)),
         ("last", output.time_text(last)),
         ("duration", "-" if first is None else format_duration(last - first)),
         ("messages", entry.messages),
-        ("stored", f"{output.size(entry.stored_bytes)} in {segments}, {chunks}"),
+        ("stored", f"{output.size(entry.stored_bytes)} in {', '.join(files)}"),
         ("coverage", about["coverage"]),
         *(("", line_of(loss)) for loss in about["losses"]),
         *(("tag", f"{key}={value}") for key, value in sorted(entry.tags.items())),
@@ -195,18 +187,16 @@ def _fields(store: Store, entry: RecordingEntry, about: dict[str, Any]) -> list[
     ]
 
 
+def _skew_text(channel: Mapping[str, Any]) -> str:
+    if channel["skew_ns"] is not None:
+        return output.short_duration(round(channel["skew_ns"]["mean"]))
+    return {None: "?", 0: "-"}.get(channel["unset_stamps"], "not set")
+
+
 def _kind(channel: Mapping[str, Any]) -> str:
     from hybridlog.schema.states import encoding_of
 
     return channel["type"] or encoding_of(channel["message_encoding"], channel["metadata"])
-
-
-def _skew_text(channel: Mapping[str, Any]) -> str:
-    if channel["skew_ns"] is not None:
-        return output.short_duration(round(channel["skew_ns"]["mean"]))
-    if channel["unset_stamps"]:
-        return "not set"
-    return "?" if channel["unset_stamps"] is None else "-"
 
 
 def _channel_note(channel: Mapping[str, Any]) -> str:
@@ -234,10 +224,10 @@ def _channel_note(channel: Mapping[str, Any]) -> str:
 _CHANNELS = [
     Column("topic"),
     Column("type", _kind, cut=12),
-    Column("messages", side="right"),
-    Column("Hz", lambda c: "-" if c["rate_hz"] is None else f"{c['rate_hz']:.2f}", "right"),
-    bytes_of("payload", "payload_bytes", order=1),
-    Column("log - header", _skew_text, "right", order=2),
+    Column("messages", kind="number"),
+    Column("Hz", "rate_hz", "rate"),
+    Column("payload", "payload_bytes", "bytes", order=1),
+    Column("log - header", _skew_text, "number", order=2),
     Column("note", _channel_note, cut=12),
 ]
 
@@ -259,32 +249,33 @@ def _show_topics(store: Store, query: Query, given: _Given) -> None:
         output.print_json(list(seen.values()))
         return
     for number, item in enumerate(seen.values()):
-        if number:
-            output.say()
         encoding = f"{item['message_encoding']}, {item['schema_encoding'] or 'no schema'}"
-        output.say(f"{item['topic']}  {item['type'] or '(no type)'}  ({encoding})")
-        for line in (item["definition"] or "").splitlines():
-            output.say(line)
+        lines = [
+            *([""] if number else []),
+            f"{item['topic']}  {item['type'] or '(no type)'}  ({encoding})",
+            *(item["definition"] or "").splitlines(),
+        ]
         if item["not_indexed"]:
-            output.say(f"not indexed: {item['not_indexed']}")
+            lines.append(f"not indexed: {item['not_indexed']}")
         if item["arrays"]:
-            output.say("Its tables have long arrays, not only their summaries.")
-        if item["fields"]:
-            output.say()
-            if item["observed"]:
-                output.say("No definition fixes the fields. The first messages have these:")
-            asked = Column("asked as", "path" if item["observed"] else _asked_as, cut=20)
-            print_table([Column("field", "path"), Column("type"), asked], item["fields"])
+            lines.append("Its tables have long arrays, not only their summaries.")
+        if item["observed"]:
+            lines += ["", "No definition fixes the fields. The first messages have these:"]
+        elif item["fields"]:
+            lines.append("")
+        for line in lines:
+            output.say(line)
+        asked = Column("asked as", "path" if item["observed"] else _asked_as, cut=20)
+        print_table([Column("field", "path"), Column("type"), asked], item["fields"])
 
 
 def _topic_dict(store: Store, recorded: RecordedChannel) -> dict[str, Any]:
     from hybridlog.query.answers.infer_fields import infer_fields
 
-    channel, codec = recorded.channel, recorded.codec
+    channel, codec, fields = recorded.channel, recorded.codec, recorded.codec.paths()
     schema, text = channel.schema, None
     if schema is not None and schema.encoding in _READABLE:
         text = bytes(schema.data).decode("utf-8", "replace")
-    fields = codec.paths()
     observed = codec.indexed and not fields
     if observed:
         fields = infer_fields(store.query([channel.topic], [recorded.recording.id]))
@@ -305,7 +296,7 @@ def _topic_dict(store: Store, recorded: RecordedChannel) -> dict[str, Any]:
 def _asked_as(field: dict[str, Any]) -> str:
     path, kind = str(field["path"]), str(field["type"])
     if "[" in kind and kind.startswith(("int", "uint", "float", "bool")):
-        return f"{path}.min, {path}.max, {path}.mean, {path}.n"
+        return ", ".join(f"{path}.{name}" for name in ("min", "max", "mean", "n"))
     return path
 
 
@@ -322,16 +313,16 @@ def _show_tables(store: Store, query: Query, _: _Given) -> None:
     topic, *others = query.topics
     if others:
         raise UsageError(f"--tables is about one topic: name one of {listed(query.topics)}.")
-    channels = channels_of(query)
+    channels, place = channels_of(query), store.directory.path
     recordings = {one.recording.id: one.recording for one in channels}
     ended = {id_: one for id_, one in recordings.items() if one.status not in UNFINISHED}
     where = f"topic = {_quoted(topic)}"
     if query.question.recordings is not None:
         where += f" and recording in ({', '.join(map(_quoted, sorted(ended)))})"
     schemas = [one.channel.schema for one in channels if one.recording.id in ended]
-    types = {"" if schema is None else schema.name for schema in schemas}
+    types = {type_prefix("" if schema is None else schema.name) for schema in schemas}
     folders: Counter[Path] = Counter()
-    for file in files_of(store.directory.path, {*map(type_prefix, types)}) if types else ():
+    for file in files_of(place, types) if types else ():
         own = (one for one in file.about.sections if one.topic == topic and one.id in ended)
         folders[file.path.parent] += sum(one.rows for one in own)
     found = [
@@ -361,9 +352,6 @@ def _quoted(text: str) -> str:
 
 def _show_losses(store: Store, given: _Given) -> None:
     """Print what is missing of topics, from when to when, and why."""
-    from hybridlog.query.topics import matcher
-    from hybridlog.record.losses import losses_of
-
     if given.topic:
         resolve(given.topic, store.topics())  # refuses a name that fits no topic
     fits = matcher(given.topic) if given.topic else None
@@ -390,9 +378,9 @@ _LOSSES = [
     Column("recording"),
     Column("topic", lambda loss: loss.get("topic") or "any"),
     Column("cause"),
-    Column("messages", lambda loss: "unknown" if loss["count"] is None else loss["count"], "right"),
-    Column("from", lambda loss: output.short_time(loss.get("from"))),
-    duration_of("for", _span),
+    Column("messages", lambda row: "unknown" if row["count"] is None else row["count"], "number"),
+    Column("from", lambda loss: loss.get("from"), "second"),
+    Column("for", _span, "duration"),
     Column("detail", lambda loss: ": ".join(filter(None, (loss.get("file"), loss.get("reason"))))),
 ]
 
@@ -418,11 +406,10 @@ def _show_sizes(store: Store, by: str, given: _Given) -> None:
 
 
 _SIZES = [
-    Column("messages", side="right", order=1),
-    bytes_of("payload", "payload_bytes", order=2),
-    bytes_of("segments", "segment_bytes"),
-    bytes_of("tables", "table_bytes"),
-    bytes_of("total", "total_bytes"),
+    Column("messages", kind="number", order=1),
+    Column("payload", "payload_bytes", "bytes", order=2),
+    *(Column(f"{what}s", f"{what}_bytes", "bytes") for what in ("segment", "table")),
+    Column("total", "total_bytes", "bytes"),
 ]
 
 
@@ -450,7 +437,6 @@ def _show_attachments(store: Store, given: _Given) -> None:
 
 
 def _attachment_dict(attachment: StoredAttachment) -> dict[str, Any]:
-    """An attachment as JSON."""
     return {
         "recording": attachment.recording,
         "name": attachment.name,
@@ -464,6 +450,6 @@ def _attachment_dict(attachment: StoredAttachment) -> dict[str, Any]:
 _ATTACHMENTS = [
     Column("attachment", "name"),
     Column("media type", "media_type"),
-    bytes_of("size", "bytes"),
-    Column("log time", lambda row: output.time_text(row["log_time_ns"] or None)),
+    Column("size", "bytes", "bytes"),
+    Column("log time", lambda row: row["log_time_ns"] or None, "time"),
 ]

@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, ClassVar
 
 import click
+from msgspec.structs import asdict
 
 from hybridlog.cli import output
 from hybridlog.cli.answers import Listing, answering
 from hybridlog.cli.options import Filtered, command, option, parse_fields
-from hybridlog.cli.output import Column, duration_of, time_of
+from hybridlog.cli.output import Column
 
 if TYPE_CHECKING:
     from hybridlog.query.intervals import Intervals
@@ -66,19 +67,9 @@ def intervals_command(given: _Given) -> None:
         if given.count:
             output.say(str(len(found)))
         else:
-            names = {
-                recording.id: recording.name
-                for recording in query.source.now().summaries_of(query.question)
-            }
-            rows = (
-                {
-                    "recording": names[row.recording],
-                    "begin_ns": row.begin_ns,
-                    "end_ns": row.end_ns,
-                    "messages": row.messages,
-                }
-                for row in found
-            )
+            summaries = query.source.now().summaries_of(query.question)
+            names = {one.id: one.name for one in summaries}
+            rows = (asdict(one) | {"recording": names[one.recording]} for one in found)
             given.show(rows, _COLUMNS, f"No {noun}.")
 
 
@@ -96,8 +87,8 @@ def _intervals(given: _Given, query: Query) -> Intervals:
 
 _COLUMNS = [
     Column("recording"),
-    time_of("begin", "begin_ns"),
-    time_of("end", "end_ns", order=1),
-    duration_of("duration", lambda row: row["end_ns"] - row["begin_ns"]),
-    Column("messages", side="right"),
+    Column("begin", "begin_ns", "time"),
+    Column("end", "end_ns", "time", order=1),
+    Column("duration", lambda row: row["end_ns"] - row["begin_ns"], "duration"),
+    Column("messages", kind="number"),
 ]

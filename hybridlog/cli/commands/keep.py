@@ -9,7 +9,10 @@ from msgspec.structs import asdict
 
 from hybridlog.cli import output
 from hybridlog.cli.options import AsJson, Choosing, InStore, Quiet, command, option, query_of
-from hybridlog.cli.output import Column, time_of
+from hybridlog.cli.output import Column
+from hybridlog.query.times import parse_duration, parse_time
+from hybridlog.query.topics import split_topic
+from hybridlog.record.losses import extent_of
 from hybridlog.wording import listed
 from hybridlog_storage.errors import UsageError
 
@@ -85,13 +88,12 @@ def keep_command(given: _Given) -> int:
         elif given.unpin:
             store.unpin(*given.unpin)
         elif given.pins:
-            chosen = given.recordings_in(store)
-            rows = [
+            rows = (
                 {"recording": entry.name, **pin_dict(pin)}
-                for entry in chosen
+                for entry in given.recordings_in(store)
                 for pin in entry.manifest.pins
-            ]
-            given.show(rows, [Column("pin", "id"), Column("recording"), *_PIN])
+            )
+            given.show(rows, _PIN)
         else:
             return _keep(store, rules, given)
     return 0
@@ -99,10 +101,8 @@ def keep_command(given: _Given) -> int:
 
 def _rules(given: _Given) -> dict[str, Any]:
     """Options in the form of the table `[retention]`."""
-    named: dict[str, Any] = {
-        name: getattr(given, name.replace("-", "_"))
-        for name in ("quota", "min-free", "max-age", "fields-age")
-    }
+    names = ("quota", "min_free", "max_age", "fields_age", "never_tag")
+    named: dict[str, Any] = {name.replace("_", "-"): getattr(given, name) for name in names}
     named |= {"never-tag": [*given.never_tag], "topic": {}}
     for word in given.topic:
         pattern, _, age = word.rpartition("=")
@@ -132,26 +132,23 @@ def _spans(store: Store, given: _Given) -> Iterator[tuple[str, int | None, int |
     """Id of a recording, begin and end of what is to be pinned of it; None for all."""
     from hybridlog.maintenance.edit import may_hold
     from hybridlog.query.answers.marks import mark_topics
-    from hybridlog.query.times import parse_duration, parse_time
-    from hybridlog.query.topics import split_topic
-    from hybridlog.record.losses import extent_of
 
     before, after = given.before, given.after
-    if given.at is not None:
-        for entry in given.recordings_in(store):
-            start, end = extent_of(entry)
-            at = parse_time(given.at, start=start, end=end)
-            span = at - parse_duration(before), at + parse_duration(after) + 1
-            if may_hold(entry, *span):
-                yield entry.id, *span
-    elif not given.when:
-        yield from ((one.id, None, None) for one in given.recordings_in(store).summaries)
+    for entry in () if given.when else given.recordings_in(store):
+        if given.at is None:
+            yield entry.id, None, None
+            continue
+        start, end = extent_of(entry)
+        at = parse_time(given.at, start=start, end=end)
+        span = at - parse_duration(before), at + parse_duration(after) + 1
+        if may_hold(entry, *span):
+            yield entry.id, *span
     for condition in given.when:
         pattern, predicate = split_topic(condition)
         query = query_of(store, [pattern], given.choice)
-        query = query.where(predicate) if predicate else query
-        are_marks = {*query.topics} <= {*mark_topics(store.session)}
-        if predicate and not are_marks:
+        if predicate:
+            query = query.where(predicate)
+        if predicate and not {*query.topics} <= {*mark_topics(store.session)}:
             found = query.intervals().widened(before, after)
         else:
             found = query.windows(before, after)
@@ -160,8 +157,10 @@ def _spans(store: Store, given: _Given) -> Iterator[tuple[str, int | None, int |
 
 
 _PIN = [
-    time_of("from", "from"),
-    time_of("to", "to"),
+    Column("pin", "id"),
+    Column("recording"),
+    Column("from", kind="time"),
+    Column("to", kind="time"),
     Column("topics", lambda pin: "all" if pin["topics"] is None else listed(pin["topics"])),
     Column("reason"),
 ]
@@ -178,7 +177,8 @@ def _keep(store: Store, rules: dict[str, Any], given: _Given) -> int:
     from hybridlog.maintenance.retention import Rules
 
     wanted = rules or store.directory.settings.retention
-    if Rules.of(wanted).is_empty:
+    parsed = Rules.of(wanted)
+    if parsed.is_empty:
         raise UsageError(
             "No rule says what may go: give --quota, --min-free, --max-age, --topic or "
             "--fields-age, or write them into [retention] of hybridlog.toml, as --save does."
@@ -186,21 +186,19 @@ def _keep(store: Store, rules: dict[str, Any], given: _Given) -> int:
     if given.save:
         store.directory.check_writable()
         store.directory.change_settings(retention=rules)
-    dry_run = given.dry_run
-    found = store.keep(wanted, dry_run=dry_run)
-    plan = found.plan
+    found = store.keep(wanted, dry_run=given.dry_run)
+    plan, size = found.plan, output.size
     if not given.as_json:
         given.show(plan.steps, _STEPS)
-    size = output.size
-    freed = sum(step.bytes for step in plan.steps) if dry_run else found.freed_bytes
-    what = "would become free" if dry_run else "freed"
+    freed, what = found.freed_bytes, "freed"
+    if given.dry_run:
+        freed, what = sum(step.bytes for step in plan.steps), "would become free"
     room = f"{size(plan.used_bytes)} used, {size(plan.free_bytes)} free"
-    told = f"{room}: {size(freed)} {what}"
-    output.tell({**asdict(found), "dry_run": dry_run}, [told])
+    output.tell({**asdict(found), "dry_run": given.dry_run}, [f"{room}: {size(freed)} {what}"])
     topics = store.topics()
     useless = (
         f"No topic matches {rule.pattern}, so its rule deletes nothing."
-        for rule in Rules.of(wanted).topics
+        for rule in parsed.topics
         if not any(map(rule.fits, topics))
     )
     output.notes((*found.problems, *plan.warnings, *useless))
@@ -210,6 +208,6 @@ def _keep(store: Store, rules: dict[str, Any], given: _Given) -> int:
 _STEPS = [
     Column("recording", lambda step: step.recording),
     Column("segments", lambda step: listed(map(str, step.segments)) if step.segments else "all"),
-    Column("about", lambda step: output.size(step.bytes), "right"),
+    Column("about", lambda step: step.bytes, "bytes"),
     Column("reason", lambda step: step.reason),
 ]

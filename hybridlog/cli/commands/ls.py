@@ -31,22 +31,21 @@ def _note(entry: RecordingSummary) -> str:
     for number, what in ((entry.expired, "deleted"), (entry.not_copied, "not copied yet")):
         if number:
             notes.append(f"{output.counted(number, 'payload')} {what}")
-    notes.extend(f"{key}={value}" for key, value in sorted(entry.tags.items()))
-    notes.extend(output.cut(note["text"]) for note in entry.notes)
-    return ", ".join(notes)
-
-
-def _duration(entry: RecordingSummary) -> str:
-    return output.short_duration(entry.span[1] - entry.span[0]) if entry.span else "-"
+    notes += (f"{key}={value}" for key, value in sorted(entry.tags.items()))
+    return ", ".join([*notes, *(output.cut(note["text"]) for note in entry.notes)])
 
 
 RECORDINGS = [
     Column("recording", lambda one: one.name),
-    Column("start", lambda one: output.short_time(one.span and one.span[0])),
-    Column("duration", _duration, "right"),
-    Column("topics", lambda one: one.topic_count, "right", order=1),
-    Column("messages", lambda one: one.messages, "right"),
-    Column("stored", lambda one: output.size(one.stored_bytes), "right", order=2),
+    Column("start", lambda one: one.span[0] if one.span else None, "second"),
+    Column(
+        "duration",
+        lambda one: output.short_duration(one.span[1] - one.span[0]) if one.span else "-",
+        "number",
+    ),
+    Column("topics", lambda one: one.topic_count, "number", order=1),
+    Column("messages", lambda one: one.messages, "number"),
+    Column("stored", lambda one: one.stored_bytes, "bytes", order=2),
     Column("note", _note, cut=6),
 ]
 """Columns of a list of recordings."""
@@ -68,14 +67,14 @@ def status_text(recording: RecordingSummary) -> str:
 
 def recording_dict(recording: RecordingSummary) -> dict[str, Any]:
     """A recording in short, for JSON."""
-    span = recording.span
+    first, last = recording.span or (None, None)
     return {
         "id": recording.id,
         "name": recording.name,
         "tags": recording.tags,
         "status": recording.status,
-        "first_ns": span[0] if span else None,
-        "last_ns": span[1] if span else None,
+        "first_ns": first,
+        "last_ns": last,
         "topics": recording.topic_count,
         "messages": recording.messages,
         "expired": recording.expired,

@@ -8,6 +8,7 @@ from contextlib import suppress
 
 from hybridlog.cli import options, output
 from hybridlog.cli.options import InStore, Quiet, argument, command, option
+from hybridlog.query.times import parse_duration
 from hybridlog_storage.errors import StoreError, UsageError
 
 
@@ -67,16 +68,16 @@ def _mark_running(given: _Given, tags: dict[str, str]) -> Iterator[str]:
     from hybridlog.live.clocks import CLOCK
     from hybridlog.live.state import choose, read
     from hybridlog.maintenance.edit import mark_now
-    from hybridlog.query.times import parse_duration
     from hybridlog.store import store_path
     from hybridlog_storage.remote import directory_of
 
     around = given.pin and (parse_duration(given.pin[0]), parse_duration(given.pin[1]))
     now, directory = time.time_ns(), directory_of(store_path(given.store))
     for recording in choose(directory, given.recording):
-        simulated: int | None = None
+        at = now
         with suppress(StoreError):  # it has just begun
             simulated = read(directory.path, recording).sim_time
-        if simulated == 0:
+            at = now if simulated is None else simulated
+        if at == 0:
             raise UsageError(f"There is no time of {CLOCK} yet: mark again when it has come.")
-        yield mark_now(directory, recording, simulated or now, given.text, tags, around=around)
+        yield mark_now(directory, recording, at, given.text, tags, around=around)

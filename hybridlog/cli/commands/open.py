@@ -15,7 +15,6 @@ from hybridlog_storage.errors import extra
 
 if TYPE_CHECKING:
     from hybridlog.query.query import Query
-    from hybridlog.view.playback.server import PlaybackServer
 
 _PORT: Final = 8765
 _MAX_SHOWN = 5  # topics
@@ -47,46 +46,30 @@ def open_command(given: _Given) -> None:
         from hybridlog.view.playback.server import PlaybackServer
     from hybridlog.view.playback.played import PlayedLog
 
+    async def serve() -> None:
+        stop, loop = asyncio.Event(), asyncio.get_running_loop()
+        with ended_by_signal(lambda: loop.call_soon_threadsafe(stop.set)):
+            await server.run(stop, _print_address)
+
     with given.opened() as store:
         query = given.query(store)
-        log = PlayedLog(query)
-        name = " ".join(["hybridlog", *given.choice.name])
         server = PlaybackServer(
-            log,
-            name,
+            PlayedLog(query),
+            " ".join(["hybridlog", *given.choice.name]),
             output.note,
             port=_PORT if given.port is None else given.port,
             speed=given.speed,
             origins=given.origins,
         )
         output.remarks([*query.completeness().sentences, *unplayed(query)])
-        asyncio.run(_until_signal(server))
-
-
-async def _until_signal(server: PlaybackServer) -> None:
-    """Serve until a signal comes."""
-    import asyncio
-
-    stop = asyncio.Event()
-    loop = asyncio.get_running_loop()
-    with ended_by_signal(lambda: loop.call_soon_threadsafe(stop.set)):
-        await server.run(stop, _print_address)
+        asyncio.run(serve())
 
 
 def _print_address(port: int) -> None:
-    from urllib.parse import quote
-
     address = f"ws://127.0.0.1:{port}"
     output.say(address)
     sys.stdout.flush()
-    output.remarks(
-        [
-            f"In Foxglove or Lichtblick: Open connection, Foxglove WebSocket, {address}",
-            "In a browser: https://app.foxglove.dev/?ds=foxglove-websocket&ds.url="
-            f"{quote(address, safe='')}",
-            "Ctrl-C ends it.",
-        ]
-    )
+    output.remarks([f"Foxglove or Lichtblick: Open connection, {address}. Ctrl-C ends it."])
 
 
 def unplayed(query: Query) -> list[str]:

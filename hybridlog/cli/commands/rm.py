@@ -24,6 +24,7 @@ from hybridlog.wording import listed
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
+    from hybridlog_storage.manifest import Pin
     from hybridlog_storage.summary import RecordingSummary
 
 
@@ -46,18 +47,18 @@ def rm_command(given: _Given) -> None:
     with given.opened() as store:
         chosen = recordings_of(store, choice).summaries
         if not given.yes:
-            pins = [pin.reason for one in chosen for pin in store.entry(one.id).manifest.pins]
+            pins = [pin for one in chosen for pin in store.entry(one.id).manifest.pins]
             _confirm(chosen, pins)
         for one in chosen:
             store.remove(one.id)
             output.tell(None, [f"deleted {one.name}"])
 
 
-def _confirm(chosen: Sequence[RecordingSummary], pins: Sequence[str]) -> None:
+def _confirm(chosen: Sequence[RecordingSummary], pins: Sequence[Pin]) -> None:
     """Ask for consent, with what would be lost."""
     what = f"{listed(one.name for one in chosen)} for good"
     if pins:
-        reasons = listed(filter(None, dict.fromkeys(pins)))
+        reasons = listed(filter(None, dict.fromkeys(pin.reason for pin in pins)))
         what += f", with {output.counted(len(pins), 'pin')} ({reasons})"
     if not sys.stdin.isatty():
         raise UsageError(f"Deleting {what} needs --yes.")

@@ -32,6 +32,6 @@ def stats_command(given: _Given) -> None:
         found = [asdict(row) for row in stats]
         if given.strict:
             query.completeness().check()
-        shown = [Column(name, side="right", order=name == "std") for name in _NAMES]
+        shown = [Column(name, kind="number", order=name == "std") for name in _NAMES]
         columns = [Column("topic", varies=True), Column("field"), *shown]
         given.show(found, columns, "No field is a number.")

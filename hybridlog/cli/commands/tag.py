@@ -30,10 +30,10 @@ class _Given(Choosing, InStore, AsJson, Quiet):
 def tag_command(given: _Given) -> None:
     """Set, show or remove the tags of recordings."""
     choice, pairs = given.choice, given.words
+    if choice.is_everything and not pairs:
+        raise UsageError("Name a recording, or choose some: -r 'monday*', --has TOPIC.")
     if choice.is_everything:
-        if not given.words:
-            raise UsageError("Name a recording, or choose some: -r 'monday*', --has TOPIC.")
-        choice, pairs = Choice.of(given.words[0]), given.words[1:]
+        choice, pairs = Choice.of(pairs[0]), pairs[1:]
     with given.opened() as store:
         chosen = recordings_of(store, choice).summaries
         tags = options.parse_tags(pairs)

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, ClassVar
 
 from hybridlog.cli.answers import SCREEN, Tabular
 from hybridlog.cli.options import Strict, Topics, argument, command, option, tf_topic, topics
-from hybridlog.cli.output import Column, duration_of, print_table, rate_of, remarks
+from hybridlog.cli.output import Column, print_table, remarks
+from hybridlog.query.times import parse_duration, parse_range, parse_time
 from hybridlog.wording import counted, listed
 from hybridlog_storage.errors import IncompleteError, UsageError
 from hybridlog_storage.times import END
@@ -18,11 +19,9 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     import numpy as np
-    import pyarrow as pa
     from numpy.typing import NDArray
 
     from hybridlog.query.query import Query
-    from hybridlog.query.times import TimeLike
     from hybridlog.tf.reader import Trees
     from hybridlog.tf.tree import FrameTree
 
@@ -88,17 +87,16 @@ def _show_transforms(given: _Given, target: str, trees: Trees, query: Query | No
     topic = None if query is None else query.topics[0]
     tree = trees.tree(topic)
     if query is None:
-        stamps = _times(tree, given, given.span if given.step else given.between)
+        stamps = _times(tree, given, target)
         log_time = 0 * stamps + END  # of the last epoch
     else:
         asked = query.source.now(), query.question, query.counters
         frames, stamps, log_time = frames_and_stamps(*asked)
-        source = frames[0] if source is None and len(frames) == 1 and frames[0] else source
+        source = source or (frames[0] if len(frames) == 1 and frames[0] else None)
     if source is None:
         raise UsageError("A transform has two frames: name TARGET and SOURCE.")
     shown = slice(given.limit)  # reasons are about the rows that are given
-    asked_at = stamps[shown], log_time[shown]
-    found = trees.lookup(topic, target, source, *asked_at)
+    found = trees.lookup(topic, target, source, stamps[shown], log_time[shown])
     if len(stamps) == len(found) == 1 and found.missing:
         tree.transform(target, source, int(stamps[0]))
     given.answer([found.to_arrow()])
@@ -109,33 +107,32 @@ def _show_transforms(given: _Given, target: str, trees: Trees, query: Query | No
     )
 
 
-def _times(
-    tree: FrameTree, given: _Given, between: tuple[TimeLike, TimeLike | None] | None
-) -> NDArray[np.int64]:
+def _times(tree: FrameTree, given: _Given, target: str) -> NDArray[np.int64]:
     """The times that are wanted, ns."""
     import numpy as np
 
-    from hybridlog.query.times import parse_duration, parse_range, parse_time
-
     start, end = tree.span
-    target, step = given.target or "", given.step
-    if step is not None:
-        low, high = parse_range(*(between or (None, None)), start=start, end=end)
-        length = parse_duration(step)
+    if given.step is not None:
+        low, high = parse_range(*(given.span or (None, None)), start=start, end=end)
+        length = parse_duration(given.step)
         if not length or (high - low) // length >= _MAX_TIMES:
-            raise UsageError(f"--step {step} would be more than {_MAX_TIMES:,} times.")
+            raise UsageError(f"--step {given.step} would be more than {_MAX_TIMES:,} times.")
         return np.arange(low, high, length, dtype=np.int64)
-    if between is not None:
+    if given.between is not None:
         raise UsageError("--between needs --step or --topic.")
-    if given.at:
-        return np.array([parse_time(one, start=start, end=end) for one in given.at], np.int64)
-    return np.array([tree.latest(target, given.source or target)], np.int64)
+    times = [parse_time(one, start=start, end=end) for one in given.at]
+    return np.array(times or [tree.latest(target, given.source or target)], np.int64)
 
 
 def _show_trees(trees: Mapping[str, FrameTree], given: _Given) -> None:
     """Show the frames of trees, by a topic of each, which is a column if there are several."""
+    import pyarrow as pa
+
     if given.to_form != SCREEN:
-        given.answer([_with_name(name, tree) for name, tree in trees.items()])
+        tables = ((name, tree.to_arrow()) for name, tree in trees.items())
+        given.answer(
+            [one.add_column(0, "tree", pa.array([name] * len(one), "str")) for name, one in tables]
+        )
         return
     frames = (
         (topic, "  " * depth + name, tree.frames.get(name), tree.span[0])
@@ -147,22 +144,15 @@ def _show_trees(trees: Mapping[str, FrameTree], given: _Given) -> None:
     remarks(dict.fromkeys(text for tree in trees.values() for text in tree.problems()))
 
 
-def _with_name(topic: str, tree: FrameTree) -> pa.Table:
-    import pyarrow as pa
-
-    table = tree.to_arrow()
-    return table.add_column(0, "tree", pa.array([topic] * len(table), pa.string()))
-
-
 _FRAMES = [
     Column("tree", 0),
     Column("frame", 1),
     Column(
         "transforms",
         lambda row: row[2] and ("static" if row[2].is_static else len(row[2].stamps)),
-        "right",
+        "number",
     ),
-    rate_of("Hz", lambda row: row[2] and row[2].rate_hz),
-    duration_of("longest gap", lambda row: row[4] and row[4][1] - row[4][0]),
-    Column("from", lambda row: row[4] and f"{(row[4][0] - row[3]) / 1e9:+.3f}s", "right"),
+    Column("Hz", lambda row: row[2] and row[2].rate_hz, "rate"),
+    Column("longest gap", lambda row: row[4] and row[4][1] - row[4][0], "duration"),
+    Column("from", lambda row: row[4] and f"{(row[4][0] - row[3]) / 1e9:+.3f}s", "number"),
 ]

@@ -12,6 +12,7 @@ from hybridlog.cli import output
 from hybridlog.cli.options import Place, argument, command, option
 from hybridlog.cli.output import Column, table_lines
 from hybridlog.cli.signals import Stopped
+from hybridlog.record.losses import Cause
 from hybridlog_storage.stopping import at_safe_points
 
 if TYPE_CHECKING:
@@ -41,20 +42,19 @@ def top_command(given: _Given) -> None:
     from hybridlog_storage.remote import directory_of
 
     directory = directory_of(store_path(given.store))
-    (recorder,) = choose(directory, [] if given.recording is None else [given.recording])
-    name = recorder
-    on_screen = not given.as_json and sys.stdout.isatty() and not given.once
+    (name,) = choose(directory, [] if given.recording is None else [given.recording])
+    is_once = given.once or not (given.as_json or sys.stdout.isatty())
     with suppress(Stopped), at_safe_points(), output.Drawn(error=False) as table:
-        for state in states(directory, recorder, _EVERY_S):
+        for state in states(directory, name, _EVERY_S):
             name = state.name
             if given.as_json:
                 output.print_json(summary_of(state), at_once=True)
-            elif on_screen:
+            elif not is_once:
                 draw(state, table)
             else:
                 for line in _lines_of(state, output.screen_width()):
                     output.say(line)
-            if given.once or not (given.as_json or on_screen):
+            if is_once:
                 return
         if not given.as_json:
             output.note(f"{name} has ended.")
@@ -68,9 +68,8 @@ def draw(state: RecorderState, table: output.Drawn) -> None:
 
 def _lines_of(state: RecorderState, width: int, height: int | None = None) -> list[str]:
     """A state as the lines of a table of topics, with others below it."""
-    ends = textwrap.wrap(summary(state), width)
-    for topic in state.silent:
-        ends += textwrap.wrap(output.printable(f"{topic} is silent"), width)
+    silent = (output.printable(f"{topic} is silent") for topic in state.silent)
+    ends = [line for text in (summary(state), *silent) for line in textwrap.wrap(text, width)]
     topics = state.topics
     rows = len(topics) if height is None else max(height - 1 - len(ends), 4)
     if left := max(len(topics) - rows, 0):
@@ -83,18 +82,16 @@ def _lines_of(state: RecorderState, width: int, height: int | None = None) -> li
 
 _TOPIC: Final = Column("topic", lambda topic: topic.topic, cut=16)
 _COLUMNS: Final = [
-    Column("Hz", lambda topic: f"{topic.hz:.1f}", "right"),
-    Column("MB/s", lambda topic: f"{topic.bytes_per_s / 1e6:.2f}", "right", order=1),
-    Column("messages", lambda topic: topic.messages, "right"),
-    Column("thinned", lambda topic: topic.thinned or "", "right", order=2),
-    Column("lost", lambda topic: topic.lost or "", "right"),
+    Column("Hz", lambda topic: f"{topic.hz:.1f}", "number"),
+    Column("MB/s", lambda topic: topic.bytes_per_s / 1e6, "rate", order=1),
+    Column("messages", lambda topic: topic.messages, "number"),
+    Column("thinned", lambda topic: topic.thinned or "", "number", order=2),
+    Column("lost", lambda topic: topic.lost or "", "number"),
 ]
 
 
 def summary(state: RecorderState) -> str:
     """One line for the whole recorder."""
-    from hybridlog.record.losses import Cause
-
     reason = state.index_failure.partition("\n")[0].partition(". ")[0].rstrip(".")
     why = f": {output.cut(output.printable(reason), _SHORT)}" if reason else ""
     parts = [

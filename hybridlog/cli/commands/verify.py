@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
-from fnmatch import fnmatchcase
-from typing import TYPE_CHECKING
 
-from msgspec.structs import asdict, replace
+from msgspec.structs import asdict
 
 from hybridlog.cli import output
 from hybridlog.cli.options import (
@@ -22,13 +19,6 @@ from hybridlog.cli.options import (
 )
 from hybridlog.cli.output import Bar
 from hybridlog.wording import listed
-from hybridlog_storage.errors import TopicError
-
-if TYPE_CHECKING:
-    from hybridlog.maintenance.report import Repaired
-    from hybridlog.maintenance.verify import Finding, Verification
-    from hybridlog.store import Store
-    from hybridlog_storage.summary import RecordingSummary
 
 
 class _Given(Choosing, InStore, AsJson, Quiet):
@@ -56,52 +46,33 @@ def verify_command(given: _Given) -> int:
         output.note("The store has a new id now.")
     started = time.monotonic()
     with given.opened(verifies=True) as store:
-        chosen, unreadable = _chosen(given, store)
-        names = None if given.choice.is_everything else [*(one.id for one in chosen), *unreadable]
+        # One that cannot be read has lost its name: it is named by its id.
+        lost = [name for name in given.names if name in store.shared.repairs.unreadable]
+        chosen = () if lost else recordings_of(store, given.choice).summaries
+        ids = None if given.choice.is_everything else [*lost, *(one.id for one in chosen)]
         with Bar("verify") as bar:
-            result = store.verify(names, bar.part, repair=given.repair)
+            result = store.verify(ids, bar.part, repair=given.repair)
     elapsed = time.monotonic() - started
     if given.as_json:
         output.print_json({**asdict(result), "seconds": round(elapsed, 3)})
     else:
-        _print(result, elapsed)
+        lines = [(one.recording, one.place, f"mended: {one.done}") for one in result.repaired]
+        lines += (
+            (one.recording, one.place, f"{one.problem.removesuffix('.')}; {one.cure}")
+            for one in result.findings
+        )
+        for line in lines:
+            output.say(": ".join(filter(None, line)))
+        many = len(result.findings)
+        told = (
+            f"{output.counted(result.recordings, 'recording')}, "
+            f"{output.counted(result.chunks, 'chunk')}, "
+            f"{output.counted(result.messages, 'message')}, "
+            f"{output.size(result.bytes_read)} read in {elapsed:.2f} s: "
+            f"{output.counted(many, 'problem') if many else 'all is well'}"
+        )
+        output.tell(None, [told])
         if running := [one.name for one in chosen if one.status == "open"]:
             said = f"Still being recorded, and checked as far as sealed: {listed(running)}."
             output.remarks([said])
     return 1 if result.findings else 0
-
-
-def _chosen(given: _Given, store: Store) -> tuple[Sequence[RecordingSummary], list[str]]:
-    """The chosen recordings, and ids of chosen ones that cannot be read: their names are lost."""
-    choice, known = given.choice, [*store.shared.repairs.unreadable]
-    unreadable = [one for one in known if any(fnmatchcase(one, name) for name in choice.name)]
-    names = tuple(name for name in choice.name if name not in unreadable)
-    if unreadable and not names:
-        return [], unreadable
-    try:
-        return recordings_of(store, replace(choice, name=names)).summaries, unreadable
-    except TopicError:
-        if not unreadable:
-            raise
-        return [], unreadable
-
-
-def _print(result: Verification, elapsed: float) -> None:
-    for done in result.repaired:
-        _say(done, f"mended: {done.done}")
-    for finding in result.findings:
-        _say(finding, f"{finding.problem.removesuffix('.')}; {finding.cure}")
-    verdict = "all is well"
-    if result.findings:
-        verdict = output.counted(len(result.findings), "problem")
-    told = (
-        f"{output.counted(result.recordings, 'recording')}, "
-        f"{output.counted(result.chunks, 'chunk')}, "
-        f"{output.counted(result.messages, 'message')}, "
-        f"{output.size(result.bytes_read)} read in {elapsed:.2f} s: {verdict}"
-    )
-    output.tell(None, [told])
-
-
-def _say(one: Finding | Repaired, what: str) -> None:
-    output.say(": ".join(filter(None, (one.recording, one.place, what))))

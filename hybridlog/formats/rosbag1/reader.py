@@ -158,14 +158,6 @@ class _Connection(NamedTuple):
     topic: bytes
     data: bytes
 
-    @classmethod
-    def of(cls, record: _Record, data: bytes) -> _Connection | None:
-        """The content of a record in some bytes; None of another kind."""
-        if record.op != _CONNECTION:
-            return None
-        content = data[record.start : record.end]
-        return cls(record.number(b"conn"), record.fields[b"topic"], content)
-
     def channel(self) -> Channel:
         """The channel of its messages."""
         fields = {k.decode(errors="replace"): v for k, v in _fields(self.data).items()}
@@ -195,15 +187,9 @@ class Rosbag1Source(Source):
         self._cut: tuple[str, int | None] | None = None  # why the file ends early, and what is lost
         try:
             self._file: BinaryIO = path.open("rb", buffering=1 << 16)
+            self._open()
         except OSError as error:
             raise cannot_open(path, error) from error
-        try:
-            self._open()
-        except BaseException as error:
-            self.close()
-            if isinstance(error, OSError):
-                raise cannot_open(path, error) from error
-            raise
 
     def close(self) -> None:
         """Close the file."""
@@ -217,10 +203,7 @@ class Rosbag1Source(Source):
             raise SourceError(_not_version_2(self.path, magic))
         record = self._record(len(MAGIC))
         if record is None and self.size_bytes < len(MAGIC) + 4096:
-            raise SourceError(
-                f"{self.path}: the file ends in the bag header, before any message; "
-                "copy it again from where it was recorded"
-            )
+            raise SourceError(_not_version_2(self.path, magic))
         if record is None or record.op != _BAG_HEADER:
             return
         if encryptor := record.fields.get(b"encryptor"):
@@ -244,8 +227,8 @@ class Rosbag1Source(Source):
             data = self._read(record.start, record.end - record.start)
             if record.op == _CONNECTION:  # that in a chunk may be lost
                 connections += 1
-                conn = record.number(b"conn")
-                self._fallback[conn] = _Connection(conn, record.fields[b"topic"], data)
+                found = _Connection(record.number(b"conn"), record.fields[b"topic"], data)
+                self._fallback[found.conn] = found
             elif record.op == _CHUNK_INFO:
                 chunks += 1
                 pairs = np.frombuffer(data, "<u4", len(data) // 8 * 2).reshape(-1, 2)
@@ -381,14 +364,17 @@ class Rosbag1Source(Source):
                 if _OP in data[start : start + length + len(_OP)]:
                     rows.pop()  # its length is wrong: a record begins in it
                     end = start
-            found = None if record is None else _Connection.of(record, data)
+            found = None
+            if record is not None and record.op == _CONNECTION:
+                content = data[record.start : record.end]
+                found = _Connection(record.number(b"conn"), record.fields[b"topic"], content)
+                end = record.end
             is_known = found is not None and self._meaning.get(found.conn, found) == found
             if rows and (not is_known or len(rows) >= BATCH_MESSAGES):
                 yield self._batch(data, rows)
                 rows = []
-            if record is not None and found is not None:
+            if found is not None:
                 self._meaning[found.conn] = found
-                end = record.end
         return end
 
     def _chunk(self, pos: int, record: _Record) -> Generator[Batch, None, int]:
@@ -422,14 +408,14 @@ class Rosbag1Source(Source):
         size, length = record.number(b"size"), record.end - record.start
         most = min(max(size, _UNSTATED), MAX_PAYLOAD)
         self._file.seek(record.start)
-        left, content = length, BytesIO()
+        left, content, data = length, BytesIO(), b""
         stream = _UNPACKERS[record.fields[b"compression"]]()
         while not stream.eof:
-            data = self._file.read(min(_STEP, left)) if stream.needs_input else b""
-            if stream.needs_input and not data:
+            if stream.needs_input and not (data := self._file.read(min(_STEP, left))):
                 break
             left -= len(data)
             content.write(stream.decompress(data, _STEP))
+            data = b""
             if content.tell() > most:
                 raise ValueError(f"its header says {size} bytes, it has more than {most}")
             if is_implausible(content.tell(), length):
@@ -472,7 +458,7 @@ class Rosbag1Source(Source):
 
 def _not_version_2(path: Path, magic: bytes) -> str:
     if MAGIC.startswith(magic):
-        what = f"ends after {len(magic)} bytes, before any message" if magic else "is empty"
+        what = "ends before any message" if magic else "is empty"
         return f"{path}: the file {what}; copy it again from where it was recorded"
     if magic.startswith((b"#ROSBAG V", b"#ROSRECORD")):
         version = magic.split(b"V", 1)[-1].strip().decode(errors="replace")

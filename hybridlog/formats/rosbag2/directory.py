@@ -18,21 +18,19 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-def read_metadata(folder: Path) -> BagMetadata | Damage | None:
-    """The metadata of the bag in a folder, the damage if it is unreadable, None without any."""
+def read_metadata(folder: Path) -> tuple[BagMetadata | None, list[Damage]]:
+    """The metadata of the bag in a folder, None without any, and the damage if it is unreadable."""
     path = folder / NAME
     try:
         with path.open("rb") as file:
-            data = file.read(MAX_BYTES + 1)
+            return parse_metadata(file.read(MAX_BYTES + 1).decode(errors="replace")), []
     except (FileNotFoundError, NotADirectoryError):
-        return None
+        return None, []
     except OSError as error:
-        return Damage(path, 0, None, f"the metadata cannot be read ({error.strerror})", 0)
-    try:
-        return parse_metadata(data.decode(errors="replace"))
+        reason = f"the metadata cannot be read ({error.strerror})"
     except YamlError as error:
         reason = f"the metadata cannot be used ({error}); the files beside it are read without it"
-        return Damage(path, 0, len(data), reason, 0)
+    return None, [Damage(path, 0, None, reason, 0)]
 
 
 def locate(folder: Path, metadata: BagMetadata) -> tuple[list[Path], list[Damage]]:

@@ -50,20 +50,18 @@ class SqliteSource(Source):
         self._early = 0
         self._select = ""
         self._got = 0
-        self._problem: tuple[int, str] | None = None
+        self._problem: str | None = None
         page, pages = _read_header(path)
         self._missing = pages * page - self.size_bytes
         try:
             self._db = _connect(path, page, self.size_bytes)
-        except sqlite3.Error as error:
-            raise _unreadable(path, error) from error
-        try:
             self._open()
-        except BaseException as error:
-            self.close()
-            if isinstance(error, sqlite3.Error | OverflowError | ValueError):
-                raise _unreadable(path, error) from error
-            raise
+        except (sqlite3.Error, OverflowError, ValueError) as error:
+            raise SourceError(
+                f"{path}: SQLite cannot read it ({error}); copy it, with its -wal file if there is "
+                "one, to where you may write, or repair a copy with "
+                "`sqlite3 FILE .recover | sqlite3 NEW`"
+            ) from error
 
     def close(self) -> None:
         """Close the database."""
@@ -133,17 +131,12 @@ class SqliteSource(Source):
             type_name = str(kind or "")
             # Services and actions are recorded by their events, and defined by themselves.
             found = definitions.get(type_name) or definitions.get(interface_of(type_name))
-            metadata = {}
+            metadata = {"topic_type_hash": str(type_hash)} if type_hash else {}
             if "offered_qos_profiles" in columns:
                 metadata["offered_qos_profiles"] = str(qos or "")
-            if type_hash:
-                metadata["topic_type_hash"] = str(type_hash)
+            schema, has_sent = Schema(type_name, *(found or ("", b""))), self._has_publish_time
             channel = Channel(
-                str(name),
-                str(encoding or ""),
-                Schema(type_name, *(found or ("", b""))),
-                metadata,
-                has_publish_time=self._has_publish_time,
+                str(name), str(encoding or ""), schema, metadata, has_publish_time=has_sent
             )
             self._channel_of[number] = self.add_channel(channel)
 
@@ -180,23 +173,21 @@ class SqliteSource(Source):
                 rows, size = [], 0
         yield from self._batch(rows, size)
         self.bytes_read = self.size_bytes
+        told: list[tuple[str, int | None]] = []
         if self._problem is not None:
-            first, problem = self._problem
-            reason = f"rows from id {first} on cannot be read: SQLite says {problem}"
-            lost = None
-            if self.message_count is not None:
-                lost = max(0, self.message_count - self._got)
-            self.damage.append(Damage(self.path, None, None, reason, lost))
+            known = self.message_count
+            lost = None if known is None else max(0, known - self._got)
+            told.append((self._problem, lost))
         elif self._missing > 0:
             reason = "the file is cut short, but only behind its messages"
             self.damage.append(Damage(self.path, self.size_bytes, self._missing, reason, 0))
         if self._undefined:
             ids = listed(sorted(map(str, self._undefined)))
             reason = f"messages of topics that the bag does not list (topic id {ids})"
-            self.damage.append(Damage(self.path, None, None, reason, self._undefined.total()))
+            told.append((reason, self._undefined.total()))
         if self._early:
-            reason = "messages with a time before 1970, which no log can keep"
-            self.damage.append(Damage(self.path, None, None, reason, self._early))
+            told.append(("messages with a time before 1970, which no log can keep", self._early))
+        self.damage += (Damage(self.path, None, None, reason, lost) for reason, lost in told)
 
     def _rows(self) -> Iterator[_Row]:
         """The rows before the first damage; keeps its place and what SQLite says of it."""
@@ -216,7 +207,7 @@ class SqliteSource(Source):
             if row[0] >= start:
                 start = row[0] + 1
                 yield row
-        self._problem = max(start, 1), problem
+        self._problem = f"rows from id {max(start, 1)} on cannot be read: SQLite says {problem}"
 
     def _batch(self, rows: list[_Row], size: int) -> Iterator[Batch]:
         if not rows:
@@ -286,10 +277,3 @@ def _connect(path: Path, page: int, size: int) -> sqlite3.Connection:
         "PRAGMA trusted_schema = OFF; PRAGMA cell_size_check = ON; PRAGMA query_only = ON"
     )
     return db
-
-
-def _unreadable(path: Path, error: Exception) -> SourceError:
-    return SourceError(
-        f"{path}: SQLite cannot read it ({error}); copy it, with its -wal file if there is one, to "
-        "where you may write, or repair a copy with `sqlite3 FILE .recover | sqlite3 NEW`"
-    )

@@ -24,33 +24,10 @@ if TYPE_CHECKING:
     from hybridlog_storage.messages import Batch, Channel
     from hybridlog_storage.segments.segment_format import Attachment
 
-MAX_FILE: Final = 2 << 30
-"""Bytes of payload at which a file ends."""
 STORAGES: Final = {"mcap": ".mcap", "sqlite3": ".db3"}
 """Suffixes of files by the storage of a bag."""
 _VERSION: Final = 9
 _TABLES: Final = f"{Sqlite3Writer.SQLITE_SCHEMA} UPDATE schema SET ros_distro = 'hybridlog';"  # noqa: S608
-
-
-class _Span(Struct):
-    """Messages of a file or of the bag."""
-
-    messages: int = 0
-    first: int = 2**63 - 1
-    last: int = 0
-
-    def add(self, batch: Batch) -> None:
-        self.messages += len(batch)
-        self.first = min(self.first, int(batch.log_time.min()))
-        self.last = max(self.last, int(batch.log_time.max()))
-
-    def described(self) -> dict[str, Any]:
-        first = self.first if self.messages else 0
-        return {
-            "duration": {"nanoseconds": self.last - first},
-            "starting_time": {"nanoseconds_since_epoch": first},
-            "message_count": self.messages,
-        }
 
 
 class _Topic(Struct):
@@ -81,19 +58,19 @@ def write_rosbag2(answer: Answer, target: Target, **settings: Any) -> None:
 class Rosbag2Writer(LogWriter):
     """Writes a bag."""
 
-    def __init__(self, target: Target, *, storage: str = "mcap", max_file: int = MAX_FILE) -> None:
+    def __init__(self, target: Target, *, storage: str = "mcap") -> None:
         self._storage = storage
         path = path_of(target, "rosbag2", "a directory")
         self._name = os.fspath(path)
-        self._max_file = max_file
         with failures(self._name):
             self._final, self._unfinished = new_directory(path, "a bag of ROS 2 is a directory")
         self.topics: dict[tuple[str, str], _Topic] = {}
         self._known: dict[Channel, _Topic] = {}
-        self._files: dict[str, _Span] = {}
-        self._all = _Span()
-        self._log: McapWriter | _SqliteFile | None = None
-        self._size = 0
+        self._messages, self._first, self._last = 0, 2**63 - 1, 0
+        self._file = f"{self._final.name}_0{STORAGES[storage]}"
+        place = self._unfinished.path / self._file
+        is_mcap = storage == "mcap"
+        self._log = McapWriter(place, profile="ros2") if is_mcap else _SqliteFile(place, self)
 
     def write(self, batch: Batch, channels: Sequence[Channel]) -> None:
         """Append messages in the order of the rows."""
@@ -102,45 +79,25 @@ class Rosbag2Writer(LogWriter):
         topics = {number: self.topic(channels[number]) for number in set(batch.channel.tolist())}
         for number in batch.channel.tolist():
             topics[number].messages += 1
-        if self._size >= self._max_file:
-            self._next_file()
-        self._current().write(batch, channels)
-        self._size += batch.payload_bytes
-        self._all.add(batch)
-        self._files[next(reversed(self._files))].add(batch)
+        self._log.write(batch, channels)
+        self._messages += len(batch)
+        self._first = min(self._first, int(batch.log_time.min()))
+        self._last = max(self._last, int(batch.log_time.max()))
 
     def declare(self, channels: Sequence[Channel]) -> None:
         """Add channels, which need have no messages; those that fit into no bag are left out."""
         for channel in channels:
             if channel.message_encoding == "cdr" and channel.schema is not None:
                 self.topic(channel)
-                self._current().declare([channel])
+                self._log.declare([channel])
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Add a metadata record to the current file."""
-        self._current().add_metadata(name, values)
+        """Add a metadata record, in MCAP."""
+        self._log.add_metadata(name, values)
 
     def add_attachment(self, attachment: Attachment) -> None:
-        """Add an attachment to the current file, piece by piece."""
-        self._current().add_attachment(attachment)
-
-    def _current(self) -> McapWriter | _SqliteFile:
-        if self._log is None:
-            self._next_file()
-        assert self._log is not None
-        return self._log
-
-    def _next_file(self) -> None:
-        if self._log is not None:
-            self._log.commit()
-        name = f"{self._final.name}_{len(self._files)}{STORAGES[self._storage]}"
-        self._files[name] = _Span()
-        self._size = 0
-        path = self._unfinished.path / name
-        if self._storage == "mcap":
-            self._log = McapWriter(path, profile="ros2")
-        else:
-            self._log = _SqliteFile(path, self)
+        """Add an attachment, piece by piece, in MCAP."""
+        self._log.add_attachment(attachment)
 
     def topic(self, channel: Channel) -> _Topic:
         """The topic of a channel."""
@@ -164,7 +121,7 @@ class Rosbag2Writer(LogWriter):
 
     def commit(self) -> None:
         """Complete the bag."""
-        self._current().commit()
+        self._log.commit()
         described = {"rosbag2_bagfile_information": self.described()}
         with failures(self._name):
             with (self._unfinished.path / NAME).open("x", encoding="utf-8") as file:
@@ -175,10 +132,16 @@ class Rosbag2Writer(LogWriter):
 
     def described(self) -> dict[str, Any]:
         """The metadata of the bag so far."""
+        first = self._first if self._messages else 0
+        span = {
+            "duration": {"nanoseconds": self._last - first},
+            "starting_time": {"nanoseconds_since_epoch": first},
+            "message_count": self._messages,
+        }
         return {
             "version": _VERSION,
             "storage_identifier": self._storage,
-            **self._all.described(),
+            **span,
             "topics_with_message_count": [
                 {
                     "topic_metadata": {
@@ -194,16 +157,15 @@ class Rosbag2Writer(LogWriter):
             ],
             "compression_format": "",
             "compression_mode": "",
-            "relative_file_paths": [*self._files],
-            "files": [{"path": name, **one.described()} for name, one in self._files.items()],
+            "relative_file_paths": [self._file],
+            "files": [{"path": self._file, **span}],
             "custom_data": None,
             "ros_distro": "hybridlog",
         }
 
     def abort(self) -> None:
         """Remove the bag."""
-        if self._log is not None:
-            self._log.abort()
+        self._log.abort()
         self._unfinished.remove()
 
 
