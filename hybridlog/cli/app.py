@@ -16,6 +16,7 @@ import click
 from hybridlog import __version__
 from hybridlog.cli import signals
 from hybridlog.cli.output import Bar, counted, notes, printable
+from hybridlog_storage.disk.unfinished import undo_unfinished
 from hybridlog_storage.errors import NO_SPACE, DiskFullError, HybridlogError, WithoutMongoError
 
 if TYPE_CHECKING:
@@ -134,11 +135,9 @@ def opened_store(
     with Bar("indexing", quiet=quiet) as bar:
         store = open_store(path, mongo=mongo, progress=bar.part, **how)
     with store:
-        doing = "so the files answer"
-        if records:
-            doing = store.shared.index.index_to_record("Recording").without
-        told = _repairs(store, doing, verifies=verifies)
-        notes(told)
+        index, doing = store.shared.index, "so the files answer"
+        doing = index.index_to_record("Recording").without if records else doing
+        notes(told := _repairs(store, doing, verifies=verifies))
         try:
             yield store.snapshot() if snapshot else store
         finally:
@@ -188,7 +187,7 @@ def main() -> NoReturn:
     try:
         code = _run()
     except signals.Stopped as stopped:
-        signals.undo_unfinished()
+        undo_unfinished()
         code = _complain(signals.INTERRUPTED, stopped.exit_code)
     _leave(_flushed(code))
 

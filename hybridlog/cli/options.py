@@ -224,39 +224,33 @@ def parameters_of(kind: type) -> list[click.Parameter]:
 
 def check(kind: type, context: click.Context) -> None:
     """Refuse parameters that lack another one, or do not go together."""
-    parameters = {str(one.name): one for one in context.command.params}
+    spelled = {
+        str(one.name): one.opts[0]
+        if isinstance(one, click.Option)
+        else str(one.metavar).strip("[].")
+        for one in context.command.params
+    }
     given = {
         name
-        for name in parameters
+        for name in spelled
         if context.get_parameter_source(name) is ParameterSource.COMMANDLINE
         and context.params[name] not in (None, (), False)
     }
-
-    def spelled(name: str) -> str:
-        name, _, value = name.partition("=")
-        one = parameters[name]
-        return value or (
-            one.opts[0] if isinstance(one, click.Option) else str(one.metavar).strip("[].")
-        )
-
-    def is_given(name: str) -> bool:
-        name, _, value = name.partition("=")
-        return context.params[name] == value if value else name in given
-
+    values = {f"{name}={value}" for name, value in context.params.items()}
     for one in (each for each in fields(kind) if each.name in given):
-        name = spelled(one.name)
-        needs = [n for n in one.metadata.get(_NEEDS, ()) if n.partition("=")[0] in parameters]
-        if needs and not any(map(is_given, needs)):
-            others = " or ".join(map(spelled, needs))
+        name, wanted = spelled[one.name], one.metadata.get(_NEEDS, ())
+        needs = [each.partition("=") for each in wanted if each.partition("=")[0] in spelled]
+        if needs and not (given | values).intersection(wanted):
+            others = " or ".join(value or spelled[field] for field, _, value in needs)
             raise UsageError(f"{name} is for {others}: add that, or leave out {name}.")
         for other in filter(given.__contains__, one.metadata.get(_EXCLUDES, ())):
             raise UsageError(
-                f"{name} and {spelled(other)} exclude each other: leave out one of them."
+                f"{name} and {spelled[other]} exclude each other: leave out one of them."
             )
 
 
 def command(
-    kind: type[_Kind], name: str | None = None, to: click.Group | None = None, **settings: Any
+    kind: type[_Kind], name: str | None = None, to: click.Group | None = None
 ) -> Callable[[Callable[[_Kind], int | None]], click.Command]:
     """Make a function a command: it gets its options, and may give an exit code."""
 
@@ -270,8 +264,7 @@ def command(
                 raise click.exceptions.Exit(code)
 
         call.__click_params__ = parameters_of(kind)[::-1]  # type: ignore[attr-defined]
-        make: Any = click.command(name, **{"cls": Command, **settings})
-        made: click.Command = make(call)
+        made = click.command(name, cls=Command)(call)
         if to is not None:
             to.add_command(made)
         return made

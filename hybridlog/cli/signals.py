@@ -21,6 +21,7 @@ from typing import Final, NoReturn
 
 from hybridlog.cli import output
 from hybridlog_storage import stopping
+from hybridlog_storage.disk.unfinished import undo_unfinished
 from hybridlog_storage.errors import (
     BucketError,
     DatabaseError,
@@ -59,12 +60,11 @@ def install() -> None:
     SIGINT counts even if it was ignored, which shells without job control do to background jobs;
     an ignored SIGHUP (`nohup`) or SIGTERM stays ignored.
     """
-    is_stopping = False
+    told: list[int] = []
 
     def stop(number: int, _frame: FrameType | None) -> None:
-        nonlocal is_stopping
-        is_second, is_stopping = is_stopping, True
-        if is_second or not stopping.postpone(partial(_stop, number)):
+        told.append(number)
+        if len(told) > 1 or not stopping.postpone(partial(_stop, number)):
             _leave(number)
 
     for number in SIGNALS:
@@ -135,13 +135,6 @@ def watch(
                     report(problem)
             told = {*map(str, met)}
             stopping.pause(wait_s)
-
-
-def undo_unfinished() -> None:
-    """Take back what a command has not completed when it is stopped, such as files."""
-    unfinished = sys.modules.get("hybridlog_storage.disk.unfinished")
-    if unfinished is not None:
-        unfinished.undo_unfinished()
 
 
 def write_note(text: str) -> None:

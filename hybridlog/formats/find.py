@@ -58,13 +58,12 @@ def find_logs(top: Path) -> Found:
     for folder, files in _folders(top, found):
         known = {file.path: log for file in files if (log := _log_file(file, found.problems))}
         listed = _listed(folder, files)
-        is_bag_found = False
+        bags: list[LogSet] = []
         for parts in grouped_parts(known):
             if listed.isdisjoint(path.name for path in parts):
                 found.logs.append(LogSet.of([known[path] for path in parts]))
-            elif not is_bag_found:
-                found.logs.append(LogSet.at(folder))
-                is_bag_found = True
+            elif not bags:
+                found.logs += (bags := [LogSet.at(folder)])
     return found
 
 
@@ -154,19 +153,18 @@ def _folders(top: Path, found: Found) -> Iterator[tuple[Path, list[_File]]]:
     visited = set()
     for place, below, names in os.walk(top, onerror=failed, followlinks=True):
         folder, about = Path(place), Path(place).stat()
-        is_known = (about.st_dev, about.st_ino) in visited
-        visited.add((about.st_dev, about.st_ino))
-        if is_known or STORE in names:
+        if STORE in names or (about.st_dev, about.st_ino) in visited:
             below.clear()
             continue
+        visited.add((about.st_dev, about.st_ino))
         below[:] = sorted(name for name in below if not name.startswith("."))
         files = []
-        for name in sorted(names):
+        for name in sorted(name for name in names if not name.startswith(".")):
             with suppress(OSError):  # a symlink to nowhere, or a file that has just gone
                 about = (folder / name).stat()
-                if S_ISREG(about.st_mode) and not name.startswith("."):
-                    file = folder / name, about.st_size, about.st_mtime_ns, about.st_ino
-                    files.append(_File(*file))
+                if S_ISREG(about.st_mode):
+                    own = about.st_size, about.st_mtime_ns, about.st_ino
+                    files.append(_File(folder / name, *own))
         yield folder, files
 
 
@@ -192,11 +190,10 @@ def _has_end(file: _File) -> bool:
         with file.path.open("rb") as opened:
             head = opened.read(_BAG_HEAD)
             opened.seek(max(0, file.size - len(_MCAP_END)))
-            if head.startswith(_MCAP_END):
-                return file.size > len(_MCAP_END) and opened.read() == _MCAP_END
+            tail = opened.read()
     except OSError:
         return False
-    place = head.find(_BAG_INDEX) + len(_BAG_INDEX)
-    index = int.from_bytes(head[place : place + 8], "little")
-    is_bag = head.startswith(b"#ROSBAG V2.0") and place >= len(_BAG_INDEX)
-    return is_bag and 0 < index <= file.size
+    if head.startswith(_MCAP_END):
+        return file.size > len(_MCAP_END) and tail == _MCAP_END
+    _, _, place = head.partition(_BAG_INDEX)
+    return head.startswith(b"#ROSBAG V2.0") and 0 < int.from_bytes(place[:8], "little") <= file.size

@@ -167,7 +167,7 @@ def record(
         latched=copy.front.messages if copy.front is not None else 0,
         latched_left_out=copy.front.left_out if copy.front is not None else 0,
         attachments_left_out=copy.attachments_left_out,
-        remarks=capture.follower.said,
+        remarks=[*source.remarks, *capture.follower.said],
     )
 
 

@@ -12,7 +12,7 @@ def test_what_is_no_table_is_said_and_left_out(store: Path, tmp_path: Path) -> N
     done = run("export", tmp_path / "x", "-F", "csv", "-r", "odd", store=store)
     for topic in ("/code", "/recursive", "/cbor", "/no_definition"):
         assert f"{topic} cannot be made a table" in done.err
-    assert "long.csv: 0 messages, " in done.err
+    assert "long.csv: 0 messages of /long, " in done.err
     assert "3 messages do not fit their definition: not in this answer" in done.err
     # Three topics whose names fall together without the rule have files of their own.
     assert len(list((tmp_path / "x").glob("a__b*.csv"))) == 3

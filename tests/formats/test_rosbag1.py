@@ -417,6 +417,7 @@ def test_zeros_behind_index_records_are_no_damage(tmp_path: Path, compression: s
         assert source.message_count == 400
         assert contents(source) == expected
         assert source.damage == []
+        assert len(source.remarks) == 1
 
 
 @pytest.mark.parametrize("size", [0, 12, 40])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, ClassVar
 
 import click
@@ -12,6 +11,7 @@ from hybridlog.cli.answers import Tabular
 from hybridlog.cli.options import Filtered, InFrame, command, option, parse_fields, query_of
 from hybridlog.cli.output import remarks
 from hybridlog.query.choice import Choice
+from hybridlog.query.topics import resolve, split_topic
 from hybridlog_storage.errors import TopicError, UsageError
 
 if TYPE_CHECKING:
@@ -89,15 +89,17 @@ def align_command(given: _Given) -> None:
 
 def _aligned(store: Store, given: _Given) -> Aligned:
     """A row for each message of a topic."""
-    base = given.base or ""
-    queries = _queries(store, [base, *given.named(store)], given.choice, given.beside)
+    from hybridlog.query.query import narrowed
+
+    base, others = given.base or "", Choice.of(given.beside) if given.beside else given.choice
+    rest = (query_of(store, [name], others) for name in given.named(store))
+    queries = [query_of(store, [base], given.choice)]
+    queries += (narrowed(query, topic) for query in rest for topic in query.topics)
     for text in given.where:
-        places, predicate = _named(queries, text, "--where wants TOPIC: PREDICATE")
-        for place in places:
+        for place, predicate in _named(queries, text, "--where wants TOPIC: PREDICATE"):
             queries[place] = queries[place].where(predicate)
     for text in given.fields:
-        places, names = _named(queries, text, "--fields wants TOPIC: A,B.C")
-        for place in places:
+        for place, names in _named(queries, text, "--fields wants TOPIC: A,B.C"):
             queries[place] = queries[place].fields(*parse_fields(names))
     if given.frame is not None:
         from hybridlog.query.planner import Planner
@@ -109,9 +111,8 @@ def _aligned(store: Store, given: _Given) -> Aligned:
             for query, is_placed in zip(queries, placed, strict=True)
         ]
     queries[0] = given.bounded(queries[0])
-    if given.strict:
-        for query in queries:
-            query.completeness().check()
+    for query in queries if given.strict else ():
+        query.completeness().check()
     return store.align(
         queries[0],
         queries[1:],
@@ -122,29 +123,13 @@ def _aligned(store: Store, given: _Given) -> Aligned:
     )
 
 
-def _queries(
-    store: Store, topics: Sequence[str], choice: Choice, beside: Sequence[str]
-) -> list[Query]:
-    """A query for each topic; the base is one topic."""
-    from hybridlog.query.query import narrowed
-
-    others = Choice.of(beside) if beside else choice
-    base, *found = (
-        query_of(store, [name], others if n else choice) for n, name in enumerate(topics)
-    )
-    return [base, *(narrowed(q, topic) for q in found for topic in q.topics)]
-
-
-def _named(queries: list[Query], text: str, form: str) -> tuple[list[int], str]:
-    """The queries about a topic before a colon, and what follows it."""
-    from hybridlog.query.topics import resolve, split_topic
-
+def _named(queries: list[Query], text: str, form: str) -> list[tuple[int, str]]:
+    """The places of the queries about a topic before a colon, and what follows it."""
     topic, rest = split_topic(text)
     if not topic or not rest:
         raise UsageError(f"{form}, not {text!r}.")
-    known = dict.fromkeys(name for query in queries for name in query.topics)
-    names = resolve([topic], known)
-    places = [n for n, query in enumerate(queries) if query.topics[0] in names]
+    names = resolve([topic], dict.fromkeys(name for query in queries for name in query.topics))
+    places = [(n, rest) for n, query in enumerate(queries) if query.topics[0] in names]
     if not places:
         raise TopicError(f"{topic} is no topic of this alignment.")
-    return places, rest
+    return places

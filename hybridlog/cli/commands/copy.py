@@ -113,15 +113,17 @@ def _copied(
 
     assert given.to is not None
     report, there = CopyReport(), "there" if given.source is None else "here"
+    lacking = f"; payloads that were deleted {there} were not copied"
     try:
         with Bar("copy") as bar:
             store.copy(given.to, chosen, how, bar.part, report)
     finally:
         if sys.exception() is None or report != CopyReport():
             lines = [f"copied {name}" for name in report.copied]
-            for name in () if is_short else report.known:
-                more = f"; payloads that were deleted {there} were not copied"
-                lines.append(f"{name} is {there} already{more if name in report.lacking else ''}")
+            lines += (
+                f"{name} is {there} already{lacking if name in report.lacking else ''}"
+                for name in (() if is_short else report.known)
+            )
             if report.freed_bytes > 0:  # of a few messages, fields may take more than payloads
                 lines.append(f"{output.size(report.freed_bytes)} freed")
             output.tell(asdict(report), lines, at_once=is_short)

@@ -125,21 +125,19 @@ def fetch_command(choices: _Choices) -> None:
                 raise
         if choices.strict:
             query.completeness().check(payloads=not choices.count)
-        lost: list[str] = []
         if choices.count:
-            count = query.count()
+            count, more = query.count(), ""
             completeness = query.completeness()
             if choices.strict:
                 completeness.check()
             output.say(str(count))
             if completeness.has_losses:
-                lost = [completeness.describe(count, query.question.limit)]
+                more = completeness.describe(count, query.question.limit)
         else:
             query = _answer(query, choices)
-            if front := latched(query.counters):
-                lost = [front.removeprefix(" and ")]
+            more = latched(query.counters).removeprefix(" and ")
         sys.stdout.flush()
-        output.remarks((*query.completeness().sentences, *lost))
+        output.remarks(filter(None, (*query.completeness().sentences, more)))
 
 
 def _answer(query: Query, choices: _Choices) -> Query:
@@ -158,9 +156,8 @@ def _answer(query: Query, choices: _Choices) -> Query:
     from hybridlog.query.query import tables_of
 
     answered = query if query.question.limit is not None else query.limit(SCREEN_ROWS + 1)
-    tables = tables_of(answered)
     completeness = answered.completeness if strict else None
-    choices.answer(tables, completeness=completeness, noun="message")
+    choices.answer(tables_of(answered), completeness=completeness, noun="message")
     return answered
 
 
@@ -174,11 +171,10 @@ def _follow(query: Query, choices: _Choices) -> None:
         with at_safe_points():
             write_following(following, choices.to_form)
     finally:
-        asked = Query(query.source.now(), following.question)
+        now = query.source.now()
+        asked = Query(now, following.question)
         asked.counters = query.counters
-        ended = (
-            one for one in asked.source.now().summaries_of(asked.question) if one.status != "open"
-        )
+        ended = (one for one in now.summaries_of(asked.question) if one.status != "open")
         output.remarks(asked.completeness().sentences)
         output.remarks(f"{one.name} has ended: {status_text(one)}." for one in ended)
 
@@ -202,8 +198,6 @@ def _query(store: Store, choices: _Choices) -> Query:
     if choices.fields is not None:
         query = query.fields(*parse_fields(choices.fields))
     query = choices.placed(query)
-    if choices.every > 1:
-        query = query.every(choices.every)
-    if choices.reverse:
-        query = query.reverse()
+    query = query.every(choices.every) if choices.every > 1 else query
+    query = query.reverse() if choices.reverse else query
     return query if choices.limit is None else query.limit(choices.limit)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import bz2
 import struct
 from collections import Counter
+from contextlib import ExitStack
 from io import BytesIO
 from typing import TYPE_CHECKING, Any, BinaryIO, Final, NamedTuple
 
@@ -186,8 +187,10 @@ class Rosbag1Source(Source):
         self._got = self._chunk_end = 0
         self._cut: tuple[str, int | None] | None = None  # why the file ends early, and what is lost
         try:
-            self._file: BinaryIO = path.open("rb", buffering=1 << 16)
-            self._open()
+            with ExitStack() as held:
+                self._file: BinaryIO = held.enter_context(path.open("rb", buffering=1 << 16))
+                self._open()
+                held.pop_all()
         except OSError as error:
             raise cannot_open(path, error) from error
 
@@ -323,6 +326,7 @@ class Rosbag1Source(Source):
             self._tell(self.size_bytes, 0, *self._cut)
         if self._got == self.message_count and {one.reason for one in self.damage} == {_NO_RECORD}:
             self.damage.clear()  # some recorders write zeros there
+            self.remarks.append(f"{self.path}: bytes between its records are no part of it")
         if self.message_count is not None:
             self.settle(self.message_count, self._got)
         if self._undefined:
