@@ -10,7 +10,7 @@ from __future__ import annotations
 import inspect
 import time
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import AbstractContextManager, closing
+from contextlib import AbstractContextManager
 from dataclasses import Field, dataclass, field, fields
 from functools import wraps
 from itertools import chain
@@ -123,19 +123,13 @@ def _completed(context: click.Context, param: click.Parameter, incomplete: str) 
     from hybridlog_storage.cache import import_numpy_late
 
     import_numpy_late()
-    from hybridlog.opened import OpenStore
-    from hybridlog.store import store_path
-    from hybridlog_storage.remote import directory_of
+    from hybridlog.store import open_store
 
+    place: Path | None = context.params.get("store")
     try:
-        value: Path | None = context.params.get("store")
         # The shell has not expanded the tilde of the line that is being completed.
-        path = store_path(None if value is None else Path(value).expanduser())
-        with closing(OpenStore(directory_of(path), "none", None)) as shared:
-            snapshot = shared.now().look()
-            names = [one.name for one in snapshot.summaries]
-            if kind == "TOPIC":
-                names = snapshot.topics
+        with open_store(place and Path(place).expanduser(), read_only=True) as store:
+            names = store.topics() if kind == "TOPIC" else store.recordings().names
     except (HybridlogError, OSError):
         return []
     return [name for name in names if name.startswith(incomplete)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
@@ -142,7 +142,10 @@ def export_command(given: _Given) -> None:
         for path, _ in parts if split is not None and form in _LOGS else ():
             check_room(path, force=given.force, is_directory=is_folder)
         for path, one in parts:
-            (_write_log if form in _LOGS else _write_tables)(one, form, path, given)
+            if form in _LOGS:
+                _write_log(one, form, path, given)
+            else:
+                _write_tables(store, one, form, path, given)
             output.remarks(one.completeness().sentences)
 
 
@@ -163,14 +166,21 @@ def _write_log(query: Query, form: str, path: Path, given: _Given) -> None:
         output.note("A bag has no attachments and metadata records of the log; an MCAP file has.")
 
 
-def _write_tables(query: Query, form: str, directory: Path, given: _Given) -> None:
+def _write_tables(store: Store, query: Query, form: str, directory: Path, given: _Given) -> None:
     """Write one file a topic, except topics that do not fit or have no message in the range."""
     from hybridlog.query.query import narrowed
     from hybridlog.query.ranges import RangeResolver
 
     # Refuses a range without any message.
     RangeResolver(query.source.now(), query.question).resolve()
-    topics = _image_topics(query) if OUTPUTS[form].content == "video" else query.topics
+    topics: Sequence[str] = query.topics
+    if OUTPUTS[form].content == "video":
+        from hybridlog.arrays.message_arrays import IMAGES
+
+        found = given.recordings_in(store).topics(*IMAGES)
+        topics = [topic for topic in topics if topic in found]
+        if not topics:
+            raise UsageError("There is no topic of images or of video.")
     paths = {
         topic: directory / f"{name}{OUTPUTS[form].suffixes[0]}"
         for topic, name in _names(topics).items()
@@ -213,17 +223,6 @@ def _names(topics: Iterable[str]) -> dict[str, str]:
         number = seen[name.casefold()]
         found[topic] = name if number == 1 else f"{name}~{number}"
     return found
-
-
-def _image_topics(query: Query) -> list[str]:
-    """The topics of images and of video among those of a query."""
-    from hybridlog.arrays.message_arrays import IMAGES, plain_type
-
-    entries = map(query.source.now().entry_of, query.source.now().summaries_of(query.question))
-    found = {c.topic for entry in entries for c in entry.channels if plain_type(c.type) in IMAGES}
-    if not found.intersection(query.topics):
-        raise UsageError("There is no topic of images or of video.")
-    return [topic for topic in query.topics if topic in found]
 
 
 def _print_written(path: Path, query: Query, topic: str = "") -> None:

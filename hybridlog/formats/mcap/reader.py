@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import chain
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from mcap import records
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
     from hybridlog_storage.messages import Batch
 
+_Definition: TypeAlias = records.Schema | records.Channel
 _UNDEFINED = -1
 _IDS = 1 << 16
 
@@ -42,6 +43,11 @@ class McapSource(Source):
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, kind="MCAP", profile="", files=[path])
+        # The present meaning of ids, and indexes of channels by id; negative if it is not known.
+        self._schemas: dict[int, records.Schema] = {}
+        self._records: dict[int, records.Channel] = {}
+        self._table = np.full(_IDS, _UNDEFINED, np.int32)
+        self._made: dict[tuple[object, ...], int] = {}  # indexes of channels by what they say
         try:
             with path.open("rb") as file:
                 # Attachments outlive this reader.
@@ -57,8 +63,12 @@ class McapSource(Source):
                 "check that the file was copied whole"
             )
         scan = Scan(read, self.size_bytes)
-        self._definitions = _Definitions(self, scan.summary)
         if scan.summary is not None:
+            # It repeats all definitions, also those in unreadable chunks.
+            for schema in scan.summary.schemas.values():
+                self._define(schema)
+            for channel in scan.summary.channels.values():
+                self._define(channel)
             if scan.summary.statistics is not None:
                 self.message_count = scan.summary.statistics.message_count
             self.time_range = _time_range(scan.summary)
@@ -85,7 +95,8 @@ class McapSource(Source):
         except OSError as error:
             raise cannot_open(self.path, error) from error
         self.bytes_read = self.size_bytes
-        self._definitions.use_rest()
+        for number in self._records:  # without messages
+            self._use(number)
         if self.message_count is not None:
             self.settle(self.message_count, self._given)
 
@@ -95,7 +106,7 @@ class McapSource(Source):
         elif isinstance(item, mcap_content.Damage):
             self.note(Damage(self.path, item.offset, item.length, item.reason, item.messages))
         elif isinstance(item, records.Schema | records.Channel):
-            self._definitions.add(item)
+            self._define(item)
         elif isinstance(item, records.Metadata | Attachment):
             self.extras.append(item)
 
@@ -105,18 +116,19 @@ class McapSource(Source):
         found = np.empty(len(batch), np.int32)
         row = 0
         for definition in content.definitions:
-            if definition.row > row and self._definitions.changes(definition.record):
+            known = self._known(definition.record)
+            if definition.row > row and known is not None and known != definition.record:
                 found[row : definition.row] = self._channels(batch.channel[row : definition.row])
                 row = definition.row
-            self._definitions.add(definition.record)
+            self._define(definition.record)
         found[row:] = self._channels(batch.channel[row:])
-        known = found >= 0
-        if not known.all():
-            lost = int((~known).sum())
-            names = listed(map(str, distinct(batch.channel[~known]).tolist()), 5)
+        is_known = found >= 0
+        if not is_known.all():
+            lost = int((~is_known).sum())
+            names = listed(map(str, distinct(batch.channel[~is_known]).tolist()), 5)
             reason = f"{lost} messages on channels that are not defined ({names})"
             self.note(Damage(self.path, offset, None, reason, lost))
-            batch, found = batch.take(known), found[known]
+            batch, found = batch.take(is_known), found[is_known]
         if len(batch):
             self._given += len(batch)
             yield replace(batch, channel=found)
@@ -125,8 +137,37 @@ class McapSource(Source):
         """Indexes of channels by the definitions so far; negative if there is none."""
         # Sorting takes longer than a few rows.
         for number in set(ids.tolist()) if len(ids) < 10 else distinct(ids).tolist():
-            self._definitions.use(number)
-        return self._definitions.table[ids]
+            self._use(number)
+        return self._table[ids]
+
+    def _known(self, record: _Definition) -> _Definition | None:
+        own = self._schemas if isinstance(record, records.Schema) else self._records
+        return own.get(record.id)
+
+    def _define(self, record: _Definition) -> None:
+        """Apply this definition from now on."""
+        if self._known(record) == record:
+            return
+        if isinstance(record, records.Channel):
+            self._records[record.id] = record
+            self._table[record.id] = _UNDEFINED
+        elif record.id:  # MCAP: a schema with id 0 is to be ignored
+            self._schemas[record.id] = record
+            self._table[:] = _UNDEFINED
+
+    def _use(self, number: int) -> None:
+        """Enter a channel id in the table, if it is defined."""
+        record = self._records.get(number)
+        if record is None or self._table[number] != _UNDEFINED:
+            return
+        said = self._schemas.get(record.schema_id)
+        schema = None if said is None else Schema(said.name, said.encoding, said.data)
+        metadata = tuple(sorted(record.metadata.items()))
+        key = (number, record.topic, record.message_encoding, metadata, schema)
+        if key not in self._made:
+            made = Channel(record.topic, record.message_encoding, schema, record.metadata)
+            self._made[key] = self.add_channel(made)
+        self._table[number] = self._made[key]
 
 
 def _time_range(summary: Summary) -> tuple[int, int] | None:
@@ -135,69 +176,3 @@ def _time_range(summary: Summary) -> tuple[int, int] | None:
     start = min((index.message_start_time for index in indexes), default=END)
     last = max((index.message_end_time for index in indexes), default=-1)
     return span_of(start, last) if start <= last <= END else None
-
-
-class _Definitions:
-    """The present meaning of each MCAP channel id.
-
-    Attributes:
-        table: int32[65536], index in the source's channels by channel id, negative if the id
-            is undefined or unused.
-    """
-
-    def __init__(self, source: Source, summary: Summary | None) -> None:
-        self.table = np.full(_IDS, _UNDEFINED, np.int32)
-        self._source = source
-        self._schemas: dict[int, records.Schema] = {}
-        self._records: dict[int, records.Channel] = {}
-        self._schema_ids = np.zeros(_IDS, np.int32)  # by channel id
-        self._made: dict[tuple[object, ...], int] = {}  # indexes of channels by what they say
-        # The summary repeats all definitions, also those in unreadable chunks.
-        if summary is not None:
-            for schema in summary.schemas.values():
-                self.add(schema)
-            for channel in summary.channels.values():
-                self.add(channel)
-
-    def changes(self, record: records.Schema | records.Channel) -> bool:
-        """True if this definition changes the meaning of an id."""
-        known = self._known(record)
-        return known is not None and known != record
-
-    def add(self, record: records.Schema | records.Channel) -> None:
-        """Apply this definition from now on."""
-        if self._known(record) == record:
-            return
-        if isinstance(record, records.Channel):
-            self._records[record.id] = record
-            self._schema_ids[record.id] = record.schema_id
-            self.table[record.id] = _UNDEFINED
-        elif record.id:  # MCAP: a schema with id 0 is to be ignored
-            self._schemas[record.id] = record
-            self.table[self._schema_ids == record.id] = _UNDEFINED
-
-    def _known(
-        self, record: records.Schema | records.Channel
-    ) -> records.Schema | records.Channel | None:
-        return (self._schemas if isinstance(record, records.Schema) else self._records).get(
-            record.id
-        )
-
-    def use(self, channel_id: int) -> None:
-        """Enter this id in the table, if it is defined."""
-        record = self._records.get(channel_id)
-        if record is None or self.table[channel_id] != _UNDEFINED:
-            return
-        said = self._schemas.get(record.schema_id)
-        schema = None if said is None else Schema(said.name, said.encoding, said.data)
-        metadata = tuple(sorted(record.metadata.items()))
-        key = (channel_id, record.topic, record.message_encoding, metadata, schema)
-        if key not in self._made:
-            made = Channel(record.topic, record.message_encoding, schema, record.metadata)
-            self._made[key] = self._source.add_channel(made)
-        self.table[channel_id] = self._made[key]
-
-    def use_rest(self) -> None:
-        """Enter the channels without messages."""
-        for number in self._records:
-            self.use(number)

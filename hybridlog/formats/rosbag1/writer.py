@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 _TIME_LIMIT = 2**32 * 10**9
 _LARGEST_DEFINITION = 256 << 10
-_ConnectionKey = tuple[str, str, bytes, str, str | None, str | None]
 
 
 def write_bag(answer: Answer, target: Target) -> None:
@@ -43,8 +42,7 @@ class BagWriter(LogWriter):
 
     def __init__(self, target: Target) -> None:
         path = path_of(target, "bag", "a file")
-        self._connections: dict[_ConnectionKey, Connection] = {}
-        self._known: dict[Channel, Connection] = {}
+        self._connections: dict[tuple[object, ...], Connection] = {}
         self._name = os.fspath(path)
         with failures(self._name):
             self._final, is_file = destination(path)
@@ -86,25 +84,20 @@ class BagWriter(LogWriter):
                     self._connection(channel)
 
     def _connection(self, channel: Channel) -> Connection:
-        connection = self._known.get(channel)
-        if connection is None:
-            connection = self._known[channel] = self._register(channel)
-        return connection
-
-    def _register(self, channel: Channel) -> Connection:
-        if channel.message_encoding != "ros1" or channel.schema is None:
+        """The connection of a channel; channels that a bag tells alike share one."""
+        schema = channel.schema
+        if channel.message_encoding != "ros1" or schema is None:
             raise UsageError(
                 f"{channel.topic} has {channel.message_encoding or 'unknown'} messages"
-                f"{'' if channel.schema else ' without a definition'}, and a ROS 1 bag holds "
+                f"{'' if schema else ' without a definition'}, and a ROS 1 bag holds "
                 "ROS 1 messages only; nothing is converted, so that every byte stays as it "
                 "came: write --format mcap"
             )
         metadata = source_metadata(channel)
-        schema = channel.schema
-        md5sum = metadata.get("md5sum") or _md5sum(schema)
-        callerid, latching = metadata.get("callerid"), metadata.get("latching")
-        key = (channel.topic, schema.name, schema.data, md5sum, callerid, latching)
+        said = (metadata.get(name) for name in ("md5sum", "callerid", "latching"))
+        key = (channel.topic, schema.name, schema.data, *said)
         if key not in self._connections:
+            md5sum = metadata.get("md5sum") or _md5sum(schema)
             self._connections[key] = self._writer.add(channel.topic, schema, md5sum, metadata)
         return self._connections[key]
 

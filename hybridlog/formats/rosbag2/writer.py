@@ -65,7 +65,6 @@ class Rosbag2Writer(LogWriter):
         with failures(self._name):
             self._final, self._unfinished = new_directory(path, "a bag of ROS 2 is a directory")
         self.topics: dict[tuple[str, str], _Topic] = {}
-        self._known: dict[Channel, _Topic] = {}
         self._messages, self._first, self._last = 0, 2**63 - 1, 0
         self._file = f"{self._final.name}_0{STORAGES[storage]}"
         place = self._unfinished.path / self._file
@@ -101,23 +100,21 @@ class Rosbag2Writer(LogWriter):
 
     def topic(self, channel: Channel) -> _Topic:
         """The topic of a channel."""
-        if channel not in self._known:
-            if channel.message_encoding != "cdr" or channel.schema is None:
-                cure = "write --format mcap"
-                if channel.message_encoding == "ros1":
-                    cure = "write --format bag, and convert that with rosbags-convert"
-                raise UsageError(
-                    f"{channel.topic} has {channel.message_encoding or 'unknown'} messages"
-                    f"{'' if channel.schema else ' without a definition'}, and a ROS 2 bag holds "
-                    "ROS 2 messages only; nothing is converted, so that every byte stays as it "
-                    f"came: {cure}, or leave the topic out with -t"
-                )
-            type_hash = channel.metadata.get("topic_type_hash", "").strip()
-            own = _Topic(len(self.topics) + 1, channel, type_hash)
-            found = self.topics.setdefault((channel.topic, channel.schema.name), own)
-            found.offered[channel.metadata.get("offered_qos_profiles", "")] = None
-            self._known[channel] = found
-        return self._known[channel]
+        if channel.message_encoding != "cdr" or channel.schema is None:
+            cure = "write --format mcap"
+            if channel.message_encoding == "ros1":
+                cure = "write --format bag, and convert that with rosbags-convert"
+            raise UsageError(
+                f"{channel.topic} has {channel.message_encoding or 'unknown'} messages"
+                f"{'' if channel.schema else ' without a definition'}, and a ROS 2 bag holds "
+                "ROS 2 messages only; nothing is converted, so that every byte stays as it "
+                f"came: {cure}, or leave the topic out with -t"
+            )
+        type_hash = channel.metadata.get("topic_type_hash", "").strip()
+        own = _Topic(len(self.topics) + 1, channel, type_hash)
+        found = self.topics.setdefault((channel.topic, channel.schema.name), own)
+        found.offered[channel.metadata.get("offered_qos_profiles", "")] = None
+        return found
 
     def commit(self) -> None:
         """Complete the bag."""
