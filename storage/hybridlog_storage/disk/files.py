@@ -94,19 +94,11 @@ def open_file(path: Path, flags: int, mode: int = 0o666) -> int:
 
 def read_file(path: Path, most: int) -> bytes:
     """Read a small ordinary file, up to `most` bytes and one more, to notice larger files."""
-    fd = open_file(path, os.O_RDONLY)
-    try:
-        if not stat.S_ISREG(os.fstat(fd).st_mode):
+    with os.fdopen(open_file(path, os.O_RDONLY), "rb") as file:
+        about = os.fstat(file.fileno())
+        if not stat.S_ISREG(about.st_mode):
             raise OSError(0, "it is not an ordinary file", str(path))
-        fetch(fd, [(0, most + 1)])
-        parts: list[bytes] = []
-        left = most + 1
-        while left > 0 and (part := os.read(fd, min(left, 1 << 20))):
-            parts.append(part)
-            left -= len(part)
-        return b"".join(parts)
-    finally:
-        os.close(fd)
+        return file.read(min(about.st_size, most) + 1)
 
 
 def write_all(fd: int, parts: Sequence[Buffer]) -> int:
