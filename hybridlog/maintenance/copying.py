@@ -53,7 +53,7 @@ class CopyOptions:
         then_expire: Delete the payloads here that were proved there; pinned ones stay.
         limit_rate: Bytes a second, at most; None for no limit.
         ssh: The program, with options, that reaches `ssh://` places; None for `ssh`.
-        check: Read the copies that are there already, too, and replace what is damaged.
+        check: Prove the copies that are there already, too, and replace what is damaged.
     """
 
     only_fields: bool = False

@@ -49,7 +49,7 @@ class _Copy(Choosing, InStore, AsJson, Quiet):
         "Delete payloads here once their copy is proved there; pinned ones stay."
     )
     limit_rate: float | None = option("Bytes a second at most, such as 5MB/s.", "RATE", type=_RATE)
-    check: bool = option("Read copies that are there already, too, and mend them.")
+    check: bool = option("Prove copies that are there already, too, and mend them.")
     watch: bool = option("Go on with what ends later, until Ctrl-C.")
     ssh: str | None = option(
         "The ssh program, with options; without, ssh.",
