@@ -126,22 +126,6 @@ def test_a_change_is_one_manifest(
         assert not store.verify().findings
 
 
-def test_marks_and_pins(here: Path, address: str, proxy: Proxy) -> None:
-    publish_all(here, address, ("run", "more"))
-    with hl.open(address) as store:
-        kept = store.mark("run", "+2s", "seen", {"by": "lab"}, until="+3s").manifest.marks
-        assert [mark.text for mark in kept] == ["slipped", "seen"]
-        store.mark("run", "+4s", "wrong")
-        assert len(store.unmark("run", "wrong").manifest.marks) == 2
-        pin = store.pin("run", "+0s", "+5s", reason="to keep")
-        assert store.unpin(store.pin("more")) is None
-    files.mounted.clear()
-    with hl.open(address) as store:
-        (entry,) = store.recordings("run")
-        assert ([one.id for one in entry.manifest.pins], entry.manifest.marks) == ([pin], kept)
-        assert not store.verify().findings
-
-
 @pytest.mark.parametrize("left", [3, 2, 1, 0])
 def test_a_removal_deletes_all_objects(here: Path, address: str, proxy: Proxy, left: int) -> None:
     """Files first, then the manifest; the next removal finishes one that was cut."""

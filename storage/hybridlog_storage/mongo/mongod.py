@@ -176,7 +176,7 @@ class EmbeddedMongod:
                     if has_started:
                         raise self._failure()
                     self._launch(path, keeper)
-                    has_started = True
+                    began, has_started = time.monotonic(), True
                 elif _answers(path):
                     return f"mongodb://{quote(path, safe='')}/?directConnection=true"
             finally:

@@ -40,6 +40,7 @@ except ImportError as error:
 
 if TYPE_CHECKING:
     from obstore import GetOptions, PutMode
+    from obstore.store import ObjectStore
 
     from hybridlog_storage.messages import Buffer
 
@@ -48,7 +49,8 @@ PART_BYTES: Final = 64 << 20
 _PART: Final = 16 << 20
 _PAGE: Final = 1000  # names that servers list at once
 _TRIES: Final = 4
-_REQUEST_S: Final = 300  # of 16 MiB at 0.5 Mbit/s
+_READ_S: Final = 60
+_WRITE_S: Final = 900
 _RETRY_S: Final = 60
 _CUT = re.compile(r"(?i)body|reset|closed|incomplete|timed? ?out|eof|sending request")
 _NO_BUCKET = re.compile(r"NoSuchBucket|ContainerNotFound|bucket does not exist")
@@ -101,18 +103,7 @@ class Bucket:
             raise UsageError(f"{address!r} is not the address of a bucket, as s3://lab/store is.")
         self.address = found
         self._honoured: set[type] = set()  # kinds of conditions
-        _check_process(found)
-        try:
-            self._store = obstore.store.from_url(
-                found,
-                client_options={
-                    "timeout": timedelta(seconds=_REQUEST_S),
-                    "allow_http": _allows_http(),
-                },
-                retry_config={"max_retries": 6, "retry_timeout": timedelta(seconds=_RETRY_S)},
-            )
-        except (exceptions.BaseError, ValueError) as error:
-            raise UsageError(f"{found} cannot be opened: {_reason(error)}") from error
+        self._reading, self._writing = (_opened(found, limit) for limit in (_READ_S, _WRITE_S))
 
     def objects(self, prefix: str = "") -> list[Object]:
         """All objects whose names begin with a folder's name, in order; 1,000 a request.
@@ -121,7 +112,7 @@ class Bucket:
         """
 
         def listed() -> list[Object]:
-            pages = obstore.list(self._store, prefix or None, chunk_size=_PAGE)
+            pages = obstore.list(self._reading, prefix or None, chunk_size=_PAGE)
             return [_object(about, str(about["path"])) for page in pages for about in page]
 
         return self._again(prefix, listed)
@@ -139,7 +130,7 @@ class Bucket:
 
     def _get(self, name: str, options: GetOptions, most: int) -> tuple[Object, bytes]:
         def read() -> tuple[Object, bytes]:
-            answer = obstore.get(self._store, name, options=options)
+            answer = obstore.get(self._reading, name, options=options)
             data = bytes(next(iter(answer.stream(most + 1)), b""))
             return _object(answer.meta, name), data[: most + 1]
 
@@ -173,7 +164,7 @@ class Bucket:
         if size <= PART_BYTES:
             return Object(name, size, self._put(name, b"".join(pieces), "overwrite"))
         with self._explained(name):
-            made = obstore.put(self._store, name, pieces, chunk_size=_PART, max_concurrency=4)
+            made = obstore.put(self._writing, name, pieces, chunk_size=_PART, max_concurrency=4)
             return Object(name, size, _version(made))
 
     def delete(self, names: Sequence[str]) -> None:
@@ -181,7 +172,7 @@ class Bucket:
         if not names:
             return
         try:
-            self._again(names[0], partial(obstore.delete, self._store, names))
+            self._again(names[0], partial(obstore.delete, self._writing, names))
         except FileNotFoundError:  # some servers stop there
             for name in names if len(names) > 1 else ():
                 self.delete([name])
@@ -212,7 +203,7 @@ class Bucket:
         )
 
     def _put(self, name: str, content: bytes, mode: PutMode) -> str:
-        put = partial(obstore.put, self._store, name, content, mode=mode, use_multipart=False)
+        put = partial(obstore.put, self._writing, name, content, mode=mode, use_multipart=False)
         return self._again(name, lambda: _version(put()))
 
     def _again(self, name: str, work: Callable[[], _T]) -> _T:
@@ -264,6 +255,18 @@ def _check_process(address: str) -> None:
             f"{address} cannot be read here: this process was forked from one that has read from "
             "a bucket. Start it by `spawn` instead, as multiprocessing_context='spawn' does."
         )
+
+
+def _opened(address: str, timeout_s: int) -> ObjectStore:
+    _check_process(address)
+    try:
+        return obstore.store.from_url(
+            address,
+            client_options={"timeout": timedelta(seconds=timeout_s), "allow_http": _allows_http()},
+            retry_config={"max_retries": 6, "retry_timeout": timedelta(seconds=_RETRY_S)},
+        )
+    except (exceptions.BaseError, ValueError) as error:
+        raise UsageError(f"{address} cannot be opened: {_reason(error)}") from error
 
 
 def _allows_http() -> bool:
