@@ -19,7 +19,7 @@ from msgspec.structs import replace
 from hybridlog_storage.cells import CATALOG, Cells, cells_of_user
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import HeldError, StoreError, TopicError, unreadable
-from hybridlog_storage.manifest import File, Manifest
+from hybridlog_storage.manifest import Manifest
 from hybridlog_storage.manifests import (
     MANIFEST_LOCK,
     MANIFEST_OLD,
@@ -101,10 +101,6 @@ class Listing(Struct, frozen=True):
         others = {*self.others, *self.sealed.values(), *self.rows} - {*sealed.values()} - listed
         return replace(self, sealed=dict(sorted(sealed.items())), others=tuple(sorted(others)))
 
-    def has_all(self, rows: Collection[File]) -> bool:
-        """True if some files of rows are there with their sizes."""
-        return all(self.rows.get(file.name) == file.bytes for file in rows)
-
     def left_over(self, manifest: Manifest) -> list[str]:
         """Files that were to be deleted.
 
@@ -115,7 +111,8 @@ class Listing(Struct, frozen=True):
             own = rows.get(number, [])
             names = {file.name for file in own}
             found += [n for n in self.rows if int(n[:6]) == number and n not in names]
-            if not log.is_here and self.has_all(own) and number in self.sealed:
+            has_all = all(self.rows.get(file.name) == file.bytes for file in own)
+            if not log.is_here and has_all and number in self.sealed:
                 found.append(self.sealed[number])
         there = {**self.sealed, **{int(name[:6]): name for name in self.rows}}
         return found + [n for number, n in there.items() if manifest.has_let_go(number)]
@@ -243,8 +240,9 @@ class StoreDirectory:
             ):
                 for one in ids:
                     with suppress(FileNotFoundError):
-                        about = os.stat(f"{one}.json", dir_fd=fd, follow_symlinks=False)
-                        found[one] = f"{_folder_look(one, inside)} {_file_look(about)}"
+                        o = os.stat(f"{one}.json", dir_fd=fd, follow_symlinks=False)
+                        own = f"{o.st_ino} {o.st_size} {o.st_mtime_ns} {o.st_ctime_ns}"
+                        found[one] = f"{_folder_look(one, inside)} {own}"
         except OSError as error:
             raise unreadable(error, self.path, f"The store {self.path}") from error
         return found
@@ -376,10 +374,6 @@ def _folder_look(recording: str, folders: int) -> str:
     except FileNotFoundError:
         return "0 0 0"
     return f"{about.st_ino} {about.st_mtime_ns} {about.st_ctime_ns}"
-
-
-def _file_look(about: os.stat_result) -> str:
-    return f"{about.st_ino} {about.st_size} {about.st_mtime_ns} {about.st_ctime_ns}"
 
 
 def is_stable(look: str) -> bool:

@@ -217,22 +217,19 @@ class BucketStore(Source):
 
     def names(self, inner: tuple[str, ...]) -> tuple[int, dict[str, os.stat_result]]:
         """The entries of a folder of tables, and a number that changes with them."""
-        found = self.tables()
+        found, number = self.tables(), self.manifests.number
         if inner == (TABLES,):
-            return self.number, dict.fromkeys(found, _stat(_FOLDER, 0, 0))
+            return number, dict.fromkeys(found, _stat(_FOLDER, 0, 0))
         if len(inner) != 2 or inner[0] != TABLES or inner[1] not in found:
             raise FileNotFoundError(errno.ENOENT, "there is no such folder", inner[-1])
         entries = found[inner[1]].items()
-        return self.number, {name: _stat(_FILE, inode_of(o), o.size) for name, o in entries}
-
-    @property
-    def number(self) -> int:
-        """Changes with what was seen of the store."""
-        return self.manifests.number
+        return self.manifests.number, {
+            name: _stat(_FILE, inode_of(o), o.size) for name, o in entries
+        }
 
     def tables(self) -> dict[str, dict[str, Object]]:
         """The objects of tables by folder and name."""
-        number = self.number
+        number = self.manifests.number
         if self._tables[0] != number:
             found: dict[str, dict[str, Object]] = {}
             for one in tables_of(self.bucket):
@@ -349,7 +346,7 @@ class RemoteDirectory(StoreDirectory):
     def changed(self) -> int:
         """A number that changes with what is seen of the store."""
         self.manifests.look()
-        return self.source.number
+        return self.manifests.number
 
     def looks(self, ids: Sequence[str]) -> dict[str, str]:
         """The look of each recording, by id: the version of its manifest."""
