@@ -6,8 +6,8 @@ Messages that come before the clock are held, so that latched ones are not misse
 first time.
 
 The clock of this machine may be set while a recorder runs. Log times are those of the clock,
-whatever it says. Durations, such as that of a ring or of a
-silence, are measured in steady times: log times without what the clock was set by.
+whatever it says. Durations, such as that of a ring or of a silence, are measured in times that
+nobody sets.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final
 
 from hybridlog.record.losses import Cause
 from hybridlog_storage.manifest import Loss, replace
@@ -72,11 +72,8 @@ class SimulatedTime:
         """The latest time of the clock, ns; 0 before the first."""
         return self._latest[1]
 
-    def clock(self, now: int, *, received: int) -> None:
+    def _tick(self, now: int, received: int) -> None:
         """Take a time of the clock, ns."""
-        if not 0 <= now < _MAX_NS:
-            self._recorder.say(f"{CLOCK}: {now} ns is no time that can be stored; it is ignored")
-            return
         with self._lock:
             is_first, before = not self._ticks, self._latest[1]
             self._latest = (received, now)
@@ -133,7 +130,7 @@ class SimulatedTime:
                     "give no time"
                 )
             else:
-                self.clock(now, received=received)
+                self._tick(now, received)
             if not self._is_clock_recorded:
                 return
 
@@ -206,19 +203,10 @@ def clock_time(channel: Channel, payload: bytes) -> int | None:
 
 
 _MIN_JUMP_NS: Final = 500_000_000  # a smaller difference is a clock that is slowed or sped up
-_MAX_KEPT_JUMPS: Final = 1000
-
-
-class Jump(NamedTuple):
-    """The clock was set, at a steady time, forward or back; in all, this one included. All ns."""
-
-    at: int
-    by: int
-    set_by: int
 
 
 class MachineClock:
-    """Notices when the clock is set: by `set_by` ns since the beginning. Thread safe.
+    """Notices, when it is looked at, that the clock was set: by `set_by` ns since the beginning.
 
     `now` returns its time, ns since the epoch, `monotonic` one that nobody sets, ns.
     """
@@ -229,53 +217,18 @@ class MachineClock:
         monotonic: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self.now = now
+        self.monotonic = monotonic
         self.set_by = 0
-        self._monotonic = monotonic
-        self._offset = now() - monotonic()
-        self._jumps: deque[Jump] = deque(maxlen=_MAX_KEPT_JUMPS)
-        self._told = now() - 1
-        self._lock = threading.Lock()
+        self._looked = monotonic()
+        self._offset = now() - self._looked
 
-    def steady(self, log_time: int) -> int:
-        """A log time, ns, of about now, as if the clock had never been set."""
-        if abs(log_time - self._monotonic() - self._offset) >= _MIN_JUMP_NS:
-            self._look()
-        return log_time - self.set_by
-
-    def steady_before(self, log_time: int) -> int:
-        """The last time at which the clock said a log time, as a steady time, ns."""
-        now = self.steady(self.now())
-        for jump in reversed(self._jumps):
-            if jump.at <= log_time - jump.set_by <= now:
-                return log_time - jump.set_by
-        return log_time
-
-    def log_time(self, steady: int) -> int:
-        """The time of the clock at a steady time, ns."""
-        return steady + next((j.set_by for j in reversed(self._jumps) if j.at <= steady), 0)
-
-    def log_times(self, begin: int, end: int) -> tuple[int, int]:
-        """The least and the greatest time of the clock between two steady times, ns."""
-        found = [self.log_time(begin), self.log_time(end)]
-        for jump in [*self._jumps]:
-            if begin < jump.at <= end:
-                found += [jump.at + jump.set_by - jump.by, jump.at + jump.set_by]
-        return min(found), max(found)
-
-    def jumps(self) -> list[Jump]:
-        """The jumps since the last call."""
-        self._look()
-        with self._lock:
-            found = [jump for jump in self._jumps if jump.at > self._told]
-            self._told = max((jump.at for jump in found), default=self._told)
-        return found
-
-    def _look(self) -> None:
-        with self._lock:
-            now = self.now()
-            by = now - self._monotonic() - self._offset
-            self._offset += by
-            if abs(by) >= _MIN_JUMP_NS:
-                at = now - by - self.set_by
-                self.set_by += by
-                self._jumps.append(Jump(at, by, self.set_by))
+    def look(self) -> tuple[int, int]:
+        """By how much it was set since the last look, and at that moment by its new time, ns."""
+        now, looked = self.now(), self._looked
+        self._looked = self.monotonic()
+        by = now - self._looked - self._offset
+        self._offset += by
+        if abs(by) < _MIN_JUMP_NS:
+            by = 0
+        self.set_by += by
+        return by, now - (self._looked - looked)

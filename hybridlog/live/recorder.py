@@ -23,7 +23,7 @@ from hybridlog.entries import put_entry
 from hybridlog.entries import text as as_text
 from hybridlog.follow.child import FollowerProcess, Task
 from hybridlog.live.clocks import CLOCK, MachineClock, SimulatedTime
-from hybridlog.live.incidents import RULE, Incidents, Moment, Silence, SilenceWatch
+from hybridlog.live.incidents import RULE, Incidents, SilenceWatch
 from hybridlog.live.policy import (
     SMALL_BYTES,
     WHOLE_BELOW,
@@ -38,7 +38,7 @@ from hybridlog.maintenance.keep import RetentionThread
 from hybridlog.maintenance.retention import Rules
 from hybridlog.query.times import format_duration, format_time
 from hybridlog.record.losses import Cause
-from hybridlog.record.marks import CLOCK_SET, CONTRACT
+from hybridlog.record.marks import CLOCK_SET
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.completion import completed
 from hybridlog.wording import size
@@ -50,7 +50,7 @@ from hybridlog_storage.errors import (
     StoreError,
     UsageError,
 )
-from hybridlog_storage.manifest import Loss, new_random
+from hybridlog_storage.manifest import Loss, Mark, new_random
 from hybridlog_storage.manifests import MANIFESTS
 from hybridlog_storage.messages import REDUCED, Channel, left_channel
 
@@ -162,7 +162,8 @@ class Recorder:
         self._looked = self._written_at = self._started
         self._written = 0
         self._newest = max(store.session.look().summaries, key=attrgetter("created"), default=None)
-        self._silence = SilenceWatch(options.contract, self._note_silence)
+        self._silence = SilenceWatch(options.contract)
+        self._silences: set[str] = set()  # ids of those that were told
         self._ended_at: int | None = None
         self._simulated: SimulatedTime | None = None
         if options.use_sim_time:
@@ -176,11 +177,8 @@ class Recorder:
         self._says = StateFile(store.directory, self._target.id)
         self._incidents = Incidents(
             partial(self._directory.manifests.change, self._target.id),
-            clock=None if options.use_sim_time else self._clock,
-            first=lambda: self._target.first_time,
-            silence=self._silence,
-            now=self._now,
-            say=self.say,
+            lambda: self._target.first_time,
+            self.say,
         )
         try:
             self._retention = RetentionThread(
@@ -214,7 +212,7 @@ class Recorder:
             task,
             has_documents=index.is_wanted and options.derives,
             triggers=triggers,
-            hit=lambda text, time: self.fire(text, self._passed(time)),
+            hit=self.fire,
             say=self.say,
         )
         return self._follower
@@ -259,7 +257,6 @@ class Recorder:
             says = f"the clock of this machine says {format_time(now)}"
             self._note_clock(f"{says}, and recording {self._newest.name} was begun later", {}, now)
         self._retention.start()
-        self._incidents.start()
 
     def wait(self, seconds: float) -> bool:
         """Wait for the end for at most so long; returns True once it has come."""
@@ -293,7 +290,8 @@ class Recorder:
         self._follower.wait_s = wait_s
         self._says.remove()
         self._retention.stop()
-        self._incidents.stop(ended_at)
+        self._check_silences(ended_at)
+        self._write_marks()
         if self._is_marked(self._target.id) or (
             not (self.stopped_for_disk and self._target.first_time is None)
             and (self._recorded_by_content or any(source.was_reached for source in self._sources))
@@ -302,21 +300,22 @@ class Recorder:
         else:
             self._target.abort()
             return []
-        self._note_last(report)
+        if self._write_marks():  # what triggers have found last
+            self._shared.catch_up(report.entry.id)
+            report.entry = put_entry(self._directory, self._shared.catalog, self._target.id)
         if self._target.cut_off:
             self._refuse(Cause.DISK, "the disk was full")
             for topic, count in self._target.cut_off.items():
                 self._count_lost(topic, Cause.DISK, count)
         return [report]
 
-    def _note_last(self, report: RecordReport) -> None:
-        """Mark and pin what triggers have found last."""
+    def _write_marks(self) -> bool:
+        """Mark and pin what is new; returns whether something was. What fails is tried again."""
         try:
-            if self._incidents.write():
-                self._shared.catch_up(report.entry.id)
-        except HybridlogError as error:
-            self.say(f"the last messages of triggers are not marked and pinned: {error}")
-        report.entry = put_entry(self._directory, self._shared.catalog, self._target.id)
+            return self._incidents.write()
+        except (HybridlogError, OSError) as error:
+            self.say(f"marking or pinning failed: {error}")
+            return False
 
     @property
     def rest(self) -> RecorderOptions:
@@ -337,13 +336,15 @@ class Recorder:
         elapsed = max(now - self._looked, 1e-3)
         self._looked = now
         self._check_clock(now)
-        now_steady = self._now()
+        self._check_silences()
+        self._write_marks()
         lost: Counter[str] = Counter()
         with self._lock:
             for one in self._topics.values():
                 lost.update({str(cause): count for cause, count in one.lost.items()})
             shown = [one for one in self._topics.values() if one.tallies or one.is_present]
-        topics = [one.look(elapsed, now_steady) for one in sorted(shown, key=attrgetter("topic"))]
+        shown.sort(key=attrgetter("topic"))
+        topics = [one.look(elapsed, self._steady()) for one in shown]
         stored, stored_bytes = self._target.stored
         failure = self._target.index_failure
         state = RecorderState(
@@ -378,17 +379,13 @@ class Recorder:
         waited = now - self._written_at - self._options.flush_interval_s
         return waited if waited > _SLOW_WRITE_S else 0.0
 
-    def fire(self, text: str, steady: int | None = None) -> None:
-        """Mark and pin what is around a steady time, ns, or now; waits for nothing."""
+    def fire(self, text: str, at: int | None = None) -> None:
+        """Mark and pin what is around a log time, ns, or now; waits for nothing."""
         options = self._options
         before = options.before_s if options.before_s is not None else options.ring_s or 0.0
-        at = self._now() if steady is None else steady
+        at = self._now() if at is None else at
         begin, end = at - round(before * 1e9), at + round(options.after_s * 1e9)
         self._incidents.hit(as_text(text), begin, end)
-
-    def _passed(self, log_time: int) -> int:
-        """The last time that had a log time, as a steady time, ns."""
-        return log_time if self._simulated is not None else self._clock.steady_before(log_time)
 
     def _is_marked(self, recording: str) -> bool:
         with suppress(StoreError):
@@ -396,39 +393,29 @@ class Recorder:
         return False
 
     def _now(self) -> int:
-        """The present as a steady time, ns."""
+        """The present as a log time, ns."""
         now = self._clock.now()
-        return self._steady(now) if self._simulated is None else self._simulated.at(now)
+        return now if self._simulated is None else self._simulated.at(now)
 
-    def _steady(self, log_time: int) -> int:
-        """A log time, ns, if the clock of this machine had never been set."""
-        return log_time if self._simulated is not None else self._clock.steady(log_time)
+    def _steady(self, log_time: int | None = None) -> int:
+        """The present, or a log time of it, as nobody sets it, ns; of a simulation its own."""
+        if self._simulated is None:
+            return self._clock.monotonic()
+        return self._now() if log_time is None else log_time
 
-    def _note_silence(self, one: Silence, mark: str, is_over: bool) -> None:  # noqa: FBT001
-        """Tell a silence that begins, and mark it from its beginning on; later its end."""
-        if not is_over:
-            self._say(f"{one.text} ({RULE} of the contract)")
-        tags = {"cause": CONTRACT, "rule": RULE, "topic": one.topic}
-        end = one.end if is_over else None
-        self._incidents.note(mark, Moment(one.text, tags, one.begin, end))
+    def _check_silences(self, ended_at: int | None = None) -> None:
+        """Tell silences that begin, and mark them from their beginning on; later their ends."""
+        for one in self._silence.look(self._steady(), ended_at):
+            if one.id not in self._silences:
+                self._silences.add(one.id)
+                self._say(f"{one.mark.text} ({RULE} of the contract)")
+            self._incidents.note(one.mark)
 
     def unfitting(self) -> list[str]:
-        """Options that name topics of which none has come, in words."""
-        options = self._options
+        """Patterns of topics to record, or to leave without documents, that nothing has fitted."""
+        chosen = self._options.matcher, self._options.no_index
         with self._lock:
-            topics = [name for name, one in self._topics.items() if one.has_come]
-            found = [
-                f"'{as_text(pattern)}'"
-                for chosen in (options.matcher, options.no_index)
-                if chosen is not None
-                for pattern in chosen.unused()
-            ]
-        rules = [
-            *((one.fits, f"'{as_text(one.pattern)}' of --throttle") for one in options.throttles),
-            *((one.fits, f"'{as_text(one.pattern)}' of --priority") for one in options.priorities),
-            *((one.fits, f"the trigger '{as_text(one.text)}'") for one in options.triggers),
-        ]
-        return found + [text for fits, text in rules if not any(map(fits, topics))]
+            return [f"'{as_text(one)}'" for all_ in chosen if all_ for one in all_.unused()]
 
     def silent(self) -> list[str]:
         """Topics that had publishers and never sent a message."""
@@ -461,7 +448,6 @@ class Recorder:
             too_many = self._expected > _MAX_EXPECTED
         if not too_many:
             self._target.expect(channel)
-            self._follower.expect(channel)
 
     def take(
         self,
@@ -475,10 +461,10 @@ class Recorder:
         """See `Sink.take`."""
         recorded = self._recorded.get(channel) or self._meet(channel, payload)
         size = len(payload)
-        steady = self._steady(received)
-        through = recorded.throttle is None or recorded.throttle.lets_through(steady)
+        through = recorded.throttle is None or recorded.throttle.lets_through(received)
         if through and not self._claim():
             return  # messages after the end are not part of the recording
+        steady = self._steady(received)
         recorded.tally.add(size, steady)
         if not through:
             self._lose(recorded, Cause.THROTTLE, "", received)
@@ -501,7 +487,7 @@ class Recorder:
                 # Its fields may fit where its payload does not.
                 is_stored = self._store_fields(recorded, payload, received, sent, number)
             if is_stored:
-                self._silence.take(recorded.channel.topic, steady)
+                self._silence.take(recorded.channel.topic, steady, received)
             else:
                 self.say(
                     f"{recorded.channel.topic}: the memory budget is used up and messages are lost "
@@ -693,17 +679,17 @@ class Recorder:
                     "simulation, or leave out --use-sim-time"
                 )
             return
-        for jump in self._clock.jumps():
-            by = format_duration(round(abs(jump.by), -8))
-            where = "forward" if jump.by > 0 else "back"
-            tags = {"set_by_ns": str(jump.by)}
-            text = f"the clock of this machine was set {where} by {by}"
-            self._note_clock(text, tags, jump.at)
+        by, at = self._clock.look()
+        if by:
+            where = "forward" if by > 0 else "back"
+            text = f"the clock of this machine was set {where} by "
+            text += format_duration(round(abs(by), -8))
+            self._note_clock(text, {"set_by_ns": str(by)}, at)
 
     def _note_clock(self, text: str, tags: Mapping[str, str], at: int) -> None:
-        """Report that the clock of this machine was set, or is to be, at a steady time, ns."""
+        """Report that the clock of this machine was set, or is to be, at a log time, ns."""
         self._say(f"{text}; log times are those of the clock")
-        self._incidents.note(new_random(), Moment(text, {"cause": CLOCK_SET, **tags}, at))
+        self._incidents.note(Mark(new_random(), at, text, {"cause": CLOCK_SET, **tags}))
 
 
 def make_room(store: Store, reserve_bytes: int) -> None:

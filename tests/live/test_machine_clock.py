@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 from itertools import pairwise
 
 import pytest
@@ -58,25 +57,6 @@ class Robot(Recorded):
 
 def words(begin: int, end: int) -> list[str]:
     return [str(n) for n in range(begin, end)]
-
-
-def test_a_time_is_steady_however_often_the_clock_is_set() -> None:
-    rng = random.Random(3)
-    clock = Clock(BOOT)
-    begin, up = BOOT, clock.up
-    log_times: dict[int, int] = {}
-    for _ in range(200):
-        steady = clock.steady(clock.time)
-        assert abs(steady - begin - (clock.up - up)) <= 200 * SECOND // 100
-        log_times[steady] = clock.time
-        clock.run(rng.randrange(1, 3 * SECOND))
-        if rng.random() < 0.3:
-            clock.time = rng.randrange(NOW + 30 * YEAR)
-        else:
-            clock.time += rng.randrange(-SECOND // 100, SECOND // 100)  # slower, or faster
-    assert {steady: clock.log_time(steady) for steady in log_times} == log_times
-    assert len(clock.jumps()) > 30
-    assert not clock.jumps()
 
 
 def test_a_clock_that_is_set_mid_recording(plain: hl.Store) -> None:
@@ -165,9 +145,10 @@ def test_a_ring_goes_by_the_time_that_passes(plain: hl.Store, set_to: int) -> No
     robot.recorder.fire("by hand")
     robot.play(chatter, *words(23, 27), step=SECOND)
     (report,) = robot.recorder.stop()
-    messages = {m.decode().data: m.log_time_ns for m in plain.topic("/chatter")}
+    messages = [m.decode().data for m in plain.topic("/chatter")]
     assert sorted(messages, key=int) == words(0, 27)  # in no more than a second of this test
     (pin,) = report.entry.manifest.pins
-    assert all(pin.first <= messages[word] <= pin.last for word in words(18, 25))
+    at = set_to + 3 * SECOND
+    assert (pin.first, pin.last) == (max(at - 5 * SECOND, 0), at + 2 * SECOND)  # log times
     (mark,) = (one for one in report.entry.manifest.marks if "cause" not in one.tags)
-    assert (mark.time, mark.end) == (pin.first, pin.last)
+    assert mark.end == pin.last

@@ -8,7 +8,7 @@ from pathlib import Path
 import hybridlog as hl
 from hybridlog.contract import Contract, TopicRules
 from hybridlog.contract.judge import broken
-from hybridlog.live.incidents import Silence, SilenceWatch
+from hybridlog.live.incidents import SilenceWatch
 from hybridlog.live.recorder import Recorder, RecorderOptions
 from hybridlog.live.sources.replay import ReplaySource
 from hybridlog.record.marks import MARKS
@@ -102,35 +102,32 @@ class Watch(SilenceWatch):
     """Looks when it is told, and returns what it notes."""
 
     def __init__(self, **topics: TopicRules) -> None:
-        self.begun: list[tuple[str, int, int]] = []
-        self.over: list[tuple[str, int, int]] = []
-        super().__init__(Contract(topics), self.note)
+        super().__init__(Contract(topics))
 
-    def note(self, one: Silence, mark: str, is_over: bool) -> None:
-        (self.over if is_over else self.begun).append((one.topic, one.begin, one.end))
+    def say(self, topic: str, time: int) -> None:
+        self.take(topic, time, time + 1000)
 
-    def seen(self, now: int, *, is_end: bool = False) -> tuple[object, object]:
-        self.begun, self.over = [], []
-        self.look(now, is_end=is_end)
-        return sorted(self.begun), self.over
+    def seen(self, now: int, ended_at: int | None = None) -> list[tuple[str, int, int | None]]:
+        return sorted((one.topic, one.begin, one.end) for one in self.look(now, ended_at))
 
 
 def test_each_silence_is_told_once_and_ends_once() -> None:
     rule = TopicRules(longest_gap=10)
     watch = Watch(a=rule, b=rule, o=TopicRules(longest_gap=10, optional=True))
-    watch.take("other", 100)
-    assert watch.seen(110) == ([], [])
-    assert watch.seen(111) == ([("a", 100, 111), ("b", 100, 111)], [])
-    assert watch.seen(150) == ([], [])
+    watch.say("other", 100)
+    assert watch.seen(110) == []
+    assert watch.seen(111) == [("a", 1100, None), ("b", 1100, None)]
+    assert watch.seen(150) == []
     assert watch.silent == ["a", "b"]
-    watch.take("a", 160)
-    assert watch.seen(161) == ([], [("a", 100, 160)])
-    watch.take("a", 175)  # between two looks
-    watch.take("a", 170)  # late, and not before
-    assert watch.seen(176) == ([("a", 160, 175)], [("a", 160, 175)])
-    watch.take("o", 176)  # optional, and late
-    assert watch.seen(176) == ([("o", 100, 176)], [("o", 100, 176)])
-    assert watch.seen(177, is_end=True) == ([], [("b", 100, 177)])
+    watch.say("a", 160)
+    assert watch.seen(161) == [("a", 1100, 1160)]
+    watch.say("a", 175)  # between two looks
+    watch.say("a", 170)  # late, and not before
+    assert watch.seen(176) == [("a", 1160, 1175)]
+    watch.say("o", 176)  # optional, and late
+    assert watch.seen(176) == [("o", 1100, 1176)]
+    assert watch.breaches == 4
+    assert watch.seen(177, 1177) == [("b", 1100, 1177)]
 
 
 def test_the_command_tells_marks_runs_a_command_and_judges(tmp_path: Path) -> None:

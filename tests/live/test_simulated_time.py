@@ -180,18 +180,6 @@ def test_a_clock_that_is_not_wanted_gives_the_time_all_the_same(store: hl.Store)
     assert [channel.topic for channel in simulation.entry.channels] == ["/chatter"]
 
 
-def test_the_time_of_a_server_without_the_topic(store: hl.Store) -> None:
-    simulation = Simulation(store)
-    sink = simulation.speaker.sink
-    assert sink is not None
-    simulation.say("early")
-    sink.clock(1 << 63, received=simulation.now)
-    assert "is no time that can be stored" in simulation.said[0]
-    sink.clock(4 * SECOND, received=simulation.now + 1)
-    simulation.say("a")
-    assert simulation.end()[0] == [("early", 4.0), ("a", 4.0)]
-
-
 def test_marks_and_throttles_go_by_the_clock(store: hl.Store) -> None:
     simulation = Simulation(store, throttles=[throttle_rule("/chatter", "1Hz")])
     for seconds in range(4):
