@@ -9,7 +9,7 @@ import pytest
 from msgspec import UNSET
 
 from hybridlog.maintenance.edit import pin_of
-from hybridlog.maintenance.retention import Held, Plan, Rules, held_of, plan
+from hybridlog.maintenance.retention import Held, Plan, Rules, held_of, past_ring, plan
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.manifest import Channel, File, Manifest, Part, replace
 
@@ -56,7 +56,7 @@ def gone(number: int, age: float) -> list[File]:
     return [log, rows]
 
 
-def held(name: str, *files: File, ended: bool = True, seen: Any = None, **values: Any) -> Recording:
+def held(name: str, *files: File, ended: bool = True, **values: Any) -> Recording:
     manifest = Manifest(
         f"{name}-{sum(name.encode()):016x}",
         name,
@@ -66,7 +66,7 @@ def held(name: str, *files: File, ended: bool = True, seen: Any = None, **values
         files=files,
         **values,
     )
-    return manifest, held_of(manifest, NOW, seen)
+    return manifest, held_of(manifest, NOW)
 
 
 def made(
@@ -102,18 +102,16 @@ def test_payloads_of_topics_go_at_their_age_and_segments_at_theirs() -> None:
 @pytest.mark.parametrize(
     ("used", "free", "steps"),
     [
-        # Below 80 % of 100 MB nothing, then the camera, above 90 % whole segments.
-        (80, 99, []),
-        (81, 99, [("old", (0,))]),
-        (90, 99, [("old", (0, 2))]),
-        (91, 99, [("old", (0, 1, 2))]),
-        (121, 99, [("old", (0, 1, 2, 3, 4, 5)), ("new", (0, 1, 2))]),
+        # Below 90 % of 100 MB nothing, then down to 80 %: the camera, then whole segments.
+        (90, 99, []),
+        (91, 99, [("old", (0, 2))]),
+        (104, 99, [("old", (0, 2, 4))]),
+        (121, 99, [("old", (0, 2, 4)), ("new", (0, 2)), ("old", (1,))]),
         # Free space acts alike: 20 MB are to stay free.
-        (1, 25, []),
-        (1, 24, [("old", (0,))]),
+        (1, 20, []),
         (1, 19, [("old", (0,))]),
-        (1, 5, [("old", (0, 1, 2, 3))]),
-        (95, 5, [("old", (0, 1, 2, 3))]),
+        (1, 5, [("old", (0, 2, 4))]),
+        (95, 5, [("old", (0, 2, 4))]),
     ],
 )
 def test_when_room_is_short_the_oldest_goes(used: int, free: int, steps: list[Any]) -> None:
@@ -123,35 +121,20 @@ def test_when_room_is_short_the_oldest_goes(used: int, free: int, steps: list[An
     assert not found.is_short
 
 
-def test_a_topic_rule_leaves_what_triggers_have_not_seen() -> None:
-    rules = {"quota": "100MB", "topic": {CAMERA: "1y"}}
-    running = held("running", *both(50, 40, 20), ended=False, seen={0, 1})
-    assert [log.goes_last for log in running[1]] == [False, False, True, True, True, True]
-    assert [one[:2] for one in told(made(rules, running, used=90 * MB))] == [("running", (0,))]
-    # More is short than the others have: it goes after them, and a new recording before it.
-    order = [one[:2] for one in told(made(rules, running, NEW, used=115 * MB))]
-    assert order == [("running", (0, 1, 2)), ("new", (0, 1, 2, 3))]
-
-
-def test_a_writer_that_waits_gets_the_largest_first() -> None:
-    rules = Rules(quota=100 * MB, is_urgent=True)
-    (step,) = plan([OLD], rules, used=98 * MB, free=10**12, now=NOW).steps
-    assert step.segments == (0, 2, 4)
-
-
 def test_a_reason_says_what_was_short() -> None:
     rules = {"min-free": "20MB", "topic": {CAMERA: "1y"}}
-    (low,) = made(rules, OLD, used=1, free=24 * MB).steps
-    assert low.reason == "/camera/front: less than 25.0 MB is free"
+    (low,) = made(rules, OLD, used=1, free=19 * MB).steps
+    assert low.reason == "/camera/front: less than 20.0 MB is free"
 
 
 def test_topics_go_in_the_order_of_their_rules() -> None:
     rules = {"quota": "100MB", "topic": {"scan": "1y", "/**": "2y"}}
-    found = made(rules, NEW, OLD, used=98.5 * MB - 9 * MB)
-    # 9.5 MB: the scan of all five segments is 10 MB; nothing of the camera goes.
+    found = made(rules, NEW, OLD, used=98 * MB)
+    # 18 MB: the scan of all five segments is 10 MB.
     assert told(found) == [
-        ("old", (1, 3, 5), "scan: more than 80% of 100.0 MB is used"),
-        ("new", (1, 3), "scan: more than 80% of 100.0 MB is used"),
+        ("old", (1, 3, 5), "scan: more than 90% of 100.0 MB is used"),
+        ("new", (1, 3), "scan: more than 90% of 100.0 MB is used"),
+        ("old", (0,), "/**: more than 90% of 100.0 MB is used"),
     ]
 
 
@@ -197,6 +180,35 @@ def test_whole_groups_go_the_oldest_first() -> None:
     assert step.groups == (0, 1, 2)
 
 
+def test_a_quota_below_what_must_stay_takes_nothing() -> None:
+    pin = pin_of("a", (NOW - 51 * DAY, NOW - 50 * DAY), None, "")
+    pinned = held("old", *both(50, 40, 20), pins=(pin,))
+    room: dict[str, Any] = {"used": 200 * MB, "free": 10**12, "now": NOW}
+    rules = Rules.of({"quota": "60MB", "max-age": "30d"})
+    found = plan([pinned], rules, others=51 * MB, **room)
+    # 10 MB are pinned. Other rules hold all the same.
+    assert told(found) == [("old", (2, 3), "older than 30d")]
+    assert found.is_short
+    assert "A quota of 60.0 MB cannot be kept" in found.warnings[0]
+    assert "61.0 MB must stay" in found.warnings[0]
+    assert len(plan([pinned], rules, others=50 * MB, **room).steps) > 1
+    tagged = plan([OLD], Rules.of({"quota": "20MB"}), others=21 * MB, **room)
+    assert not tagged.steps
+
+
+def test_a_ring_lets_groups_go_but_for_latched_messages_in_force() -> None:
+    logs = [sealed(n, 0, SCAN, group=n // 2 * 2) for n in range(4)]
+    latched = {"latching": "1"}
+    channels = {0: Channel(CAMERA), 1: Channel(SCAN, metadata=latched, encoding="ros1")}
+    manifest = replace(held("ring", *logs, tags={"keep": "yes"})[0], channels=channels)
+    (first,) = past_ring(manifest, [0])
+    assert (first.groups, first.but, first.bytes) == ((0,), (), 4 * MB)
+    (last,) = past_ring(manifest, [2])
+    assert (last.groups, last.but, last.bytes) == ((2,), (3,), 2 * MB)
+    pinned = replace(manifest, pins=(pin_of("a", (None, None), None, ""),))
+    assert past_ring(pinned, [0, 2]) == []
+
+
 def test_a_topic_that_shares_its_log_goes_with_it() -> None:
     shared = held("old", sealed(0, 50, CAMERA, SCAN), sealed(2, 20))
     found = made({"topic": {CAMERA: "7d"}}, shared)
@@ -228,7 +240,7 @@ def test_what_a_pin_touches_never_goes(pin: dict[str, Any], left: list[int]) -> 
     pins = (pin_of("a", pin.get("span", (None, None)), pin.get("topics"), ""),)
     for rules in ({"max-age": "1d"}, {"topic": {CAMERA: "1d"}}):
         found = made(
-            {**rules, "quota": "1MB", "fields-age": "10d"}, held("r", *files, pins=pins), used=1e9
+            {**rules, "quota": "100MB", "fields-age": "10d"}, held("r", *files, pins=pins), used=1e9
         )
         assert sorted(n for one in found.steps for n in one.segments) == left
     assert found.is_short

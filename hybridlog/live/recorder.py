@@ -662,7 +662,7 @@ class Recorder:
         try:
             check_room(state.free_bytes, options.reserve_bytes, coming)
         except DiskFullError as error:
-            if not self._retention.wants(round(options.reserve_bytes + coming)):
+            if not self._retention.make_room(round(options.reserve_bytes + coming)):
                 self._refuse(Cause.DISK, str(error))
         failure = self._target.failure
         if isinstance(failure, DiskFullError):

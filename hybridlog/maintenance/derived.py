@@ -81,23 +81,18 @@ class StoreIndex(Struct, frozen=True):
             if known.get(entry.key) == entry.digests and entry.is_decoded:
                 current.append(entry.id)
             elif directory.is_writable:  # else the segments answer, without an index
-                self._bring_one(entry, report)
                 changed.add(entry.id)
+                # A process that holds the lock indexes it.
+                with suppress(HeldError, TopicError):
+                    try:
+                        made = self._bring(entry)
+                    except SegmentError as error:
+                        report.unreadable[entry.id] = str(error)
+                    else:
+                        report.indexed |= {} if made is None else {entry.name: made.made}
         if current:
             self.catalog.put_indexed(current, index)
         return changed.union(current)
-
-    def _bring_one(self, entry: RecordingEntry, report: RepairReport) -> None:
-        """Bring one recording up to date, unless another process is writing it."""
-        # The process that holds the lock indexes it.
-        with suppress(HeldError, TopicError):
-            try:
-                made = self._bring(entry)
-            except SegmentError as error:
-                report.unreadable[entry.id] = str(error)
-            else:
-                if made is not None:
-                    report.indexed[entry.name] = made.made
 
     def _bring(self, entry: RecordingEntry, **options: Any) -> Follower | None:
         directory, catalog, database = self.directory, self.catalog, self.database
@@ -148,31 +143,24 @@ def index_arrays(
     progress: Progress | None = None,
 ) -> list[ArraysOfTopic]:
     """Change the setting of topics, and make their tables anew where these differ from it."""
+    from hybridlog.columns.folders import files_of
+
     others = [one for one in read_settings(directory.path).arrays if one not in topics]
     directory.change_settings(arrays=tuple(sorted(others if off else {*others, *topics})))
     found = {topic: ArraysOfTopic(topic) for topic in topics}
     for entry in entries:
         own = topics_of(entry) & found.keys()
         wanted = {topic for topic in own if _differs(known, entry, topic, off=off)}
-        if not wanted:
-            continue
-        make_tables(directory, catalog, entry, topics=wanted, progress=progress)
-        known.look_again()
+        options = {"topics": wanted, "progress": progress}
+        problem = wanted and make_tables(directory, catalog, entry, **options)
         for topic in wanted:
-            is_left = _differs(known, entry, topic, off=off)
-            (found[topic].left if is_left else found[topic].recordings).append(entry.name)
+            (found[topic].left if problem else found[topic].recordings).append(entry.name)
+    known.look_again()
     channels = [channel for entry in entries for channel in entry.channels]
     for topic, one in found.items():
         types = {type_prefix(one.type) for one in channels if one.topic == topic}
-        one.bytes = _bytes(directory.path, types)
+        one.bytes = sum(file.size_bytes for file in files_of(directory.path, types)) if types else 0
     return list(found.values())
-
-
-def _bytes(root: Path, types: Collection[str]) -> int:
-    """Bytes of all tables of some types."""
-    from hybridlog.columns.folders import files_of
-
-    return sum(file.size_bytes for file in files_of(root, {*types})) if types else 0
 
 
 def _differs(known: Tables, entry: RecordingEntry, topic: str, *, off: bool) -> bool:
@@ -187,34 +175,29 @@ def _differs(known: Tables, entry: RecordingEntry, topic: str, *, off: bool) -> 
 
 
 def bring_tables(source: Shared, target: RemoteDirectory, recordings: Collection[str]) -> None:
-    """Bring the tables of recordings that were copied into a bucket; messages answer without."""
-    for recording in recordings:
-        entry = source.now().find(recording)
-        if entry is not None and entry.status not in UNFINISHED:
-            _bring_tables(source, target, entry)
+    """Bring the tables of recordings that were copied into a bucket; messages answer without.
 
-
-def _bring_tables(source: Shared, target: RemoteDirectory, entry: RecordingEntry) -> None:
-    """Write the tables of a recording; no file of them has another recording."""
+    No file of them has another recording.
+    """
     from hybridlog_storage.copy_places import read
 
-    names, numbers = [], dict[str, int]()
-    with tempfile.TemporaryDirectory(prefix="hybridlog-") as place:
-        for path in _tables(source, entry, Path(place)):
-            folder = path.parent.name
-            number = numbers[folder] = numbers.get(folder, -1) + 1
-            name = f"{TABLES}/{folder}/{entry.id}-{number}{SUFFIX}"
-            names.append(name)
-            try:
-                fd = files.open_file(path, os.O_RDONLY)
-            except OSError as error:
-                raise unreadable(error, path) from error
-            try:
-                size = os.fstat(fd).st_size
-                target.bucket.put(name, size, read(fd, 0, size))
-            finally:
-                os.close(fd)
-    target.source.keep_tables(entry.id, names)
+    for recording in recordings:
+        entry, names = source.now().find(recording), list[str]()
+        if entry is None or entry.status in UNFINISHED:
+            continue
+        with tempfile.TemporaryDirectory(prefix="hybridlog-") as place:
+            for number, path in enumerate(_tables(source, entry, Path(place))):
+                names.append(f"{TABLES}/{path.parent.name}/{entry.id}-{number}{SUFFIX}")
+                try:
+                    fd = files.open_file(path, os.O_RDONLY)
+                except OSError as error:
+                    raise unreadable(error, path) from error
+                try:
+                    size = os.fstat(fd).st_size
+                    target.bucket.put(names[-1], size, read(fd, 0, size))
+                finally:
+                    os.close(fd)
+        target.source.keep_tables(entry.id, names)
 
 
 def _tables(source: Shared, entry: RecordingEntry, root: Path) -> list[Path]:

@@ -13,7 +13,6 @@ that the next change of the store removes.
 
 from __future__ import annotations
 
-import math
 import os
 import secrets
 import shutil
@@ -28,6 +27,7 @@ from typing import TYPE_CHECKING, Final
 
 from msgspec import Struct, field, structs
 
+from hybridlog.columns.layout import TABLES
 from hybridlog.maintenance.retention import (
     Held,
     Plan,
@@ -36,6 +36,7 @@ from hybridlog.maintenance.retention import (
     held_of,
     is_pinned,
     may_go,
+    past_ring,
     plan,
 )
 from hybridlog.maintenance.sizes import disk_bytes
@@ -60,6 +61,7 @@ from hybridlog_storage.manifest import (
     with_rows,
     with_totals,
 )
+from hybridlog_storage.manifests import RECORDINGS
 from hybridlog_storage.segments.segment_reader import SegmentReader, front
 from hybridlog_storage.settings import read_settings
 
@@ -107,9 +109,9 @@ class Keeper:
     """Applies rules of retention to a store.
 
     `remove` deletes a recording, by its id, unless a check of its manifest raises. `own` is the
-    one that this process makes; after `ring_s` its groups go, and `let_go` counts their messages.
-    `judged` returns the numbers of its segments that triggers have seen, None for all: the others
-    go last. `is_wanted` is asked before each deletion.
+    one that this process makes; after `ring_s` its groups go, and `let_go` counts their messages,
+    once triggers have `judged` them: it returns the numbers of these segments, None for all.
+    `is_wanted` is asked before each deletion.
     """
 
     def __init__(
@@ -123,7 +125,7 @@ class Keeper:
         is_wanted: Callable[[], bool] = lambda: True,
     ) -> None:
         self.let_go = 0
-        self._ring_s = math.inf if ring_s is None else ring_s + _LATE_S
+        self._ring_s = ring_s
         self._sealed: dict[int, float] = {}  # when each group was first seen, by `monotonic`
         self._directory, self._remove, self._own = directory, remove, own
         self._judged, self._is_wanted = judged, is_wanted
@@ -133,28 +135,31 @@ class Keeper:
     def plan(self, rules: Rules) -> Plan:
         """The deletions that are due now."""
         directory, now = self._directory, time.time_ns()
-        used = 0 if rules.is_empty else disk_bytes(directory.path)
         free = shutil.disk_usage(directory.path).free
-        # A ring alone looks at nothing else.
-        ids = [self._own] if rules.is_empty and self._own else directory.ids()
-        has_arrays = bool(directory.settings.arrays)
-        held = self._held(ids, now)
-        return plan(held, rules, used=used, free=free, now=now, has_arrays=has_arrays)
+        if rules.is_empty:
+            return Plan(0, free)
+        return plan(
+            self._held(now),
+            rules,
+            used=disk_bytes(directory.path),
+            others=disk_bytes(directory.path, but={RECORDINGS, TABLES, SPARE}),
+            free=free,
+            now=now,
+            has_arrays=bool(directory.settings.arrays),
+        )
 
     def keep(self, rules: Rules) -> KeepReport:
         """Let go what has to go; HeldError while another process makes a pass."""
         with self._alone():
             if not rules.is_empty:
                 _lay_spare(self._directory, rules)  # counts among what is used
-            found = KeepReport(self.plan(rules))
-            planned = found.plan
+            found = KeepReport(Plan(0, 0))
+            if self._ring_s is not None and not self._do_all(self._past_ring(), rules, found):
+                return found
+            found.plan = planned = self.plan(rules)
             for _ in range(_MAX_ROUNDS):
-                if not planned.steps:
+                if not planned.steps or not self._do_all([*planned.steps], rules, found):
                     break
-                for step in planned.steps:
-                    if not self._is_wanted():
-                        return found
-                    self._do(step, rules, found)
                 planned = self.plan(rules)
                 found.plan.steps += planned.steps
             found.plan.warnings, found.plan.is_short = planned.warnings, planned.is_short
@@ -172,7 +177,7 @@ class Keeper:
             own = [now.logs[number] for number in sorted(logs) if number in now.logs]
             going = [log.number for log in own if may_go(log) and not is_pinned(log, now)]
             if going and not rules.is_never(now.tags):
-                self._do(Step(now.name, recording, tuple(going), 0, ""), rules, found, copy)
+                self._do(Step(now.name, recording, tuple(going), 0, copy), rules, found, copy)
         return found
 
     @contextmanager
@@ -181,29 +186,40 @@ class Keeper:
             self._failed.clear()
             yield
 
-    def _held(self, ids: Iterable[str], now: int) -> Iterator[tuple[Manifest, list[Held]]]:
+    def _held(self, now: int) -> Iterator[tuple[Manifest, list[Held]]]:
         """Recordings and what they hold; nothing of those that others hold.
 
         Nor of those whose manifests were made again, which may lack pins.
         """
-        for manifest in self._directory.manifests.each(ids):
-            failed, logs = self._failed[manifest.id], list[Held]()
-            if manifest.id == self._own:
-                over = self._over(manifest)
-                logs = held_of(manifest, now, self._judged(), failed, over)
-            elif (
+        directory = self._directory
+        for manifest in directory.manifests.each(directory.ids()):
+            failed = self._failed[manifest.id]
+            is_ours = manifest.id == self._own or (
                 manifest.status != "unproven"
-                and _WHOLE not in failed
-                and (manifest.is_ended or not self._directory.is_recorded(manifest.id))
-            ):
-                logs = held_of(manifest, now, stays=failed)
-            yield manifest, logs
+                and (manifest.is_ended or not directory.is_recorded(manifest.id))
+            )
+            is_held = is_ours and _WHOLE not in failed
+            yield manifest, held_of(manifest, now, failed) if is_held else []
 
-    def _over(self, manifest: Manifest) -> set[int]:
-        """The groups of its own recording whose time in the ring is over, whatever a clock says."""
+    def _past_ring(self) -> list[Step]:
+        """Deletions of groups whose time in the ring is over, whatever a clock says."""
+        assert self._own is not None
+        assert self._ring_s is not None
+        manifest, seen = self._directory.manifests.read(self._own), self._judged()
         now, groups = time.monotonic(), {log.group for log in manifest.logs.values()}
         self._sealed = {group: self._sealed.get(group, now) for group in groups}
-        return {group for group, at in self._sealed.items() if now - at >= self._ring_s}
+        if seen is not None:
+            groups -= {log.group for n, log in manifest.logs.items() if n not in seen}
+        over = (one for one in groups if now - self._sealed[one] >= self._ring_s + _LATE_S)
+        return past_ring(manifest, sorted(over))
+
+    def _do_all(self, steps: Iterable[Step], rules: Rules, found: KeepReport) -> bool:
+        """Do some steps; False once they are wanted no more."""
+        for step in steps:
+            if not self._is_wanted():
+                return False
+            self._do(step, rules, found)
+        return True
 
     def _do(self, step: Step, rules: Rules, found: KeepReport, copy: str = "") -> None:
         """Do a step, with the room of the spare file if there is no other; reports in `found`."""
@@ -228,37 +244,27 @@ class Keeper:
             self._failed[step.id].add(number)
 
     def _done(self, step: Step, check: Check, copy: str) -> tuple[int, dict[int, str]]:
-        if not step.segments and not step.groups:
+        if step.is_whole:
             self._remove(step.id, check)
             return step.bytes, {}
         directory, is_own = self._directory, step.id == self._own
         lock = directory.writing(step.id, step.recording, wait_s=LOCK_WAIT_S)
         with nullcontext() if is_own else lock:
-            if step.groups:
-
-                def choose(now: Manifest) -> list[File]:
-                    own = [file for file in now.files if file.group in step.groups]
-                    return [file for file in own if file.number not in step.but]
-
-                gone = let_go(directory, step.id, choose, check).let_go
-                self.let_go = gone.messages if is_own and gone else self.let_go
-                return step.bytes, {}
-            return expire(
-                directory, step.id, step.segments, copy=copy, check=check, is_followed=is_own
-            )
+            if step.segments:
+                return expire(
+                    directory, step.id, step.segments, copy=copy, check=check, is_followed=is_own
+                )
+            gone = let_go(directory, step.id, lambda now: _lines_of(now, step.going(now)), check)
+        self.let_go = gone.let_go.messages if is_own and gone.let_go else self.let_go
+        return step.bytes, {}
 
 
 def _check(step: Step, rules: Rules, manifest: Manifest) -> None:
     """Raise ChangedError if what goes in a step must stay by now."""
-    if rules.is_never(manifest.tags):
+    if step.reason and rules.is_never(manifest.tags):
         raise ChangedError(f"{step.recording}: a tag that keeps it was set meanwhile.")
-    is_whole = not step.segments and not step.groups
-    going = [
-        log
-        for number, log in manifest.logs.items()
-        if number in step.segments or (log.group in step.groups and number not in step.but)
-    ]
-    if (is_whole and manifest.pins) or any(is_pinned(log, manifest) for log in going):
+    going = step.going(manifest)
+    if (step.is_whole and manifest.pins) or any(is_pinned(log, manifest) for log in going):
         raise ChangedError(f"{step.recording}: a pin was set meanwhile.")
 
 
@@ -324,7 +330,7 @@ def expire(
             except DiskFullError:
                 if use_spare(directory):
                     continue
-                let_go(directory, recording, partial(_lines_of, log.number), check, NO_ROOM)
+                let_go(directory, recording, partial(_lines_of, logs=(log,)), check, NO_ROOM)
             except SegmentError as error:
                 damaged[log.number] = str(error)
                 freed -= log.bytes
@@ -362,8 +368,10 @@ def _are_whole(path: Path, rows: Collection[File]) -> bool:
     return bool(rows)
 
 
-def _lines_of(number: int, manifest: Manifest) -> list[File]:
-    return [file for file in manifest.files if file.number == number]
+def _lines_of(manifest: Manifest, logs: Collection[File]) -> list[File]:
+    """The lines of logs, and of their rows."""
+    numbers = {log.number for log in logs}
+    return [file for file in manifest.files if file.number in numbers]
 
 
 def make_rows(
@@ -558,8 +566,9 @@ class RetentionThread:
         pin: Callable[[], object],
         judged: Callable[[], Collection[int] | None],
     ) -> None:
-        self._directory = directory
+        self._directory, self._sealed, self._say = directory, sealed, say
         self._pin = None if ring_s is None else pin
+        self._over = threading.Event()
         self.keeper = Keeper(
             directory,
             remove,
@@ -568,13 +577,8 @@ class RetentionThread:
             judged=judged,
             is_wanted=lambda: not self._over.is_set(),
         )
-        self._sealed = sealed
-        self._reserve = self._wanted = reserve
-        self._say = say
-        self._over = threading.Event()
+        self._reserve = reserve
         self._alone = threading.Lock()  # who makes a pass
-        self._is_asked = False  # for one
-        self._is_exhausted = False  # nothing was left to go when it was asked for
         self._thread = threading.Thread(target=self._run, name="hybridlog-keep", daemon=True)
         self._rules = self._read_rules()
         self._has_warned = False
@@ -589,39 +593,31 @@ class RetentionThread:
         if self._thread.is_alive():
             self._thread.join()
 
-    def wants(self, free_bytes: int) -> bool:
-        """Ask for so many free bytes; False if none can be made."""
-        self._wanted = max(free_bytes, self._reserve)
-        if self._is_exhausted and not self._is_asked:
-            return False
-        self._is_asked = True
-        return self._rules.makes_room
+    def make_room(self, free_bytes: int = 0) -> bool:
+        """Make a pass, for so many free bytes at least, at once; returns whether to try again."""
+        return self._rules.makes_room and self._pass(free_bytes) != 0
 
-    def make_room(self) -> bool:
-        """Make a pass on a full disk, for a writer that waits; returns whether to try again."""
-        freed = self._pass(is_urgent=True)
-        return freed is None or freed > 0
-
-    def _read_rules(self) -> Rules:
+    def _read_rules(self, free_bytes: int | None = None) -> Rules:
         rules = Rules.of(read_settings(self._directory.path).retention)
-        return rules.with_free(self._wanted) if rules.makes_room else rules
+        if rules.makes_room:
+            rules = rules.with_free(max(free_bytes or 0, self._reserve))
+        return structs.replace(rules, is_urgent=free_bytes is not None)
 
     def _run(self) -> None:
         looked = last_pass = last_ring = -_AGES_S
         sealed = 0
         while not self._over.wait(_TICK_S):
-            now, count, is_asked, is_low = time.monotonic(), self._sealed(), self._is_asked, False
+            now, count = time.monotonic(), self._sealed()
+            is_due = count != sealed or now - last_pass >= _AGES_S
             if now - looked >= LOOK_S:
                 looked = now
                 with self._saying():
-                    free = shutil.disk_usage(self._directory.path).free
                     self._rules = self._read_rules()
-                    is_low = free < (self._rules.min_free or 0)
-            if is_asked or is_low or count != sealed or now - last_pass >= _AGES_S:
-                last_pass, last_ring, sealed = now, now, count
-                freed = self._pass()
-                sealed = -1 if freed is None else sealed
-                self._is_exhausted, self._is_asked = is_asked and freed == 0, False
+                    free = shutil.disk_usage(self._directory.path).free
+                    is_due = is_due or free < (self._rules.min_free or 0)
+            if is_due:
+                last_pass = last_ring = now
+                sealed = -1 if self._pass() is None else count
             elif self._pin is not None and now - last_ring >= _RING_S:
                 last_ring = now
                 self._pass(is_ring=True)
@@ -633,23 +629,24 @@ class RetentionThread:
         except (HybridlogError, OSError) as error:
             self._say(f"making room failed: {error}")
 
-    def _pass(self, *, is_urgent: bool = False, is_ring: bool = False) -> int | None:
-        """Make a pass; returns the bytes that it freed, None while another process makes one."""
+    def _pass(self, free_bytes: int | None = None, *, is_ring: bool = False) -> int | None:
+        """Make a pass for so many free bytes; returns those that it freed, None without one."""
         with self._alone, self._saying():
-            self._rules = self._read_rules()
-            if self._over.is_set() or (self._rules.is_empty and self._pin is None):
+            if self._over.is_set():
+                return None
+            self._rules = self._read_rules(free_bytes)
+            if self._rules.is_empty and self._pin is None:
                 return 0
             if self._pin is not None:
                 self._pin()
-            rules = Rules() if is_ring else structs.replace(self._rules, is_urgent=is_urgent)
             try:
-                done = self.keeper.keep(rules)
+                done = self.keeper.keep(Rules() if is_ring else self._rules)
             except HeldError:
                 self._over.wait(_TICK_S)
                 return None
             warnings = [] if self._has_warned else done.plan.warnings
             self._has_warned = bool(done.plan.warnings)
-            reasons = (f"making room: {one.reason}" for one in done.plan.steps if one.reason)
+            reasons = (f"making room: {one.reason}" for one in done.plan.steps)
             for text in (*reasons, *done.problems, *warnings):
                 self._say(text)
             return done.freed_bytes

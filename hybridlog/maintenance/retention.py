@@ -28,9 +28,8 @@ if TYPE_CHECKING:
 MIN_SEGMENT: Final = 4 << 20
 MAX_SEGMENT: Final = 1 << 30
 _SEGMENTS_OF_QUOTA: Final = 50
-_TOPICS_FROM: Final = 0.8  # share of the quota above which payloads of topics go
-_SEGMENTS_FROM: Final = 0.9  # share above which whole segments go
-_TOPICS_BELOW: Final = 1.25  # times the free space below which segments go
+_FROM: Final = 0.9, 1.0  # share of the quota above which something goes; of the free space, below
+_TO: Final = 0.8, 1.25  # and until then
 _CLOCK_WAS_SET: Final = 1_577_836_800 * 10**9  # 2020: earlier times are of a clock not set yet
 _LEAST_BARE: Final = 1 << 16  # bytes that a size without a unit has; less is meant as gigabytes
 _KEYS: Final = ("quota", "min-free", "max-age", "topic", "never-tag", "fields-age")
@@ -56,7 +55,7 @@ class Rules(Struct, frozen=True):
             topic the first one counts.
         never_tag: Tags of recordings of which nothing goes, None for any value.
         fields_age: Age at which whole recordings go, with fields and counts, as written.
-        is_urgent: Whether a writer waits for room: then the largest segments go first.
+        is_urgent: Whether a writer waits for room: then groups go of what is being recorded, too.
     """
 
     quota: int | None = None
@@ -91,7 +90,7 @@ class Rules(Struct, frozen=True):
     @property
     def is_empty(self) -> bool:
         """True if nothing ever goes."""
-        return self == Rules(never_tag=self.never_tag)
+        return self == Rules(never_tag=self.never_tag, is_urgent=self.is_urgent)
 
     @property
     def makes_room(self) -> bool:
@@ -152,11 +151,7 @@ class Held(Struct, frozen=True):
     Attributes:
         written: When it was written, or the time of its last message if that is later, ns.
         row_bytes: Bytes of its files of rows.
-        is_pinned: Whether a pin keeps messages of it.
-        stays: Whether nothing of its group may go now.
-        goes_last: Whether triggers have not seen it yet.
-        is_over: Whether its time in a ring is over, and triggers have seen it.
-        is_in_force: Whether it has latched messages that no later ones have replaced.
+        stays: Whether nothing of its group may go: a pin keeps messages of it, or it failed to go.
     """
 
     recording: Manifest
@@ -164,11 +159,7 @@ class Held(Struct, frozen=True):
     written: int
     row_bytes: int
     topics: frozenset[str]
-    is_pinned: bool
     stays: bool
-    goes_last: bool
-    is_over: bool
-    is_in_force: bool
 
     @property
     def key(self) -> tuple[str, int]:
@@ -180,51 +171,18 @@ class Held(Struct, frozen=True):
         """Bytes of its file; 0 if it is gone."""
         return self.log.bytes if self.log.is_here else 0
 
-    @property
-    def may_go(self) -> bool:
-        """True if its payloads may go before its group, unless they are pinned."""
-        return may_go(self.log) and not self.stays
 
-    @property
-    def order(self) -> tuple[bool, int, int, tuple[str, int]]:
-        """The oldest first, and last what triggers have not seen."""
-        return self.goes_last, self.written, self.recording.created, self.key
-
-
-def held_of(
-    manifest: Manifest,
-    now: int,
-    seen: Collection[int] | None = None,
-    stays: Collection[int] = (),
-    over: Collection[int] = (),
-) -> list[Held]:
-    """The logs of a recording at `now`, ns.
-
-    Those go last that are not among the numbers that triggers have `seen`; None if there are no
-    triggers. `stays` has the numbers of those that cannot go, `over` groups whose time in a ring is
-    over.
-    """
-    found, in_force = list[Held](), _in_force(manifest) if over else set[int]()
-    later, rows = now, manifest.rows
+def held_of(manifest: Manifest, now: int, stays: Collection[int] = ()) -> list[Held]:
+    """The logs of a recording at `now`, ns; `stays` has the numbers of some that cannot go."""
+    found, later, rows = list[Held](), now, manifest.rows
     for number, log in sorted(manifest.logs.items(), reverse=True):
         parts = _parts_of(log, manifest)
-        last = max((part.last or 0 for _, part in parts), default=0)
         # A log is not newer than those that follow it, whatever the clock was.
-        later = min(later, max(log.written, last))
-        found.append(
-            Held(
-                manifest,
-                log,
-                later,
-                sum(file.bytes for file in rows.get(number, ())),
-                frozenset(topic for topic, _ in parts),
-                is_pinned(log, manifest),
-                number in stays,
-                seen is not None and number not in seen,
-                log.group in over and (seen is None or number in seen),
-                number in in_force,
-            )
-        )
+        later = min(later, max([log.written, *(part.last or 0 for _, part in parts)]))
+        size = sum(file.bytes for file in rows.get(number, ()))
+        topics = frozenset(topic for topic, _ in parts)
+        stay = number in stays or is_pinned(log, manifest)
+        found.append(Held(manifest, log, later, size, topics, stay))
     return found[::-1]
 
 
@@ -287,6 +245,20 @@ class Step(Struct, frozen=True):
     groups: tuple[int, ...] = ()
     but: tuple[int, ...] = ()
 
+    def going(self, manifest: Manifest) -> list[File]:
+        """The logs that go."""
+        return [
+            log
+            for number, log in manifest.logs.items()
+            if number in self.segments
+            or (number not in self.but and (log.group in self.groups or self.is_whole))
+        ]
+
+    @property
+    def is_whole(self) -> bool:
+        """True if the recording goes."""
+        return not self.segments and not self.groups
+
 
 class Plan(Struct):
     """Deletions, in their order.
@@ -306,6 +278,19 @@ class Plan(Struct):
     is_short: bool = False
 
 
+def past_ring(manifest: Manifest, groups: Iterable[int]) -> list[Step]:
+    """Deletions of groups whose time in a ring is over: fields, too, not latched ones in force."""
+    in_force, steps = _in_force(manifest), list[Step]()
+    for group in groups:
+        logs = [log for log in manifest.logs.values() if log.group == group]
+        but = tuple(log.number for log in logs if log.number in in_force)
+        if len(but) < len(logs) and not any(is_pinned(log, manifest) for log in logs):
+            numbers = {log.number for log in logs} - in_force
+            size = sum(f.bytes for f in manifest.present.values() if f.number in numbers)
+            steps.append(Step(manifest.name, manifest.id, (), size, "", (group,), but))
+    return steps
+
+
 def plan(
     held: Iterable[tuple[Manifest, Sequence[Held]]],
     rules: Rules,
@@ -313,15 +298,16 @@ def plan(
     used: int,
     free: int,
     now: int,
+    others: int = 0,
     has_arrays: bool = False,
 ) -> Plan:
     """Plan deletions: their order, and the reason of each.
 
-    `held` are recordings with their logs, none of those that another process records; `used` and
-    `free` are bytes, `now` is ns. With `has_arrays`, tables shrink when payloads go, by unknown
-    amounts: whole groups wait for the next plan, which measures again.
+    `held` are recordings with their logs, none of those that another process records; `used`,
+    `free` and `others`, of what no rule deletes, are bytes, `now` is ns. With `has_arrays`, tables
+    shrink when payloads go, by unknown amounts: whole groups wait for the next plan.
     """
-    return _Planning(rules, Plan(used, free), now, has_arrays=has_arrays).made(held)
+    return _Planning(rules, Plan(used, free), now, has_arrays=has_arrays).made(held, others)
 
 
 class _Planning:
@@ -333,141 +319,114 @@ class _Planning:
         self._shared: set[str] = set()  # topics of rules, in logs with others
         self._going: set[tuple[str, int]] = set()  # keys of logs
 
-    def made(self, held: Iterable[tuple[Manifest, Sequence[Held]]]) -> Plan:
+    def made(self, held: Iterable[tuple[Manifest, Sequence[Held]]], others: int) -> Plan:
+        rules, age = self._rules, self._rules.fields_age
         for manifest, logs in held:
-            if not self._rules.is_never(manifest.tags) and not self._goes_whole(manifest, logs):
+            size = sum(file.bytes for file in manifest.present.values())
+            if not logs or rules.is_never(manifest.tags):
+                others += size
+            elif age is not None and self._is_old(manifest, logs[-1], parse_duration(age)):
+                self._step(Step(manifest.name, manifest.id, (), size, f"fields older than {age}"))
+            else:
+                others += sum(one.size + one.row_bytes for one in logs if one.stays)
                 self._left += logs
-        self._left.sort(key=lambda one: one.order)
-        self._by_ring()
-        self._by_age()
-        self._by_room()
+        self._left.sort(key=lambda one: (one.written, one.recording.created, one.key))
+        self._refuse(others)
+        if rules.max_age is not None:
+            self._take(f"older than {rules.max_age}", age=parse_duration(rules.max_age))
+        for rule in rules.topics:
+            self._take(f"{rule.pattern} older than {rule.age}", rule, age=rule.age_ns)
+        if self._short(_FROM) > 0:
+            self._make_room()
         self._warn()
         return self._plan
 
-    def _is_older(self, written: int, age: int) -> bool:
+    def _is_older(self, one: Held, age: int) -> bool:
         # The age of what a clock that was not set has written is unknown.
-        return _CLOCK_WAS_SET <= written <= self._now - age
+        return _CLOCK_WAS_SET <= one.written <= self._now - age
 
-    def _goes_whole(self, manifest: Manifest, logs: Sequence[Held]) -> bool:
-        age = self._rules.fields_age
-        if age is None or manifest.pins or not manifest.is_ended:
-            return False
-        if not logs or not self._is_older(logs[-1].written, parse_duration(age)):
-            return False
-        size = sum(one.size + one.row_bytes for one in logs)
-        self._step(Step(manifest.name, manifest.id, (), size, f"fields older than {age}"))
-        return True
+    def _is_old(self, manifest: Manifest, last: Held, age: int) -> bool:
+        return manifest.is_ended and not manifest.pins and self._is_older(last, age)
 
-    def _by_ring(self) -> None:
-        """Let groups go whose time is over, rows too, but for latched messages in force."""
-        for (recording, group), logs in self._grouped().items():
-            going = [one for one in logs if not one.is_in_force]
-            if going and all(one.is_over and not (one.is_pinned or one.stays) for one in logs):
-                self._going |= {one.key for one in going}
-                freed = sum(one.size + one.row_bytes for one in going)
-                but = tuple(one.log.number for one in logs if one.is_in_force)
-                self._step(Step(logs[0].recording.name, recording, (), freed, "", (group,), but))
+    def _refuse(self, needed: int) -> None:
+        """Leave out a quota that cannot be kept: it would take all, and miss what it is for."""
+        quota = self._rules.quota
+        if quota is not None and needed > quota:
+            self._rules, self._plan.is_short = replace(self._rules, quota=None), True
+            self._plan.warnings.append(
+                f"A quota of {size(quota)} cannot be kept, so nothing goes for it: {size(needed)} "
+                "must stay, since it is pinned, being recorded, or MongoDB and the catalog. Give "
+                "more than that."
+            )
 
-    def _grouped(self) -> dict[tuple[str, int], list[Held]]:
-        """What is left by recording and group, the oldest first."""
+    def _make_room(self) -> None:
+        """Let payloads go, of topics with rules first, then whole groups."""
+        rules, quota = self._rules, self._rules.quota
+        reason = f"less than {size(rules.min_free or 0)} is free"
+        if quota is not None and self._plan.used_bytes - self._freed > _FROM[0] * quota:
+            reason = f"more than {_FROM[0]:.0%} of {size(quota)} is used"
+        for rule in rules.topics:
+            self._take(f"{rule.pattern}: {reason}", rule, need=self._short(_TO))
+        self._take(reason, need=self._short(_TO))
+        if self._short(_FROM) > 0 and not (self._has_arrays and self._going):
+            self._groups(f"{reason}, and no payloads are left to go")
+
+    def _groups(self, reason: str) -> None:
+        """Let whole groups go, the oldest first, until enough is free."""
         groups: defaultdict[tuple[str, int], list[Held]] = defaultdict(list)
-        for one in sorted(self._left, key=lambda one: one.order):
-            groups[one.recording.id, one.log.group].append(one)
-        return groups
-
-    def _by_age(self) -> None:
-        age = self._rules.max_age
-        if age is not None:
-            self._take(f"older than {age}", age_ns=parse_duration(age))
-        for rule in self._rules.topics:
-            self._take(f"{rule.pattern} older than {rule.age}", rule, age_ns=rule.age_ns)
-
-    def _by_room(self) -> None:
-        if self._short(_SEGMENTS_FROM, 1.0) > 0:
-            need = self._short(_TOPICS_FROM, _TOPICS_BELOW)
-            if self._rules.is_urgent:
-                self._left.sort(key=lambda one: (one.goes_last, -one.size))
-            self._take(self._reason(_SEGMENTS_FROM, 1.0), need=need)
-        for rule in self._rules.topics:
-            need = self._short(_TOPICS_FROM, _TOPICS_BELOW)
-            if need > 0:
-                reason = f"{rule.pattern}: {self._reason(_TOPICS_FROM, _TOPICS_BELOW)}"
-                self._take(reason, rule, need=need)
-        is_known = not (self._has_arrays and self._going)
-        if is_known and self._short(_SEGMENTS_FROM, 1.0) > 0:
-            self._groups()
-
-    def _groups(self) -> None:
-        """Let whole groups go, the oldest first, until enough is free.
-
-        Those of a recording in progress only while its writer waits.
-        """
-        reason = f"{self._reason(_SEGMENTS_FROM, 1.0)}, and no payloads are left to go"
-        need = self._short(_TOPICS_FROM, _TOPICS_BELOW)
-        groups = {
-            key: logs
-            for key, logs in self._grouped().items()
-            if logs[0].recording.is_ended or self._rules.is_urgent
-        }
-        chosen: dict[str, dict[int, int]] = {}  # what becomes free besides, by group
+        for one in self._left:
+            if one.recording.is_ended or self._rules.is_urgent:
+                groups[one.recording.id, one.log.group].append(one)
+        counts = Counter(recording for recording, _ in groups)
+        need, chosen = self._short(_TO), defaultdict[str, dict[int, int]](dict)
         for (recording, group), logs in groups.items():
-            if need > 0 and not any(one.is_pinned or one.stays for one in logs):
-                size = sum(one.row_bytes for one in logs)
-                size += sum(one.size for one in logs if one.key not in self._going)
-                chosen.setdefault(recording, {})[group] = size
-                need -= size
+            if need > 0 and not any(one.stays for one in logs):
+                here = sum(one.size for one in logs if one.key not in self._going)
+                chosen[recording][group] = here + sum(one.row_bytes for one in logs)
+                need -= chosen[recording][group]
         for recording, own in chosen.items():
             manifest = groups[recording, next(iter(own))][0].recording
-            left = {group for one, group in groups if one == recording} - own.keys()
-            is_whole = manifest.is_ended and not left and not manifest.pins
+            is_all = len(own) == counts[recording]
+            is_whole = is_all and manifest.is_ended and not manifest.pins
             numbers = () if is_whole else tuple(own)
             self._step(Step(manifest.name, recording, (), sum(own.values()), reason, numbers))
 
-    def _short(self, share: float, times: float) -> float:
+    def _short(self, bounds: tuple[float, float]) -> float:
         """Bytes that are to become free for a share of the quota, and for the free space."""
-        rules, need = self._rules, -math.inf
+        rules, need, (share, times) = self._rules, -math.inf, bounds
         if rules.quota is not None:
             need = self._plan.used_bytes - share * rules.quota
         if rules.min_free is not None:
             need = max(need, times * rules.min_free - self._plan.free_bytes)
         return need - self._freed
 
-    def _reason(self, share: float, times: float) -> str:
-        rules = self._rules
-        quota = rules.quota
-        if quota is not None and self._plan.used_bytes - self._freed > share * quota:
-            return f"more than {share:.0%} of {size(quota)} is used"
-        return f"less than {size(times * (rules.min_free or 0))} is free"
-
     def _take(
         self,
         reason: str,
         rule: TopicRule | None = None,
         *,
-        age_ns: int | None = None,
+        age: int | None = None,
         need: float = math.inf,
     ) -> None:
         """Let logs go, the oldest first, until `need` bytes become free; a step a recording.
 
-        With `rule`, those with no other topics than its own; with `age_ns`, those that are as old.
+        With `rule`, those with no other topics than its own; with `age`, ns, those that are as old.
         """
-        chosen: dict[str, list[Held]] = {}  # by recording
+        chosen = defaultdict[str, list[Held]](list)  # by recording
         for one in self._left:
             if need <= 0:
                 break
-            if not one.may_go or (age_ns is not None and not self._is_older(one.written, age_ns)):
+            if not may_go(one.log) or (age is not None and not self._is_older(one, age)):
                 continue
             if rule is not None:
                 fits = {t for t in one.topics if self._rules.topic_rule(t) is rule}
                 if fits != one.topics:
                     self._shared |= fits
                     continue
-                if age_ns is None and one.goes_last:
-                    continue
-            if one.key not in self._going and not one.is_pinned:
+            if one.key not in self._going and not one.stays:
                 self._going.add(one.key)
                 need -= one.size
-                chosen.setdefault(one.recording.id, []).append(one)
+                chosen[one.recording.id].append(one)
         for recording, logs in chosen.items():
             numbers = tuple(sorted(one.log.number for one in logs))
             size, name = sum(one.size for one in logs), logs[0].recording.name
@@ -483,9 +442,8 @@ class _Planning:
                 f"{listed(sorted(self._shared))}: older files have other topics, too, and go with "
                 "these. A rule for a topic holds for files that are opened after it."
             )
-        left = self._short(_SEGMENTS_FROM, 1.0)
-        self._plan.is_short = left > 0
-        if left > 0:
+        if (left := self._short(_FROM)) > 0:
+            self._plan.is_short = True
             self._plan.warnings.append(
                 f"{size(left)} more should be deleted, but all that is left must stay: it is "
                 "pinned, being recorded, or tables and the index."

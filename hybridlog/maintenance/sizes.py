@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from itertools import chain
 from typing import TYPE_CHECKING, TypeVar
@@ -113,12 +113,12 @@ def sizes_of(
     return Sizes(_largest_first(rows), index)
 
 
-def disk_bytes(root: Path) -> int:
-    """Bytes that everything below a folder takes; links are not followed."""
+def disk_bytes(root: Path, but: Collection[str] = ()) -> int:
+    """Bytes that everything below a folder takes, without some names; links are not followed."""
     found, folders = 0, [os.fspath(root)]
     while folders:
         with suppress(OSError), os.scandir(folders.pop()) as entries:  # it may go meanwhile
-            for entry in entries:
+            for entry in (one for one in entries if one.name not in but):
                 with suppress(OSError):
                     found += entry.stat(follow_symlinks=False).st_blocks * 512
                     if entry.is_dir(follow_symlinks=False):

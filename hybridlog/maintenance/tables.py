@@ -1,4 +1,4 @@
-"""Creates, checks and removes the tables of recordings."""
+"""Finds and removes the tables of recordings."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from hybridlog_storage.disk import files
 from hybridlog_storage.errors import StoreError, TopicError
 
 if TYPE_CHECKING:
-    from hybridlog.columns.column_file import ColumnFile
     from hybridlog.columns.tables import Tables
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
@@ -24,41 +23,6 @@ def missing(
     from hybridlog.columns.tables import Tables
 
     return (tables or Tables(directory.path)).lacking(entry, topics_of(entry))
-
-
-class TableChecker:
-    """Checks the tables of recordings; each file once."""
-
-    def __init__(self, directory: StoreDirectory) -> None:
-        from hybridlog.columns.tables import Tables
-
-        self._directory = directory
-        self.tables = Tables(directory.path)
-        self._checked: dict[int, str] = {}
-
-    def damage(self, entry: RecordingEntry) -> dict[str, str]:
-        """Problems of the existing tables, by topic. Reads every byte of them."""
-        found: dict[str, str] = {}
-        for topic in sorted(topics_of(entry)):
-            table = self.tables.of(entry, topic)
-            if table is not None:
-                problems = [*filter(None, map(self._problem, table.files))]
-            else:  # a missing one is no problem
-                damaged = self.tables.damaged(entry, topic)
-                problems = [f"The table {path} is damaged." for path in damaged]
-            if problems:
-                found[topic] = problems[0]
-        return found
-
-    def _problem(self, file: ColumnFile) -> str:
-        """The damage of a file; empty without any."""
-        if file.number not in self._checked:
-            try:
-                file.check()
-                self._checked[file.number] = ""
-            except StoreError as error:
-                self._checked[file.number] = str(error)
-        return self._checked[file.number]
 
 
 def remove(directory: StoreDirectory, recording: str, entry: RecordingEntry | None = None) -> None:

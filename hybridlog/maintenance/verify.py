@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING
 
 from msgspec import Struct, field, structs
 
-from hybridlog.columns.recording_logs import RecordingRows
+from hybridlog.columns.layout import topics_of
 from hybridlog.columns.rows_file import RowsFile
 from hybridlog.entries import free_name_in, made_again, put_entry
 from hybridlog.follow.follower import bring, make_tables
-from hybridlog.maintenance import tables
 from hybridlog.maintenance.opening import recover, recover_segments
 from hybridlog.maintenance.report import Repaired, reporter
-from hybridlog_storage.catalog import WHOLE, file_of
+from hybridlog_storage.catalog import WHOLE
 from hybridlog_storage.disk.directory import LOCK, LOCK_WAIT_S
 from hybridlog_storage.errors import (
     HeldError,
@@ -30,12 +29,13 @@ from hybridlog_storage.errors import (
 from hybridlog_storage.manifest import encode, replace
 from hybridlog_storage.manifests import DiskManifests
 from hybridlog_storage.segments.recovery import damage_of, rebuild_summary
-from hybridlog_storage.segments.segment_reader import SegmentReader, open_log
+from hybridlog_storage.segments.segment_reader import SegmentReader
 from hybridlog_storage.settings import EMBEDDED, is_uri, read_settings, write_settings
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from hybridlog.columns.column_file import ColumnFile
     from hybridlog.maintenance.report import Progress, RepairReport
     from hybridlog.opened import OpenStore
     from hybridlog_storage.catalog import Catalog, RecordingEntry
@@ -98,13 +98,15 @@ def verify(
     nothing is written.
     """
     directory, left, result = shared.directory, list[Finding](), Verification()
+    if names is None:
+        names = {one: one for one in (*directory.ids(), *directory.manifests.without())}
     if repairs:
         left = _repair(shared, names, result.repaired, progress)
         shared.invalidate()
-    checker = tables.TableChecker(directory)
-    for recording in _all(directory) if names is None else names:
+    tables = TableChecker(directory)
+    for recording in names:
         result.recordings += 1
-        check = _Check(directory, shared.catalog, recording, result, checker)
+        check = _Check(directory, shared.catalog, tables, result, recording, recording)
         try:
             check.run(progress)
         except ManifestError as error:
@@ -117,43 +119,73 @@ def verify(
     return result
 
 
-def _all(directory: StoreDirectory) -> list[str]:
-    return [*directory.ids(), *directory.manifests.without()]
+class TableChecker:
+    """Checks the tables of recordings; each file once."""
+
+    def __init__(self, directory: StoreDirectory) -> None:
+        from hybridlog.columns.tables import Tables
+
+        self.tables = Tables(directory.path)
+        self._checked: dict[int, str] = {}
+
+    def lacking(self, entry: RecordingEntry) -> set[str]:
+        """Topics whose tables lack rows, or have others than the recording."""
+        self.tables.look_again()
+        return self.tables.lacking(entry, topics_of(entry))
+
+    def damage(self, entry: RecordingEntry) -> dict[str, str]:
+        """Problems of the existing tables, by topic. Reads every byte of them."""
+        found: dict[str, str] = {}
+        for topic in sorted(topics_of(entry)):
+            table = self.tables.of(entry, topic)
+            if table is not None:
+                problems = [*filter(None, map(self._problem, table.files))]
+            else:  # a missing one is no problem
+                damaged = self.tables.damaged(entry, topic)
+                problems = [f"The table {path} is damaged." for path in damaged]
+            if problems:
+                found[topic] = problems[0]
+        return found
+
+    def _problem(self, file: ColumnFile) -> str:
+        """The damage of a file; empty without any."""
+        if file.number not in self._checked:
+            self._checked[file.number] = ""
+            try:
+                file.check()
+            except StoreError as error:
+                self._checked[file.number] = str(error)
+        return self._checked[file.number]
 
 
-class _Check:
+class _Check(Struct):
     """Checks one recording."""
 
-    def __init__(
-        self,
-        directory: StoreDirectory,
-        catalog: Catalog,
-        recording: str,
-        result: Verification,
-        checker: tables.TableChecker,
-    ) -> None:
-        self._directory, self._catalog, self._checker = directory, catalog, checker
-        self._recording = self._name = recording
-        self._result = result
-        self._path = directory.recording(recording)
-        self._lost: dict[tuple[int, int], str] = {}  # logs that cannot be read, as in the catalog
+    directory: StoreDirectory
+    catalog: Catalog
+    tables: TableChecker
+    result: Verification
+    recording: str
+    name: str
+    lost: dict[tuple[int, int], str] = field(default_factory=dict)
+    """Logs that cannot be read, as in the catalog."""
 
     def found(self, place: str, problem: str, cure: str = _REPAIR) -> None:
         """Add a problem."""
-        cure = RESTORE if self._directory.is_remote else cure
-        self._result.findings.append(Finding(self._name, place, problem, cure))
+        cure = RESTORE if self.directory.is_remote else cure
+        self.result.findings.append(Finding(self.name, place, problem, cure))
 
     def run(self, progress: Progress | None) -> None:
         """Check the whole recording; StoreError if it cannot be read at all."""
-        directory, recording = self._directory, self._recording
+        directory, recording = self.directory, self.recording
         is_held = directory.holder(recording) is not None
         directory.look_closely(recording)
         manifest, listing = directory.manifests.find(recording), directory.listing(recording)
         if manifest is None:
             self.found("manifest", "it is missing, so losses are unknown")
             return
-        self._name = manifest.name
-        self._result.bytes_read += len(encode(manifest))
+        self.name = manifest.name
+        self.result.bytes_read += len(encode(manifest))
         if manifest.status == "unproven":
             self.found(
                 "manifest",
@@ -163,150 +195,141 @@ class _Check:
         files, done = manifest.present.values(), 0
         total = sum(file.bytes for file in files)
         for file in files:
-            tell = reporter(progress, self._name, total, done)
-            self._file(file, listing, tell)
+            self._file(file, listing, reporter(progress, self.name, total, done))
             done += file.bytes
         if not is_held and directory.holder(recording) is None:
             self._others(listing, manifest)
-        known = self._catalog.damage(recording)
-        if not self._lost.keys() <= known.keys():
-            self._catalog.put_damage(recording, {**self._lost, **known})
-        entry = put_entry(directory, self._catalog, recording)
-        self._result.messages += entry.messages + len(entry.manifest.marks)
+        known = self.catalog.damage(recording)
+        if not self.lost.keys() <= known.keys():
+            self.catalog.put_damage(recording, {**self.lost, **known})
+        entry = put_entry(directory, self.catalog, recording)
+        self.result.messages += entry.messages + len(entry.manifest.marks)
         if entry.status != "open":
-            for topic, problem in self._checker.damage(entry).items():
+            for topic, problem in self.tables.damage(entry).items():
                 self.found(f"table of {topic}", problem)
 
     def _file(self, file: File, listing: Listing, tell: Callable[[int], None]) -> None:
         """Compare a file with its digest; of a log that differs, find what is lost."""
+        self.result.bytes_read += max(listing.sizes.get(file.name, 0), 0)
         damage = [*self._damage(file, listing, tell)]
-        if damage:
-            directory, now = self._directory, self._directory.manifests.find(self._recording)
-            if now is None or file not in now.present.values():
-                return  # it was let go, or replaced, meanwhile
-            if file.kind == "log" and file.number in directory.listing(self._recording).open:
-                return  # it is about to get its name
+        if not damage:
+            self.result.chunks += file.chunks
+            return
+        now = self.directory.manifests.find(self.recording)
+        # It may have been let go, or replaced, meanwhile, or is about to get its name.
+        is_listed = now is not None and file in now.present.values()
+        if is_listed and file.number not in self.directory.listing(self.recording).open:
             for found in damage:
                 self.found(*found)
-        else:
-            self._result.chunks += file.chunks
-        self._result.bytes_read += max(listing.sizes.get(file.name, 0), 0)
 
     def _damage(
         self, file: File, listing: Listing, tell: Callable[[int], None]
     ) -> Iterator[tuple[str, str, str]]:
         """Place, problem and cure of what is damaged in a file."""
-        path = self._path / file.name
+        path = self.directory.recording(self.recording)
         if file.name not in listing.sizes:
             yield file.name, "it is missing", RESTORE if file.kind == "rows" else _RESTORE_LOST
-        elif file.kind == "rows":
-            try:
-                RowsFile(self._path, file).check()
-            except StoreError as error:
-                yield file.name, str(error), RESTORE
-        else:
-            try:
-                found, has_summary = damage_of(path, file.digest, tell)
-            except SegmentError as error:
-                found, has_summary = [], True
-                yield file.name, str(error), RESTORE
-            if not has_summary or (found and not found[0].offset):  # or it is another one
-                self._lost[file.number, WHOLE] = ""
-            cure = RESTORE if has_summary or found[1:] else _REPAIR
-            for at, problem, _ in found:
-                yield f"{file.name} byte {at}", problem, cure
+            return
+        try:
+            if file.kind == "rows":
+                RowsFile(path, file).check()
+                return
+            found, has_summary = damage_of(path / file.name, file.digest, tell)
+        except StoreError as error:
+            found, has_summary = [], file.kind == "rows" or not isinstance(error, SegmentError)
+            yield file.name, str(error), RESTORE
+        if not has_summary or (found and not found[0].offset):  # or it is another one
+            self.lost[file.number, WHOLE] = ""
+        cure = RESTORE if has_summary or found[1:] else _REPAIR
+        for at, problem, _ in found:
+            yield f"{file.name} byte {at}", problem, cure
 
     def _others(self, listing: Listing, manifest: Manifest) -> None:
         """Find files that the manifest does not list."""
-        left, listing = listing.left_over(manifest), listing.choosing(manifest)
+        left = listing.left_over(manifest)
         for name in left:
             self.found(name, "it was left over by a command that was stopped")
         for name in listing.open.values():
             self.found(name, "a crash has left it open")
-        for number, name in listing.sealed.items():
-            if number not in manifest.logs and name not in left:
-                self.found(name, "the manifest does not list it", f"{_REPAIR}, or {_MOVE}")
-        for name in sorted({*listing.others} - {*left, LOCK}):
-            self.found(name, "it is not a file of a recording", _MOVE)
+        known = {*manifest.present, *left, LOCK}
+        for name in sorted({*listing.sealed.values(), *listing.rows, *listing.others} - known):
+            self.found(name, "the manifest does not list it", f"{_REPAIR}, or {_MOVE}")
 
 
 def _repair(
-    shared: OpenStore,
-    names: Mapping[str, str] | None,
-    done: list[Repaired],
-    progress: Progress | None,
+    shared: OpenStore, names: Mapping[str, str], done: list[Repaired], progress: Progress | None
 ) -> list[Finding]:
     """Repair files, manifests, the catalog, tables and index; returns what was not repaired."""
-    directory, catalog, repairs = shared.directory, shared.catalog, shared.repairs
+    directory, catalog, report = shared.directory, shared.catalog, shared.repairs
     directory.check_writable()
-    database, left = shared.index.reached(writes=True), list[Finding]()
-    checker = tables.TableChecker(directory)
-    chosen = {one: one for one in _all(directory)} if names is None else names
-    for recording, name in chosen.items():
+    database, left, tables = shared.index.reached(writes=True), [], TableChecker(directory)
+    for recording, name in names.items():
         try:
             with directory.writing(recording, name, wait_s=LOCK_WAIT_S):
-                done += _repair_one(directory, repairs, recording)
+                made, is_restored = _repair_one(directory, catalog, report, recording)
+                done += made
                 entry = put_entry(directory, catalog, recording)
             if entry.status == "open":
                 continue
-            if database is not None and _is_restored(directory, catalog, entry):
+            if database is not None and is_restored:
                 bring(directory, catalog, entry, database, anew=True, progress=progress)
                 done.append(Repaired(entry.name, "index", "damaged chunks are readable again"))
                 entry = put_entry(directory, catalog, recording)
             if entry.status != "damaged":  # tables of lost data are valid once it is restored
-                made, failed = _make_tables(directory, catalog, checker, entry)
-                done += made
-                left += failed
+                left += _make_tables(directory, catalog, tables, entry, done)
         except RecordingGoneError:
             continue  # its removal was finished
-        except HeldError as error:
-            if names is not None or recording in repairs.unreadable:
-                left.append(Finding(name, "recording", str(error), AGAIN))
         except (StoreError, TopicError) as error:
-            left.append(Finding(name, "recording", str(error), AGAIN))
+            # What another process holds is no problem unless it was named, or cannot be read.
+            if not isinstance(error, HeldError) or name != recording or name in report.unreadable:
+                left.append(Finding(name, "recording", str(error), AGAIN))
     return left
 
 
 def _make_tables(
-    directory: StoreDirectory, catalog: Catalog, checker: tables.TableChecker, entry: RecordingEntry
-) -> tuple[list[Repaired], list[Finding]]:
-    """Make missing and damaged tables again; returns which, and which cannot be made."""
-    damaged = checker.damage(entry)
-    wanted = tables.missing(directory, entry, checker.tables).union(damaged)
-    if not wanted:
-        return [], []
-    problem = make_tables(directory, catalog, entry, topics=damaged)
-    checker.tables.look_again()
-    damaged = checker.damage(entry)
-    left = tables.missing(directory, entry, checker.tables).union(damaged)
-    places = {one: f"table of {one}" for one in sorted(wanted)}
-    done = [Repaired(entry.name, places[one], "made again") for one in places if one not in left]
-    return done, [
-        Finding(entry.name, places[one], f"it cannot be made again: {why}", AGAIN)
-        for one in places
-        if (why := problem or damaged.get(one))
-    ]
+    directory: StoreDirectory,
+    catalog: Catalog,
+    tables: TableChecker,
+    entry: RecordingEntry,
+    done: list[Repaired],
+) -> list[Finding]:
+    """Make missing and damaged tables again, which are then `done`; returns why not, if not."""
+    damaged = tables.damage(entry)
+    wanted = sorted(tables.lacking(entry).union(damaged))
+    problem = make_tables(directory, catalog, entry, topics=damaged) if wanted else ""
+    if problem:
+        why = f"it cannot be made again: {problem}"
+        return [Finding(entry.name, f"table of {topic}", why, AGAIN) for topic in wanted]
+    left = tables.lacking(entry) if wanted else ()
+    made = [topic for topic in wanted if topic not in left]
+    done += (Repaired(entry.name, f"table of {topic}", "made again") for topic in made)
+    return []
 
 
-def _repair_one(directory: StoreDirectory, report: RepairReport, recording: str) -> list[Repaired]:
+def _repair_one(
+    directory: StoreDirectory, catalog: Catalog, report: RepairReport, recording: str
+) -> tuple[list[Repaired], bool]:
+    """Repair manifest and summaries; tells also whether damaged segments are whole again."""
     done, path = _manifest(directory, report, recording), directory.recording(recording)
-    manifest = directory.manifests.read(recording)
+    manifest, is_restored = directory.manifests.read(recording), False
+    damaged = {number for number, _ in catalog.damage(recording)}
     for number, log in manifest.logs.items():
         if log.is_here:
             with suppress(StoreError), SegmentReader(path / log.name, number) as reader:
                 # Damage that stays is found by `verify`, which comes next.
-                if reader.digest() != log.digest and rebuild_summary(path / log.name):
+                if reader.digest() == log.digest:
+                    is_restored = is_restored or number in damaged
+                elif rebuild_summary(path / log.name):
                     done.append(Repaired(manifest.name, log.name, "its summary was rebuilt"))
-    return done
+    return done, is_restored
 
 
 def _manifest(directory: StoreDirectory, report: RepairReport, recording: str) -> list[Repaired]:
-    manifests, is_lost = DiskManifests(directory.path), True
+    manifests = DiskManifests(directory.path)
     with suppress(ManifestError):
-        is_lost = manifests.find(recording) is None
-    if not is_lost:
-        recover(directory, recording, report)
-        return []
+        if manifests.find(recording) is not None:
+            recover(directory, recording, report)
+            return []
     recover_segments(directory, recording, directory.listing(recording), None)
 
     def make(old: Manifest | None) -> Manifest:
@@ -316,16 +339,6 @@ def _manifest(directory: StoreDirectory, report: RepairReport, recording: str) -
 
     made = manifests.restore(recording, make)
     return [Repaired(made.name, "manifest", "made again")]
-
-
-def _is_restored(directory: StoreDirectory, catalog: Catalog, entry: RecordingEntry) -> bool:
-    """True if an unreadable chunk is readable again, after its file was restored."""
-    for number, chunk in catalog.damage(entry.id):
-        path = directory.recording(entry.id) / file_of(entry, number)
-        with suppress(SegmentError), open_log(path, number, RecordingRows(path.parent)) as reader:
-            reader.read_chunk(reader.summary().chunks[chunk])
-            return True
-    return False
 
 
 def become_another(path: Path, mongo: str | None) -> None:

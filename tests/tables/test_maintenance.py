@@ -15,7 +15,7 @@ from hybridlog.columns.layout import PARTS, TABLES
 from hybridlog.columns.tables import Tables
 from hybridlog.follow.follower import make_tables
 from hybridlog.maintenance import tables as making
-from hybridlog.maintenance.verify import RESTORE
+from hybridlog.maintenance.verify import RESTORE, TableChecker
 from hybridlog.record.marks import MARKS
 from tests import places
 from tests.damage import flip
@@ -152,7 +152,7 @@ def test_rows_of_another_segment_are_not_kept(few: hl.Store) -> None:
         pieces.append((replace(section, segments=stale), table.slice(before, section.rows)))
         before += section.rows
     folders._write(path, pieces)
-    assert not making.TableChecker(few.directory).damage(entry)
+    assert not TableChecker(few.directory).damage(entry)
     assert making.missing(few.directory, entry) == {"/a", "/b"}
     assert not make_tables(few.directory, few.shared.catalog, entry, topics=["/a"])
     assert making.missing(few.directory, entry) == set()

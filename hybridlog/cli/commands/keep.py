@@ -73,8 +73,8 @@ def keep_command(given: _Given) -> int:
     """Keep the store within a quota; pin what never goes.
 
     Payloads go, fields and counts stay. Without options for rules, those of [retention] in
-    hybridlog.toml hold. Above 80 % of the quota payloads of the topics of --topic go, above
-    90 % whole segments, the oldest first. Exits with 1 when not enough may go.
+    hybridlog.toml hold. Above 90 % of the quota payloads go until it is 80 %, those of the
+    topics of --topic first, then the oldest. Exits with 1 when not enough may go.
     """
     rules, is_all = {} if given.pin else _rules(given), given.choice.is_everything
     if given.pin and is_all:
