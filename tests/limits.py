@@ -33,7 +33,6 @@ PLACES = {
     "foxglove_pause_s": "hybridlog.live.sources.foxglove.connection._PAUSE_S",
     "foxglove_send_s": "hybridlog.live.sources.foxglove.connection._SEND_S",
     "foxglove_retry_s": "hybridlog.live.sources.foxglove.connection._RETRY_S",
-    "outbox_payload_bytes": "hybridlog.live.sources.ros2.child.outbox.MAX_PAYLOAD",
     "ros2_hello_s": "hybridlog.live.sources.ros2.source.HELLO_S",
     "ros2_hand_over_s": "hybridlog.live.sources.ros2.source._HAND_OVER_S",
     "ros2_pause_s": "hybridlog.live.sources.ros2.source._PAUSE_S",

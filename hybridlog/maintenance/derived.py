@@ -151,11 +151,12 @@ def index_arrays(
     for entry in entries:
         own = topics_of(entry) & found.keys()
         wanted = {topic for topic in own if _differs(known, entry, topic, off=off)}
-        options = {"topics": wanted, "progress": progress}
-        problem = wanted and make_tables(directory, catalog, entry, **options)
+        if wanted:
+            make_tables(directory, catalog, entry, topics=wanted, progress=progress)
+            known.look_again()
         for topic in wanted:
-            (found[topic].left if problem else found[topic].recordings).append(entry.name)
-    known.look_again()
+            is_left = _differs(known, entry, topic, off=off)
+            (found[topic].left if is_left else found[topic].recordings).append(entry.name)
     channels = [channel for entry in entries for channel in entry.channels]
     for topic, one in found.items():
         types = {type_prefix(one.type) for one in channels if one.topic == topic}

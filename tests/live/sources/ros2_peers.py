@@ -201,7 +201,8 @@ with open(starts) as log:
     start = len(log.readlines())
 
 def event(**what):
-    peer.sendall(event_frame(what))
+    body = json.dumps(what).encode()
+    peer.sendall(HEADER.pack(EVENT, len(body)) + body)
 
 def hello():
     event(event="hello", middleware="rmw_fake")
@@ -211,14 +212,11 @@ def channel(number=0, topic="/a", **more):
                  offered="- durability: 2", hash="")
     event(event="channel", number=number, topic=topic, **{{**known, **more}})
 
-def lost(**what):
-    event(event="lost", topic="/a", first=1, last=1, detail="", **what)
-
 def raw(kind, size, body=b""):
     peer.sendall(HEADER.pack(kind, size) + body)
 
 def message(number, payload, sequence=1):
-    entry = ENTRY.pack(number, len(payload), 1_700_000_000_000_000_000, 0, sequence)
+    entry = ENTRY.pack(number, 1_700_000_000_000_000_000, 0, sequence)
     peer.sendall(HEADER.pack(MESSAGE, len(entry) + len(payload)) + entry + payload)
 
 def wait():

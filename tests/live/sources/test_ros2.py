@@ -107,26 +107,9 @@ def test_a_child_that_does_not_listen_is_ended(
 
 
 BROKEN = [
-    ('raw(9, 100, b"x" * 100)', "kind 9"),
-    ("raw(MESSAGE, 0xFFFFFFFF)", "of 4294967295 bytes"),
-    ("raw(EVENT, 0xFFFFFFFF)", "of 4294967295 bytes"),
-    ("raw(MESSAGE, 3)", "of 3 bytes"),
-    ('raw(EVENT, 3, b"{x}")', "JSON"),
-    ('raw(EVENT, 3, b"\\xff\\xfe{")', "JSON"),
-    ('raw(EVENT, 200000, b"[" * 200000)', "JSON"),
-    ('raw(EVENT, 4, b"[ 1]")', "not an object"),
-    ('event(event="what")', "a malformed event: {'event': 'what'}"),
-    ('event(event="gone", topic=5)', "topic"),
-    ('channel(number="x")', "number"),
-    ('channel(definition="\\ud800")', "not text"),
-    ('lost(cause="x", count=1)', "cause"),
-    ('lost(cause="queue", count=-1)', "count"),
-    ('message(99, b"x")', "an unknown channel"),
-    ('raw(MESSAGE, ENTRY.size + 5, ENTRY.pack(0, 4, 1, 1, 1) + b"12345")', "not as long"),
     ('peer.sendall(b"\\1\\0")\nos._exit(3)', "middle"),
     (
-        "raw(MESSAGE, 1 << 30, ENTRY.pack(0, (1 << 30) - ENTRY.size, 1, 1, 1) + bytes(1000))\n"
-        "os._exit(3)",
+        "raw(MESSAGE, 1 << 30, ENTRY.pack(0, 1, 1, 1) + bytes(1000))\nos._exit(3)",
         "middle",
     ),
     (
@@ -242,9 +225,6 @@ def test_a_python_without_rclpy() -> None:
     ("body", "reason"),
     [
         ('event(event="failed", missing=False, why="RCLError: no\\nroom")', "RCLError: no room"),
-        ('peer.sendall(b"GET / HTTP/1.1")', "unknown kind"),
-        ("peer.sendall(HEADER.pack(EVENT, 1 << 24))", "something else than a greeting"),
-        ('peer.sendall(HEADER.pack(EVENT, 2) + b"[]")', "not an object"),
     ],
 )
 def test_ros_that_does_not_come_up(tmp_path: Path, body: str, reason: str) -> None:

@@ -8,6 +8,7 @@ import socket
 import sys
 import time
 from pathlib import Path
+from threading import Thread
 from types import SimpleNamespace
 from typing import Any
 from xml.etree import ElementTree as ET
@@ -19,13 +20,11 @@ from hybridlog.live.sources.ros2.child import topics
 from hybridlog.live.sources.ros2.child.child import Child
 from hybridlog.live.sources.ros2.child.definitions import Definition, Definitions, UnknownTypeError
 from hybridlog.live.sources.ros2.child.middleware import VARIABLES, Offer, Profile
-from hybridlog.live.sources.ros2.child.outbox import MAX_PAYLOAD, Outbox
+from hybridlog.live.sources.ros2.child.outbox import Outbox
 from hybridlog.live.sources.ros2.child.topics import Topics
 from hybridlog.live.sources.ros2.source import Receiver
 from tests.imports import ROOT, imports_of
-from tests.limits import Limit
 from tests.live.sources.heard import Heard
-from tests.waiting import wait_for
 
 GAPS = "hybridlog.live.sources.sequence_gaps"
 CHILD = "hybridlog.live.sources.ros2.child"
@@ -105,51 +104,27 @@ def test_types_that_cannot_be_said(tmp_path: Path, name: str, reason: str) -> No
         definitions.find(name)
 
 
-def drained(peer: socket.socket, outbox: Outbox) -> Heard:
-    """What a receiver at the other end makes of all that an outbox holds."""
-    from threading import Thread
-
-    heard = Heard()
-    ours, theirs = peer, outbox._peer
-    receiver = Receiver(ours, heard, {})
-    reader = Thread(target=receiver.run)
-    reader.start()
-    wait_for(outbox.send)
-    theirs.shutdown(socket.SHUT_WR)
-    reader.join()
-    return heard
-
-
-def test_what_finds_no_room_is_counted() -> None:
+def test_messages_and_events_arrive_in_their_order() -> None:
     ours, theirs = socket.socketpair()
+    heard = Heard()
+    reader = Thread(target=Receiver(ours, heard, {}).run)
     with ours, theirs:
-        outbox = Outbox(theirs, budget=1 << 20)
+        reader.start()
+        outbox = Outbox(theirs)
         definition = Definition("ros2msg", b"caf\xff", has_bytes=False)
         assert outbox.channel("/x", "a/msg/B", definition, "", "") == 0
-        for at in range(100):
-            outbox.message(0, bytes(50_000), 10 + at, 0, -1)
-            outbox.send()
-        assert outbox.waiting <= 1 << 20
-        outbox.report_refused()
-        heard = drained(ours, outbox)
+        sizes = [0, 5, 32 << 10, 3, 3 << 20, *[20_000] * 100, 1]
+        for number, size in enumerate(sizes):
+            outbox.message(0, bytes([number % 256]) * size, 10 + number, 0, number)
+        outbox.lost("/x", "transport", 3)
+        theirs.shutdown(socket.SHUT_WR)
+        reader.join()
+    assert [(len(one.payload), one.sequence) for one in heard.taken] == [
+        (size, number) for number, size in enumerate(sizes)
+    ]
+    assert heard.taken[0].channel.schema.data == b"caf\xff"  # type: ignore[union-attr]
     [loss] = heard.losses
-    assert (loss.topic, loss.cause, loss.last) == ("/x", "queue", 109)
-    assert loss.count is not None
-    assert loss.count + len(heard.taken) == 100
-    assert loss.first == 10 + len(heard.taken)
-
-
-def test_a_large_message_goes_if_nothing_waits_and_the_wire_takes_it(limit: Limit) -> None:
-    assert MAX_PAYLOAD < 1 << 32
-    limit(outbox_payload_bytes=5000)
-    ours, theirs = socket.socketpair()
-    with ours, theirs:
-        outbox = Outbox(theirs, budget=1000)
-        outbox.message(0, bytes(5000), 1, 0, -1)
-        assert not outbox.refused
-        outbox = Outbox(theirs)
-        outbox.message(0, bytes(5001), 1, 0, -1)
-        assert outbox.refused[0][0] == 1
+    assert (loss.topic, loss.cause, loss.count) == ("/x", "transport", 3)
 
 
 class FakeSubscription:
@@ -200,7 +175,7 @@ class Rig:
             def message(self, *message: Any) -> None:
                 rig.messages.append(message)
 
-        peer: Any = SimpleNamespace(setblocking=lambda _: None)
+        peer: Any = SimpleNamespace(sendall=lambda _: None)
         self.box: Any = Box(peer)
         found = packages(
             folder,

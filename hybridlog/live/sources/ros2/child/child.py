@@ -6,19 +6,19 @@ One thread does everything except reading the recorder's commands.
 
 from __future__ import annotations
 
+import json
 import os
-import select
 import signal
 import socket
-import sys
 import threading
 import time
 from collections import deque
+from contextlib import suppress
 from typing import Any
 
 from hybridlog.live.sources.ros2.child.definitions import Definitions, share_folders
 from hybridlog.live.sources.ros2.child.middleware import Middleware
-from hybridlog.live.sources.ros2.child.outbox import Outbox, WireError, parse_object
+from hybridlog.live.sources.ros2.child.outbox import Outbox
 from hybridlog.live.sources.ros2.child.topics import Topics
 
 _LOOK_S = 0.5
@@ -28,14 +28,13 @@ _IDLE_S = 0.5
 _PAUSE_S = 0.001
 _SMALL_COUNT = 64
 _SMALL_BYTES = 1 << 20
-_SEND_BYTES = 1 << 20
 _SHORT_WAIT_S = 0.01
 _DRAIN_S = 0.5
-_FLUSH_S = 2.0
+_LEAVE_S = 4.0
 
 
 class Child:
-    """Moves messages from ROS into the outbox, and the outbox into the socket."""
+    """Moves messages from ROS into the socket."""
 
     def __init__(self, middleware: Middleware, topics: Topics, outbox: Outbox) -> None:
         self._middleware = middleware
@@ -58,10 +57,8 @@ class Child:
 
     # The main thread.
 
-    def run(self, peer: socket.socket) -> None:
+    def run(self) -> None:
         """Works until it is stopped; OSError if the recorder has ended."""
-        writable = select.poll()
-        writable.register(peer, select.POLLOUT)
         began = next_look = time.monotonic()
         while not self._is_stopping:
             while self._commands:
@@ -72,16 +69,15 @@ class Child:
                 self._topics.look()
                 # A new recorder needs the existing topics at once.
                 next_look = now + (_FIRST_LOOKS_S if now - began < _EAGER_S else _LOOK_S)
-            wait = 0.0
-            if self._outbox.send():
-                wait = max(0.0, min(_IDLE_S, next_look - time.monotonic()))
-            count, size = self._take(wait)
-            if not self._outbox.send():
-                writable.poll(2)
-            elif count < _SMALL_COUNT and size < _SMALL_BYTES:
+            count, size = self._take(max(0.0, min(_IDLE_S, next_look - time.monotonic())))
+            if count < _SMALL_COUNT and size < _SMALL_BYTES:
                 # A short pause, so that messages come in batches and not one per wake-up.
                 time.sleep(_PAUSE_S)
-        self._finish(writable)
+        deadline = time.monotonic() + _DRAIN_S
+        while self._take(_SHORT_WAIT_S)[0] >= _SMALL_COUNT and time.monotonic() < deadline:
+            pass
+        self._topics.account(final=True)
+        self._outbox.event("bye")
 
     def _take(self, wait: float) -> tuple[int, int]:
         """Takes messages, and waits `wait` seconds at most; returns their number and bytes."""
@@ -99,23 +95,8 @@ class Child:
                 continue
             count += taken
             size += taken_size
-            if taken_size >= _SEND_BYTES:
-                # The recorder can work meanwhile, and the next topic has room.
-                self._outbox.send()
-        self._outbox.close_batch()
+        self._outbox.flush()
         return count, size
-
-    def _finish(self, writable: select.poll) -> None:
-        """Passes on the messages received so far, for a limited time."""
-        deadline = time.monotonic() + _DRAIN_S
-        while self._take(_SHORT_WAIT_S)[0] >= _SMALL_COUNT and time.monotonic() < deadline:
-            if not self._outbox.send():
-                writable.poll(2)
-        self._topics.account(final=True)
-        self._outbox.event("bye")
-        deadline = time.monotonic() + _FLUSH_S
-        while not self._outbox.send() and time.monotonic() < deadline:
-            writable.poll(100)
 
 
 def run(number: int) -> int:
@@ -129,7 +110,6 @@ def run(number: int) -> int:
         # The recorder reports any error of ROS.
         why = f"{type(error).__name__}: {error}"
         outbox.event("failed", missing=isinstance(error, ImportError), why=why)
-        outbox.send()
         return 1
     topics = Topics(middleware, outbox, Definitions(share_folders()))
     child = Child(middleware, topics, outbox)
@@ -137,7 +117,7 @@ def run(number: int) -> int:
     signal.signal(signal.SIGTERM, lambda _number, _frame: child.stop())
     threading.Thread(target=_listen, args=(peer, child), daemon=True).start()
     try:
-        child.run(peer)
+        child.run()
     except (BrokenPipeError, ConnectionResetError):
         # The recorder has died.
         return 1
@@ -148,27 +128,10 @@ def run(number: int) -> int:
 
 def _listen(peer: socket.socket, child: Child) -> None:
     """Reads the recorder's commands until the end of input."""
-    readable = select.poll()
-    readable.register(peer, select.POLLIN)
-    rest = b""
-    while True:
-        readable.poll()
-        try:
-            data = peer.recv(1 << 16)
-        except BlockingIOError:
-            continue
-        except OSError:
-            data = b""
-        if not data:
-            break
-        *lines, rest = (rest + data).split(b"\n")
-        try:
-            for line in lines:
-                child.command(parse_object(line))
-        except WireError as error:
-            print(f"malformed command: {error}", file=sys.stderr)  # noqa: T201
-            break
+    with suppress(OSError), peer.makefile("rb") as lines:
+        for line in lines:
+            child.command(json.loads(line))
     child.stop()
     # Even if the middleware hangs, the child must not outlive the recorder.
-    time.sleep(2 * _FLUSH_S)
+    time.sleep(_LEAVE_S)
     os._exit(1)

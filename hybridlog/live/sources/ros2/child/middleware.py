@@ -321,8 +321,8 @@ RELIABLE, BEST_EFFORT = 1, 2
 TRANSIENT_LOCAL, VOLATILE = 1, 2
 AUTOMATIC = 1
 
-DEPTH = 1000
-"""Messages that the middleware queues for a subscription, enough for a burst.
+DEPTH = 4000
+"""Messages that the middleware queues for a subscription, while the recorder reads others.
 
 The queue takes memory only for messages that it holds.
 """

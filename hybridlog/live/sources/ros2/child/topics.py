@@ -207,11 +207,10 @@ class Topics:
         self._outbox.lost(topic.name, "unreadable", None, detail=problem)
 
     def account(self, *, final: bool = False) -> None:
-        """Reports losses in transport and in the outbox."""
+        """Reports losses in transport."""
         for topic in self.owners.values():
             assert topic.stream is not None
             self._account(topic, topic.stream, final=final)
-        self._outbox.report_refused()
 
     def _account(self, topic: Topic, stream: Stream, *, final: bool) -> None:
         if len(topic.nodes) > MAX_PUBLISHERS:
