@@ -291,7 +291,7 @@ def _show(state: RecorderState, table: output.Drawn | None, *, as_json: bool) ->
         draw(state, table)
     elif as_json:
         with suppress(BrokenPipeError):  # who reads it may go; the recording goes on
-            output.print_json({"state": summary_of(state)}, at_once=True)
+            output.print_json({"state": asdict(state)}, at_once=True)
 
 
 def notify_service(*assignments: str) -> None:

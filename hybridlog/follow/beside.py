@@ -20,8 +20,8 @@ import hybridlog
 from hybridlog.entries import put_entry
 from hybridlog.follow.child import ENDED, Task, Trigger
 from hybridlog.follow.follower import Follower, begin_again, make_rows_ahead
+from hybridlog.maintenance.opening import missing
 from hybridlog.maintenance.report import Followed
-from hybridlog.maintenance.tables import missing
 from hybridlog.query.answers.follow import Arrivals
 from hybridlog.query.predicate.types import check
 from hybridlog.query.question import Counters, Question

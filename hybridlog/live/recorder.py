@@ -367,6 +367,8 @@ class Recorder:
             breaches=self._silence.breaches,
             clock_set_s=self._clock.set_by / 1e9,
             sim_time=None if self._simulated is None else self._simulated.latest,
+            hz=sum(topic.hz for topic in topics),
+            bytes_per_s=sum(topic.bytes_per_s for topic in topics),
         )
         self._check_limits(state)
         self._says.write(state)

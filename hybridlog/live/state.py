@@ -11,11 +11,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 from msgspec import Struct, field
-from msgspec.structs import asdict
 
 from hybridlog.record.losses import Cause
 from hybridlog_storage.disk import files
@@ -53,21 +52,8 @@ class RecorderState(Struct, frozen=True):
     breaches: int = 0
     clock_set_s: float = 0.0
     sim_time: int | None = None
-
-    @property
-    def hz(self) -> float:
-        """Messages a second since the previous look."""
-        return sum(topic.hz for topic in self.topics)
-
-    @property
-    def bytes_per_s(self) -> float:
-        """Payload bytes a second since the previous look."""
-        return sum(topic.bytes_per_s for topic in self.topics)
-
-
-def summary_of(state: RecorderState) -> dict[str, Any]:
-    """A state as JSON, for scripts."""
-    return {**asdict(state), "hz": state.hz, "bytes_per_s": state.bytes_per_s}
+    hz: float = 0.0
+    bytes_per_s: float = 0.0
 
 
 class StateFile:
@@ -139,34 +125,23 @@ def states(directory: StoreDirectory, recording: str, every_s: float) -> Iterato
 def choose(directory: StoreDirectory, named: Sequence[str]) -> list[str]:
     """The ids of recordings that recorders write; without names, the only one.
 
-    Raises:
-        UsageError: No recorder runs, several run and no name is given, or a name matches
-            none or several.
+    A name is that of a recording, its id, or the beginning of one of them. UsageError if no
+    recorder runs, or a name fits none or several.
     """
-    names = running(directory)
+    names, found = running(directory), list[str]()
     if not names:
         raise UsageError("No recorder runs on this store; start one with `hybridlog record`.")
-    if not named and len(names) > 1:
-        raise UsageError(f"Several recorders run; name one of {', '.join(names.values())}.")
-    return list(dict.fromkeys(_resolve(name, names) for name in named)) or [*names]
-
-
-def _resolve(name: str, recorders: Mapping[str, str]) -> str:
-    """The id of the running recorder that a user's name means.
-
-    Raises:
-        UsageError: No recorder matches, or several do.
-    """
-    fitting = [one for one, known in recorders.items() if name in {one, known}] or [
-        one
-        for one, known in recorders.items()
-        if name and any(text.startswith(name) for text in (known, one, one[-16:]))
-    ]
-    if len(fitting) != 1:
-        what = "is ambiguous" if fitting else "is no running recorder"
-        known = ", ".join(recorders[one] for one in fitting or recorders)
-        raise UsageError(f"{name!r} {what}: name one of {known}.")
-    return fitting[0]
+    for name in named or [""]:
+        fitting = [one for one, known in names.items() if name in {one, known}] or [
+            one
+            for one, known in names.items()
+            if any(text.startswith(name) for text in (known, one, one[-16:]))
+        ]
+        if len(fitting) != 1:
+            what = f"{name!r} is no running recorder" if name else "Several recorders run"
+            raise UsageError(f"{what}: name one of {', '.join(names.values())}.")
+        found += fitting
+    return list(dict.fromkeys(found))
 
 
 def _path(store: Path, recording: str) -> Path:

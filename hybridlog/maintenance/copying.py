@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Final
 
 from hybridlog.entries import free_name_in
 from hybridlog.opened import OpenStore
+from hybridlog.snapshot import UNFINISHED
 from hybridlog.wording import counted
 from hybridlog_storage import copy
 from hybridlog_storage.copy_places import Directory, RefusedError
@@ -106,12 +107,16 @@ class Copying:
 
     def run(self, chosen: Sequence[RecordingSummary]) -> None:
         """Copy some recordings; after an error what was copied stays, and it can be run again."""
-        self._directory, options = self.shared.directory, self.options
-        if options.only_fields and options.then_expire:
+        self._directory = directory = self.shared.directory
+        if self.options.only_fields and self.options.then_expire:
             raise UsageError("Payloads that are not copied cannot expire: drop one of the two.")
-        if options.then_expire:
-            self._directory.check_writable()
-        self._source = self._source_of(self._directory)
+        if self.options.then_expire:
+            directory.check_writable()
+        self._source: Source = Directory(directory.path)
+        if directory.is_remote:
+            from hybridlog_storage.remote.store import mount
+
+            self._source = mount(directory.place)
         self._arrived: list[str] = []  # ids of recordings of which something was copied
         self._done = 0  # bytes of recordings before, and after this one
         self._left = sum(one.stored_bytes for one in chosen)
@@ -123,14 +128,6 @@ class Copying:
             for one in chosen:
                 self._left -= one.stored_bytes
                 self._copy(one)
-
-    @staticmethod
-    def _source_of(directory: StoreDirectory) -> Source:
-        if directory.is_remote:
-            from hybridlog_storage.remote.store import mount
-
-            return mount(directory.place)
-        return Directory(directory.path)
 
     @contextmanager
     def _opened(self) -> Iterator[tuple[Place, Callable[[str], str]]]:
@@ -187,33 +184,15 @@ class Copying:
 
         Paths do not tell, nor does the id of a store, which its backups have, too.
         """
-        if not isinstance(self._source, Directory):
+        if self._directory.is_remote or not self._directory.is_writable:
             return self._source.address == self._place.address
-        if not self._directory.is_writable:
-            return False  # nothing of it can be deleted
         try:
-            with self._source.marked() as mark:
+            with Directory(self._directory.path).marked() as mark:
                 return mark in self._place.sizes(MANIFESTS)
         except StoreError:
             if self.options.then_expire:
                 raise
             return False  # a full disk can be copied from
-
-    def _how(self, one: RecordingSummary) -> copy.How:
-        options = self.options
-
-        def progress(done: int, total: int) -> None:
-            if self.progress is not None:
-                self.progress(one.name, self._done + done, self._done + total + self._left)
-
-        return copy.How(
-            self._without_payloads if options.only_fields else None,
-            options.check,
-            options.limit_rate,
-            self._named,
-            progress,
-            partial(self._let_go, one) if options.then_expire else None,
-        )
 
     @contextmanager
     def _without_payloads(self, now: Manifest, logs: list[File]) -> Iterator[copy.Prepared]:
@@ -234,15 +213,28 @@ class Copying:
 
     def _copy(self, one: RecordingSummary) -> None:
         report, name = self.report, f"Recording {one.name!r} of {self._directory.place}"
+
+        def progress(done: int, total: int) -> None:
+            if self.progress is not None:
+                self.progress(one.name, self._done + done, self._done + total + self._left)
+
+        options = self.options
+        how = copy.How(
+            self._without_payloads if options.only_fields else None,
+            options.check,
+            options.limit_rate,
+            self._named,
+            progress,
+            partial(self._let_go, one) if options.then_expire else None,
+        )
+        if one.status in UNFINISHED:
+            report.refused[one.name] = (
+                f"{name} has not ended: copy it when it has. After a crash, `hybridlog verify "
+                "--repair` there ends it."
+            )
+            return
         try:
-            if one.status == "open":
-                raise RefusedError(f"{name} is being written. Copy it when it has ended.")
-            if one.status == "unfinished":
-                raise RefusedError(
-                    f"{name} was cut short by a crash. Run `hybridlog verify --repair` there, "
-                    "then copy it."
-                )
-            self._note(one, copy.copy(self._source, self._place, one.id, self._how(one)))
+            self._note(one, copy.copy(self._source, self._place, one.id, how))
         except (RefusedError, ManifestError) as error:
             report.refused[one.name] = str(error)
         except HeldError as error:
@@ -266,8 +258,7 @@ class Copying:
             report.copied.append(name)
         elif not copied.lost:
             report.known.append(name)
-            if copied.lacking:
-                report.lacking.append(name)
+            report.lacking += [name] if copied.lacking else []
 
     def _let_go(self, one: RecordingSummary, proved: Collection[int]) -> None:
         """Let payloads expire here whose copies were proved there just now."""

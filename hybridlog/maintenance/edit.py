@@ -9,7 +9,7 @@ from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING
 
 from hybridlog.entries import free_name_in, text
-from hybridlog.maintenance import tables
+from hybridlog.maintenance.opening import remove_tables
 from hybridlog.query.times import TimeLike, format_time, parse_range, parse_time
 from hybridlog.record.losses import extent_of
 from hybridlog_storage.disk.directory import LOCK_WAIT_S, gone
@@ -268,7 +268,7 @@ def remove_if(
             except RecordingGoneError as error:
                 raise gone(entry.name) from error
             with suppress(OSError, StoreError):  # or else the next change does both
-                tables.remove(directory, entry.id, entry)
+                remove_tables(directory, entry.id, entry)
                 shared.catalog.remove(entry.id)
             if database is not None:
                 with suppress(DatabaseError):

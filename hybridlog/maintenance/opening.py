@@ -1,6 +1,7 @@
 """Looks at the recordings of a store, and finishes what a crash or a killed command has left.
 
 A look reads manifests and names of files, and writes nothing but the catalog. No server is needed.
+What is left over are tables, too: which a recording lacks, and how they are removed, is here.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from msgspec import Struct, field
 
+from hybridlog.columns.layout import PARTS, parts_folder, topics_of, type_prefix
 from hybridlog.entries import (
     NO_MANIFEST,
     Seen,
@@ -22,14 +24,16 @@ from hybridlog.entries import (
     summary_by,
     unlisted,
 )
-from hybridlog.maintenance import tables
 from hybridlog.snapshot import UNFINISHED, Snapshot
 from hybridlog_storage.catalog import Catalog, Damage
+from hybridlog_storage.disk import files
 from hybridlog_storage.errors import DiskFullError, RecordingGoneError, StoreError, TopicError
 from hybridlog_storage.manifest import Loss, Manifest, replace
 
 if TYPE_CHECKING:
+    from hybridlog.columns.tables import Tables
     from hybridlog.maintenance.report import RepairReport
+    from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.disk.directory import Listing, StoreDirectory
     from hybridlog_storage.segments.recovery import Recovered
     from hybridlog_storage.segments.segment_file import Sealed
@@ -125,7 +129,7 @@ class StoreFiles(Struct):
         directory, catalog = self.directory, self.catalog
         known = {*directory.ids(), *directory.manifests.without()}
         gone = self._gone - known
-        tables.clear(directory, gone, known)
+        clear_tables(directory, gone, known)
         for recording in gone:
             catalog.remove(recording)
         self._is_swept = True
@@ -182,3 +186,42 @@ def recover_segments(
     return [
         recover_segment(path / name, announce, recording=said) for name in listing.open.values()
     ]
+
+
+def missing(
+    directory: StoreDirectory, entry: RecordingEntry, tables: Tables | None = None
+) -> set[str]:
+    """Topics of which tables lack rows, or have others than the catalog."""
+    from hybridlog.columns.tables import Tables
+
+    return (tables or Tables(directory.path)).lacking(entry, topics_of(entry))
+
+
+def remove_tables(
+    directory: StoreDirectory, recording: str, entry: RecordingEntry | None = None
+) -> None:
+    """Remove all tables of a recording."""
+    from hybridlog.columns.folders import TableFolders
+
+    prefixes = [""] if entry is None else {type_prefix(one.type) for one in entry.channels}
+    created = None if entry is None else entry.created
+    TableFolders(directory.path, recording, created).remove(prefixes)
+    with suppress(FileNotFoundError):
+        files.remove_tree(parts_folder(directory.path, recording))
+
+
+def clear_tables(directory: StoreDirectory, gone: Collection[str], known: Collection[str]) -> None:
+    """Remove tables of removed recordings, and unfinished files that a crash has left.
+
+    `known` are the recordings that there are. What is impossible now is done the next time.
+    """
+    unfinished = set(gone)
+    with suppress(OSError):
+        unfinished.update(name.removeprefix("r") for name in files.names(directory.path / PARTS))
+    for recording in sorted(unfinished):
+        with suppress(OSError, StoreError, TopicError):
+            if recording not in known:
+                remove_tables(directory, recording)
+                continue
+            with directory.writing(recording):
+                files.remove_tree(parts_folder(directory.path, recording))

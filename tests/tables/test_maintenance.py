@@ -14,7 +14,7 @@ from hybridlog.columns.folders import TableFolders
 from hybridlog.columns.layout import PARTS, TABLES
 from hybridlog.columns.tables import Tables
 from hybridlog.follow.follower import make_tables
-from hybridlog.maintenance import tables as making
+from hybridlog.maintenance import opening as making
 from hybridlog.maintenance.verify import RESTORE, TableChecker
 from hybridlog.record.marks import MARKS
 from tests import places

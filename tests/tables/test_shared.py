@@ -12,7 +12,7 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.columns import folders
-from hybridlog.maintenance import tables as making
+from hybridlog.maintenance import opening as making
 from hybridlog_storage.disk import files
 from hybridlog_storage.messages import Schema
 from tests.calls import Calls

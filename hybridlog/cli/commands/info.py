@@ -306,7 +306,7 @@ def _show_tables(store: Store, query: Query, _: _Given) -> None:
 
     from hybridlog.columns.folders import files_of
     from hybridlog.columns.layout import type_prefix
-    from hybridlog.maintenance.tables import missing
+    from hybridlog.maintenance.opening import missing
     from hybridlog.query.query import channels_of
     from hybridlog.snapshot import UNFINISHED
 

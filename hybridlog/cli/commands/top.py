@@ -8,6 +8,8 @@ import textwrap
 from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
+from msgspec.structs import asdict
+
 from hybridlog.cli import output
 from hybridlog.cli.options import Place, argument, command, option
 from hybridlog.cli.output import Column, table_lines
@@ -37,7 +39,7 @@ def top_command(given: _Given) -> None:
 
     Without a terminal, and without --json, the state is shown once.
     """
-    from hybridlog.live.state import choose, states, summary_of
+    from hybridlog.live.state import choose, states
     from hybridlog.store import store_path
     from hybridlog_storage.remote import directory_of
 
@@ -48,7 +50,7 @@ def top_command(given: _Given) -> None:
         for state in states(directory, name, _EVERY_S):
             name = state.name
             if given.as_json:
-                output.print_json(summary_of(state), at_once=True)
+                output.print_json(asdict(state), at_once=True)
             elif not is_once:
                 draw(state, table)
             else:

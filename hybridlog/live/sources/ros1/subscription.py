@@ -99,24 +99,13 @@ class Subscription:
     def channel(self, fields: Mapping[str, str]) -> Channel | None:
         """The channel of a connection; None if it is unwanted."""
         type_name = fields.get("type", "")
-        if type_name and type_name != ANY and not self._takes(type_name, fields):
-            return None
+        if type_name and type_name != ANY:
+            self._type = self._type or type_name
+            if not self._context.sink.wants(self.topic, type_name):
+                return None
         channel = channel_of(self.topic, fields)
         self._context.sink.expect(channel)
         return channel
-
-    def _takes(self, type_name: str, fields: Mapping[str, str]) -> bool:
-        """Tells whether messages of a type are wanted; reports publishers that disagree."""
-        if not self._type:
-            self._type = type_name
-        elif type_name != self._type:
-            publisher = one_line(fields.get("callerid", "an unnamed node"))
-            self._context.sink.say(
-                f"{one_line(self.topic)}: publishers do not agree on its type, "
-                f"{one_line(self._type)} or {one_line(type_name)} (from {publisher}); "
-                "both are recorded"
-            )
-        return self._context.sink.wants(self.topic, type_name)
 
     async def _connect(self, uri: str, link: _Link) -> None:
         await link.run(self._context)
@@ -131,26 +120,23 @@ class _Link:
 
     def __init__(self, subscription: Subscription, uri: str) -> None:
         self.is_listed = True
-        self.is_up = False
-        self.has_ended = False
+        self.is_up = self.has_ended = False
         self._subscription = subscription
         self._uri = uri
-        self._told: set[str] = set()  # kinds of problems
 
     async def run(self, context: Context) -> None:
         """Connects and reconnects until the publisher is neither listed nor reachable."""
         topic, failures = self._subscription.topic, 0
         while True:
             try:
-                about = context.caller, topic, self._uri
-                connected, fields = await subscribe(*about)
+                connected, fields = await subscribe(context.caller, topic, self._uri)
             except (OSError, PeerError) as error:
                 if not self.is_listed:
                     return
                 failures += 1
                 # A single failure is normal: a node that ends is listed a little longer.
-                if failures >= 2:
-                    self._say_problem(context, error)
+                if failures == 2:
+                    context.sink.say(self._told(error))
             else:
                 failures = 0
                 try:
@@ -166,26 +152,16 @@ class _Link:
             context.forget(self._uri)
             await asyncio.sleep(_PAUSE_S)
 
-    def _say_problem(self, context: Context, error: OSError | PeerError) -> None:
-        """Tells the user that a publisher fails."""
+    def _told(self, error: OSError | PeerError) -> str:
+        """A failure, for the user."""
         uri, reason = one_line(self._uri), reason_of(error)
         if isinstance(error, UnreachedError):
-            self._say(
-                context,
-                f"the publisher {uri} cannot be reached",
-                f"{reason}; trying again. Is it dead (`rosnode cleanup`), or on a computer with "
-                "an unknown name (set ROS_IP there)?",
+            return (
+                f"the publisher {uri} cannot be reached: {reason}; trying again. Is it dead "
+                "(`rosnode cleanup`), or on a computer with an unknown name (set ROS_IP there)?"
             )
-        else:
-            topic = one_line(self._subscription.topic)
-            what = f"{topic}: cannot subscribe at its publisher {uri}"
-            self._say(context, what, f"{reason}; trying again")
-
-    def _say(self, context: Context, what: str, why: str) -> None:
-        """Tells the user of a problem, the first time."""
-        if what not in self._told:
-            self._told.add(what)
-            context.sink.say(f"{what}: {why}")
+        topic = one_line(self._subscription.topic)
+        return f"{topic}: cannot subscribe at its publisher {uri}: {reason}; trying again"
 
     async def _serve(self, context: Context, connected: socket.socket, channel: Channel) -> None:
         """Lets the reader read a connection until it ends."""
@@ -204,9 +180,8 @@ class _Link:
         context.reader.add(stream)
         if failure := await ended:
             name = one_line(channel.metadata.get("callerid", "an unnamed node"))
-            topic, uri = one_line(self._subscription.topic), one_line(self._uri)
-            lost = f"{topic}: lost the connection to {name} at {uri}"
-            self._say(context, lost, f"{failure}; connecting again")
+            what = f"{one_line(channel.topic)}: lost the connection to {name}"
+            context.sink.say(f"{what} at {one_line(self._uri)}: {failure}; connecting again")
 
     def _set_up(self, *, is_up: bool) -> None:
         self.is_up = is_up
