@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 from xmlrpc.server import SimpleXMLRPCServer
 
-from hybridlog.live.sources.ros1.subscription import decode_header, encode_header
+from hybridlog.live.sources.ros1.source import decode_header, encode_header
 
 DEFINITION = (
     "Header header\nuint8[] data\n"

@@ -9,7 +9,7 @@ from socketserver import ThreadingMixIn
 from typing import Any
 from xmlrpc.server import SimpleXMLRPCRequestHandler, SimpleXMLRPCServer
 
-from hybridlog.live.sources.ros1.subscription import decode_header, encode_header
+from hybridlog.live.sources.ros1.source import decode_header, encode_header
 from hybridlog_storage.messages import Channel
 from tests.live.sources.heard import Heard, Listening
 

@@ -11,12 +11,12 @@ import pytest
 
 from hybridlog.live.sources.base import Cause, PeerError, one_line
 from hybridlog.live.sources.network import endpoint_of
-from hybridlog.live.sources.ros1.stream import Stream
-from hybridlog.live.sources.ros1.subscription import (
+from hybridlog.live.sources.ros1.source import (
     channel_of,
     decode_header,
     encode_header,
 )
+from hybridlog.live.sources.ros1.stream import Stream
 from hybridlog.live.sources.sequence_gaps import has_sequence_numbers
 from hybridlog_storage.messages import Channel, Schema
 from tests.live.sources.ros1_peers import Collector, framed

@@ -28,7 +28,7 @@ from picows import (
 )
 
 from hybridlog.live.sources.base import Cause, Loss, PeerError, Sink, one_line
-from hybridlog.live.sources.foxglove.protocol import (
+from hybridlog.live.sources.foxglove.source import (
     MAX_TEXT,
     MESSAGE_DATA,
     SUBPROTOCOLS,
