@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from hybridlog.live.sources.base import Sink
     from hybridlog_storage.messages import Channel
 
+    _Record = Callable[[Callable[[int], int]], None]
+
 
 CLOCK: Final = "/clock"
 """The topic with the time."""
@@ -59,7 +61,7 @@ class SimulatedTime:
         self._latest = (0, 0)
         self._ticks: deque[tuple[int, int]] = deque(maxlen=_MAX_TICKS)
         # What is done when the clock comes, and when it does not.
-        self._held: deque[tuple[Callable[[int], None], Callable[[], None]]] | None = deque()
+        self._held: list[tuple[_Record, Callable[[], None]]] | None = []
         self._held_bytes = 0
 
     @property
@@ -134,46 +136,42 @@ class SimulatedTime:
             if not self._is_clock_recorded:
                 return
 
-        def record(log_time: int) -> None:
-            self._recorder.take(channel, payload, received=log_time, sent=sent, sequence=sequence)
+        def record(at: Callable[[int], int]) -> None:
+            self._recorder.take(
+                channel, payload, received=at(received), sent=sent, sequence=sequence
+            )
 
         def drop() -> None:
             detail = f"it came before the first time of {CLOCK}"
             self._drop(channel, len(payload), Cause.CLOCK, detail, received)
 
-        if self._held is None or not self._hold(len(payload), record, drop):
-            record(self.at(received))
+        self._pass(len(payload), record, drop)
 
     def lost(self, loss: Loss) -> None:
         """See `Sink.lost`."""
         if loss.topic == CLOCK and not self._is_clock_recorded:
             return
 
-        def report(first: int, last: int) -> None:
-            self._recorder.lost(replace(loss, first=first, last=last))
+        def record(at: Callable[[int], int]) -> None:
+            self._recorder.lost(replace(loss, first=at(loss.first or 0), last=at(loss.last or 0)))
 
-        if self._held is None or not self._hold(
-            0, lambda now: report(now, now), lambda: self._recorder.lost(loss)
-        ):
-            report(self.at(loss.first or 0), self.at(loss.last or 0))
+        self._pass(0, record, lambda: self._recorder.lost(loss))
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._recorder, name)
 
-    # Parts of it.
-
-    def _hold(self, size: int, record: Callable[[int], None], drop: Callable[[], None]) -> bool:
-        """Keep an item until the clock comes; False once everything held has been passed on."""
+    def _pass(self, size: int, record: _Record, drop: Callable[[], None]) -> None:
+        """Pass something on with the time of the clock, or hold it until there is one."""
         with self._lock:
-            if self._held is None:
-                return False
-            fits = self._held_bytes + size + _OVERHEAD <= self._max_bytes
-            if fits:
-                self._held_bytes += size + _OVERHEAD
+            is_held, size = self._held is not None, size + _OVERHEAD
+            fits = self._held_bytes + size <= self._max_bytes
+            if self._held is not None and fits:
+                self._held_bytes += size
                 self._held.append((record, drop))
-        if not fits:
+        if not is_held:
+            record(self.at)
+        elif not fits:
             drop()
-        return True
 
     def _release(self, now: int) -> None:
         """Pass on what is held, in the order of arrival."""
@@ -182,9 +180,9 @@ class SimulatedTime:
                 if not self._held:
                     self._held = None
                     return
-                held, self._held, self._held_bytes = self._held, deque(), 0
+                held, self._held, self._held_bytes = self._held, [], 0
             for record, _ in held:
-                record(now)
+                record(lambda _: now)
 
 
 def clock_time(channel: Channel, payload: bytes) -> int | None:

@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from operator import index as index_of
 from queue import Empty, SimpleQueue
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from msgspec import Struct, field
@@ -81,14 +81,6 @@ class LiveOptions(Struct, frozen=True):
             raise UsageError("the flush interval must be between 0 and 3600 seconds")
 
 
-class _Message(NamedTuple):
-    channel: int
-    log_time: int
-    publish_time: int
-    sequence: int
-    payload: Buffer
-
-
 class _Taken(Struct):
     """What was taken of a channel: log times in ns."""
 
@@ -129,7 +121,7 @@ class LiveRecording:
         self._taken: dict[Channel, _Taken] = {}
         self._channels: list[Channel] = []
         self._least = _MAX_NS  # log time of all
-        self._inbox: deque[_Message] = deque()
+        self._inbox: deque[tuple[int, int, int, int, Buffer]] = deque()  # number of a channel first
         self._received = 0  # bytes of all messages, with their heads
         self._moved = 0  # of those that are in chunks
         self._worth_waking = min(_WAKE_BYTES, options.budget_bytes // 4)
@@ -267,7 +259,7 @@ class LiveRecording:
             taken.messages += 1
             self._least = min(self._least, now)
             # Ctrl-C may interrupt the main thread anywhere: a message is in the queue or not.
-            self._inbox.append(_Message(taken.index, now, sent, sequence, payload))
+            self._inbox.append((taken.index, now, sent, sequence, payload))
             self._received += size
             enough = self._received - self._moved >= self._worth_waking
         if enough:
@@ -503,7 +495,7 @@ def follow_interval_s(options: LiveOptions) -> float | None:
     return None if options.is_ring else min(_INDEX_INTERVALS * options.flush_interval_s, _LOOK_S)
 
 
-def _batch(messages: deque[_Message]) -> LooseBatch:
+def _batch(messages: deque[tuple[int, int, int, int, Buffer]]) -> LooseBatch:
     channel, log_time, publish_time, sequence, payloads = zip(*messages, strict=True)
     return LooseBatch(
         np.fromiter(payloads, np.object_, len(payloads)),

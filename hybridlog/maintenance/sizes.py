@@ -98,18 +98,16 @@ def sizes_of(
     rows, topics = list[Size](), set[str]()
     tables = table_bytes(directory.path, entries)
     for entry in entries:
-        segments, messages = _segment_bytes(entry), entry.messages_by_topic()
+        name, segments, messages = entry.name, _segment_bytes(entry), entry.messages_by_topic()
         payload = Counter[str]()
         for channel in entry.channels:
             payload[channel.topic] += channel.stats.payload_bytes
-        for topic in {"", *messages}:
-            table = tables.get((entry.id, topic), 0)
-            size = Size(entry.name, topic, messages[topic], payload[topic], segments[topic], table)
-            rows.append(size)
-        topics.update(topic for topic, number in messages.items() if number)
-    index = None
-    if database is not None:
-        index = sum(database.size(collection_of(topic)) for topic in topics)
+        rows += (
+            Size(name, one, messages[one], payload[one], segments[one], tables[entry.id, one])
+            for one in {"", *messages}
+        )
+        topics.update(+messages)
+    index = None if database is None else sum(database.size(collection_of(one)) for one in topics)
     return Sizes(_largest_first(rows), index)
 
 
@@ -151,7 +149,7 @@ def _segment_bytes(entry: RecordingEntry) -> Counter[str]:
     return whole
 
 
-def table_bytes(root: Path, entries: Sequence[RecordingEntry]) -> Mapping[tuple[str, str], int]:
+def table_bytes(root: Path, entries: Sequence[RecordingEntry]) -> Counter[tuple[str, str]]:
     """Bytes of the tables by recording and topic: their share of the rows of each file."""
     from hybridlog.columns.folders import files_of
 
