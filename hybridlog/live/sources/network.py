@@ -108,8 +108,8 @@ def reason_of(error: Exception) -> str:
     """The reason of an error, in a few words for the user."""
     if isinstance(error, TimeoutError):
         return "no answer in time"
-    if isinstance(error, OSError) and error.errno and not isinstance(error, socket.gaierror):
-        return os.strerror(error.errno)
+    if type(error).__module__ == "builtins" and isinstance(error, OSError) and error.errno:
+        return os.strerror(error.errno)  # those of names and TLS have numbers of their own
     return one_line(getattr(error, "strerror", None) or str(error))
 
 

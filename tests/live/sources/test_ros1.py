@@ -137,7 +137,6 @@ def test_publishers_of_different_types() -> None:
             master.add("/topic", "", "/int", other.uri)
             sink.wait_for(b"text", b"7")
             wait_for(lambda: bool(bools.asked))
-            sink.wait_said("/topic", "std_msgs/String", "std_msgs/Int8", "/int?[31m")
     assert bools.connections <= 1
     schemas = [taken.channel.schema for taken in sink.taken]
     assert [schema.name for schema in schemas if schema] == ["std_msgs/String", "std_msgs/Int8"]

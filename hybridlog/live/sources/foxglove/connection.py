@@ -7,7 +7,6 @@ import json
 import logging
 import re
 import socket
-import ssl
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable
@@ -128,20 +127,12 @@ class Client:
             made = await connect(place)
             transport, listener = await self._shake_hands(made, session)
         except WSHandshakeError as error:
-            raise PeerError(_refusal(error)) from error
-        except ssl.SSLCertVerificationError as error:
-            raise PeerError(
-                f"its certificate is not trusted ({error.verify_message}); name the "
-                "certificate of its authority in SSL_CERT_FILE"
-            ) from error
-        except ssl.SSLError as error:
-            raise PeerError(
-                f"does not speak TLS ({error.reason or error}); try ws:// instead of wss://"
-            ) from error
+            status = (error.raw_header or b"").split(b"\r\n", 1)[0]
+            raise PeerError(_UNREACHED.format(one_line(status or str(error)))) from error
         except OSError as error:
-            raise PeerError(_reason_of(error)) from error
+            raise PeerError(_UNREACHED.format(reason_of(error))) from error
         if listener is None:
-            raise PeerError(_NO_WEBSOCKET)
+            raise PeerError(_UNREACHED.format("it is no websocket server"))
         return transport
 
     async def _shake_hands(
@@ -174,27 +165,10 @@ class Client:
             raise
 
 
-_NO_WEBSOCKET = "not a websocket server; check the port (foxglove_bridge uses 8765)"
-
-
-def _refusal(error: WSHandshakeError) -> str:
-    """Reason and remedy for an answer that refuses the websocket."""
-    status = (error.raw_header or b"").split(b"\r\n", 1)[0].decode("ascii", "replace")
-    if not status.startswith("HTTP/"):
-        return _NO_WEBSOCKET
-    return (
-        f"does not open a websocket ({status[9:] or error}); check port and path, and whether it "
-        "asks for ws://USER:PASSWORD@HOST:PORT"
-    )
-
-
-def _reason_of(error: OSError) -> str:
-    """The reason of a socket error, for the user."""
-    if isinstance(error, ConnectionRefusedError):
-        return "refuses connections; start foxglove_bridge or the program, or correct the port"
-    return f"cannot be reached ({reason_of(error)})"
-
-
+_UNREACHED = (
+    "cannot be reached ({}); start foxglove_bridge or the program, or check host, port (8765), TLS "
+    "(wss://, SSL_CERT_FILE) and password (ws://USER:PASSWORD@HOST:PORT)"
+)
 _MAX_CHANNELS: Final = 1 << 16
 _MAX_RETIRED: Final = 1 << 12
 _MAX_NS: Final = 1 << 63
