@@ -34,7 +34,7 @@ from hybridlog.live.policy import (
 from hybridlog.live.recording import LiveOptions, LiveRecording, follow_interval_s
 from hybridlog.live.state import RecorderState, StateFile, Tally, TopicCounts
 from hybridlog.maintenance.edit import remove_if
-from hybridlog.maintenance.keep import RetentionThread
+from hybridlog.maintenance.keep import RoomMaker
 from hybridlog.maintenance.retention import Rules
 from hybridlog.query.times import format_duration, format_time
 from hybridlog.record.losses import Cause
@@ -181,7 +181,7 @@ class Recorder:
             self.say,
         )
         try:
-            self._retention = RetentionThread(
+            self._room = RoomMaker(
                 store.directory,
                 partial(remove_if, store.shared),
                 self._target.id,
@@ -192,7 +192,7 @@ class Recorder:
                 pin=self._incidents.write,
                 judged=lambda: self._follower.judged,
             )
-            self._target.make_room = self._retention.make_room
+            self._target.make_room = self._room.make_room
         except BaseException:
             self._target.abort()
             raise
@@ -256,7 +256,6 @@ class Recorder:
         if self._simulated is None and self._newest is not None and self._newest.created > now:
             says = f"the clock of this machine says {format_time(now)}"
             self._note_clock(f"{says}, and recording {self._newest.name} was begun later", {}, now)
-        self._retention.start()
 
     def wait(self, seconds: float) -> bool:
         """Wait for the end for at most so long; returns True once it has come."""
@@ -289,7 +288,6 @@ class Recorder:
             self._simulated.close()
         self._follower.wait_s = wait_s
         self._says.remove()
-        self._retention.stop()
         self._check_silences(ended_at)
         self._write_marks()
         if self._is_marked(self._target.id) or (
@@ -338,6 +336,8 @@ class Recorder:
         self._check_clock(now)
         self._check_silences()
         self._write_marks()
+        if not self._over.is_set():
+            self._room.look()
         lost: Counter[str] = Counter()
         with self._lock:
             for one in self._topics.values():
@@ -361,7 +361,7 @@ class Recorder:
             stored_bytes,
             self._stalled_s(now),
             incidents=self._incidents.count,
-            let_go=None if self._options.ring_s is None else self._retention.keeper.let_go,
+            let_go=None if self._options.ring_s is None else self._room.keeper.let_go,
             taken=dict(self._target.taken),
             silent=self._silence.silent,
             breaches=self._silence.breaches,
@@ -664,7 +664,8 @@ class Recorder:
         try:
             check_room(state.free_bytes, options.reserve_bytes, coming)
         except DiskFullError as error:
-            if not self._retention.make_room(round(options.reserve_bytes + coming)):
+            is_over = self._over.is_set()
+            if not (is_over or self._room.make_room(round(options.reserve_bytes + coming))):
                 self._refuse(Cause.DISK, str(error))
         failure = self._target.failure
         if isinstance(failure, DiskFullError):

@@ -19,7 +19,7 @@ import shutil
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
 from functools import partial
 from types import MappingProxyType
@@ -111,7 +111,6 @@ class Keeper:
     `remove` deletes a recording, by its id, unless a check of its manifest raises. `own` is the
     one that this process makes; after `ring_s` its groups go, and `let_go` counts their messages,
     once triggers have `judged` them: it returns the numbers of these segments, None for all.
-    `is_wanted` is asked before each deletion.
     """
 
     def __init__(
@@ -122,13 +121,12 @@ class Keeper:
         *,
         ring_s: float | None = None,
         judged: Callable[[], Collection[int] | None] = lambda: None,
-        is_wanted: Callable[[], bool] = lambda: True,
     ) -> None:
         self.let_go = 0
         self._ring_s = ring_s
         self._sealed: dict[int, float] = {}  # when each group was first seen, by `monotonic`
         self._directory, self._remove, self._own = directory, remove, own
-        self._judged, self._is_wanted = judged, is_wanted
+        self._judged = judged
         # Segments that this pass could not change, by recording; -1 for all of it.
         self._failed: defaultdict[str, set[int]] = defaultdict(set)
 
@@ -154,11 +152,14 @@ class Keeper:
             if not rules.is_empty:
                 _lay_spare(self._directory, rules)  # counts among what is used
             found = KeepReport(Plan(0, 0))
-            if self._ring_s is not None and not self._do_all(self._past_ring(), rules, found):
-                return found
+            for step in [] if self._ring_s is None else self._past_ring(self._ring_s):
+                self._do(step, rules, found)
             found.plan = planned = self.plan(rules)
             for _ in range(_MAX_ROUNDS):
-                if not planned.steps or not self._do_all([*planned.steps], rules, found):
+                steps = [*planned.steps]
+                for step in steps:
+                    self._do(step, rules, found)
+                if not steps:
                     break
                 planned = self.plan(rules)
                 found.plan.steps += planned.steps
@@ -201,25 +202,16 @@ class Keeper:
             is_held = is_ours and _WHOLE not in failed
             yield manifest, held_of(manifest, now, failed) if is_held else []
 
-    def _past_ring(self) -> list[Step]:
+    def _past_ring(self, ring_s: float) -> list[Step]:
         """Deletions of groups whose time in the ring is over, whatever a clock says."""
         assert self._own is not None
-        assert self._ring_s is not None
         manifest, seen = self._directory.manifests.read(self._own), self._judged()
         now, groups = time.monotonic(), {log.group for log in manifest.logs.values()}
         self._sealed = {group: self._sealed.get(group, now) for group in groups}
         if seen is not None:
             groups -= {log.group for n, log in manifest.logs.items() if n not in seen}
-        over = (one for one in groups if now - self._sealed[one] >= self._ring_s + _LATE_S)
+        over = (one for one in groups if now - self._sealed[one] >= ring_s + _LATE_S)
         return past_ring(manifest, sorted(over))
-
-    def _do_all(self, steps: Iterable[Step], rules: Rules, found: KeepReport) -> bool:
-        """Do some steps; False once they are wanted no more."""
-        for step in steps:
-            if not self._is_wanted():
-                return False
-            self._do(step, rules, found)
-        return True
 
     def _do(self, step: Step, rules: Rules, found: KeepReport, copy: str = "") -> None:
         """Do a step, with the room of the spare file if there is no other; reports in `found`."""
@@ -538,19 +530,17 @@ def _remove_arrays(directory: StoreDirectory, manifest: Manifest, going: Collect
 
 
 LOOK_S: Final = 5.0
-"""Seconds between two looks at the rules and at free space."""
-_TICK_S: Final = 0.1
-_AGES_S: Final = 60.0  # between two passes for the ages alone
-_RING_S: Final = 1.0  # and for a ring
+"""Seconds between two passes because too little is free."""
+_AGES_S: Final = 60.0  # and between two for the ages alone
 
 
-class RetentionThread:
-    """Makes room ahead of need for the recording of this process, on a thread of its own.
+class RoomMaker:
+    """Makes room ahead of need for the recording of this process, as it is looked at.
 
     A pass is made when a segment was sealed (`sealed` counts them), when less is free than the
-    rules or the recorder (`reserve`, bytes) want, and once a minute; for a ring alone, once a
-    second, after `pin` has pinned what triggers want. What it cannot do is told, and never stops
-    the recorder. All else is as of `Keeper`.
+    rules or the recorder (`reserve`, bytes) want, and once a minute; for a ring alone, with each
+    look, after `pin` has pinned what triggers want. What it cannot do is told, and never stops the
+    recorder. All else is as of `Keeper`.
     """
 
     def __init__(
@@ -566,35 +556,28 @@ class RetentionThread:
         pin: Callable[[], object],
         judged: Callable[[], Collection[int] | None],
     ) -> None:
-        self._directory, self._sealed, self._say = directory, sealed, say
+        self._directory, self._sealed, self._reserve, self._say = directory, sealed, reserve, say
         self._pin = None if ring_s is None else pin
-        self._over = threading.Event()
-        self.keeper = Keeper(
-            directory,
-            remove,
-            own,
-            ring_s=ring_s,
-            judged=judged,
-            is_wanted=lambda: not self._over.is_set(),
-        )
-        self._reserve = reserve
+        self.keeper = Keeper(directory, remove, own, ring_s=ring_s, judged=judged)
         self._alone = threading.Lock()  # who makes a pass
-        self._thread = threading.Thread(target=self._run, name="hybridlog-keep", daemon=True)
+        self._passed, self._counted = -_AGES_S, 0
         self._rules = self._read_rules()
         self._has_warned = False
 
-    def start(self) -> None:
-        """Begin."""
-        self._thread.start()
-
-    def stop(self) -> None:
-        """End after the deletion in progress."""
-        self._over.set()
-        if self._thread.is_alive():
-            self._thread.join()
+    def look(self) -> None:
+        """Make a pass if one is due; call it about once a second."""
+        since, count, is_low = time.monotonic() - self._passed, self._sealed(), False
+        with suppress(HybridlogError, OSError):  # the next pass tells
+            free = shutil.disk_usage(self._directory.path).free
+            is_low = since >= LOOK_S and free < (self._read_rules().min_free or 0)
+        if is_low or count != self._counted or since >= _AGES_S:
+            self._passed += since
+            self._counted = -1 if self._pass() is None else count
+        elif self._pin is not None:
+            self._pass(is_ring=True)
 
     def make_room(self, free_bytes: int = 0) -> bool:
-        """Make a pass, for so many free bytes at least, at once; returns whether to try again."""
+        """Make a pass, for so many free bytes at least; returns whether to try again."""
         return self._rules.makes_room and self._pass(free_bytes) != 0
 
     def _read_rules(self, free_bytes: int | None = None) -> Rules:
@@ -603,51 +586,25 @@ class RetentionThread:
             rules = rules.with_free(max(free_bytes or 0, self._reserve))
         return structs.replace(rules, is_urgent=free_bytes is not None)
 
-    def _run(self) -> None:
-        looked = last_pass = last_ring = -_AGES_S
-        sealed = 0
-        while not self._over.wait(_TICK_S):
-            now, count = time.monotonic(), self._sealed()
-            is_due = count != sealed or now - last_pass >= _AGES_S
-            if now - looked >= LOOK_S:
-                looked = now
-                with self._saying():
-                    self._rules = self._read_rules()
-                    free = shutil.disk_usage(self._directory.path).free
-                    is_due = is_due or free < (self._rules.min_free or 0)
-            if is_due:
-                last_pass = last_ring = now
-                sealed = -1 if self._pass() is None else count
-            elif self._pin is not None and now - last_ring >= _RING_S:
-                last_ring = now
-                self._pass(is_ring=True)
-
-    @contextmanager
-    def _saying(self) -> Iterator[None]:
-        try:
-            yield
-        except (HybridlogError, OSError) as error:
-            self._say(f"making room failed: {error}")
-
     def _pass(self, free_bytes: int | None = None, *, is_ring: bool = False) -> int | None:
-        """Make a pass for so many free bytes; returns those that it freed, None without one."""
-        with self._alone, self._saying():
-            if self._over.is_set():
-                return None
-            self._rules = self._read_rules(free_bytes)
-            if self._rules.is_empty and self._pin is None:
-                return 0
-            if self._pin is not None:
-                self._pin()
+        """Make a pass; returns the bytes that it freed, None if another process makes one."""
+        with self._alone:
             try:
+                self._rules = self._read_rules(free_bytes)
+                if self._rules.is_empty and self._pin is None:
+                    return 0
+                if self._pin is not None:
+                    self._pin()
                 done = self.keeper.keep(Rules() if is_ring else self._rules)
             except HeldError:
-                self._over.wait(_TICK_S)
+                time.sleep(_POLL_S)
                 return None
+            except (HybridlogError, OSError) as error:
+                self._say(f"making room failed: {error}")
+                return 0
             warnings = [] if self._has_warned else done.plan.warnings
             self._has_warned = bool(done.plan.warnings)
             reasons = (f"making room: {one.reason}" for one in done.plan.steps)
             for text in (*reasons, *done.problems, *warnings):
                 self._say(text)
             return done.freed_bytes
-        return 0

@@ -450,7 +450,7 @@ import_module("hybridlog.cli.app").main()
 def test_a_recorder_loads_nothing_of_what_its_follower_does(logs: Path, tmp_path: Path) -> None:
     store = tmp_path / "store"
     with hl.open(store, create=True) as opened:
-        opened.directory.change_settings(retention={"quota": "4MB"})
+        opened.directory.change_settings(retention={"max-age": "0s"})
     words = ("--replay", logs / "robot.bag", "--speed", 5, "--split-size", "1MiB")
     program = (sys.executable, "-c", LOADS_LITTLE)
     with recorder(store, *words, "--trigger", "/map: data == 0", program=program) as process:

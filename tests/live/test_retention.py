@@ -14,6 +14,7 @@ import hybridlog as hl
 from hybridlog.live.recorder import RecorderOptions
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.mongo.index_documents import RECORDINGS
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 from hybridlog_storage.settings import write_settings
 from tests import places
 from tests.indexed import documents_of, misindexed
@@ -51,7 +52,7 @@ def test_rules_that_are_written_while_it_runs_hold(tmp_path: Path) -> None:
         robot.speaker.say(CAMERA, image(0))
         with store_with(tmp_path / "store", **{"min-free": "1000TB"}):
             pass
-        wait_for(lambda: robot.said)
+        robot.recorder.look()
         robot.recorder.stop()
     assert "all that is left must stay" in robot.said[0]
     with hl.open(tmp_path / "store", mongo="none") as store:
@@ -64,8 +65,9 @@ def test_documents_that_mongodb_loses_after_their_messages_expired_are_made_agai
 ) -> None:
     path = tmp_path / "store"
     with hl.open(path, create=True) as store:
-        store.directory.change_settings(retention={"quota": "12MB"})
-        robot = Recorded(store, RecorderOptions(reserve_bytes=0))
+        store.directory.change_settings(retention={"max-age": "0s"})
+        settings = SegmentSettings(segment_size=4 << 20)
+        robot = Recorded(store, RecorderOptions(reserve_bytes=0, settings=settings))
         recorder = robot.recorder
         (folder,) = places.folders(path)
         sent = 0
@@ -76,6 +78,7 @@ def test_documents_that_mongodb_loses_after_their_messages_expired_are_made_agai
                 robot.speaker.say(CAMERA, image(sent), sent * 10**9)
                 sent += 1
             time.sleep(0.1)
+            recorder.look()
 
         wait_for(lambda: say(10) or has_expired(folder))
         database = store.shared.index.connect()

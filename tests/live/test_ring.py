@@ -29,7 +29,6 @@ RING_S = 0.4
 @pytest.fixture(autouse=True)
 def is_prompt(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(keep, "_LATE_S", 0.1)
-    monkeypatch.setattr(keep, "_TICK_S", 0.02)
 
 
 class Robot(Recorded):
@@ -56,6 +55,7 @@ class Robot(Recorded):
         while time.monotonic() < end:
             self.speaker.say(scan_channel(), scan(self.sent, 2000))
             self.sent += 1
+            self.recorder.look()
             time.sleep(0.01)
 
     def run_until(self, holds: Callable[[], object]) -> None:
