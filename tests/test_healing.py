@@ -8,7 +8,6 @@ import random
 import resource
 import shutil
 import signal
-import sqlite3
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -301,42 +300,3 @@ def test_a_store_without_handles_is_not_a_damaged_one(store: Path, *, has_catalo
     assert all("ulimit -n" in failure for failure in failures)
     assert ask() == want
     assert run("verify", store=store).err == ""
-
-
-# --- catalog and tables ---
-
-
-def zeroed(path: Path) -> None:
-    content = path.read_bytes()
-    path.write_bytes(content[:4096] + bytes(4096) + content[8192:])
-
-
-OF_CATALOG: dict[str, Callable[[Path], object]] = {
-    "deleted": Path.unlink,
-    "zeros": zeroed,
-    "text": lambda path: path.write_text("no catalog\n" * 999),
-    "cut": lambda path: os.truncate(path, 5000),
-    "a folder": lambda path: (path.unlink(), path.mkdir()),
-}
-
-
-@pytest.mark.parametrize("way", [*OF_CATALOG, "locked"])
-def test_a_catalog_lost_while_the_store_is_open(store: Path, way: str) -> None:
-    """Names stay unique, and content that is there is refused."""
-    with (
-        hl.open(store, mongo=NOWHERE) as opened,
-        contextlib.closing(sqlite3.connect(store / CATALOG)) as db,
-    ):
-        imu = opened.topic(IMU)
-        want = imu.count(), imu.where(WHERE).count(), sum(1 for _ in imu)
-        one, two = opened.session.look().summaries
-        if way == "locked":
-            db.execute("BEGIN EXCLUSIVE")
-        else:
-            OF_CATALOG[way](store / CATALOG)
-        assert (imu.count(), imu.where(WHERE).count(), sum(1 for _ in imu)) == want
-        assert two.source["fingerprint"] in opened.session.snapshot().by_fingerprint
-        assert opened.edit(one.id, name=two.name).name == f"{two.name}-2"
-        opened.refresh()
-        assert len(opened.recordings()) == 2
-        assert (imu.count(), imu.where(WHERE).count(), sum(1 for _ in imu)) == want

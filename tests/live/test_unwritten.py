@@ -9,14 +9,13 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
-from hybridlog_storage.errors import HeldError, IncompleteError
+from hybridlog_storage.errors import IncompleteError
 from tests.cli.running import run
 from tests.indexed import documents_of
 from tests.limits import Limit
 from tests.live.robot import robot
 from tests.live.speaker import text, text_channel
 from tests.live.test_follow import NOWHERE, wait_until_flushed
-from tests.waiting import wait_for
 
 SECOND = 1_000_000_000
 CHANNEL = text_channel("/a")
@@ -159,25 +158,3 @@ def test_what_the_index_lacks_is_told_where_mongodb_answers(tmp_path: Path, limi
         recording.close()
         assert raw.count() == 5
         assert raw.counters.unindexed == 0
-
-
-def test_a_killed_recording_is_not_said_to_go_on(tmp_path: Path) -> None:
-    path = tmp_path / "store"
-    with robot(path, "load", flush_s=0.05) as killed:
-        killed.say("/a", "x")
-        before = hl.open(path)
-        wait_for(lambda: before.session.look().summaries[0].messages)
-        assert [entry.status for entry in before.recordings()] == ["open"]
-        with pytest.raises(HeldError, match=f"is being written by process {killed.pid}"):
-            before.remove("load")
-        killed.kill()
-    with before:
-        with hl.open(path) as after:
-            for store in (before, after):
-                assert [one.status for one in store.session.look().summaries] == ["unfinished"]
-                assert [entry.status for entry in store.recordings()] == ["unfinished"]
-                assert store.recordings()[0].messages > 0
-        with hl.open(path) as after:
-            after.edit("load", note="found")
-            for store in (after, before):
-                assert [entry.status for entry in store.recordings()] == ["recovered"]
