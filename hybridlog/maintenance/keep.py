@@ -155,13 +155,12 @@ class Keeper:
             for step in [] if self._ring_s is None else self._past_ring(self._ring_s):
                 self._do(step, rules, found)
             found.plan = planned = self.plan(rules)
-            for _ in range(_MAX_ROUNDS):
-                steps = [*planned.steps]
-                for step in steps:
+            for _ in range(_MAX_ROUNDS if planned.steps else 0):
+                for step in [*planned.steps]:
                     self._do(step, rules, found)
-                if not steps:
-                    break
                 planned = self.plan(rules)
+                if not planned.steps:
+                    break
                 found.plan.steps += planned.steps
             found.plan.warnings, found.plan.is_short = planned.warnings, planned.is_short
         return found
@@ -217,38 +216,37 @@ class Keeper:
         """Do a step, with the room of the spare file if there is no other; reports in `found`."""
         if self._failed[step.id] and not step.segments:
             return  # planned before it was known: the next plan judges again
-        while True:
-            try:
-                freed, damaged = self._done(step, partial(_check, step, rules), copy)
-                break
-            except DiskFullError:
-                if not use_spare(self._directory):
-                    raise
-            except (StoreError, TopicError) as error:
-                found.problems.append(str(error))
-                if not isinstance(error, ChangedError):  # else the next plan judges again
-                    self._failed[step.id].add(_WHOLE)
-                return
-        found.freed_bytes += freed
-        for number, reason in damaged.items():
-            cure = "Its payloads stay until the file is restored from a copy"
-            found.problems.append(f"{reason}. {cure}")
-            self._failed[step.id].add(number)
-
-    def _done(self, step: Step, check: Check, copy: str) -> tuple[int, dict[int, str]]:
-        if step.is_whole:
-            self._remove(step.id, check)
-            return step.bytes, {}
-        directory, is_own = self._directory, step.id == self._own
+        directory, is_own, freed = self._directory, step.id == self._own, step.bytes
+        check = partial(_check, step, rules)
         lock = directory.writing(step.id, step.recording, wait_s=LOCK_WAIT_S)
-        with nullcontext() if is_own else lock:
-            if step.segments:
-                return expire(
-                    directory, step.id, step.segments, copy=copy, check=check, is_followed=is_own
-                )
-            gone = let_go(directory, step.id, lambda now: _lines_of(now, step.going(now)), check)
-        self.let_go = gone.let_go.messages if is_own and gone.let_go else self.let_go
-        return step.bytes, {}
+        try:
+            with nullcontext() if is_own or step.is_whole else lock:
+                if step.is_whole:
+                    self._remove(step.id, check)
+                elif step.groups:
+                    gone = let_go(directory, step.id, step.going, check)
+                    self.let_go = gone.let_go.messages if is_own and gone.let_go else self.let_go
+                else:
+                    freed, damaged = expire(
+                        directory,
+                        step.id,
+                        step.segments,
+                        copy=copy,
+                        check=check,
+                        is_followed=is_own,
+                    )
+                    self._failed[step.id] |= damaged.keys()
+                    cure = "Its payloads stay until the file is restored from a copy"
+                    found.problems += (f"{reason}. {cure}" for reason in damaged.values())
+            found.freed_bytes += freed
+        except DiskFullError:
+            if not use_spare(directory):
+                raise
+            self._do(step, rules, found, copy)
+        except (StoreError, TopicError) as error:
+            found.problems.append(str(error))
+            if not isinstance(error, ChangedError):  # else the next plan judges again
+                self._failed[step.id].add(_WHOLE)
 
 
 def _check(step: Step, rules: Rules, manifest: Manifest) -> None:
@@ -322,7 +320,8 @@ def expire(
             except DiskFullError:
                 if use_spare(directory):
                     continue
-                let_go(directory, recording, partial(_lines_of, logs=(log,)), check, NO_ROOM)
+                going_alone = Step("", recording, (log.number,), 0, "").going
+                let_go(directory, recording, going_alone, check, NO_ROOM)
             except SegmentError as error:
                 damaged[log.number] = str(error)
                 freed -= log.bytes
@@ -358,12 +357,6 @@ def _are_whole(path: Path, rows: Collection[File]) -> bool:
     except OSError:
         return False
     return bool(rows)
-
-
-def _lines_of(manifest: Manifest, logs: Collection[File]) -> list[File]:
-    """The lines of logs, and of their rows."""
-    numbers = {log.number for log in logs}
-    return [file for file in manifest.files if file.number in numbers]
 
 
 def make_rows(
@@ -440,14 +433,15 @@ def let_go(
 ) -> Manifest:
     """Delete files of a recording with all that is left; returns the manifest without them.
 
-    This process has locked the recording, or records it. `choose` is called with each manifest that
-    is changed; `check` raises if they must stay. `lost` is the reason of a row of the loss ledger,
-    empty if they are counted as let go.
+    This process has locked the recording, or records it. `choose` returns the logs of a manifest
+    that go, with their rows; `check` raises if they must stay. `lost` is the reason of a row of the
+    loss ledger, empty if they are counted as let go.
     """
 
     def how(now: Manifest) -> Manifest:
         check(now)
-        gone = choose(now)
+        numbers = {log.number for log in choose(now)}
+        gone = [file for file in now.files if file.number in numbers]
         if not gone:
             return now
         parts = [(n, part) for f in gone if f.kind == "log" for n, part in f.parts.items()]
