@@ -78,7 +78,7 @@ class StoreFiles(Struct):
         found, damaged = {}, self.catalog.damaged(recordings)
         for recording in recordings:
             try:
-                seen = self._see(recording, damaged.get(recording, {}))
+                seen = self.see(recording, damaged.get(recording, {}))
             except StoreError as error:
                 self.report.unreadable[recording] = str(error)
                 continue
@@ -88,13 +88,15 @@ class StoreFiles(Struct):
             self.catalog.put(found.values())
         return {recording: summary for recording, (summary, _) in found.items()}
 
-    def see(self, recording: str) -> Seen | None:
-        """A recording by its manifest, with results of decoding; None if it is gone."""
-        return self._see(recording, self.catalog.damage(recording), self.catalog)
+    def see(self, recording: str, damage: Damage | None = None) -> Seen | None:
+        """A recording by its manifest; None if it is gone.
 
-    def _see(self, recording: str, damage: Damage, catalog: Catalog | None = None) -> Seen | None:
+        Without its known `damage`, the catalog tells that, and what was decoded.
+        """
+        catalog = self.catalog if damage is None else None
+        known = self.catalog.damage(recording) if damage is None else damage
         try:
-            seen = see(self.directory, recording, damage, catalog)
+            seen = see(self.directory, recording, known, catalog)
         except RecordingGoneError:
             self._left.add(recording)  # its removal was interrupted
             return None

@@ -128,12 +128,8 @@ class ReplaySource(ThreadedSource):
         return channel
 
     def _report(self, damage: Damage) -> None:
-        place = str(damage.file)
-        if damage.offset is not None:
-            place += f", byte {damage.offset}"
-            if damage.length is not None:
-                place += f" to {damage.offset + damage.length}"
-        detail = f"{place}: {damage.reason}"
+        at = "" if damage.offset is None else f", byte {damage.offset}"
+        detail = f"{damage.file}{at}: {damage.reason}"
         if damage.messages_lost == 0:
             self._sink.say(detail)
             return

@@ -29,7 +29,6 @@ from urllib.parse import urlsplit
 from xml.parsers.expat import ExpatError
 
 import msgspec
-from msgspec import Struct
 
 from hybridlog.live.sources.base import PeerError, one_line
 from hybridlog.live.sources.network import (
@@ -85,9 +84,9 @@ class Ros1Source(LoopSource):
         super().__init__()
         self.address = master_uri or os.environ.get("ROS_MASTER_URI") or _DEFAULT_URI
         self.was_reached = False
-        self._caller = f"/hybridlog_{os.getpid()}_{secrets.token_hex(4)}"
-        self._max_message_bytes = max_message_bytes
-        self._poll_s = poll_s
+        self.caller = f"/hybridlog_{os.getpid()}_{secrets.token_hex(4)}"
+        self.max_message_bytes = max_message_bytes
+        self.poll_s = poll_s
 
     def check(self) -> None:
         """Checks the address."""
@@ -115,14 +114,11 @@ class Ros1Source(LoopSource):
             if not failed.done():
                 failed.set_exception(error)
 
-        graph = Graph(uri, self._poll_s, self._reached)
         reader = Reader(lambda error: loop.call_soon_threadsafe(fail, error))
         reader.start()
         try:
             async with asyncio.TaskGroup() as tasks:
-                about = self._caller, sink, reader, self._max_message_bytes
-                context = Context(*about, tasks.create_task, graph.forget)
-                tasks.create_task(graph.watch(context))
+                tasks.create_task(Graph(uri, self, sink, reader, tasks.create_task).watch())
                 await failed
         except BaseExceptionGroup as group:
             raise group.exceptions[0] from None
@@ -135,12 +131,21 @@ _REST: Final = 4
 
 
 class Graph:
-    """The topics of a master, and the subscriptions to them."""
+    """The topics of a master, and the subscriptions to them.
 
-    def __init__(self, uri: str, poll_s: float, reached: Callable[[], None]) -> None:
+    `spawn` runs a coroutine until the source stops.
+    """
+
+    def __init__(
+        self,
+        uri: str,
+        source: Ros1Source,
+        sink: Sink,
+        reader: Reader,
+        spawn: Callable[[Coroutine[None, None, None]], object],
+    ) -> None:
+        self.source, self.sink, self.reader, self.spawn = source, sink, reader, spawn
         self._uri = uri
-        self._poll_s = poll_s
-        self._reached = reached
         self._subscriptions: dict[str, Subscription] = {}
         self._nodes: dict[str, str] = {}  # addresses by name
 
@@ -148,81 +153,64 @@ class Graph:
         """Look again where the node of an address is: it does not answer there."""
         self._nodes = {name: known for name, known in self._nodes.items() if known != uri}
 
-    async def watch(self, context: Context) -> None:
+    async def watch(self) -> None:
         """Polls the master until cancelled."""
         loop = asyncio.get_running_loop()
         while True:
             began = loop.time()
             try:
-                await self._poll(context)
+                await self._poll()
             except PeerError as error:
-                context.sink.say(
+                self.sink.say(
                     f"no ROS master at {one_line(self._uri)} ({error}); waiting for it. Start "
                     "roscore, or give its address with --ros1 or ROS_MASTER_URI"
                 )
                 await asyncio.sleep(_PAUSE_S)
                 continue
             # A large system that takes long to poll is polled less often.
-            await asyncio.sleep(max(self._poll_s, _REST * (loop.time() - began)))
+            await asyncio.sleep(max(self.source.poll_s, _REST * (loop.time() - began)))
 
-    async def _poll(self, context: Context) -> None:
+    async def _poll(self) -> None:
         """Polls the master once, and updates the subscriptions."""
         lists = list[tuple[str, list[str]]]
-        state = await self._asked(context, tuple[lists, object, object], "getSystemState")
-        self._reached()
-        types = dict(await self._asked(context, list[tuple[str, str]], "getTopicTypes"))
+        state = await self._asked(tuple[lists, object, object], "getSystemState")
+        self.source.was_reached = True
+        types = dict(await self._asked(list[tuple[str, str]], "getTopicTypes"))
         publishers = {topic: nodes for topic, nodes in state[0] if nodes}
         for topic in publishers.keys() | self._subscriptions.keys():
             kind = types.get(topic, "")
             kind = "" if kind == ANY else kind
             if topic not in self._subscriptions:
-                if not context.sink.wants(topic, kind):
+                if not self.sink.wants(topic, kind):
                     continue
-                self._subscriptions[topic] = Subscription(context, topic)
-            uris = [await self._find(context, node) for node in publishers.get(topic, ())]
+                self._subscriptions[topic] = Subscription(self, topic)
+            uris = [await self._find(node) for node in publishers.get(topic, ())]
             self._subscriptions[topic].update(kind, filter(None, uris))
 
-    async def _find(self, context: Context, node: str) -> str:
+    async def _find(self, node: str) -> str:
         """The address of a node; empty if it has gone."""
         if node not in self._nodes:
             try:
-                self._nodes[node] = await self._asked(context, str, "lookupNode", node)
+                self._nodes[node] = await self._asked(str, "lookupNode", node)
             except RefusedError:
                 return ""
         return self._nodes[node]
 
-    async def _asked(
-        self, context: Context, kind: type[_Kind], method: str, *arguments: object
-    ) -> _Kind:
+    async def _asked(self, kind: type[_Kind], method: str, *arguments: object) -> _Kind:
         """What the master answers."""
-        answer = await call(self._uri, method, context.caller, *arguments)
+        answer = await call(self._uri, method, self.source.caller, *arguments)
         try:
             return msgspec.convert(answer, kind)
         except msgspec.ValidationError as error:
             raise PeerError("its answer is not that of a ROS master") from error
 
 
-class Context(Struct, frozen=True):
-    """Parts that all subscriptions of a source share.
-
-    `spawn` runs a coroutine until the source stops; `forget` asks the master again for the node of
-    an address.
-    """
-
-    caller: str
-    sink: Sink
-    reader: Reader
-    max_message_bytes: int
-    spawn: Callable[[Coroutine[None, None, None]], object]
-    forget: Callable[[str], None]
-
-
 class Subscription:
     """A wanted topic."""
 
-    def __init__(self, context: Context, topic: str) -> None:
+    def __init__(self, graph: Graph, topic: str) -> None:
         self.topic = topic
-        self._context = context
+        self._graph = graph
         self._links: dict[str, _Link] = {}
         self._type = ""
         self._reported = (False, "")
@@ -242,7 +230,7 @@ class Subscription:
                 del self._links[uri]
         for uri in sorted(listed - set(self._links)):
             link = self._links[uri] = _Link(self, uri)
-            self._context.spawn(self._connect(uri, link))
+            self._graph.spawn(self._connect(uri, link))
         self.report()
 
     def report(self) -> None:
@@ -252,23 +240,23 @@ class Subscription:
             return
         before, self._reported = self._reported, now
         if now[0]:
-            self._context.sink.topic_came(self.topic, self._type)
+            self._graph.sink.topic_came(self.topic, self._type)
         elif before[0]:
-            self._context.sink.topic_gone(self.topic)
+            self._graph.sink.topic_gone(self.topic)
 
     def channel(self, fields: Mapping[str, str]) -> Channel | None:
         """The channel of a connection; None if it is unwanted."""
         type_name = fields.get("type", "")
         if type_name and type_name != ANY:
             self._type = self._type or type_name
-            if not self._context.sink.wants(self.topic, type_name):
+            if not self._graph.sink.wants(self.topic, type_name):
                 return None
         channel = channel_of(self.topic, fields)
-        self._context.sink.expect(channel)
+        self._graph.sink.expect(channel)
         return channel
 
     async def _connect(self, uri: str, link: _Link) -> None:
-        await link.run(self._context)
+        await link.run(self._graph)
         link.is_up, link.has_ended = False, True
         if not link.is_listed:
             del self._links[uri]
@@ -284,19 +272,19 @@ class _Link:
         self._subscription = subscription
         self._uri = uri
 
-    async def run(self, context: Context) -> None:
+    async def run(self, graph: Graph) -> None:
         """Connects and reconnects until the publisher is neither listed nor reachable."""
         topic, failures = self._subscription.topic, 0
         while True:
             try:
-                connected, fields = await subscribe(context.caller, topic, self._uri)
+                connected, fields = await subscribe(graph.source.caller, topic, self._uri)
             except (OSError, PeerError) as error:
                 if not self.is_listed:
                     return
                 failures += 1
                 # A single failure is normal: a node that ends is listed a little longer.
                 if failures == 2:
-                    context.sink.say(self._told(error))
+                    graph.sink.say(self._told(error))
             else:
                 failures = 0
                 try:
@@ -307,9 +295,9 @@ class _Link:
                 if channel is None:
                     connected.close()
                     return
-                await self._serve(context, connected, channel)
+                await self._serve(graph, connected, channel)
             self._set_up(is_up=False)
-            context.forget(self._uri)
+            graph.forget(self._uri)
             await asyncio.sleep(_PAUSE_S)
 
     def _told(self, error: OSError | PeerError) -> str:
@@ -323,7 +311,7 @@ class _Link:
         topic = one_line(self._subscription.topic)
         return f"{topic}: cannot subscribe at its publisher {uri}: {reason}; trying again"
 
-    async def _serve(self, context: Context, connected: socket.socket, channel: Channel) -> None:
+    async def _serve(self, graph: Graph, connected: socket.socket, channel: Channel) -> None:
         """Lets the reader read a connection until it ends."""
         loop = asyncio.get_running_loop()
         ended: asyncio.Future[str] = loop.create_future()
@@ -335,13 +323,13 @@ class _Link:
         def closed(failure: str) -> None:
             loop.call_soon_threadsafe(settle, failure)
 
-        stream = Stream(connected, channel, context.sink, context.max_message_bytes, closed)
+        stream = Stream(connected, channel, graph.sink, graph.source.max_message_bytes, closed)
         self._set_up(is_up=True)
-        context.reader.add(stream)
+        graph.reader.add(stream)
         if failure := await ended:
             name = one_line(channel.metadata.get("callerid", "an unnamed node"))
             what = f"{one_line(channel.topic)}: lost the connection to {name}"
-            context.sink.say(f"{what} at {one_line(self._uri)}: {failure}; connecting again")
+            graph.sink.say(f"{what} at {one_line(self._uri)}: {failure}; connecting again")
 
     def _set_up(self, *, is_up: bool) -> None:
         self.is_up = is_up
