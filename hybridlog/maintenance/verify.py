@@ -245,14 +245,9 @@ class _Check(Struct):
             yield f"{file.name} byte {at}", problem, cure
 
     def _others(self, listing: Listing, manifest: Manifest) -> None:
-        """Find files that the manifest does not list."""
-        left = listing.left_over(manifest)
-        for name in left:
-            self.found(name, "it was left over by a command that was stopped")
-        for name in listing.open.values():
-            self.found(name, "a crash has left it open")
-        known = {*manifest.present, *left, LOCK}
-        for name in sorted({*listing.sealed.values(), *listing.rows, *listing.others} - known):
+        """Find files that the manifest does not list: of a crash, or from elsewhere."""
+        found = {*listing.sealed.values(), *listing.open.values(), *listing.rows, *listing.others}
+        for name in sorted(found - manifest.present.keys() - {LOCK}):
             self.found(name, "the manifest does not list it", f"{_REPAIR}, or {_MOVE}")
 
 
