@@ -30,9 +30,14 @@ from hybridlog.cli.signals import handled, write_note
 from hybridlog.contract import Contract
 from hybridlog.follow.child import Trigger
 from hybridlog.live.incidents import PINNED
-from hybridlog.live.policy import default_budget, priority_rule, throttle_rule
-from hybridlog.live.recorder import Recorder, RecorderOptions, make_room
-from hybridlog.live.state import summary_of
+from hybridlog.live.recorder import (
+    Recorder,
+    RecorderOptions,
+    make_room,
+    priority_rule,
+    throttle_rule,
+)
+from hybridlog.live.recording import default_budget
 from hybridlog.query.answers.lost import coverage, in_words
 from hybridlog.record.losses import Cause, losses_of
 from hybridlog_storage.errors import (

@@ -6,6 +6,8 @@ topic the received messages are the stored ones plus those in the loss ledger.
 
 from __future__ import annotations
 
+import math
+import re
 import shutil
 import threading
 import time
@@ -14,7 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from operator import attrgetter
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Final, cast
 
 from msgspec import Struct
 from msgspec.structs import replace
@@ -24,19 +26,13 @@ from hybridlog.entries import text as as_text
 from hybridlog.follow.child import FollowerProcess, Task
 from hybridlog.live.clocks import CLOCK, MachineClock, SimulatedTime
 from hybridlog.live.incidents import RULE, Incidents, SilenceWatch
-from hybridlog.live.policy import (
-    SMALL_BYTES,
-    WHOLE_BELOW,
-    Rule,
-    Throttle,
-    first_fit,
-)
-from hybridlog.live.recording import LiveOptions, LiveRecording, follow_interval_s
+from hybridlog.live.recording import SMALL_BYTES, LiveOptions, LiveRecording, follow_interval_s
 from hybridlog.live.state import RecorderState, StateFile, Tally, TopicCounts
 from hybridlog.maintenance.edit import remove_if
 from hybridlog.maintenance.keep import RoomMaker
 from hybridlog.maintenance.retention import Rules
 from hybridlog.query.times import format_duration, format_time
+from hybridlog.query.topics import TopicMatcher, matcher
 from hybridlog.record.losses import Cause
 from hybridlog.record.marks import CLOCK_SET
 from hybridlog.schema.codecs import codec_for
@@ -58,7 +54,6 @@ if TYPE_CHECKING:
     from hybridlog.contract import Contract
     from hybridlog.follow.child import Trigger
     from hybridlog.live.sources.base import LiveSource, Sink
-    from hybridlog.query.topics import TopicMatcher
     from hybridlog.record.recorder import RecordReport
     from hybridlog.store import Store
     from hybridlog_storage.catalog import RecordingEntry
@@ -72,6 +67,79 @@ _SEQUENCES = 1 << 32
 _HELD_SHARE = 8  # of the memory budget, for messages that come before `/clock`
 _CLOCK_WAIT_S = 5.0
 _SLOW_WRITE_S = 2.0  # to pack and write a chunk, on a disk that is busy
+
+
+_RATE = re.compile(r"(\d+(?:\.\d+)?)\s*(?:hz)?", re.IGNORECASE)
+_HIGHEST_HZ = 1e6
+WHOLE_BELOW: Final = {"low": 0.5, "normal": 0.7, "high": 0.9}
+"""Shares of the budget above which large messages of a priority keep their fields only."""
+
+
+class Rule(Struct, frozen=True):
+    """A setting for the topics that match a pattern: a rate in Hz, or a share of the budget."""
+
+    pattern: str
+    fits: TopicMatcher
+    value: float
+
+
+def throttle_rule(pattern: str, rate: str) -> Rule:
+    """A rule that limits topics to a rate such as `5Hz` or `0.5`.
+
+    Raises:
+        UsageError: The rate is malformed.
+        TopicError: The pattern is malformed.
+    """
+    found = _RATE.fullmatch(rate.strip())
+    hz = float(found[1]) if found else 0.0
+    if not 0 < hz <= _HIGHEST_HZ:
+        raise UsageError(f"{rate!r} is no rate: give messages a second, such as 5Hz.")
+    return Rule(pattern, matcher([pattern]), hz)
+
+
+def priority_rule(pattern: str, word: str) -> Rule:
+    """A rule that gives topics the priority `low`, `normal` or `high`.
+
+    Raises:
+        UsageError: The priority is unknown.
+        TopicError: The pattern is malformed.
+    """
+    try:
+        return Rule(pattern, matcher([pattern]), WHOLE_BELOW[word.strip().lower()])
+    except KeyError:
+        raise UsageError(f"Unknown priority {word!r}; choose low, normal or high.") from None
+
+
+def first_fit(rules: Sequence[Rule], topic: str) -> float | None:
+    """The value of the first rule that matches a topic, None if none does."""
+    found = [rule.value for rule in rules if rule.fits(topic)]
+    return found[0] if found else None
+
+
+class Throttle:
+    """Limits a topic to a rate, with even intervals between messages.
+
+    Time is the messages' receive time. A message may come a quarter of an interval early.
+    Without that tolerance a jittering topic of 10 Hz gives 3.3 Hz instead of 5.
+    """
+
+    def __init__(self, hz: float) -> None:
+        self._interval = math.ceil(1e9 / hz)
+        self._slack = self._interval // 4
+        self._due = self._reset = -2 * self._interval  # long ago: the next message passes
+        self._last = 0
+
+    def lets_through(self, received: int) -> bool:
+        """Tells whether a message is stored."""
+        if received < self._last - self._interval:
+            self._due = self._reset  # the clock was set back
+        self._last = received
+        if received < self._due - self._slack:
+            return False
+        # The interval starts when the message was due: from its arrival the rate would sag.
+        late = received - self._due
+        self._due = (self._due if late < self._interval else received) + self._interval
+        return True
 
 
 class RecorderOptions(LiveOptions, frozen=True):

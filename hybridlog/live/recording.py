@@ -15,12 +15,11 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from operator import index as index_of
 from queue import Empty, SimpleQueue
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
 import numpy as np
 from msgspec import Struct, field
 
-from hybridlog.live.policy import MIN_USER_BUDGET, SMALL_BYTES, default_budget
 from hybridlog.record.capture import Capture
 from hybridlog.record.losses import Cause, Ledger
 from hybridlog.record.recorder import RecordReport
@@ -49,6 +48,23 @@ _MAX_NS = 1 << 63
 _SOURCE = {"path": "", "kind": "live", "profile": "", "bytes": 0}
 LIVE_SETTINGS = SegmentSettings(segment_size=1 << 30, segment_span_s=600.0)
 """Live segments are short, since what is not sealed is read anew by each command."""
+
+
+SMALL_BYTES = 4096
+"""Messages up to this payload size stay whole: reducing them saves next to nothing."""
+MIN_USER_BUDGET: Final = 1 << 20
+"""Smallest budget that a user may choose, bytes."""
+_MIN_BUDGET, _MAX_BUDGET = 64 << 20, 2 << 30
+_MACHINE_SHARE: Final = 16
+
+
+def default_budget() -> int:
+    """A sixteenth of the machine's memory in bytes, from 64 MiB to 2 GiB.
+
+    It bridges some seconds of a slow disk, and leaves memory to other programs of the robot.
+    """
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return min(max(memory // _MACHINE_SHARE, _MIN_BUDGET), _MAX_BUDGET)
 
 
 class LiveOptions(Struct, frozen=True):

@@ -9,8 +9,7 @@ import pytest
 import hybridlog as hl
 from hybridlog.contract import Contract, TopicRules
 from hybridlog.live.clocks import MachineClock
-from hybridlog.live.policy import throttle_rule
-from hybridlog.live.recorder import RecorderOptions
+from hybridlog.live.recorder import RecorderOptions, throttle_rule
 from hybridlog.query.times import format_duration
 from hybridlog.record.losses import Cause
 from hybridlog.record.marks import MARKS

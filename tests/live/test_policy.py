@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybridlog.live.policy import (
+from hybridlog.live.recorder import (
     WHOLE_BELOW,
     Throttle,
     first_fit,

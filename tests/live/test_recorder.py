@@ -19,8 +19,7 @@ from mcap.reader import make_reader
 import hybridlog as hl
 from hybridlog.live import recorder as recorder_module
 from hybridlog.live import recording as recording_module
-from hybridlog.live.policy import priority_rule, throttle_rule
-from hybridlog.live.recorder import Recorder, RecorderOptions
+from hybridlog.live.recorder import Recorder, RecorderOptions, priority_rule, throttle_rule
 from hybridlog.live.state import choose, read, running
 from hybridlog.record.losses import Cause
 from hybridlog.record.marks import MARKS

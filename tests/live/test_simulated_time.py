@@ -11,8 +11,7 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.live.clocks import clock_time
-from hybridlog.live.policy import throttle_rule
-from hybridlog.live.recorder import RecorderOptions
+from hybridlog.live.recorder import RecorderOptions, throttle_rule
 from hybridlog.query.topics import matcher
 from hybridlog.record.losses import Cause
 from hybridlog_storage.manifest import Loss
