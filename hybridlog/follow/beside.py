@@ -18,28 +18,23 @@ from msgspec.structs import replace
 
 import hybridlog
 from hybridlog.entries import put_entry
-from hybridlog.follow.child import ENDED, Task, Trigger
+from hybridlog.follow.child import Task, Trigger
 from hybridlog.follow.follower import Follower, begin_again, make_rows_ahead
 from hybridlog.maintenance.opening import missing
 from hybridlog.maintenance.report import Followed
 from hybridlog.query.answers.follow import Arrivals
-from hybridlog.query.predicate.types import check
 from hybridlog.query.question import Counters, Question
 from hybridlog.record.marks import MARKS
-from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.errors import (
     DatabaseError,
-    DefinitionError,
     DiskFullError,
     HybridlogError,
     StoreError,
-    WhereError,
     WithoutMongoError,
 )
 
 if TYPE_CHECKING:
     from hybridlog.store import Store
-    from hybridlog_storage.messages import Channel
 
 _EVERY_S: Final = 0.25
 _ROWS_S: Final = 5.0
@@ -99,28 +94,13 @@ class _Beside:
     def hear(self) -> None:
         """Hear the recorder, until it ends."""
         try:
-            while True:
-                order = self._control.recv()
-                if order == ENDED:
-                    if self._follower is not None:
-                        self._follower.is_stopped = True  # until it finishes
-                    self._ended.set()
-                else:
-                    self._check(order)
+            self._control.recv()  # that it is sealed
+            if self._follower is not None:
+                self._follower.is_stopped = True  # until it finishes
+            self._ended.set()
+            self._control.recv()  # until the recorder ends
         except (EOFError, OSError):
             os._exit(0)
-
-    def _check(self, channel: Channel) -> None:
-        with suppress(DefinitionError):
-            types = {path.path: path.type for path in codec_for(channel).paths()} or None
-            for one in self._triggers:
-                if one.predicate is not None and one.fits(channel.topic):
-                    try:
-                        check(one.predicate, types)
-                    except WhereError as error:
-                        never = f"trigger {one.text!r} can never fire on {channel.topic}"
-                        why = str(error).splitlines()[0]  # the others point into its text
-                        self.tell("say", f"{never}: {why}")
 
     def run(self) -> None:
         """Do all that a recording needs until its end, and the rest then."""

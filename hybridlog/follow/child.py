@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from hybridlog.shared import Shared
     from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
-    from hybridlog_storage.messages import Channel
 
 _START: Final = (
     "import sys; sys.path[:] = {!r}; from hybridlog.follow.beside import serve; serve({})"
@@ -108,7 +107,7 @@ class FollowerProcess:
         self._reach = reach
         self._hit = hit
         self._say = say or self.said.append
-        self._orders: list[Channel | str] = []
+        self._is_ended = False  # and sealed: the process is to end
         self._process: subprocess.Popen[bytes] | None = None
         self._begun = time.monotonic()
         self._over = threading.Event()
@@ -154,17 +153,12 @@ class FollowerProcess:
 
         self._thread.start()
 
-    def expect(self, channel: Channel) -> None:
-        """Tell the triggers that can never fire on a channel, before its first message."""
-        if any(one.fits(channel.topic) for one in self._triggers):
-            self._orders.append(channel)
-
     def finish(self, entry: RecordingEntry) -> RecordingEntry:
         """Wait until it has done everything, but no longer than wanted."""
         if self._reach is not None and time.monotonic() - self._begun < SHORT_S:
             return self._finish_here(entry, self._reach())
         self._is_finishing = True
-        self._orders.append(ENDED)
+        self._is_ended = True
         begun = time.monotonic()
         while self._thread.is_alive() and not self._is_left:
             if self.wait_s is not None and time.monotonic() - begun >= self.wait_s:
@@ -234,11 +228,11 @@ class FollowerProcess:
 
     def _hear(self, control: Connection[Any, Any]) -> bool:
         control.send(self._task)
-        told = 0
+        is_told = False
         while not self._over.is_set():
-            for order in self._orders[told:]:
-                control.send(order)
-                told += 1
+            if self._is_ended and not is_told:
+                control.send(ENDED)
+                is_told = True
             if not control.poll(_POLL_S):
                 continue
             match control.recv():
