@@ -251,7 +251,7 @@ class Recorder:
         try:
             self._room = RoomMaker(
                 store.directory,
-                partial(remove_if, store.shared),
+                partial(remove_if, store.shared, clears=False),
                 self._target.id,
                 sealed=lambda: self._target.capture.writer.totals.segments,
                 reserve=options.reserve_bytes,

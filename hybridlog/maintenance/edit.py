@@ -250,18 +250,22 @@ def unmark(shared: OpenStore, recording: str, moment: TimeLike | None, note: str
 
 
 def remove_if(
-    shared: OpenStore, recording: str, check: Callable[[Manifest], None] = lambda _: None
+    shared: OpenStore,
+    recording: str,
+    check: Callable[[Manifest], None] = lambda _: None,
+    *,
+    clears: bool = True,
 ) -> None:
     """Delete a recording of an open store.
 
     Its manifest says so first, then its files go, then the manifest; who may write finishes what
     was interrupted. `check` is called with the newest manifest, and raises to keep the recording.
-    If MongoDB fails, the next connection clears it.
+    If MongoDB fails, or is not to be waited for (`clears`), the next connection clears it.
     """
     directory = shared.directory
     try:
         entry = shared.now().entry(recording)
-        database = shared.index.reached(writes=True)
+        database = shared.index.reached(writes=True) if clears else None
         with directory.writing(entry.id, entry.name, wait_s=LOCK_WAIT_S):
             try:
                 directory.manifests.remove(entry.id, check)
