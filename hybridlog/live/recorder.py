@@ -356,6 +356,7 @@ class Recorder:
             self._simulated.close()
         self._follower.wait_s = wait_s
         self._says.remove()
+        self._room.stop()
         self._check_silences(ended_at)
         self._write_marks()
         if self._is_marked(self._target.id) or (

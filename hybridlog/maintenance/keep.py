@@ -111,6 +111,7 @@ class Keeper:
     `remove` deletes a recording, by its id, unless a check of its manifest raises. `own` is the
     one that this process makes; after `ring_s` its groups go, and `let_go` counts their messages,
     once triggers have `judged` them: it returns the numbers of these segments, None for all.
+    `is_wanted` is asked before each deletion.
     """
 
     def __init__(
@@ -121,12 +122,13 @@ class Keeper:
         *,
         ring_s: float | None = None,
         judged: Callable[[], Collection[int] | None] = lambda: None,
+        is_wanted: Callable[[], bool] = lambda: True,
     ) -> None:
         self.let_go = 0
         self._ring_s = ring_s
         self._sealed: dict[int, float] = {}  # when each group was first seen, by `monotonic`
         self._directory, self._remove, self._own = directory, remove, own
-        self._judged = judged
+        self._judged, self._is_wanted = judged, is_wanted
         # Segments that this pass could not change, by recording; -1 for all of it.
         self._failed: defaultdict[str, set[int]] = defaultdict(set)
 
@@ -159,7 +161,7 @@ class Keeper:
                 for step in [*planned.steps]:
                     self._do(step, rules, found)
                 planned = self.plan(rules)
-                if not planned.steps:
+                if not (planned.steps and self._is_wanted()):
                     break
                 found.plan.steps += planned.steps
             found.plan.warnings, found.plan.is_short = planned.warnings, planned.is_short
@@ -214,7 +216,8 @@ class Keeper:
 
     def _do(self, step: Step, rules: Rules, found: KeepReport, copy: str = "") -> None:
         """Do a step, with the room of the spare file if there is no other; reports in `found`."""
-        if self._failed[step.id] and not step.segments:
+        is_known = not self._failed[step.id] or step.segments
+        if not (is_known and self._is_wanted()):
             return  # planned before it was known: the next plan judges again
         directory, is_own, freed = self._directory, step.id == self._own, step.bytes
         check = partial(_check, step, rules)
@@ -531,10 +534,10 @@ _AGES_S: Final = 60.0  # and between two for the ages alone
 class RoomMaker:
     """Makes room ahead of need for the recording of this process, as it is looked at.
 
-    A pass is made when a segment was sealed (`sealed` counts them), when less is free than the
-    rules or the recorder (`reserve`, bytes) want, and once a minute; for a ring alone, with each
-    look, after `pin` has pinned what triggers want. What it cannot do is told, and never stops the
-    recorder. All else is as of `Keeper`.
+    A pass, on a thread of its own, is made when a segment was sealed (`sealed` counts them), when
+    less is free than the rules or the recorder (`reserve`, bytes) want, and once a minute; for a
+    ring alone, with each look, after `pin` has pinned what triggers want. What it cannot do is
+    told, and never stops the recorder. All else is as of `Keeper`.
     """
 
     def __init__(
@@ -552,23 +555,42 @@ class RoomMaker:
     ) -> None:
         self._directory, self._sealed, self._reserve, self._say = directory, sealed, reserve, say
         self._pin = None if ring_s is None else pin
-        self.keeper = Keeper(directory, remove, own, ring_s=ring_s, judged=judged)
+        self._is_over = False
+        self.keeper = Keeper(
+            directory,
+            remove,
+            own,
+            ring_s=ring_s,
+            judged=judged,
+            is_wanted=lambda: not self._is_over,
+        )
         self._alone = threading.Lock()  # who makes a pass
+        self._thread = threading.Thread()
         self._passed, self._counted = -_AGES_S, 0
         self._rules = self._read_rules()
         self._has_warned = False
 
     def look(self) -> None:
-        """Make a pass if one is due; call it about once a second."""
+        """Begin a pass if one is due; call it about once a second."""
+        if self._thread.is_alive():
+            return
         since, count, is_low = time.monotonic() - self._passed, self._sealed(), False
         with suppress(HybridlogError, OSError):  # the next pass tells
             free = shutil.disk_usage(self._directory.path).free
             is_low = since >= LOOK_S and free < (self._read_rules().min_free or 0)
-        if is_low or count != self._counted or since >= _AGES_S:
-            self._passed += since
-            self._counted = -1 if self._pass() is None else count
-        elif self._pin is not None:
-            self._pass(is_ring=True)
+        is_due = is_low or count != self._counted or since >= _AGES_S
+        if is_due:
+            self._passed, self._counted = self._passed + since, count
+        if is_due or self._pin is not None:
+            options = {"is_ring": not is_due}
+            self._thread = threading.Thread(target=self._pass, kwargs=options, daemon=True)
+            self._thread.start()
+
+    def stop(self) -> None:
+        """End after the deletion in progress."""
+        self._is_over = True
+        if self._thread.is_alive():
+            self._thread.join()
 
     def make_room(self, free_bytes: int = 0) -> bool:
         """Make a pass, for so many free bytes at least; returns whether to try again."""
@@ -591,6 +613,7 @@ class RoomMaker:
                     self._pin()
                 done = self.keeper.keep(Rules() if is_ring else self._rules)
             except HeldError:
+                self._counted = -1
                 time.sleep(_POLL_S)
                 return None
             except (HybridlogError, OSError) as error:

@@ -52,7 +52,7 @@ def test_rules_that_are_written_while_it_runs_hold(tmp_path: Path) -> None:
         robot.speaker.say(CAMERA, image(0))
         with store_with(tmp_path / "store", **{"min-free": "1000TB"}):
             pass
-        robot.recorder.look()
+        wait_for(lambda: robot.recorder.look() and robot.said)
         robot.recorder.stop()
     assert "all that is left must stay" in robot.said[0]
     with hl.open(tmp_path / "store", mongo="none") as store:
