@@ -22,7 +22,7 @@ import numpy as np
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 
-from hybridlog.live.sources.foxglove.source import MESSAGE_DATA, SUBPROTOCOLS
+from hybridlog.live.sources.foxglove.protocol import MESSAGE_DATA, SUBPROTOCOLS
 from hybridlog.view.guard import Admission, listen
 from hybridlog.view.playback.played import PlaybackClock
 from hybridlog_storage.errors import HybridlogError, UsageError

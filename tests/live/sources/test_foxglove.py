@@ -19,7 +19,8 @@ from typing import Any
 import pytest
 
 from hybridlog.live.sources.base import Cause, PeerError
-from hybridlog.live.sources.foxglove.source import FoxgloveSource, parse_channel
+from hybridlog.live.sources.foxglove.protocol import parse_channel
+from hybridlog.live.sources.foxglove.source import FoxgloveSource
 from hybridlog_storage.errors import MissingDependencyError, UsageError
 from hybridlog_storage.messages import Schema
 from tests.calls import Calls

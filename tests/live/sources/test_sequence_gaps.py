@@ -11,7 +11,7 @@ import pytest
 
 from hybridlog.live.sources.base import Cause
 from hybridlog.live.sources.foxglove.connection import Session
-from hybridlog.live.sources.foxglove.source import MESSAGE_DATA
+from hybridlog.live.sources.foxglove.protocol import MESSAGE_DATA
 from hybridlog.live.sources.ros1.stream import Stream
 from hybridlog.live.sources.sequence_gaps import SequenceGap, SequenceGapDetector
 from hybridlog_storage.messages import Channel, Schema

@@ -27,7 +27,7 @@ from picows import (
 )
 
 from hybridlog.live.sources.base import Cause, Loss, PeerError, Sink, one_line
-from hybridlog.live.sources.foxglove.source import (
+from hybridlog.live.sources.foxglove.protocol import (
     MAX_TEXT,
     MESSAGE_DATA,
     SUBPROTOCOLS,
