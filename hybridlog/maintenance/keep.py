@@ -593,16 +593,21 @@ class RoomMaker:
             self._thread.join()
 
     def make_room(self, free_bytes: int = 0) -> bool:
-        """Make a pass, for so many free bytes at least; returns whether to try again."""
-        return self._rules.makes_room and self._pass(free_bytes) != 0
+        """Make a pass, for so many free bytes at least; returns whether to try again.
 
-    def _read_rules(self, free_bytes: int | None = None) -> Rules:
+        Without a number, for a writer that waits.
+        """
+        if not self._rules.makes_room:
+            return False
+        return self._pass(free_bytes, is_urgent=not free_bytes) != 0
+
+    def _read_rules(self, free_bytes: int = 0) -> Rules:
         rules = Rules.of(read_settings(self._directory.path).retention)
-        if rules.makes_room:
-            rules = rules.with_free(max(free_bytes or 0, self._reserve))
-        return structs.replace(rules, is_urgent=free_bytes is not None)
+        return rules.with_free(max(free_bytes, self._reserve)) if rules.makes_room else rules
 
-    def _pass(self, free_bytes: int | None = None, *, is_ring: bool = False) -> int | None:
+    def _pass(
+        self, free_bytes: int = 0, *, is_urgent: bool = False, is_ring: bool = False
+    ) -> int | None:
         """Make a pass; returns the bytes that it freed, None if another process makes one."""
         with self._alone:
             try:
@@ -611,7 +616,8 @@ class RoomMaker:
                     return 0
                 if self._pin is not None:
                     self._pin()
-                done = self.keeper.keep(Rules() if is_ring else self._rules)
+                rules = Rules() if is_ring else structs.replace(self._rules, is_urgent=is_urgent)
+                done = self.keeper.keep(rules)
             except HeldError:
                 self._counted = -1
                 time.sleep(_POLL_S)
