@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Collection
@@ -12,6 +11,7 @@ from contextlib import suppress
 from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
+from threading import Event, Lock, Thread
 from typing import TYPE_CHECKING, Any, Final
 
 from msgspec.structs import replace
@@ -58,7 +58,7 @@ def serve(handle: int) -> None:
                 os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
         store = hybridlog.open(task.store, mongo=task.mongo)
         beside = _Beside(control, task, store)
-        threading.Thread(target=beside.hear, daemon=True).start()
+        Thread(target=beside.hear, daemon=True).start()
         try:
             with store:
                 beside.run()
@@ -76,15 +76,13 @@ class _Beside:
         self._task = task
         self._store = store
         self._triggers = [Trigger.of(text) for text in task.triggers]
-        self._lock = threading.Lock()
-        self._ended = threading.Event()
+        self._lock = Lock()
+        self._ended = Event()
         self._follower: Follower | None = None
         self._state: Followed | None = None
         self._before = 0  # messages that an earlier process has indexed
         self._sealed: Collection[int] = ()  # that have their rows
         self._rows_due = 0.0
-        self._derives = threading.Thread(target=self._harmless, args=(self._derive,), daemon=True)
-        self._recovers = threading.Thread(target=self._harmless, args=(self._recover,), daemon=True)
 
     def tell(self, *what: object) -> None:
         """Tell the recorder something."""
@@ -104,11 +102,13 @@ class _Beside:
 
     def run(self) -> None:
         """Do all that a recording needs until its end, and the rest then."""
-        self._derives.start()
-        self._recovers.start()
+        works = (self._derive, self._recover)
+        threads = [Thread(target=self._harmless, args=(work,), daemon=True) for work in works]
+        for thread in threads:
+            thread.start()
         self._watch(self._task.seen)
         self.tell("seen")
-        for thread in (self._derives, self._recovers):
+        for thread in threads:
             while thread.is_alive():
                 thread.join(_EVERY_S)
                 self._tell_state()
@@ -194,7 +194,6 @@ class _Beside:
             if is_lost and index.reached(brings=False, writes=True) is not None:
                 follower.discard()
                 follower = self._begin(is_again=True)
-        follower.is_stopped = False
         directory, catalog = self._store.directory, self._store.shared.catalog
         follower.finish(put_entry(directory, catalog, task.recording))
 

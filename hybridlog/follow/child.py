@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import subprocess
 import sys
@@ -19,7 +20,6 @@ from hybridlog.maintenance.report import Followed
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.topics import TopicMatcher, matcher, split_topic
 from hybridlog_storage.errors import (
-    DatabaseError,
     DiskFullError,
     HybridlogError,
     StoreError,
@@ -30,11 +30,9 @@ from hybridlog_storage.errors import (
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
 
-    from hybridlog.index.indexing import IndexTarget
     from hybridlog.query.predicate.tree import Predicate
     from hybridlog.shared import Shared
-    from hybridlog_storage.catalog import Catalog, RecordingEntry
-    from hybridlog_storage.disk.directory import StoreDirectory
+    from hybridlog_storage.catalog import RecordingEntry
 
 _START: Final = (
     "import sys; sys.path[:] = {!r}; from hybridlog.follow.beside import serve; serve({})"
@@ -73,38 +71,34 @@ class FollowerProcess:
     """Evaluates triggers, then makes rows, tables and documents, by a process that ends with this.
 
     When it ends before the recording, as for want of memory, it is started again, and goes on
-    where it was. With `reach`, a recording that has ended before `SHORT_S` is followed in this
-    process, at its end.
+    where it was. With a `purpose`, which errors of the index name, a recording that has ended
+    before `SHORT_S` is followed in this process, at its end.
     `judged` has the numbers of the sealed files that triggers have read; it is None without
-    triggers, or when the process is given up. At the end it is waited for `wait_s`, if that is not
-    None.
+    triggers, or when the process is given up. At the end it is waited for `wait_s`.
     """
 
     def __init__(
         self,
-        directory: StoreDirectory,
-        catalog: Catalog,
+        shared: Shared,
         task: Task,
+        state: Followed,
         *,
-        has_documents: bool,
-        failure: DatabaseError | None = None,
-        reach: Callable[[], IndexTarget] | None = None,
+        purpose: str = "",
         triggers: Sequence[Trigger] = (),
         hit: Callable[[str, int], object] = lambda *_: None,
         say: Callable[[str], None] | None = None,
     ) -> None:
-        self.state = Followed(has_documents, failure=failure)
+        self.state = state
         self.said: list[str] = []
         self.judged: Collection[int] | None = () if triggers else None
-        self.wait_s: float | None = None
-        self._is_finishing = self._is_left = False
-        self._directory = directory
-        self._catalog = catalog
+        self.wait_s = math.inf
+        self._is_finishing = False
+        self._shared = shared
         self._triggers = triggers
         self._task = task
         self._has_seen = not triggers
         self._why = "their process ends again and again"
-        self._reach = reach
+        self._purpose = purpose
         self._hit = hit
         self._say = say or self.said.append
         self._is_ended = False  # and sealed: the process is to end
@@ -121,27 +115,13 @@ class FollowerProcess:
 
         Errors of the index name the `purpose`.
         """
-        index = shared.index
-        target = index.index_to_record(purpose)
-
-        def reach() -> IndexTarget:
-            if target.is_wanted:
-                with suppress(HybridlogError):  # the server may have come, or may have gone
-                    index.connect(brings=False)
-            found: IndexTarget = index.index_to_record(purpose, brings=False)
-            return found
+        target = shared.index.index_to_record(purpose)
+        state = Followed(target.is_wanted, failure=target.failure)
 
         def start(entry: RecordingEntry) -> FollowerProcess:
-            place = shared.directory.address
-            task = Task(place, index.wanted, entry.id, (), interval_s, target.is_wanted)
-            followed = cls(
-                shared.directory,
-                shared.catalog,
-                task,
-                has_documents=target.is_wanted,
-                failure=target.failure,
-                reach=reach,
-            )
+            place, wanted = shared.directory.address, shared.index.wanted
+            task = Task(place, wanted, entry.id, (), interval_s, target.is_wanted)
+            followed = cls(shared, task, state, purpose=purpose)
             followed.start()
             return followed
 
@@ -155,36 +135,40 @@ class FollowerProcess:
 
     def finish(self, entry: RecordingEntry) -> RecordingEntry:
         """Wait until it has done everything, but no longer than wanted."""
-        if self._reach is not None and time.monotonic() - self._begun < SHORT_S:
-            return self._finish_here(entry, self._reach())
+        if self._purpose and time.monotonic() - self._begun < SHORT_S:
+            return self._finish_here(entry)
         self._is_finishing = True
         self._is_ended = True
         begun = time.monotonic()
-        while self._thread.is_alive() and not self._is_left:
-            if self.wait_s is not None and time.monotonic() - begun >= self.wait_s:
-                break
+        while self._thread.is_alive() and time.monotonic() - begun < self.wait_s:
             self._thread.join(_POLL_S)
         if self._thread.is_alive():
             if not self._has_seen:
                 self._say("triggers have not seen the last messages: that takes too long")
             self._say("tables and index are not complete: the next command makes the rest")
         self.abandon()
-        return put_entry(self._directory, self._catalog, entry.id)
+        return put_entry(self._shared.directory, self._shared.catalog, entry.id)
 
-    def _finish_here(self, entry: RecordingEntry, target: IndexTarget) -> RecordingEntry:
+    def _finish_here(self, entry: RecordingEntry) -> RecordingEntry:
         from hybridlog.follow.follower import Follower, make_rows_ahead
 
         self.abandon()
+        directory, index = self._shared.directory, self._shared.index
         with suppress(StoreError, DiskFullError):  # or else they are written when logs go
-            make_rows_ahead(self._directory, entry.id, lambda: True)
-        follower = Follower(self._directory, self._catalog, entry, target)
+            make_rows_ahead(directory, entry.id, lambda: True)
+        if self.state.is_wanted:
+            with suppress(HybridlogError):  # the server may have come, or may have gone
+                index.connect(brings=False)
+        target = index.index_to_record(self._purpose, brings=False)
+        follower = Follower(directory, self._shared.catalog, entry, target)
         entry = follower.finish(entry)
         self.state = follower.state
         return entry
 
     def leave(self) -> bool:
         """Let `finish` wait no longer; False if it does not wait."""
-        was_waiting, self._is_left = self._is_finishing and not self._is_left, self._is_finishing
+        was_waiting = self._is_finishing and self.wait_s > 0
+        self.wait_s = 0.0 if self._is_finishing else self.wait_s
         return was_waiting
 
     def abandon(self) -> None:
@@ -196,7 +180,7 @@ class FollowerProcess:
             self._thread.join()
 
     def _run(self) -> None:
-        if self._reach is not None and self._over.wait(SHORT_S):
+        if self._purpose and self._over.wait(SHORT_S):
             return
         failed = 0
         while failed < _TRIES and not self._over.is_set():

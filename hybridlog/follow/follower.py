@@ -85,7 +85,6 @@ class Follower:
         failure: The error of the database; None without any.
         made: Number of chunks whose documents were made.
         messages: Number of messages that were read.
-        is_stopped: Set it to end `follow` before the next chunks.
     """
 
     def __init__(
@@ -102,7 +101,6 @@ class Follower:
         self._target = target or IndexTarget()
         self.failure = self._target.failure
         self.made = self.messages = 0
-        self.is_stopped = False
         self._directory = directory
         self._path = directory.recording(entry.id)
         self._catalog = catalog
@@ -145,14 +143,13 @@ class Follower:
         """
         manifest = self._directory.manifests.read(self._entry.id)
         listing = self._directory.listing(self._entry.id).choosing(manifest)
-        with suppress(InterruptedError):
-            for number in sorted({*listing.open, *listing.sealed} - self._ended):
-                if number in listing.sealed and number in manifest.logs:
-                    digest = manifest.logs[number].digest
-                    self._read_sealed(number, listing.sealed[number], digest)
-                else:
-                    self._read_open(number)
-            self._send()
+        for number in sorted({*listing.open, *listing.sealed} - self._ended):
+            if number in listing.sealed and number in manifest.logs:
+                digest = manifest.logs[number].digest
+                self._read_sealed(number, listing.sealed[number], digest)
+            else:
+                self._read_open(number)
+        self._send()
 
     def finish(self, entry: RecordingEntry) -> RecordingEntry:
         """Make the rest of what is derived of a recording that has ended.
@@ -233,17 +230,12 @@ class Follower:
         channels: Mapping[int, Channel],
         report: Callable[[int], None] = lambda _: None,
     ) -> None:
-        """Read those chunks of a segment that were not; InterruptedError if it is to stop.
-
-        Small ones are decoded together.
-        """
+        """Read those chunks of a segment that were not, small ones together."""
         segment, size, rows = self._segments[number], 0, 0
         group: list[StoredChunk] = []
         for place in [*(one for one in places if one.number >= segment.chunks), None]:
             is_full = size >= _GROUP_BYTES or rows >= _GROUP_ROWS
             if group and (place is None or is_full):
-                if self.is_stopped:
-                    raise InterruptedError
                 self._take(segment, group, channels)
                 report(group[-1].place.offset)
                 group, size, rows = [], 0, 0

@@ -30,6 +30,7 @@ from hybridlog.live.recording import SMALL_BYTES, LiveOptions, LiveRecording, fo
 from hybridlog.live.state import RecorderState, StateFile, Tally, TopicCounts
 from hybridlog.maintenance.edit import remove_if
 from hybridlog.maintenance.keep import RoomMaker
+from hybridlog.maintenance.report import Followed
 from hybridlog.maintenance.retention import Rules
 from hybridlog.query.times import format_duration, format_time
 from hybridlog.query.topics import TopicMatcher, matcher
@@ -275,10 +276,9 @@ class Recorder:
             follow_interval_s(self._of_recording()),
         )
         self._follower = FollowerProcess(
-            self._directory,
-            self._shared.catalog,
+            self._shared,
             task,
-            has_documents=index.is_wanted and options.derives,
+            Followed(index.is_wanted and options.derives),
             triggers=triggers,
             hit=self.fire,
             say=self.say,
@@ -354,7 +354,7 @@ class Recorder:
         self._over.set()
         if self._simulated is not None:
             self._simulated.close()
-        self._follower.wait_s = wait_s
+        self._follower.wait_s = math.inf if wait_s is None else wait_s
         self._says.remove()
         self._room.stop()
         self._check_silences(ended_at)
@@ -676,7 +676,7 @@ class Recorder:
         number: int,
     ) -> bool:
         """Store the fields of a message without its payload; False if they do not fit either."""
-        from hybridlog.columns.left_rows import reduced  # loads pyarrow
+        from hybridlog.columns.rows import reduced  # loads pyarrow
 
         if recorded.reduced is None:
             recorded.reduced = left_channel(recorded.channel, REDUCED)
