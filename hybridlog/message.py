@@ -191,7 +191,7 @@ class Messages:
 
     def refuse(self, row: int) -> NoReturn:
         """Refuse a payload that is gone."""
-        from hybridlog.columns.left_rows import digest_in, with_rows
+        from hybridlog.columns.rows import digest_in, with_rows
         from hybridlog.schema.codecs import missing_payload
 
         left = with_rows(self._batch.take(slice(row, row + 1))).left

@@ -10,9 +10,9 @@ import pytest
 
 PLACES = {
     "align_piece_bytes": "hybridlog.across.align._PIECE_BYTES",
-    "column_file_open_files": "hybridlog.columns.column_file._OPEN_FILES",
-    "shared_file_recordings": "hybridlog.columns.folders.MAX_SHARED_RECORDINGS",
-    "shared_file_rows": "hybridlog.columns.folders.MAX_SHARED_ROWS",
+    "row_group_rows": "hybridlog.columns.column_file._GROUP_ROWS",
+    "shared_file_recordings": "hybridlog.columns.table_writer.MAX_SHARED_RECORDINGS",
+    "shared_file_rows": "hybridlog.columns.table_writer.MAX_SHARED_ROWS",
     "long_table_rows": "hybridlog.columns.table_writer.LONG_ROWS",
     "group_bytes": "hybridlog.follow.follower._GROUP_BYTES",
     "short_recording_s": "hybridlog.follow.child.SHORT_S",

@@ -31,7 +31,7 @@ ALLOWED = {
     "av": ("hybridlog.arrays.video",),
     "blake3": ("hybridlog_storage.disk.append_file", "hybridlog_storage.manifest"),
     "bson": (
-        "hybridlog.columns.left_rows",
+        "hybridlog.columns.rows",
         "hybridlog.query.predicate",
         "hybridlog.schema",
         "hybridlog_storage.mongo",

@@ -9,8 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any, Final
 
-from hybridlog.arrays.message_arrays import attributes
-from hybridlog.arrays.point_arrays import byte_array
+from hybridlog.arrays.message_arrays import attributes, byte_array
 from hybridlog_storage.errors import MissingDependencyError, PayloadError, extra
 
 if TYPE_CHECKING:

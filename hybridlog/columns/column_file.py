@@ -11,11 +11,10 @@ import io
 import os
 import threading
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from contextlib import suppress
-from itertools import count
+from contextlib import contextmanager, nullcontext, suppress
+from itertools import accumulate, count
 from pathlib import Path
 from typing import Any, Final, NamedTuple
-from weakref import WeakSet
 
 import msgspec
 import pyarrow as pa
@@ -27,7 +26,7 @@ from hybridlog.columns.fields import (
     names_of,
     original_name,
 )
-from hybridlog.columns.layout import ABOUT, OWN, OWN_COLUMNS, About, Section
+from hybridlog.columns.layout import ABOUT, OWN, OWN_COLUMNS, Section
 from hybridlog.schema.arrow_types import is_bytes, is_list
 from hybridlog_storage.cache import Cache, lazy
 from hybridlog_storage.checksum import crc32
@@ -35,7 +34,6 @@ from hybridlog_storage.disk import files
 from hybridlog_storage.errors import HybridlogError, StoreError, exhausted
 from hybridlog_storage.manifest import digest_of
 
-_OPEN_FILES: Final = 256
 _AT_ONCE: Final = 1 << 20  # bytes read together for a digest, and written together
 _TAIL: Final = 8  # bytes: length of the footer, `PAR1`
 _SEAL: Final = 4  # bytes: CRC-32 of the footer, in front of it
@@ -90,6 +88,10 @@ def leaves(schema: pa.Schema) -> Iterator[Leaf]:
             ]
 
 
+def _is_counter(leaf: Leaf) -> bool:
+    return leaf.path.endswith(".seq") and pa.types.is_integer(leaf.kind)
+
+
 class ColumnFileWriter:
     """Writes one file; no reader of Parquet looks at the bytes of `front`."""
 
@@ -100,21 +102,13 @@ class ColumnFileWriter:
         self.schema = schema
         self.rows = 0
         self._raw = _Raw(files.open_file(path, os.O_RDWR | os.O_CREAT | os.O_EXCL))
-        kinds = {leaf.path: leaf.kind for leaf in leaves(schema)}
-        running = [  # adjacent values differ by little
-            path
-            for path, kind in kinds.items()
-            if path in _RUNNING
-            or pa.types.is_timestamp(kind)
-            or (path.endswith(".seq") and pa.types.is_integer(kind))
-        ]
-        # DuckDB answers wrongly from statistics of floats with NaN among them.
-        ordered = [
-            path
-            for path, kind in kinds.items()
-            if not (is_bytes(kind) or pa.types.is_floating(kind))
-        ]
-        repeating = [path for path in ordered if path not in running and kinds[path] != pa.bool_()]
+        running, ordered = [], []
+        for leaf in leaves(schema):
+            if leaf.path in _RUNNING or pa.types.is_timestamp(leaf.kind) or _is_counter(leaf):
+                running.append(leaf.path)  # adjacent values differ by little
+            # DuckDB answers wrongly from statistics of floats with NaN among them.
+            if not (is_bytes(leaf.kind) or pa.types.is_floating(leaf.kind)):
+                ordered.append(leaf.path)
         try:
             self._file = io.BufferedWriter(self._raw, _AT_ONCE)
             sink = pa.PythonFile(self._file, mode="w")
@@ -123,7 +117,7 @@ class ColumnFileWriter:
                 schema,
                 compression="zstd",
                 compression_level=level,
-                use_dictionary=repeating,
+                use_dictionary=[path for path in ordered if path not in running],
                 column_encoding=dict.fromkeys(running, "DELTA_BINARY_PACKED"),
                 write_statistics=ordered,
                 write_page_checksum=True,
@@ -142,7 +136,7 @@ class ColumnFileWriter:
     def close(self, sections: Sequence[Section], *, sync: bool = False) -> None:
         """Finish the file, with its sections in order."""
         try:
-            about = msgspec.json.encode(About(sections))
+            about = msgspec.json.encode(sections)
             self._parquet.add_key_value_metadata({ABOUT.decode(): about.decode()})
             body = self._file.tell()
             self._parquet.close()
@@ -201,10 +195,7 @@ class TablePart(NamedTuple):
 
 
 class ColumnFile:
-    """Reads one file; FileNotFoundError without it. Thread safe.
-
-    If too many are open, files are closed, and opened again.
-    """
+    """Reads one file, open while it is read; FileNotFoundError without it. Thread safe."""
 
     def __init__(self, path: Path, cache: Cache | None = None) -> None:
         self.path = path
@@ -216,7 +207,9 @@ class ColumnFile:
         try:
             self._source = _Source(path)
             metadata = pq.read_metadata(pa.BufferReader(b"PAR1" + self._source.footer))
-            self.about = About.from_json(metadata.metadata.get(ABOUT, b""))
+            about = (metadata.metadata or {}).get(ABOUT, b"")
+            self.sections = msgspec.json.decode(about, type=list[Section])
+            """What the rows are, in their order."""
             self._parquet = pq.ParquetFile(
                 pa.PythonFile(self._source, mode="r"),
                 metadata=metadata,
@@ -228,11 +221,11 @@ class ColumnFile:
             numbers = range(metadata.num_row_groups)
             self.groups = [int(metadata.row_group(number).num_rows) for number in numbers]
             """Rows of each row group."""
-            if sum(self.groups) != sum(section.rows for section in self.about.sections):
+            if sum(self.groups) != sum(section.rows for section in self.sections):
                 raise StoreError("its rows differ from its description")
         except FileNotFoundError:
             raise
-        except (OSError, StoreError, pa.ArrowException, KeyError) as error:
+        except (OSError, StoreError, pa.ArrowException, ValueError, RecursionError) as error:
             raise self._damaged(error) from error
 
     @property
@@ -244,6 +237,11 @@ class ColumnFile:
     def rows(self) -> int:
         """Rows of all recordings."""
         return sum(self.groups)
+
+    @property
+    def was_replaced(self) -> bool:
+        """True if another file has its name by now, as the last reading has found."""
+        return self._source.was_replaced
 
     def size(self, group: int, leaves: Sequence[int]) -> int:
         """Stored bytes of some columns of a row group."""
@@ -290,7 +288,7 @@ class ColumnFile:
     def read(self, group: int | None, leaves: Sequence[int]) -> pa.Table:
         """Columns, numbered in Parquet's order (depth first), of a row group; None for no rows."""
         try:
-            with self._lock:
+            with self._lock, nullcontext() if group is None else self._source.opened():
                 if group is not None:
                     self._source.fetch(self._parquet.metadata.row_group(group), leaves)
                 reader: Any = self._parquet.reader
@@ -308,7 +306,8 @@ class ColumnFile:
     def digest(self) -> str:
         """BLAKE3 of all bytes."""
         try:
-            return self._source.digest()
+            with self._lock, self._source.opened():
+                return self._source.digest()
         except (OSError, StoreError) as error:
             raise self._damaged(error) from error
 
@@ -368,12 +367,14 @@ class ColumnFile:
         arrays = {path[:-1] for path in wanted if path[-1] in SUMMARY_FIELDS}
         return any(leaf.names[: len(one)] == one for one in arrays & self.summaries.keys())
 
-    def sections(self) -> Iterator[tuple[int, Section]]:
-        """The rows in it, each section with its first row."""
-        before = 0
-        for section in self.about.sections:
-            yield before, section
-            before += section.rows
+    def has(self, recording: str) -> bool:
+        """True if it has rows of a recording."""
+        return any(one.id == recording for one in self.sections)
+
+    def begins(self) -> Iterator[tuple[int, Section]]:
+        """The sections, each with its first row."""
+        before = accumulate((one.rows for one in self.sections), initial=0)
+        return zip(before, self.sections, strict=False)
 
     def parts(self, begin: int, rows: int) -> Iterator[TablePart]:
         """Row groups with some rows of one topic."""
@@ -388,26 +389,39 @@ class ColumnFile:
 
 
 class _Source:
-    """Provides Parquet's bytes, after verifying the checksum of the footer."""
+    """Provides Parquet's bytes, after verifying the checksum of the footer; open while it reads."""
 
     def __init__(self, path: Path) -> None:
         self.closed = False
+        self.was_replaced = False
         self._path = path
-        self._lock = threading.Lock()
         self._fd = -1
         self._position = 0
         self._same: tuple[int, ...] | None = None
-        with self._lock:
-            self._open()
+        with self.opened():
             self.size = os.fstat(self._fd).st_size
-        tail = self._raw(self.size - _TAIL, self.size) if self.size > 2 * _TAIL else b""
-        length = int.from_bytes(tail[:4], "little") + _TAIL
-        if tail[4:] != b"PAR1" or length > min(self.size - _SEAL, _MAX_FOOTER):
-            raise StoreError("its end is missing")
-        sealed = self._raw(self.size - length - _SEAL, self.size)
+            tail = self._raw(self.size - _TAIL, self.size) if self.size > 2 * _TAIL else b""
+            length = int.from_bytes(tail[:4], "little") + _TAIL
+            if tail[4:] != b"PAR1" or length > min(self.size - _SEAL, _MAX_FOOTER):
+                raise StoreError("its end is missing")
+            sealed = self._raw(self.size - length - _SEAL, self.size)
         self.footer = sealed[_SEAL:]
         if crc32(self.footer) != int.from_bytes(sealed[:_SEAL], "little"):
             raise StoreError("the checksum of its footer differs")
+
+    @contextmanager
+    def opened(self) -> Iterator[None]:
+        """Open the file, which is the same as before, for one thread."""
+        self._fd = files.open_file(self._path, os.O_RDONLY)
+        try:
+            same = files.identity(self._fd)
+            self.was_replaced = self._same not in {None, same}
+            if self.was_replaced:
+                raise StoreError("it was replaced")
+            self._same = same
+            yield
+        finally:
+            os.close(self._fd)
 
     def digest(self) -> str:
         """BLAKE3 of all bytes."""
@@ -416,16 +430,13 @@ class _Source:
 
     def fetch(self, group: Any, leaves: Iterable[int]) -> None:
         """Ask a bucket once for some columns of a row group."""
-        with self._lock:
-            if self._fd < 0:
-                self._open()
-            if files.is_fetched(self._fd):
-                ranges = []
-                for column in map(group.column, leaves):
-                    begin = column.dictionary_page_offset or column.data_page_offset
-                    begin = min(begin, column.data_page_offset)
-                    ranges.append((begin, begin + column.total_compressed_size))
-                files.fetch(self._fd, ranges)
+        if files.is_fetched(self._fd):
+            ranges = []
+            for column in map(group.column, leaves):
+                begin = column.dictionary_page_offset or column.data_page_offset
+                begin = min(begin, column.data_page_offset)
+                ranges.append((begin, begin + column.total_compressed_size))
+            files.fetch(self._fd, ranges)
 
     def read(self, size: int = -1) -> bytes:
         """Read from the current position."""
@@ -435,39 +446,10 @@ class _Source:
         return self._raw(begin, end) if begin < end else b""
 
     def _raw(self, begin: int, end: int) -> bytes:
-        with self._lock:
-            if self._fd < 0:
-                self._open()
-            data = files.pread(self._fd, end - begin, begin)
+        data = files.pread(self._fd, end - begin, begin)
         if len(data) != end - begin:
             raise StoreError("it was truncated")
         return data
-
-    def __del__(self) -> None:
-        self.release()
-
-    def release(self, *, wait: bool = True) -> None:
-        """Close the file until it is read again; without `wait` not one that is just read."""
-        if self._lock.acquire(wait):
-            if self._fd >= 0:
-                os.close(self._fd)
-            self._fd = -1
-            self._lock.release()
-
-    def _open(self) -> None:
-        self._fd = files.open_file(self._path, os.O_RDONLY)
-        same = files.identity(self._fd)
-        if self._same is not None and same != self._same:
-            os.close(self._fd)
-            self._fd = -1
-            raise StoreError("it was replaced")
-        self._same = same
-        with _OPENING:
-            if len(_OPENED) >= files.most_open(_OPEN_FILES):
-                for source in [*_OPENED]:
-                    source.release(wait=False)
-                _OPENED.clear()
-            _OPENED.add(self)
 
     def seek(self, position: int, whence: int = os.SEEK_SET) -> int:
         base = {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: self.size}[whence]
@@ -478,8 +460,4 @@ class _Source:
         return self._position
 
     def close(self) -> None:
-        """Do nothing: the file remains open as long as its reader."""
-
-
-_OPENED: Final[WeakSet[_Source]] = WeakSet()
-_OPENING: Final = threading.Lock()
+        """Do nothing: it is opened to be read."""

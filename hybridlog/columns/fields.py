@@ -148,15 +148,11 @@ def records_of(
     """
     kind = columns.type
     if pa.types.is_struct(kind):
-        if not any(map(_is_changed, kind)):
-            return columns
         found: dict[str, Array] = {}
         for number, field in enumerate(kind):
             name = original_name(field)
             path = (*above, name)
-            values = records_of(columns.field(number), is_summarised, path)
-            if EMPTY in (field.metadata or {}):
-                values = _emptied(values)
+            values = records_of(content_of(field, columns.field(number)), is_summarised, path)
             if has_summaries(field):
                 if is_summarised(path):
                     found[name] = filled(values, found.get(name))
@@ -164,10 +160,20 @@ def records_of(
                     found.setdefault(name, values)
             else:
                 found[name] = values
-        return structs(found, len(columns), missing_of(columns))
-    if is_list(kind) and _is_changed(kind.value_field):
-        return with_values(columns, records_of(columns.flatten(), is_summarised, above))
+        is_same = not any(field.metadata for field in kind) and all(
+            found[field.name].type == field.type for field in kind
+        )
+        return columns if is_same else structs(found, len(columns), missing_of(columns))
+    if is_list(kind):
+        elements = columns.flatten()
+        values = records_of(elements, is_summarised, above)
+        return columns if values is elements else with_values(columns, values)
     return columns
+
+
+def content_of(field: Any, column: Array) -> Array:
+    """A column with the messages that have no fields as such, and not as booleans."""
+    return _emptied(column) if EMPTY in (field.metadata or {}) else column
 
 
 def _emptied(array: Array) -> Array:
@@ -187,16 +193,6 @@ def filled(summaries: Array, lists: Array | None) -> Array:
     columns = {field.name: part.cast(field.type) for part, field in zip(parts, kind, strict=True)}
     made = structs(columns, len(lists), missing_of(lists), list(kind))
     return pc.coalesce(summaries, made)
-
-
-def _is_changed(field: Any) -> bool:
-    """True if a column, or one inside it, is not its field under the same name."""
-    if not {ORIGINAL, SUMMARY, EMPTY}.isdisjoint(field.metadata or {}):
-        return True
-    kind = field.type
-    if pa.types.is_struct(kind):
-        return any(map(_is_changed, kind))
-    return is_list(kind) and _is_changed(kind.value_field)
 
 
 def joined(pieces: Sequence[Array]) -> Array:

@@ -15,15 +15,12 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-import msgspec
 from msgspec import Struct
-
-from hybridlog_storage.errors import StoreError
 
 if TYPE_CHECKING:
     from hybridlog_storage.catalog import RecordingEntry
@@ -62,8 +59,7 @@ OWN: Final = b"hybridlog.own"
 POINTS: Final = "points"
 """Column of the points of clouds, a list for each of their fields."""
 ABOUT: Final = b"hybridlog"
-"""Metadata of a file: an `About` as JSON."""
-VERSION: Final = 4
+"""Metadata of a file: its sections as JSON."""
 _ODD: Final = re.compile(r"[^A-Za-z0-9_]")
 
 
@@ -121,25 +117,3 @@ class Section(Struct, frozen=True):
     rows: int
     unreadable: int = 0
     arrays: bool = False
-
-
-class About(Struct, frozen=True):
-    """The description of a file of columns, in the file."""
-
-    sections: Sequence[Section]
-    version: int = VERSION
-
-    def has(self, recording: str) -> bool:
-        """True if it has rows of a recording."""
-        return any(one.id == recording for one in self.sections)
-
-    @classmethod
-    def from_json(cls, text: bytes) -> About:
-        """The description from its JSON text; StoreError if invalid or of another version."""
-        try:
-            about = msgspec.json.decode(text, type=cls)
-        except (ValueError, RecursionError) as error:
-            raise StoreError("the description of the table cannot be read") from error
-        if about.version != VERSION:
-            raise StoreError("the table has another version")
-        return about

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from typing import TYPE_CHECKING, Final
 
 from hybridlog_storage.cache import Cache, lazy
@@ -25,16 +24,12 @@ _RESTORE: Final = " Restore it from a copy; `hybridlog verify` shows what is aff
 
 
 class RecordingRows:
-    """The files of rows of one recording. Thread safe.
-
-    Nothing is read before it is needed.
-    """
+    """The files of rows of one recording; nothing is read before it is needed. Thread safe."""
 
     def __init__(self, recording: Path, cache: Cache | None = None) -> None:
         self._recording = recording
         self._cache = cache or Cache()
-        self._readers: dict[int, list[RowsFile | StoreError]] = {}  # by number of the log
-        self._lock = threading.RLock()
+        self._files: dict[int, tuple[list[RowsFile], str]] = {}  # by log, and what is wrong
 
     @lazy
     def _listed(self) -> Mapping[int, Sequence[File]]:
@@ -44,31 +39,28 @@ class RecordingRows:
 
     def left(self, log: int, chunk: int) -> tuple[Batch, NDArray[np.int64]]:
         """The rows that remain of a chunk, and the arrival numbers of its messages."""
-        from hybridlog.columns.left_rows import messages_left
+        from hybridlog.columns.rows import messages_left
 
-        files = self._of(log)
-        readable = [file for file in files if not isinstance(file, StoreError)]
+        if log not in self._files:
+            self._files[log] = self._open(log)
+        files, problems = self._files[log]
         try:
-            found = [file.of_chunk(chunk) for file in readable if chunk in file.places]
+            found = [part for file in files for part in file.of_chunk(chunk)]
         except StoreError as error:
             raise SegmentError(f"{error}{_RESTORE}") from error
         if not found:
-            problems = " ".join(str(file) for file in files if isinstance(file, StoreError))
             problems = problems or f"Rows are in no file of {self._recording}."
             raise SegmentError(f"{problems}{_RESTORE}")
         return messages_left(found)
 
-    def _of(self, log: int) -> list[RowsFile | StoreError]:
-        """The files of rows of a log, or what is wrong with them."""
+    def _open(self, log: int) -> tuple[list[RowsFile], str]:
         from hybridlog.columns.rows_file import RowsFile
 
-        with self._lock:
-            found = self._readers.get(log)
-            if found is None:
-                found = self._readers[log] = []
-                for listed in self._listed.get(log, ()):
-                    try:
-                        found.append(RowsFile(self._recording, listed, self._cache))
-                    except StoreError as error:
-                        found.append(error)
-            return found
+        files: list[RowsFile] = []
+        problems: list[str] = []
+        for listed in self._listed.get(log, ()):
+            try:
+                files.append(RowsFile(self._recording, listed, self._cache))
+            except StoreError as error:
+                problems.append(str(error))
+        return files, " ".join(problems)

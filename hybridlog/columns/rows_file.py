@@ -8,17 +8,16 @@ behind the message. Unlike a table it is never made again.
 from __future__ import annotations
 
 from hashlib import sha256
+from operator import attrgetter
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import pyarrow as pa
-from msgspec import Struct, field
 
 from hybridlog.columns.column_file import ColumnFile, ColumnFileWriter
 from hybridlog.columns.fields import side_by_side
 from hybridlog.columns.layout import Section
-from hybridlog.columns.left_rows import digest_in, with_rows
-from hybridlog.columns.rows import columns_from, rows_of
+from hybridlog.columns.rows import columns_from, digest_in, rows_of, with_rows
 from hybridlog.index.indexing import ChunkIndexer
 from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.codecs import LeftCodec
@@ -66,30 +65,30 @@ class RowsFile(ColumnFile):
         return StoreError(f"The file of rows {self.path} is not the one that the manifest lists.")
 
     @lazy
-    def places(self) -> dict[int, tuple[int, int, int]]:
-        """The row group of each chunk, its first row and number of rows there."""
-        found: dict[int, tuple[int, int, int]] = {}
+    def _places(self) -> dict[int, list[tuple[int, int, int]]]:
+        """The row groups of each chunk, its first row and number of rows there."""
+        found: dict[int, list[tuple[int, int, int]]] = {}
         for group, rows in enumerate(self.groups):
             chunks = self.read(group, self.numbers("ref.chunk"))["ref"].combine_chunks()
             numbers = chunks.field("chunk").to_numpy()
             starts = run_starts(numbers).tolist()
             for begin, end in zip(starts, [*starts[1:], rows], strict=True):
-                found[int(numbers[begin])] = group, begin, end - begin
+                found.setdefault(int(numbers[begin]), []).append((group, begin, end - begin))
         return found
 
-    def of_chunk(self, chunk: int) -> pa.StructArray:
-        """The rows of a chunk; a struct has all columns."""
-        group, begin, rows = self.places[chunk]
-        found = self._cache.made(
-            "column",
-            self.number,
-            group,
-            make=lambda: (
-                self.read(group, range(len(self.leaves))).to_struct_array().combine_chunks()
-            ),
-            size_of=lambda one: int(one.nbytes),
-        )
-        return found.slice(begin, rows)
+    def of_chunk(self, chunk: int) -> list[pa.StructArray]:
+        """The rows of a chunk, by row group; a struct has all columns."""
+        return [
+            self._group(group).slice(begin, rows)
+            for group, begin, rows in self._places.get(chunk, ())
+        ]
+
+    def _group(self, group: int) -> pa.StructArray:
+        def read() -> pa.StructArray:
+            return self.read(group, range(len(self.leaves))).to_struct_array().combine_chunks()
+
+        size_of = attrgetter("nbytes")
+        return self._cache.made("column", self.number, group, make=read, size_of=size_of)
 
 
 def line_of(folder: Path, log: File, name: str) -> File:
@@ -104,18 +103,6 @@ def line_of(folder: Path, log: File, name: str) -> File:
         times = t[own]
         parts[number] = Part(len(times), int(size[own].sum()), int(times.min()), int(times.max()))
     return rows_line(log, name, file.size_bytes, file.digest(), parts)
-
-
-class _OpenFile(Struct):
-    """A file that is being written; `tables` wait for a row group."""
-
-    topic: str
-    writer: ColumnFileWriter
-    tables: list[pa.Table] = field(default_factory=list)
-
-    def flush(self) -> None:
-        self.writer.write(pa.concat_tables(self.tables).combine_chunks())
-        self.tables.clear()
 
 
 class RowsWriter:
@@ -139,7 +126,7 @@ class RowsWriter:
         self._front = front
         self._version = version
         self._indexer = ChunkIndexer(folder.name)
-        self._open: dict[tuple[str, pa.Schema], _OpenFile] = {}  # by topic and columns
+        self._open: dict[tuple[str, pa.Schema], tuple[ColumnFileWriter, list[pa.Table]]] = {}
         self.names: list[str] = []
         """Names of the files, the first one first."""
 
@@ -147,40 +134,46 @@ class RowsWriter:
         """Add the messages of a chunk."""
         for messages in self._indexer.messages_in([chunk], self._channels):
             table = _table(messages)
-            self._file(messages.channel.topic, table.schema).tables.append(table)
-        for file in self._open.values():  # between chunks: none is in two row groups
-            if sum(one.nbytes for one in file.tables) >= _GROUP_BYTES:
-                file.flush()
+            self._waiting(messages.channel.topic, table.schema).append(table)
+        for writer, tables in self._open.values():
+            if sum(one.nbytes for one in tables) >= _GROUP_BYTES:
+                _flush(writer, tables)
 
     def close(self) -> tuple[File, ...]:
         """Finish all files, force them to the disk, and return their lines of the manifest."""
         while self._open:
-            self._finish(self._open.popitem()[1])
+            self._finish(next(iter(self._open)))
         return tuple(line_of(self._folder, self._log, name) for name in self.names)
 
     def discard(self) -> None:
         """Remove the files that are not finished."""
-        for file in self._open.values():
-            file.writer.discard()
+        for writer, _ in self._open.values():
+            writer.discard()
 
-    def _file(self, topic: str, schema: pa.Schema) -> _OpenFile:
-        found = self._open.get((topic, schema))
-        if found is None:
+    def _waiting(self, topic: str, schema: pa.Schema) -> list[pa.Table]:
+        """Rows that wait for a row group of a file, by topic and columns."""
+        key = topic, schema
+        if key not in self._open:
             if len(self._open) >= _MAX_OPEN:
-                self._finish(self._open.pop(next(iter(self._open))))
+                self._finish(next(iter(self._open)))
             name = rows_name(self._log.number, self._version + len(self.names))
             front = b"" if self.names else self._front
             self.names.append(name)
             writer = ColumnFileWriter(self._folder / name, schema, level=_LEVEL, front=front)
-            found = self._open[topic, schema] = _OpenFile(topic, writer)
-        return found
+            self._open[key] = writer, []
+        return self._open[key][1]
 
-    def _finish(self, file: _OpenFile) -> None:
-        if file.tables:
-            file.flush()
+    def _finish(self, key: tuple[str, pa.Schema]) -> None:
+        writer, tables = self._open.pop(key)
+        if tables:
+            _flush(writer, tables)
         digests = {str(self._log.number): self._log.digest}
-        section = Section(self._folder.name, file.topic, digests, file.writer.rows)
-        file.writer.close([section], sync=True)
+        writer.close([Section(self._folder.name, key[0], digests, writer.rows)], sync=True)
+
+
+def _flush(writer: ColumnFileWriter, tables: list[pa.Table]) -> None:
+    writer.write(pa.concat_tables(tables).combine_chunks())
+    tables.clear()
 
 
 def _table(messages: Messages) -> pa.Table:

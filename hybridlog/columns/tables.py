@@ -11,8 +11,10 @@ reason to look at the folders again. Recordings in progress have no tables.
 from __future__ import annotations
 
 import os
+import re
 import threading
 import time
+from bisect import bisect_right
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
@@ -28,10 +30,10 @@ from msgspec import Struct
 
 from hybridlog.columns.column_file import FIRST, ColumnFile, TablePart
 from hybridlog.columns.fields import joined, names_of, records_of
-from hybridlog.columns.folders import shared_for, shared_times
 from hybridlog.columns.layout import (
     OWN_COLUMNS,
     POINTS,
+    SHARED,
     SUFFIX,
     TABLES,
     Section,
@@ -278,6 +280,7 @@ def _in_order(parts: Sequence[TableRows]) -> TableRows:
     return rows if order is None else rows.take(order)
 
 
+_SHARED_NAME: Final = re.compile(rf"{SHARED}(\d{{20}}){re.escape(SUFFIX)}", re.ASCII)
 _MAX_FOUND: Final = 65_536  # tables that are kept
 _STABLE_NS: Final = 100_000_000  # a time of change that is older tells of every later change
 
@@ -342,7 +345,7 @@ class _Folder:
             self._open(name)
         for name in shared_for(self._shared, recording.created):
             file = self._open(name)
-            if file is not None and file.about.has(recording.id):
+            if file is not None and file.has(recording.id):
                 break
 
     def _open(self, name: str) -> ColumnFile | None:
@@ -359,7 +362,7 @@ class _Folder:
     def _add(self, name: str, file: ColumnFile | None) -> None:
         self._files[name] = _identity(self.names[name]), file
         if file is not None:
-            for begin, section in file.sections():
+            for begin, section in file.begins():
                 rows = self.rows.setdefault((section.id, section.topic), [])
                 rows.append(TopicRows(file, begin, section))
 
@@ -397,13 +400,17 @@ class Tables:
             self._looked_at.clear()
 
     def reject(self, recording: RecordingEntry, topic: str) -> None:
-        """Ignore the table from now on, because it was found to be damaged."""
+        """Ignore the table, which was found to be damaged; look again if a file was replaced."""
         with self._lock:
-            self._found[recording.id, topic] = None
+            found = self._found.get((recording.id, topic))
+            if found is not None and any(file.was_replaced for file in found.files):
+                self.look_again()
+            else:
+                self._found[recording.id, topic] = None
 
     def whole(self, file: ColumnFile) -> TopicTable:
         """All rows of a file, as if of one topic."""
-        unreadable = sum(section.unreadable for section in file.about.sections)
+        unreadable = sum(section.unreadable for section in file.sections)
         parts = [TablePart(file, group, 0, rows) for group, rows in enumerate(file.groups)]
         return TopicTable(parts, unreadable=unreadable)
 
@@ -492,3 +499,35 @@ def _channels(recording: RecordingEntry, topic: str) -> list[ChannelEntry]:
     """The channels of a topic; marks that somebody set are in no table."""
     found = (one for one in recording.channels if one.topic == topic)
     return [one for one in found if one.id != MARKS_CHANNEL]
+
+
+def type_folders(root: Path) -> list[str]:
+    """Names of the folders of tables."""
+    found = files.names(root / TABLES).items()
+    return sorted(name for name, about in found if "~" in name and S_ISDIR(about.st_mode))
+
+
+def shared_times(names: Iterable[str]) -> list[int]:
+    """The numbers in the names of shared files, in order."""
+    return sorted(int(found[1]) for found in map(_SHARED_NAME.fullmatch, names) if found)
+
+
+def shared_for(times: Sequence[int], created: int | None) -> Iterator[str]:
+    """Names of shared files that may have rows of a recording, likeliest first; `created` in ns."""
+    end = len(times) if created is None else bisect_right(times, max(created, 0))
+    return map(shared_name, reversed(times[:end]))
+
+
+def shared_name(time: int) -> str:
+    """The name of a shared file by its number."""
+    return f"{SHARED}{time:020d}{SUFFIX}"
+
+
+def files_of(root: Path, prefixes: Collection[str] = ("",)) -> Iterator[ColumnFile]:
+    """The tables in some folders; those that cannot be read are left out."""
+    with suppress(OSError):
+        for folder in type_folders(root):
+            if folder.startswith(tuple(prefixes)):
+                for name in sorted(files.names(root / TABLES / folder)):
+                    with suppress(OSError, StoreError):
+                        yield ColumnFile(root / TABLES / folder / name)

@@ -6,8 +6,13 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 
-from hybridlog.arrays.message_arrays import attributes, plain_type, to_numpy
-from hybridlog.arrays.point_arrays import POINT_MAKERS, positions
+from hybridlog.arrays.message_arrays import (
+    POINT_MAKERS,
+    attributes,
+    plain_type,
+    positions,
+    to_numpy,
+)
 from hybridlog.tf.transform import placed
 from hybridlog_storage.errors import PayloadError
 

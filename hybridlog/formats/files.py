@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
-from hybridlog.arrays.point_arrays import point_columns, positions
+from hybridlog.arrays.message_arrays import point_columns, positions
 from hybridlog.drawing.images import Picture, picture
 from hybridlog.formats.writing import Answer, Sink, Target, Whole, failures, new_directory, path_of
 from hybridlog_storage.errors import DefinitionError, PayloadError, UsageError

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from hybridlog.columns.left_rows import LeftFields
+from hybridlog.columns.rows import LeftFields
 from hybridlog.frames.names import FIELD, arranged, free_name, is_part, own_columns, summary_of
 from hybridlog.index.indexing import rows_by_channel
 from hybridlog.query.rows import summaries_in
@@ -166,7 +166,7 @@ class Decoder:
         self._counters.unreadable += len(batch) - len(found.rows)
         if isinstance(found.records, LeftFields):
             alone = () if fields is None else arrays.difference(self._chosen or ())
-            self._counters.lacking += int(found.records.lacking(alone).sum())
+            self._counters.lacking += int(found.records.lacks(fields, alone).sum())
         return found
 
     def block(

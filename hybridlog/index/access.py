@@ -18,6 +18,7 @@ from hybridlog_storage.errors import (
     StoreError,
     WithoutMongoError,
 )
+from hybridlog_storage.mongo.index_documents import IndexState, other_store
 from hybridlog_storage.settings import (
     EMBEDDED,
     NAME,
@@ -159,13 +160,9 @@ class IndexAccess:
             if self.connected is not None and (self._is_complete or not brings):
                 return self.connected
             may_end = self.connected is not None or self._named == EMBEDDED
+            connect = again_if_lost(self._connect) if may_end else self._connect
             try:
-                try:
-                    return self._connect(brings=brings)
-                except ConnectionLostError:
-                    if not may_end:
-                        raise
-                    return self._connect(brings=brings)
+                return connect(brings=brings)
             except BaseException as error:
                 self.disconnect()
                 if isinstance(error, HybridlogError):
@@ -188,8 +185,6 @@ class IndexAccess:
 
     def claim(self, database: Database) -> Owner:
         """Note in the index that it is of the store at this place."""
-        from hybridlog_storage.mongo.index_documents import IndexState
-
         owner = IndexState(database).claim(self._directory.settings.store_id, self._own_place)
         self.id, self._owns = owner.made, True
         return owner
@@ -288,8 +283,6 @@ class IndexAccess:
 
     def _open(self) -> Database:
         """The database, connected again if it is lost; it belongs to this store."""
-        from hybridlog_storage.mongo.index_documents import IndexState, other_store
-
         if (database := self.connected) is not None:
             return database
         if self._database is not None:

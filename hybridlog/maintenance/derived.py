@@ -143,7 +143,7 @@ def index_arrays(
     progress: Progress | None = None,
 ) -> list[ArraysOfTopic]:
     """Change the setting of topics, and make their tables anew where these differ from it."""
-    from hybridlog.columns.folders import files_of
+    from hybridlog.columns.tables import files_of
 
     others = [one for one in read_settings(directory.path).arrays if one not in topics]
     directory.change_settings(arrays=tuple(sorted(others if off else {*others, *topics})))
@@ -203,7 +203,8 @@ def bring_tables(source: Shared, target: RemoteDirectory, recordings: Collection
 
 def _tables(source: Shared, entry: RecordingEntry, root: Path) -> list[Path]:
     """Files with the fields of a recording; of shared ones its rows alone, below `root`."""
-    from hybridlog.columns.folders import Addition, TableFolders, files_of
+    from hybridlog.columns.table_writer import Addition, TableFolders
+    from hybridlog.columns.tables import files_of
 
     found = []
     shared = defaultdict[str, Addition](Addition)

@@ -515,8 +515,8 @@ def without_payloads(
 
 def _remove_arrays(directory: StoreDirectory, manifest: Manifest, going: Collection[File]) -> None:
     """Remove tables with arrays that expire; they are made again without these."""
-    from hybridlog.columns.folders import TableFolders
     from hybridlog.columns.layout import type_prefix
+    from hybridlog.columns.table_writer import TableFolders
 
     channels = (manifest.channels[number] for log in going for number in log.parts)
     gone = {one.topic: one.type for one in channels if one.topic in directory.settings.arrays}

@@ -203,7 +203,7 @@ def remove_tables(
     directory: StoreDirectory, recording: str, entry: RecordingEntry | None = None
 ) -> None:
     """Remove all tables of a recording."""
-    from hybridlog.columns.folders import TableFolders
+    from hybridlog.columns.table_writer import TableFolders
 
     prefixes = [""] if entry is None else {type_prefix(one.type) for one in entry.channels}
     created = None if entry is None else entry.created

@@ -151,13 +151,13 @@ def _segment_bytes(entry: RecordingEntry) -> Counter[str]:
 
 def table_bytes(root: Path, entries: Sequence[RecordingEntry]) -> Counter[tuple[str, str]]:
     """Bytes of the tables by recording and topic: their share of the rows of each file."""
-    from hybridlog.columns.folders import files_of
+    from hybridlog.columns.tables import files_of
 
     found: Counter[tuple[str, str]] = Counter()
     types = {type_prefix(channel.type) for entry in entries for channel in entry.channels}
     for file in files_of(root, types):
         rows = Counter[tuple[str, str]]()
-        for section in file.about.sections:
+        for section in file.sections:
             rows[section.id, section.topic] += section.rows
         found.update(_divided(file.size_bytes, rows))
     return found

@@ -267,7 +267,7 @@ class Rows:
             decoded, made = channel.codec.columns_of(own.batch, wanted), {}
             self.counters.unreadable += len(own.batch) - len(decoded.rows)
             if channel.is_reduced:
-                from hybridlog.columns.left_rows import LeftFields, without_lacking
+                from hybridlog.columns.rows import LeftFields, without_lacking
 
                 whole, lacking = without_lacking(decoded, arrays.difference(fields or ()))
                 if partial:

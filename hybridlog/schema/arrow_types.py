@@ -1,7 +1,7 @@
 """Types of Arrow arrays: their kinds, common types, conversion, and summaries of arrays.
 
-A conversion never rounds. Integers become the narrowest integer type for all of them.
-They become doubles only beside doubles and within 2^53. Times beside integers become
+A conversion never rounds. Integers become the widest type among them, signed beside unsigned ones
+int64. They become doubles only beside fractions and within 2^53. Times beside integers become
 integers of nanoseconds. Structs get the fields of all. Values without a common exact type
 become JSON text (`pa.json_()`).
 """
@@ -18,15 +18,14 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from hybridlog.schema.arrow_columns import EXACT, json_array, lists, structs
-from hybridlog.schema.column import Scalars, offsets
-from hybridlog.schema.summary import summarise
+from hybridlog.schema.column import Scalars, offsets, summarise
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
     from numpy.typing import NDArray
 
-    from hybridlog.schema.summary import Summary
+    from hybridlog.schema.column import Summary
 
 _INT64_MAX = (1 << 63) - 1
 _SUMMARIES: Final = (("n", "min", "max", "mean"), ("n",))
@@ -210,28 +209,15 @@ def _exact_number(kinds: Kinds, arrays: Arrays) -> pa.DataType:
     whole = [kind for kind in kinds if not _types.is_floating(kind)]
     if not whole:
         return pa.float64()
-    if len(whole) == len(kinds):
-        return _exact_integer(whole, arrays)
-    if any(map(is_time, kinds)):
-        return pa.json_()
-    narrow = {pa.int8(), pa.uint8(), pa.int16(), pa.uint16()}
-    if narrow.issuperset(whole) and pa.float64() not in kinds:
-        return pa.float32()
-    low, high = _range(array for array in arrays if array.type in whole)
-    return pa.float64() if low >= -EXACT and high <= EXACT else pa.json_()
-
-
-def _exact_integer(kinds: Kinds, arrays: Arrays) -> pa.DataType:
-    if any(map(is_time, kinds)):
+    has_times = any(map(is_time, kinds))
+    if has_times and len(whole) == len(kinds):
         return pa.int64() if pa.uint64() not in kinds else pa.json_()
-    signed = [kind for kind in kinds if _types.is_signed_integer(kind)]
-    unsigned = max((k.bit_width for k in kinds if k not in signed), default=0)
-    if not signed:
-        return pa.type_for_alias(f"uint{unsigned}")
-    bits = max(2 * unsigned, *(kind.bit_width for kind in signed))
-    if bits <= 64:
-        return pa.type_for_alias(f"int{bits}")
-    low, high = _range(arrays)
+    low, high = _range(array for array in arrays if array.type in whole)
+    if len(whole) < len(kinds):
+        is_exact = not has_times and low >= -EXACT and high <= EXACT
+        return pa.float64() if is_exact else pa.json_()
+    if len({_types.is_signed_integer(kind) for kind in kinds}) == 1:
+        return max(kinds, key=lambda kind: kind.bit_width)
     if high <= _INT64_MAX:
         return pa.int64()
     return pa.uint64() if low >= 0 else pa.json_()
@@ -280,8 +266,7 @@ def extremes(array: Array) -> Array:
         found = pc.min_max(array)
         return pa.array([found["min"].as_py(), found["max"].as_py()], kind)
     if _types.is_struct(kind):
-        children = zip(kind, array.flatten(), strict=True)
-        return structs({field.name: extremes(child) for field, child in children}, 2)
+        return structs({name: extremes(child) for name, child in fields_in(array)}, 2)
     if _types.is_fixed_size_list(kind):
         inner = extremes(array.flatten()).take(pa.array(np.arange(2 * kind.list_size) % 2))
         return pa.Array.from_buffers(kind, 2, [None], children=[inner])
@@ -340,7 +325,7 @@ def _converted_struct(array: Array, kind: pa.DataType, *, drops: bool) -> Array:
         array = summary(array)
     if not _types.is_struct(array.type):
         raise pa.ArrowInvalid(f"{array.type} is not {kind}")
-    have = dict(zip([field.name for field in array.type], array.flatten(), strict=True))
+    have = dict(fields_in(array))
     if not drops and not {field.name for field in kind} >= have.keys():
         raise pa.ArrowInvalid(f"{array.type} has fields that {kind} lacks")
     children = {
@@ -352,12 +337,20 @@ def _converted_struct(array: Array, kind: pa.DataType, *, drops: bool) -> Array:
     return structs(children, len(array), missing_of(array), kind)
 
 
+def fields_in(array: Array) -> Iterable[tuple[str, Array]]:
+    """The fields of structs, each with its name."""
+    return zip([field.name for field in array.type], array.flatten(), strict=True)
+
+
 def plain_values(
-    array: Array, cells: Callable[[Array], list[Any] | None] = lambda _: None
+    array: Array,
+    cells: Callable[[Array], list[Any] | None] = lambda _: None,
+    fields: Callable[[Array], Iterable[tuple[str, Array]]] = fields_in,
 ) -> list[Any]:
     """Values as in JSON, except NaN: times in nanoseconds, bytes in base64.
 
-    Null fields of structs are left out. `cells` returns other cells of an array, or None for these.
+    Null fields of structs are left out. `cells` returns other cells of an array, or None for these;
+    `fields` those of structs, of which two may have one name if only one of them is not null.
     """
     made = cells(array)
     if made is not None:
@@ -367,19 +360,20 @@ def plain_values(
         texts = array.storage.to_pylist()
         return [None if text is None else json.loads(text) for text in texts]
     if _types.is_struct(kind):
-        names = [field.name for field in kind]
-        columns = [plain_values(child, cells) for child in array.flatten()]
+        columns = [(name, plain_values(child, cells, fields)) for name, child in fields(array)]
+        names = [name for name, _ in columns]
+        values = zip(*(own for _, own in columns), strict=True) if names else [()] * len(array)
         rows = [
-            {n: v for n, v in zip(names, row, strict=True) if v is not None}
-            for row in (zip(*columns, strict=True) if names else [()] * len(array))
+            {name: one for name, one in zip(names, row, strict=True) if one is not None}
+            for row in values
         ]
         there = array.is_valid().to_pylist()
         return [row if one else None for row, one in zip(rows, there, strict=True)]
     if is_list(kind):
         lengths = lengths_of(array)
-        values = iter(plain_values(_elements(array, int(lengths.sum())), cells))
+        elements = iter(plain_values(_elements(array, int(lengths.sum())), cells, fields))
         counted = zip(lengths.tolist(), array.is_valid().to_pylist(), strict=True)
-        return [[next(values) for _ in range(n)] if there else None for n, there in counted]
+        return [[next(elements) for _ in range(n)] if there else None for n, there in counted]
     if is_time(kind):
         array = array.cast(pa.int64())
     elif is_bytes(kind):

@@ -105,7 +105,7 @@ class LeftCodec(Codec):
 
     def columns_of(self, batch: Batch, fields: Collection[str] | None = None) -> Decoded:
         """The fields that are left; see `Codec.columns_of`."""
-        from hybridlog.columns.left_rows import decoded_left
+        from hybridlog.columns.rows import decoded_left
 
         return decoded_left(batch, self._original, fields, reduced=self.state is State.REDUCED)
 

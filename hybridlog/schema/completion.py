@@ -16,13 +16,13 @@ from itertools import accumulate
 from operator import itemgetter
 from typing import TYPE_CHECKING
 
+import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
 from hybridlog.schema.definition import MessageType, parse_definition, releases, typestore
 from hybridlog.schema.definition_text import canonical
 from hybridlog.schema.ros_codec import WireReader
-from hybridlog.schema.wire_walk import MAX_PADDING, MisfitError
 from hybridlog_storage.errors import DefinitionError
 from hybridlog_storage.messages import REPLACED, SUPPLIED, Schema
 
@@ -125,16 +125,11 @@ def _some(payloads: Sequence[Buffer]) -> list[Buffer]:
 
 def _fit(message_type: MessageType, wire: Wire, payloads: Sequence[Buffer]) -> tuple[int, int]:
     """Messages that a type fits exactly, and that it fits at all."""
-    exact = fits = 0
+    sizes = np.array([memoryview(payload).nbytes for payload in payloads], np.int64)
+    begins = np.cumsum(sizes) - sizes
     try:
-        reader = WireReader(message_type, wire)
+        decoded = WireReader(message_type, wire).read(b"".join(payloads), begins, sizes)
     except DefinitionError:
         return 0, 0
-    for payload in payloads:
-        try:
-            rest = memoryview(payload).nbytes - len(reader.message_in(payload))
-        except MisfitError:
-            continue
-        fits += 1
-        exact += rest <= MAX_PADDING[wire]
-    return exact, fits
+    fits = len(decoded.rows)
+    return fits - len(decoded.surplus), fits

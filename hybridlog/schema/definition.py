@@ -12,15 +12,16 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 import numpy as np
 from msgspec import Struct
 
-from hybridlog.schema.definition_idl import IdlTypes, parse_idl
 from hybridlog.schema.definition_text import (
     MAX_NAME,
     NAME,
+    IdlTypes,
     RawField,
     canonical,
     derived_from,
     has_parts,
     interface_of,
+    parse_idl,
     parse_msg,
     parse_parts,
     split_sections,

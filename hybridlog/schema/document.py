@@ -25,10 +25,10 @@ from hybridlog.schema.column import (
     Strings,
     offsets,
     ranges,
+    summarise,
     take,
     top_level_names,
 )
-from hybridlog.schema.summary import summarise
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -16,9 +16,8 @@ import numpy as np
 from bson.errors import BSONError
 from bson.int64 import Int64
 
-from hybridlog.schema.column import RESERVED, top_level_names
+from hybridlog.schema.column import RESERVED, summary_of, top_level_names
 from hybridlog.schema.document import ARRAY_LIMIT, MAX_BYTES, BodyGroup
-from hybridlog.schema.summary import summary_of
 from hybridlog.schema.text import nearest, repaired_text
 from hybridlog_storage.errors import PayloadError
 

@@ -27,30 +27,17 @@ Wire: TypeAlias = Literal["ros1", "cdr"]
 Wanted: TypeAlias = "bool | dict[str, Wanted]"
 
 
-@dataclass(frozen=True, slots=True)
-class Leaf:
-    """A requested field with a column."""
-
-    slot: int
-
-
-@dataclass(frozen=True, slots=True)
-class Branch:
-    """A message: its requested fields in the order of the definition."""
-
-    fields: tuple[tuple[str, Node], ...]
-
-
-Node: TypeAlias = Leaf | Branch
+Node: TypeAlias = "int | dict[str, Node]"
+"""The slot of a requested field, or those of a message in the order of the definition."""
 
 
 def assemble(node: Node, slots: list[Column | None], rows: int) -> Column:
     """Assemble the column of a tree of names from its filled slots, of `rows` rows each."""
-    if isinstance(node, Leaf):
-        column = slots[node.slot]
+    if isinstance(node, int):
+        column = slots[node]
         assert column is not None
         return column
-    return Records({name: assemble(inner, slots, rows) for name, inner in node.fields}, rows)
+    return Records({name: assemble(inner, slots, rows) for name, inner in node.items()}, rows)
 
 
 @dataclass(frozen=True, slots=True)
@@ -276,12 +263,12 @@ class _Compiler:
             self._steps.append(Run(tuple(self._run)))
             self._run = []
 
-    def _leaf(self, wanted: Wanted) -> Leaf | None:
-        # A path below a leaf does not exist.
+    def _slot(self, wanted: Wanted) -> int | None:
+        # A path below a field without fields does not exist.
         if wanted is not True:
             return None
         self._slots += 1
-        return Leaf(self._slots - 1)
+        return self._slots - 1
 
     def _align(self, size: int) -> int:
         return size if self._wire == "cdr" else 1
@@ -291,14 +278,13 @@ class _Compiler:
             return self._message(field_type, path, wanted)
         if isinstance(field_type, ArrayOf):
             return self._array(field_type, path, wanted)
-        leaf = self._leaf(wanted)
-        slot = leaf.slot if leaf is not None else None
+        slot = self._slot(wanted)
         if isinstance(field_type, Text):
             self._flush()
             self._steps.append(TextStep(path, slot))
         else:
             self._fixed(field_type, path, slot, None)
-        return leaf
+        return slot
 
     def _fixed(
         self, kind: Primitive | Instant, path: str, slot: int | None, width: int | None
@@ -307,38 +293,35 @@ class _Compiler:
         total = size * (1 if width is None else width)
         self._run.append(Fixed(path, self._align(align), total, slot, kind, width))
 
-    def _message(self, message: MessageType, path: str, wanted: Wanted) -> Branch | None:
+    def _message(self, message: MessageType, path: str, wanted: Wanted) -> Node | None:
         if not message.fields and self._wire == "cdr":
             # IDL has no empty struct, so ROS 2 sends one byte instead.
             self._run.append(Fixed(path or message.name, 1, 1, None, None, None))
-        found: list[tuple[str, Node]] = []
+        found: dict[str, Node] = {}
         for name, field_type in message.fields:
             below = wanted if isinstance(wanted, bool) else wanted.get(name, False)
             node = self._add(field_type, f"{path}.{name}" if path else name, below)
             if node is not None:
-                found.append((name, node))
-        return Branch(tuple(found)) if found or wanted is True else None
+                found[name] = node
+        return found if found or wanted is True else None
 
-    def _array(self, array: ArrayOf, path: str, wanted: Wanted) -> Leaf | None:
+    def _array(self, array: ArrayOf, path: str, wanted: Wanted) -> int | None:
         element = array.element
         if isinstance(element, Primitive | Instant) and array.width is not None:
-            leaf = self._leaf(wanted)
-            self._fixed(element, path, leaf.slot if leaf is not None else None, array.width)
-            return leaf
+            slot = self._slot(wanted)
+            self._fixed(element, path, slot, array.width)
+            return slot
         self._flush()
         if isinstance(element, Primitive):
-            leaf = self._leaf(wanted)
-            slot = leaf.slot if leaf is not None else None
-            align = self._align(element.size)
-            self._steps.append(NumbersStep(path, slot, element, align))
-            return leaf
+            slot = self._slot(wanted)
+            self._steps.append(NumbersStep(path, slot, element, self._align(element.size)))
+            return slot
         inner = _Compiler(self._wire).program(element, f"{path}[]", wanted)
         if inner.least == 0 and inner.steps:
             raise DefinitionError(f"not indexed: {path} nests arrays of messages without fields")
-        leaf = self._leaf(inner.root is not None)
-        slot = leaf.slot if leaf is not None else None
+        slot = self._slot(inner.root is not None)
         self._steps.append(ArrayStep(path, slot, array.width, inner))
-        return leaf
+        return slot
 
 
 def compile_type(message_type: MessageType, wire: Wire, fields: Collection[str] | None) -> Program:

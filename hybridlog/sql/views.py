@@ -17,8 +17,8 @@ from msgspec.structs import replace
 
 from hybridlog.columns.fields import without
 from hybridlog.columns.layout import POINTS
-from hybridlog.columns.left_rows import LeftFields
-from hybridlog.columns.rows import NEEDED, PointColumns, is_cloud
+from hybridlog.columns.points import NEEDED, PointColumns, is_cloud
+from hybridlog.columns.rows import LeftFields
 from hybridlog.frames.answer import FIXED
 from hybridlog.query.planner import Planner
 from hybridlog.query.question import Counters, Question

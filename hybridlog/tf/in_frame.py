@@ -14,8 +14,13 @@ import numpy as np
 import pyarrow as pa
 from msgspec.structs import replace
 
-from hybridlog.arrays.message_arrays import attributes, plain_type
-from hybridlog.arrays.point_arrays import POINT_MAKERS, point_columns, positions
+from hybridlog.arrays.message_arrays import (
+    POINT_MAKERS,
+    attributes,
+    plain_type,
+    point_columns,
+    positions,
+)
 from hybridlog.formats.places import POSITIONS, poses_among
 from hybridlog.frames import answer
 from hybridlog.message import messages_in

@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import hybridlog as hl
-from hybridlog.arrays.point_arrays import point_columns
+from hybridlog.arrays.message_arrays import point_columns
 from hybridlog.drawing.points import Points, bounds, points
 from hybridlog.message import Message
 from hybridlog_storage.errors import PayloadError

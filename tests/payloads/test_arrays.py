@@ -22,7 +22,7 @@ from rosbags.typesys import Stores, get_typestore
 import hybridlog as hl
 from hybridlog.arrays.message_arrays import to_numpy
 from hybridlog.columns.fields import as_columns
-from hybridlog.columns.rows import PointColumns
+from hybridlog.columns.points import PointColumns
 from hybridlog.query.planner import Planner
 from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.errors import PayloadError, StoreError, TopicError, UsageError

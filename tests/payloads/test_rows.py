@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 import hybridlog as hl
-from hybridlog.columns.left_rows import reduced
 from hybridlog.columns.recording_logs import RecordingRows
+from hybridlog.columns.rows import reduced
 from hybridlog.columns.rows_file import RowsFile
 from hybridlog.entries import put_entry
 from hybridlog.maintenance.keep import expire, write_rows
@@ -29,6 +29,7 @@ from hybridlog_storage.segments.segment_reader import GoneLog, SegmentReader, op
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
 from tests.indexed import index_fields
+from tests.limits import limits
 
 POINT = Schema("a/Point", "ros1msg", b"int64 n\nuint8[] data\n")
 CHANNELS = [
@@ -59,12 +60,13 @@ def log_of(store: Path, messages: list[tuple[int, bytes, int, int]]) -> tuple[Pa
     return places.folder(store, "log"), [log for log in logs if log.parts]
 
 
-@given(messages=MESSAGES, kind=st.sampled_from(["expired", "elsewhere"]))
+@given(messages=MESSAGES, kind=st.sampled_from(["expired", "elsewhere"]), rows=st.integers(2, 50))
 @settings(max_examples=20)
 def test_a_log_and_its_rows_say_the_same(
-    messages: list[tuple[int, bytes, int, int]], kind: str
+    messages: list[tuple[int, bytes, int, int]], kind: str, rows: int
 ) -> None:
-    with tempfile.TemporaryDirectory() as place:
+    """Also where a chunk is in several row groups."""
+    with tempfile.TemporaryDirectory() as place, limits(row_group_rows=rows):
         folder, logs = log_of(Path(place) / "store", messages)
         for log in logs:
             line = truth.replace(log, gone=kind)

@@ -11,8 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybridlog.schema.column import Scalars
-from hybridlog.schema.summary import Summary, summarise
+from hybridlog.schema.column import Scalars, Summary, summarise
 
 DTYPES = ["?", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f4", "f8"]
 

@@ -10,8 +10,8 @@ from msgspec.structs import replace
 
 import hybridlog as hl
 from hybridlog.columns.column_file import ColumnFile
-from hybridlog.columns.folders import TableFolders
 from hybridlog.columns.layout import PARTS, TABLES
+from hybridlog.columns.table_writer import TableFolders
 from hybridlog.columns.tables import Tables
 from hybridlog.follow.follower import make_tables
 from hybridlog.maintenance import opening as making
@@ -43,7 +43,7 @@ def contents(store: hl.Store) -> dict[str, str]:
     found = {}
     for path in root.glob("*/*.parquet"):
         reader = ColumnFile(path)
-        found[str(path.relative_to(root))] = f"{reader.about.sections} {reader.table().to_pylist()}"
+        found[str(path.relative_to(root))] = f"{reader.sections} {reader.table().to_pylist()}"
     return found
 
 
@@ -145,7 +145,7 @@ def test_rows_of_another_segment_are_not_kept(few: hl.Store) -> None:
     stale = dict.fromkeys(entry.digests, "0" * 64)
     path = next((few.directory.path / TABLES).glob("*/*.parquet"))
     reader = ColumnFile(path)
-    sections = reader.about.sections
+    sections = reader.sections
     folders = TableFolders(few.directory.path, entry.id, entry.created)
     table, before, pieces = reader.table(), 0, []
     for section in sections:

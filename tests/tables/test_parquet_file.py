@@ -86,7 +86,7 @@ def test_a_file_that_is_cut_while_it_is_open(path: Path, table: pa.Table) -> Non
     reader = ColumnFile(path)
     with path.open("r+b") as file:
         file.truncate(1000)
-    with pytest.raises(StoreError, match="it was truncated"):
+    with pytest.raises(StoreError, match="it was replaced"):
         reader.read(1, [1])
 
 

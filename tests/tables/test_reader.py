@@ -20,6 +20,7 @@ from hybridlog.columns.fields import as_columns, joined, records_of
 from hybridlog.columns.layout import Section
 from hybridlog.columns.tables import Tables, TopicTable
 from hybridlog.follow.follower import make_tables
+from hybridlog_storage.errors import StoreError
 from tests.damage import flip
 from tests.some import in_turn
 from tests.tables.logs import decoded, table_of
@@ -132,7 +133,7 @@ def test_a_segment_more_or_less_is_noticed(recorded: hl.Store, tables: Tables) -
     assert tables.of(entry, entry.channels[0].topic) is None
 
 
-def test_files_are_closed_when_they_are_forgotten(recorded: hl.Store) -> None:
+def test_files_are_open_while_they_are_read(recorded: hl.Store) -> None:
     root = recorded.directory.path  # other tests of this process may hold files of theirs
 
     def opened() -> int:
@@ -142,10 +143,25 @@ def test_files_are_closed_when_they_are_forgotten(recorded: hl.Store) -> None:
     (entry,) = recorded.recordings()
     tables = Tables(root)
     for topic in topics_of(entry):
-        assert tables.of(entry, topic)
-    assert opened() == 1
-    del tables
+        table = tables.of(entry, topic)
+        assert table is not None
+        assert sum(map(len, table.scan(None))) == table.rows
     assert opened() == 0
+
+
+def test_a_file_that_is_replaced_is_looked_for_again(recorded: hl.Store, tables: Tables) -> None:
+    (entry,) = recorded.recordings()
+    table = tables.of(entry, "/large")
+    assert table is not None
+    path = file_of(recorded)
+    path.with_suffix(".new").write_bytes(path.read_bytes())
+    path.with_suffix(".new").rename(path)
+    with pytest.raises(StoreError, match="replaced"):
+        list(table.scan(None))
+    tables.reject(entry, "/large")
+    again = tables.of(entry, "/large")
+    assert again is not None
+    assert sum(map(len, again.scan(None))) == 1200
 
 
 def test_several_threads_may_ask_while_all_is_forgotten(recorded: hl.Store, tables: Tables) -> None:

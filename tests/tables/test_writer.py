@@ -10,9 +10,8 @@ import pyarrow as pa
 import pytest
 
 import hybridlog as hl
-from hybridlog.columns.folders import TableFolders
 from hybridlog.columns.layout import OWN_COLUMNS, TABLES
-from hybridlog.columns.table_writer import TableWriter
+from hybridlog.columns.table_writer import TableFolders, TableWriter
 from hybridlog.columns.tables import TableRows, Tables
 from hybridlog.index.indexing import ChunkIndexer
 from hybridlog_storage.catalog import RecordingEntry

@@ -304,8 +304,8 @@ def _show_tables(store: Store, query: Query, _: _Given) -> None:
     """Print SQL for DuckDB about the Parquet files of a topic, and which recordings they lack."""
     from glob import escape
 
-    from hybridlog.columns.folders import files_of
     from hybridlog.columns.layout import type_prefix
+    from hybridlog.columns.tables import files_of
     from hybridlog.maintenance.opening import missing
     from hybridlog.query.query import channels_of
     from hybridlog.snapshot import UNFINISHED
@@ -323,7 +323,7 @@ def _show_tables(store: Store, query: Query, _: _Given) -> None:
     types = {type_prefix("" if schema is None else schema.name) for schema in schemas}
     folders: Counter[Path] = Counter()
     for file in files_of(place, types) if types else ():
-        own = (one for one in file.about.sections if one.topic == topic and one.id in ended)
+        own = (one for one in file.sections if one.topic == topic and one.id in ended)
         folders[file.path.parent] += sum(one.rows for one in own)
     found = [
         {

@@ -44,8 +44,7 @@ from hybridlog.schema.arrow_types import (
     plain_values,
     statistic,
 )
-from hybridlog.schema.column import offsets, ranges
-from hybridlog.schema.summary import summary_of
+from hybridlog.schema.column import offsets, ranges, summary_of
 from hybridlog.schema.text import nearest
 
 if TYPE_CHECKING:
@@ -509,7 +508,7 @@ def matches(
     Returns bool[n], true where it holds; the number of messages that could not be tested, since
     they do not fit their definition or lack arrays; and that of those that lack arrays.
     """
-    from hybridlog.columns.left_rows import LeftFields
+    from hybridlog.columns.rows import LeftFields
 
     predicate = part.predicate
     assert predicate is not None

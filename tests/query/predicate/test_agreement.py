@@ -12,7 +12,7 @@ import pytest
 from hypothesis import Phase, example, given, settings
 from hypothesis import strategies as st
 
-from hybridlog.columns.left_rows import reduced
+from hybridlog.columns.rows import reduced
 from hybridlog.query.predicate.evaluate import matches, on_columns, statistic_of
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.question import Part, RecordedChannel
