@@ -212,10 +212,19 @@ class TopicTable:
         near = [span for span in spans or () if span[0] < high and span[1] > low]
         if spans is not None and not near:
             return None
-        ours, columns = self.columns(part, paths, {"t", "seq", *own})
+        check_wanted()
+        wanted = {"t", "seq", *own}
+        columns = {
+            top: part.file.column(part.group, leaves).slice(part.begin, part.rows)
+            for top, leaves in part.file.choose(paths, wanted).items()
+        }
+        ours = {name: columns.pop(name) for name in wanted if name in columns}
         t, seq = (ours.pop(name).to_numpy() for name in ("t", "seq"))
+        schema = part.file.schema
+        kinds = [schema.field(top).with_type(one.type) for top, one in columns.items()]
+        fields = structs(columns, part.rows, None, kinds)
         try:
-            records = converted(records_of(columns, self._is_summarised), kind)
+            records = converted(records_of(fields, self._is_summarised), kind)
         except pa.ArrowInvalid as error:  # an integer that no double is, beside fractions
             raise StoreError(f"The tables have no common exact type: {error}.") from error
         rows = TableRows(t, seq, ours, records)
@@ -228,20 +237,6 @@ class TopicTable:
     def parts(self) -> list[TablePart]:
         """Its row groups, by the log time of their first rows."""
         return sorted(self._parts, key=lambda part: part.first)
-
-    def columns(
-        self, part: TablePart, paths: Collection[str] | None, own: Collection[str]
-    ) -> tuple[dict[str, Any], Any]:
-        """The table's own columns of a row group by name, and those of fields, a struct each."""
-        check_wanted()
-        chosen = part.file.choose(paths, own)
-        columns = {top: _column(part, numbers) for top, numbers in chosen.items()}
-        ours = {name: columns.pop(name) for name in own if name in columns}
-        if not columns:
-            return ours, structs({}, part.rows)
-        schema = part.file.schema
-        fields = [schema.field(top).with_type(one.type) for top, one in columns.items()]
-        return ours, pa.StructArray.from_arrays([*columns.values()], fields=fields)
 
     def is_cut(self, array: tuple[str, ...]) -> bool:
         """True if an array at a path, or one inside it, may be only a summary in some row."""
@@ -266,10 +261,6 @@ class TopicTable:
             columns = pa.nulls(0, pa.struct([*table.schema]))
             found.append(records_of(columns, self._is_summarised))
         return joined(found).type
-
-
-def _column(part: TablePart, leaves: Sequence[int]) -> Any:
-    return part.file.column(part.group, leaves).slice(part.begin, part.rows)
 
 
 def _in_order(parts: Sequence[TableRows]) -> TableRows:
