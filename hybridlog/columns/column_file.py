@@ -221,22 +221,14 @@ class ColumnFile:
             numbers = range(metadata.num_row_groups)
             self.groups = [int(metadata.row_group(number).num_rows) for number in numbers]
             """Rows of each row group."""
-            if sum(self.groups) != sum(section.rows for section in self.sections):
+            self.rows = sum(self.groups)
+            self.size_bytes = self._source.size
+            if self.rows != sum(section.rows for section in self.sections):
                 raise StoreError("its rows differ from its description")
         except FileNotFoundError:
             raise
         except (OSError, StoreError, pa.ArrowException, ValueError, RecursionError) as error:
             raise self._damaged(error) from error
-
-    @property
-    def size_bytes(self) -> int:
-        """Bytes of the file."""
-        return self._source.size
-
-    @property
-    def rows(self) -> int:
-        """Rows of all recordings."""
-        return sum(self.groups)
 
     @property
     def was_replaced(self) -> bool:

@@ -20,7 +20,7 @@ from hybridlog.query.periods import GAP_PERIODS, Steps
 from hybridlog.query.query import field_types, spans_of, tables_of
 from hybridlog.query.times import TIME_LIMIT
 from hybridlog.schema.arrow_types import is_list, is_number, is_time, lengths_of
-from hybridlog.schema.kinds import NUMERIC, element_of, width_of
+from hybridlog.schema.definition_text import NUMERIC, element_of, width_of
 from hybridlog.wording import listed
 from hybridlog_storage.errors import SegmentError, TopicError, UsageError
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from hybridlog.schema.kinds import NUMBERS, element_of
+from hybridlog.schema.definition_text import NUMBERS, element_of
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence

@@ -13,6 +13,7 @@ import numpy as np
 from msgspec import Struct
 
 from hybridlog.schema.definition_text import (
+    DTYPES,
     MAX_NAME,
     NAME,
     IdlTypes,
@@ -26,7 +27,6 @@ from hybridlog.schema.definition_text import (
     parse_parts,
     split_sections,
 )
-from hybridlog.schema.kinds import DTYPES
 from hybridlog_storage.errors import DefinitionError
 
 if TYPE_CHECKING:

@@ -22,7 +22,7 @@ from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import DurationLike, parse_duration
 from hybridlog.record.losses import topics_of
-from hybridlog.schema.kinds import NUMBERS
+from hybridlog.schema.definition_text import NUMBERS
 from hybridlog.wording import listed
 from hybridlog_storage.errors import UsageError
 

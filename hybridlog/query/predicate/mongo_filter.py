@@ -27,7 +27,7 @@ from hybridlog.query.predicate.tree import (
     is_meta,
 )
 from hybridlog.query.predicate.types import STATS, FieldTypes, check
-from hybridlog.schema.kinds import width_of
+from hybridlog.schema.definition_text import width_of
 from hybridlog_storage.errors import WhereError
 
 MAX_DEPTH = 50

@@ -16,7 +16,7 @@ from hybridlog.query.predicate.tree import (
     Parts,
     Predicate,
 )
-from hybridlog.schema.kinds import FLOATS, NUMBERS, TIMES
+from hybridlog.schema.definition_text import FLOATS, NUMBERS, TIMES
 from hybridlog.wording import listed, meant
 
 Stat = Literal["n", "min", "max", "mean"]
