@@ -10,9 +10,11 @@ from __future__ import annotations
 import io
 import os
 import threading
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
+from functools import partial
 from itertools import accumulate, count
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -267,15 +269,29 @@ class ColumnFile:
         table = pa.concat_tables(groups) if groups else self.schema.empty_table()
         return table.replace_schema_metadata(None)
 
-    def column(self, group: int, leaves: Sequence[int]) -> Any:
-        """Some columns of a row group, below one column of the table, as one array; cached."""
+    def columns(self, group: int, chosen: Mapping[str, Sequence[int]]) -> dict[str, Any]:
+        """Columns of a row group, of each some of Parquet's, as arrays; cached.
 
-        def read() -> Any:
-            found = self.read(group, leaves).column(0).combine_chunks()
-            return pa.concat_arrays(found.chunks) if isinstance(found, pa.ChunkedArray) else found
+        Those that are not at hand are read together.
+        """
+        found: dict[str, Any] = {}
+        fresh: dict[str, Any] = {}
 
-        key = self.number, group, *leaves
-        return self._cache.made("column", *key, make=read, size_of=lambda one: int(one.nbytes))
+        def read(name: str) -> Any:
+            if name not in fresh:
+                left = [one for one in chosen if one not in found]
+                table = self.read(group, [leaf for one in left for leaf in chosen[one]])
+                for one in left:
+                    array = table.column(one).combine_chunks()
+                    is_cut = isinstance(array, pa.ChunkedArray)
+                    fresh[one] = pa.concat_arrays(array.chunks) if is_cut else array
+            return fresh[name]
+
+        for name, leaves in chosen.items():
+            key, make = (self.number, group, *leaves), partial(read, name)
+            size_of = attrgetter("nbytes")
+            found[name] = self._cache.made("column", *key, make=make, size_of=size_of)
+        return found
 
     def read(self, group: int | None, leaves: Sequence[int]) -> pa.Table:
         """Columns, numbered in Parquet's order (depth first), of a row group; None for no rows."""

@@ -214,10 +214,8 @@ class TopicTable:
             return None
         check_wanted()
         wanted = {"t", "seq", *own}
-        columns = {
-            top: part.file.column(part.group, leaves).slice(part.begin, part.rows)
-            for top, leaves in part.file.choose(paths, wanted).items()
-        }
+        whole = part.file.columns(part.group, part.file.choose(paths, wanted))
+        columns = {name: one.slice(part.begin, part.rows) for name, one in whole.items()}
         ours = {name: columns.pop(name) for name in wanted if name in columns}
         t, seq = (ours.pop(name).to_numpy() for name in ("t", "seq"))
         schema = part.file.schema
