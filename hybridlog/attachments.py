@@ -151,13 +151,12 @@ def extras_of(session: Session, question: Question) -> Extras:
     """Attachments and metadata records that belong to the answer of a question as a slice."""
     found = Extras([], [], [], 0, [])
     left_out = 0
-    topics = set(question.topics)
     for summary, bounds, _ in RangeResolver(session, question).resolve():
         entry = session.entry_of(summary)
         found.channels.extend(
             channel
-            for _, channel in sorted(session.definitions(entry).items())
-            if channel.topic in topics and state_of(channel.message_encoding) is State.WHOLE
+            for _, channel in sorted(session.definitions(entry, question.topics).items())
+            if state_of(channel.message_encoding) is State.WHOLE
         )
         found.metadata.extend(metadata_of(session, entry, found.problems))
         end = None if bounds is None or question.clock != "log" else bounds[1]

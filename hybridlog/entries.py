@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
 from msgspec import UNSET, ValidationError, convert, structs, to_builtins
 
-from hybridlog.record.losses import Cause, extent_of, joined, topics_of
+from hybridlog.record.losses import Cause, joined
+from hybridlog.record.marks import with_marks
 from hybridlog.schema.states import State, expired_messages
 from hybridlog_storage import manifest as truth
 from hybridlog_storage.catalog import (
@@ -215,15 +216,6 @@ def entry_of(
     )
 
 
-def with_marks(entry: RecordingEntry) -> RecordingEntry:
-    """The entry of a recording's files, and of the marks that somebody set."""
-    if not entry.manifest.marks:
-        return entry
-    from hybridlog.record.marks_log import beside  # loads numpy
-
-    return beside(entry)
-
-
 def _channels(
     manifest: Manifest,
     logs: Mapping[int, File],
@@ -269,11 +261,15 @@ def _channel(number: int, channel: truth.Channel, gone: str = "") -> ChannelEntr
     )
 
 
-def schemas_in(directory: StoreDirectory, entry: RecordingEntry) -> dict[str, Schema]:
-    """Definitions of a recording by hash, from the segments that can be read."""
+def schemas_in(
+    directory: StoreDirectory, entry: RecordingEntry, channels: Sequence[ChannelEntry]
+) -> dict[str, Schema]:
+    """Definitions of some channels of a recording by hash, from the segments that can be read."""
     found: dict[str, Schema] = {}
-    wanted = {channel.schema for channel in entry.channels} - {None}
-    for number in entry.logs:
+    wanted = {channel.schema for channel in channels} - {None}
+    ids = {channel.id % EXPIRED_IDS for channel in channels}
+    # Those with messages of them first: a question reads the files of its topics alone.
+    for number in sorted(entry.logs, key=lambda number: ids.isdisjoint(entry.logs[number].parts)):
         if wanted <= found.keys():
             break
         with suppress(SegmentError):
@@ -299,7 +295,7 @@ def summary_of(entry: RecordingEntry, look: str = "") -> RecordingSummary:
         created=entry.created,
         status=entry.status,
         span=entry.span,
-        extent=extent_of(entry),
+        extent=entry.extent,
         topics=_hash_of(topic_types(entry)),
         topic_count=len({channel.topic for channel in entry.channels}),
         messages=entry.messages,
@@ -317,7 +313,7 @@ def summary_of(entry: RecordingEntry, look: str = "") -> RecordingSummary:
 def topic_types(entry: RecordingEntry) -> frozenset[TopicType]:
     """Topics of a recording and their types; includes those that have lost all messages."""
     found = {TopicType(c.topic, c.message_encoding, c.schema or "", c.type) for c in entry.channels}
-    lost = topics_of(entry) - {topic.topic for topic in found}
+    lost = entry.topics - {topic.topic for topic in found}
     return frozenset(found | {TopicType(topic, "", "", "") for topic in lost})
 
 

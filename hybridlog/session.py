@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import (
     Callable,
     Collection,
@@ -21,7 +20,6 @@ from hybridlog.entries import put_entry, schemas_in, summary_of, topic_types
 from hybridlog.query.chunk_columns import PARTS, ChunkColumns, log_bounds
 from hybridlog.query.question import Question, RecordedChannel, field_types
 from hybridlog.query.topics import resolve
-from hybridlog.record.losses import lost_spans
 from hybridlog.record.marks import MARKS
 from hybridlog.snapshot import UNFINISHED, differing
 from hybridlog.wording import counted, listed
@@ -256,14 +254,18 @@ class Session:
         """
         known = self.shared.channels.get(recording.id)
         if known is None or known[0] is not recording:
-            counts, definitions = recording.messages_by_topic(), self.definitions(recording)
-            by_topic: dict[str, list[RecordedChannel]] = defaultdict(list)
-            for own in recording.channels:
-                if not counts[own.topic] or own.stats.messages:
-                    one = RecordedChannel(recording, own.id, definitions[own.id], own.stats)
-                    by_topic[own.topic].append(one)
-            known = self.shared.channels[recording.id] = recording, by_topic
-        found = [channel for topic in topics for channel in known[1].get(topic, ())]
+            known = self.shared.channels[recording.id] = recording, {}
+        if new := {*topics} - known[1].keys():
+            definitions = self.definitions(recording, new)
+            added: dict[str, list[RecordedChannel]] = {topic: [] for topic in new}
+            own = [one for one in recording.channels if one.topic in new]
+            has_messages = {one.topic for one in own if one.stats.messages}
+            for one in own:
+                if one.stats.messages or one.topic not in has_messages:
+                    channel = RecordedChannel(recording, one.id, definitions[one.id], one.stats)
+                    added[one.topic].append(channel)
+            known[1].update(added)
+        found = [channel for topic in topics for channel in known[1][topic]]
         return sorted(found, key=lambda channel: channel.channel_id)
 
     def field_types(
@@ -300,14 +302,16 @@ class Session:
         check(found, types)
         return found
 
-    def definitions(self, recording: RecordingEntry) -> Mapping[int, Channel]:
-        """All channels of a recording by id, also those without messages."""
+    def definitions(
+        self, recording: RecordingEntry, topics: Collection[str] | None = None
+    ) -> Mapping[int, Channel]:
+        """Channels of some topics of a recording, or all, by id, also those without messages."""
         known = self.shared.schemas
-        wanted = {c.schema: c for c in recording.channels if c.schema is not None}
-        if not wanted.keys() <= known.keys():
-            known |= schemas_in(self.directory, recording)
-        missing = wanted.keys() - known.keys()
-        if any(c.schema in missing and c.stats.messages for c in recording.channels):
+        own = [one for one in recording.channels if topics is None or one.topic in topics]
+        defined = [one for one in own if one.schema is not None]
+        if any(one.schema not in known for one in defined):
+            known |= schemas_in(self.directory, recording, defined)
+        if any(one.schema not in known and one.stats.messages for one in defined):
             for number in recording.logs:
                 with suppress(ChangedError):  # it is noted as lost, and who asks for chunks hears
                     self.chunk_table(recording, number)
@@ -320,7 +324,7 @@ class Session:
                 has_publish_time=c.has_publish_time,
                 is_indexed=c.is_indexed,
             )
-            for c in recording.channels
+            for c in own
         }
 
     def chunks(
@@ -485,7 +489,7 @@ class Session:
         Where messages are lost there is none, since rows of these must not answer.
         """
         has_marks = topic == MARKS and recording.manifest.marks
-        if recording.status in UNFINISHED or has_marks or any(True for _ in lost_spans(recording)):
+        if recording.status in UNFINISHED or has_marks or recording.lost_spans:
             return None
         return self.tables.of(recording, topic)
 

@@ -9,10 +9,9 @@ from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any, Final
 
 from hybridlog.columns.recording_logs import RecordingRows
-from hybridlog.entries import with_marks
 from hybridlog.maintenance.opening import StoreFiles
 from hybridlog.maintenance.report import RepairReport
-from hybridlog.record.marks import MARK_SCHEMA
+from hybridlog.record.marks import MARK_SCHEMA, with_marks
 from hybridlog.snapshot import UNFINISHED
 from hybridlog_storage.cache import Cache, lazy
 from hybridlog_storage.catalog import Catalog, file_of

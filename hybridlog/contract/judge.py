@@ -17,7 +17,6 @@ from hybridlog.query.answers.marks import marks_in
 from hybridlog.query.planner import log_times
 from hybridlog.query.query import Query, tables_of
 from hybridlog.query.times import format_duration
-from hybridlog.record.losses import topics_of
 from hybridlog.record.marks import CONTRACT
 from hybridlog_storage.errors import WhereError
 
@@ -61,7 +60,7 @@ _Verdict = tuple[str, str, str, str, bool]  # a result without the name of the r
 def _verdicts(
     session: Session, contract: Contract, summary: RecordingSummary
 ) -> Iterator[_Verdict]:
-    known = topics_of(session.entry_of(summary))
+    known = session.entry_of(summary).topics
 
     def about(*topics: str) -> Query:
         return Query(session, session.about(topics, [summary.id]))

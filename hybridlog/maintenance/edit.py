@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 from hybridlog.entries import free_name_in, text
 from hybridlog.maintenance.opening import remove_tables
 from hybridlog.query.times import TimeLike, format_time, parse_range, parse_time
-from hybridlog.record.losses import extent_of
 from hybridlog_storage.disk.directory import LOCK_WAIT_S, gone
 from hybridlog_storage.errors import (
     DatabaseError,
@@ -73,7 +72,7 @@ def time_of_mark(entry: RecordingEntry, moment: TimeLike) -> int:
     Outside of a recording, a mark would become its beginning or end, from which relative times
     count. One that is running has not ended yet.
     """
-    start, end = extent_of(entry)
+    start, end = entry.extent
     time = parse_time(moment, start=start, end=end)
     if entry.status == "open":
         end = max(end, clock.time_ns())
@@ -128,7 +127,7 @@ def pin(
 ) -> str:
     """Pin a time of a recording, as of `Store.pin`."""
     (entry,) = shared.now().select([recording])
-    start, stop = extent_of(entry)
+    start, stop = entry.extent
     if span != (None, None):
         parse_range(*span, start=start, end=stop)
     begin, end = (None if t is None else parse_time(t, start=start, end=stop) for t in span)
@@ -159,7 +158,7 @@ def unpin(shared: OpenStore, names: Sequence[str]) -> None:
 
 def may_hold(entry: RecordingEntry, begin: int | None, end: int | None) -> bool:
     """True if a recording may have messages in a range of time; a running one, later ones."""
-    start, stop = extent_of(entry)
+    start, stop = entry.extent
     is_over = entry.status not in {"open", "unfinished"}
     return (end is None or end > start) and not (is_over and begin is not None and begin >= stop)
 
@@ -233,7 +232,7 @@ def _marked(manifest: Manifest, made: Mark) -> Manifest:
 def unmark(shared: OpenStore, recording: str, moment: TimeLike | None, note: str) -> RecordingEntry:
     """Remove marks of a text, at a log time or None for any, and return the recording."""
     entry = shared.now().entry(recording)
-    start, end = extent_of(entry)
+    start, end = entry.extent
     time = None if moment is None else parse_time(moment, start=start, end=end)
 
     def how(now: Manifest) -> Manifest:

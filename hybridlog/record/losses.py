@@ -8,12 +8,11 @@ hour therefore costs at most one row for each flush. Readers join successive row
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any
 
-from hybridlog_storage.manifest import Loss, replace
-from hybridlog_storage.times import span_of
+from hybridlog_storage.manifest import LOST, Loss, replace
 
 if TYPE_CHECKING:
     from hybridlog_storage.catalog import RecordingEntry
@@ -52,7 +51,7 @@ class Cause(StrEnum):
     DISK = "disk"
     """The disk was full."""
 
-    SEGMENT = "segment"
+    SEGMENT = LOST
     """They were stored, and their part of the store is missing or damaged."""
 
 
@@ -113,22 +112,6 @@ def joined(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
     return [dict(row) for row in rows if row.get("from") is None] + found
 
 
-def topics_of(entry: RecordingEntry) -> set[str]:
-    """Topics of a recording, including those that have lost all stored messages.
-
-    A question about such a topic must report the missing messages.
-    """
-    lost = {row["topic"] for row in _lost_from_store(entry)} - {None}
-    return lost | {channel.topic for channel in entry.channels}
-
-
-def lost_spans(entry: RecordingEntry) -> Iterator[tuple[int, int]]:
-    """First and last log time (ns) of lost stored messages, for each row of the ledger."""
-    for row in _lost_from_store(entry):
-        if row["from"] is not None:
-            yield row["from"], row["to"]
-
-
 def losses_of(entry: RecordingEntry) -> list[dict[str, Any]]:
     """The loss ledger of a recording, with a row for what a crash cut off."""
     losses = [dict(loss) for loss in entry.losses]
@@ -143,24 +126,6 @@ def _of_a_crash(reason: str) -> dict[str, Any]:
     """A loss of an unknown number of messages."""
     row: dict[str, Any] = {"cause": CRASH, "file": "", "offset": None, "reason": reason}
     return row | {"count": None, "topic": None}
-
-
-def extent_of(entry: RecordingEntry) -> tuple[int, int]:
-    """Log time `[begin, end)` of a recording, ns; empty at 0 without messages.
-
-    Stored messages that are lost count, which preserves the meaning of relative times.
-    """
-    spans = [*lost_spans(entry)]
-    if entry.span is not None:
-        spans.append(entry.span)
-    if not spans:
-        return 0, 0
-    first, last = min(first for first, _ in spans), max(last for _, last in spans)
-    return span_of(first, last)
-
-
-def _lost_from_store(entry: RecordingEntry) -> Iterator[Mapping[str, Any]]:
-    return (row for row in entry.losses if row["cause"] == Cause.SEGMENT)
 
 
 def _sum(one: int | None, other: int | None) -> int | None:

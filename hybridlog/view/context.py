@@ -22,7 +22,6 @@ from starlette.routing import Route
 
 from hybridlog.query.answers.current import next_time
 from hybridlog.query.times import TIME_LIMIT
-from hybridlog.record.losses import extent_of
 from hybridlog_storage.errors import (
     HybridlogError,
     ResourceError,
@@ -103,7 +102,7 @@ def start_of(recording: RecordingEntry | RecordingSummary) -> int:
 
 def extent(recording: RecordingEntry) -> tuple[int, int]:
     """Log time `[begin, end)` of a recording, ns; empty when it was made if it has no messages."""
-    begin, end = extent_of(recording)
+    begin, end = recording.extent
     return (begin, end) if begin < end else (recording.created, recording.created)
 
 

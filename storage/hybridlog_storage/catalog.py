@@ -21,7 +21,7 @@ from msgspec.structs import replace
 from hybridlog_storage.cache import Cache
 from hybridlog_storage.cells import Cells, drop, put
 from hybridlog_storage.errors import SegmentError, StoreError
-from hybridlog_storage.manifest import File, Manifest
+from hybridlog_storage.manifest import LOST, File, Manifest
 from hybridlog_storage.manifests import RECORDINGS
 from hybridlog_storage.messages import EXPIRED_IDS, Channel, schema_hash
 from hybridlog_storage.segments.chunk_table import ChunkTable
@@ -34,6 +34,7 @@ from hybridlog_storage.summary import (
     hash_of,
     topics_to_json,
 )
+from hybridlog_storage.times import span_of
 
 if TYPE_CHECKING:
     from hybridlog_storage.segments.segment_reader import SegmentSummary
@@ -206,6 +207,27 @@ class RecordingEntry(Struct):
         firsts = [c.stats.first for c in self.channels if c.stats.first is not None]
         lasts = [c.stats.last for c in self.channels if c.stats.last is not None]
         return (min(firsts), max(lasts)) if firsts else None
+
+    @property
+    def topics(self) -> set[str]:
+        """All topics: a question about one that has lost all stored messages must say so."""
+        lost = {row["topic"] for row in self.losses if row["cause"] == LOST} - {None}
+        return lost | {channel.topic for channel in self.channels}
+
+    @property
+    def lost_spans(self) -> list[tuple[int, int]]:
+        """First and last log time (ns) of lost stored messages, for each row of the ledger."""
+        lost = (row for row in self.losses if row["cause"] == LOST)
+        return [(row["from"], row["to"]) for row in lost if row["from"] is not None]
+
+    @property
+    def extent(self) -> tuple[int, int]:
+        """Log time `[begin, end)`, ns; empty at 0 without messages.
+
+        Stored messages that are lost count, which preserves the meaning of relative times.
+        """
+        spans = [*self.lost_spans, *([] if self.span is None else [self.span])]
+        return span_of(min(spans)[0], max(last for _, last in spans)) if spans else (0, 0)
 
     def spans_with(self, channels: Collection[int]) -> list[tuple[int, int, int]]:
         """The spans of segments that may have messages of some channels."""

@@ -94,6 +94,10 @@ class Part(Record, frozen=True, array_like=True):
     last: Nanoseconds | None = None
 
 
+LOST: Final = "segment"
+"""Cause of the loss of stored messages whose part of the store is missing or damaged."""
+
+
 class Loss(Record, frozen=True):
     """A row of the loss ledger; `offset` and `length` are the damaged bytes of `file`."""
 

@@ -18,8 +18,7 @@ from starlette.testclient import TestClient
 
 import hybridlog as hl
 from hybridlog.query.answers.marks import marks_in
-from hybridlog.record.marks import MARKS_SEGMENT, mark_channel, mark_payload
-from hybridlog.record.marks_log import beside
+from hybridlog.record.marks import MARKS_SEGMENT, mark_channel, mark_payload, with_marks
 from hybridlog.view.guard import Admission
 from hybridlog.view.server import make_app
 from hybridlog_storage.errors import SegmentError, StoreError, TimeError, UsageError
@@ -116,7 +115,7 @@ def test_marks_that_were_set_meanwhile_are_not_taken_for_others(tmp_path: Path) 
         write_mcap(tmp_path / "a.mcap", [(Channel("/n", "json", None), BEGIN * S, b"{}")])
         store.record(tmp_path / "a.mcap", name="drive")
         one, two = (
-            beside(store.mark("drive", "+0s", text)).flushed[MARKS_SEGMENT]
+            with_marks(store.mark("drive", "+0s", text)).flushed[MARKS_SEGMENT]
             for text in ("carpet", "stairs")
         )
         (place,) = places_of(one.table)

@@ -12,7 +12,6 @@ from hybridlog.cli.options import AsJson, Choosing, InStore, Quiet, command, opt
 from hybridlog.cli.output import Column
 from hybridlog.query.times import parse_duration, parse_time
 from hybridlog.query.topics import split_topic
-from hybridlog.record.losses import extent_of
 from hybridlog.wording import listed
 from hybridlog_storage.errors import UsageError
 
@@ -138,7 +137,7 @@ def _spans(store: Store, given: _Given) -> Iterator[tuple[str, int | None, int |
         if given.at is None:
             yield entry.id, None, None
             continue
-        start, end = extent_of(entry)
+        start, end = entry.extent
         at = parse_time(given.at, start=start, end=end)
         span = at - parse_duration(before), at + parse_duration(after) + 1
         if may_hold(entry, *span):

@@ -21,8 +21,7 @@ from hybridlog.query.chunk_scan import ChunkScan, RecordingScan
 from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.topics import later
-from hybridlog.record.marks import MARKS_SEGMENT
-from hybridlog.record.marks_log import without
+from hybridlog.record.marks import MARKS_SEGMENT, without_marks
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.stopping import pause, safe_point
 
@@ -111,7 +110,7 @@ class Arrivals(Planner):
                 sealed.add(segment)
                 del read[segment]
         if entry.manifest.marks:
-            entry = without(entry, self._marks)
+            entry = without_marks(entry, self._marks)
             self.session.show(entry)
             self._marks.update(mark.id for mark in entry.manifest.marks)
             columns = ChunkColumns(MARKS_SEGMENT, entry.flushed[MARKS_SEGMENT].table)

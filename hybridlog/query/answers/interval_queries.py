@@ -23,7 +23,6 @@ from hybridlog.query.predicate.types import check
 from hybridlog.query.question import Counters
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import TIME_LIMIT, DurationLike, parse_duration
-from hybridlog.record.losses import extent_of
 from hybridlog.schema.arrow_types import is_list, lengths_of
 from hybridlog.schema.column import ranges
 from hybridlog.wording import listed
@@ -166,7 +165,7 @@ class IntervalQueries:
             time = np.concatenate([time, begins])
             order = np.argsort(time, kind="stable")
             time, holds = time[order], np.append(holds, np.zeros(len(begins), np.bool_))[order]
-        end = extent_of(part.recording)[1]
+        end = part.recording.extent[1]
         return clipped(holding(time, holds, end, gap, before=len(begun[0])), span)
 
     def _last_before(

@@ -21,7 +21,6 @@ from hybridlog.query.periods import GAP_PERIODS, mean_rate, usual_period
 from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import DurationLike, parse_duration
-from hybridlog.record.losses import topics_of
 from hybridlog.schema.definition_text import NUMBERS
 from hybridlog.wording import listed
 from hybridlog_storage.errors import UsageError
@@ -262,7 +261,7 @@ def check(
     for summary, span in [*ranges.spans(), *silent]:
         parts = {part.topic: part for part in _parts(planner, summary, span)}
         entry = session.entry_of(summary)
-        for topic in sorted({*question.topics} & topics_of(entry)):
+        for topic in sorted({*question.topics} & entry.topics):
             part, counts = parts.get(topic), lost[summary.name, topic]
             times = np.empty(0, np.int64) if part is None else planner.times(part)
             channels = [one.channel for one in session.channels_of(entry, [topic])]

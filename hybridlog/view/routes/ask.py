@@ -18,7 +18,6 @@ from starlette.responses import StreamingResponse
 from hybridlog.drawing.times import Match, Matches, aligned
 from hybridlog.query.predicate.parser import MAX_TEXT
 from hybridlog.query.times import format_time
-from hybridlog.record.losses import extent_of
 from hybridlog.view.context import route, start_of
 from hybridlog.view.sql_process import in_process, program, sql_answer
 from hybridlog_storage.stopping import held
@@ -115,7 +114,7 @@ class PageQuestion(Struct, frozen=True):
 
     def file_name(self) -> str:
         """The name of its file: recording and range."""
-        begin, end = self.span or extent_of(self.recording)
+        begin, end = self.span or self.recording.extent
         times = "_".join(format_time(time).replace(":", "") for time in (begin, end))
         return f"{_NO_NAME.sub('_', self.recording.name)}_{times}.mcap"
 
