@@ -119,7 +119,7 @@ def attachments_of(session: Session, entry: RecordingEntry) -> list[StoredAttach
             one.data_size,
             one.log_time,
             one.create_time,
-            partial(_open, session, entry.id, number, one),
+            partial(_open, session, entry, number, one),
         )
         for number, summary in (_summaries(session, entry) if entry.attachments else ())
         for one in summary.attachments
@@ -137,7 +137,7 @@ def metadata_of(
     for number, summary in _summaries(session, entry) if entry.metadata_records else ():
         for index in summary.metadata:
             try:
-                record = session.segment(entry.id, number).metadata(index)
+                record = session.segment(entry, number).metadata(index)
             except SegmentError as error:
                 if problems is None:
                     raise
@@ -172,9 +172,11 @@ def _summaries(
     session: Session, entry: RecordingEntry
 ) -> Iterator[tuple[int, SegmentSummary | Flushed]]:
     for number in sorted(map(int, entry.digests)):
-        yield number, session.segment(entry.id, number).summary()
+        yield number, session.segment(entry, number).summary()
     yield from sorted(entry.flushed.items())
 
 
-def _open(session: Session, recording: str, number: int, index: AttachmentIndex) -> Attachment:
-    return session.segment(recording, number).attachment(index)
+def _open(
+    session: Session, entry: RecordingEntry, number: int, index: AttachmentIndex
+) -> Attachment:
+    return session.segment(entry, number).attachment(index)

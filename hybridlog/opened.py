@@ -18,8 +18,7 @@ if TYPE_CHECKING:
     from hybridlog.record.recorder import RecordReport
     from hybridlog_storage.disk.directory import StoreDirectory
 
-_LIST_EVERY_S: Final = 1.0
-"""Between two comparisons of ids: tools that copy may write manifests later."""
+_TICK_NS: Final = 50_000_000
 
 
 class OpenStore(Shared):
@@ -33,34 +32,19 @@ class OpenStore(Shared):
         super().__init__(directory)
         self.index = IndexAccess(self, mongo, progress)
         self.live: WeakSet[Any] = WeakSet()  # recordings that were started by it
-        self._latest: Snapshot | None = None
-        self._changed = 0  # as of the latest state, see `StoreDirectory.changed`
+        self._changed = -1  # when ids were compared, see `StoreDirectory.changed`
         self._names: list[str] = []  # ids of recordings
-        self._listed_at = 0.0  # when they were compared last, by `monotonic`
 
     def now(self) -> Session:
         """The store at this moment, for one question; no file is read if nothing has changed."""
         self.check_process()
-        latest = self._latest
-        if latest is None or self._has_names_changed():
-            latest = self.catch_up()
+        changed, latest = self.directory.changed(), self.latest
+        if latest is None or changed != self._changed:
+            # What comes within a tick of the file system's clock leaves the time as it is.
+            self._changed = changed if time.time_ns() - changed > _TICK_NS else -1
+            if latest is None or self.directory.ids() != self._names:
+                latest = self.catch_up()
         return Session(self, latest)
-
-    def _has_names_changed(self) -> bool:
-        """True if recordings have come or gone since the latest state."""
-        now = self.directory.changed()
-        is_due = time.monotonic() - self._listed_at >= _LIST_EVERY_S
-        if now == self._changed and not is_due:
-            return False
-        self._listed_at = time.monotonic()
-        is_same = self.directory.ids() == self._names
-        self._changed = now if is_same else 0
-        return not is_same
-
-    def replace_latest(self, before: Snapshot, now: Snapshot) -> None:
-        """Let later questions begin with what one has seen, unless there is a newer state."""
-        if self._latest is before:
-            self._latest = now
 
     def catch_up(self, *recordings: str) -> Snapshot:
         """See which recordings came or went, and how some others are now; at first, all.
@@ -68,14 +52,13 @@ class OpenStore(Shared):
         All else that was read stays, so this costs little in a store of thousands.
         """
         with self.following:
-            before = self._latest or Snapshot((), {})
-            changed, names = self.directory.changed(), self.directory.ids()
-            known = before.by_id.keys()
-            ids = (known ^ {*names}) | self.repairs.unreadable.keys() | ({*recordings} & known)
-            if self._latest is not None and not ids:
-                return self._latest
-            self._latest = latest = self._files.look(before, ids)
-            self._changed, self._names = changed, names
+            before = self.latest or Snapshot((), {})
+            self._names, known = self.directory.ids(), before.by_id.keys()
+            unreadable = self.repairs.unreadable.keys()
+            ids = (known ^ {*self._names}) | unreadable | ({*recordings} & known)
+            if self.latest is not None and not ids:
+                return self.latest
+            self.latest = latest = self._files.look(before, ids)
             self.index.note_changes()
             for recording in ids & known:
                 self.channels.pop(recording, None)
@@ -96,7 +79,7 @@ class OpenStore(Shared):
     def invalidate(self) -> None:
         """Drop everything that was read, so that the next question reads the store again."""
         with self.following:
-            self._latest = None
+            self.latest = None
             self.index.note_changes()
             self._entries = {}
         self.channels.clear()

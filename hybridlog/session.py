@@ -129,7 +129,8 @@ class Session:
                 if now != summary:
                     topics = {now.topics: topic_types(found)}
                     self._recordings = before.with_changes([now], topics)
-                    self.shared.replace_latest(before, self._recordings)
+                    if self.shared.latest is before:  # later questions begin with it
+                        self.shared.latest = self._recordings
             return found
 
     def entries(self, summaries: Iterable[RecordingSummary]) -> Iterator[RecordingEntry]:
@@ -386,7 +387,7 @@ class Session:
         place = place_of(self.chunk_table(recording, segment), chunk)
 
         def read() -> dict[int, NDArray[np.int64]]:
-            found = self._read(recording.id, segment, lambda reader: reader.read_times(place))
+            found = self._read(recording, segment, lambda reader: reader.read_times(place))
             if not found.keys() >= {*place.channels}:
                 raise StoreError(
                     f"Payloads of {recording.name!r} were deleted meanwhile. Ask again."
@@ -411,7 +412,7 @@ class Session:
         """A chunk, from the cache if it is there, else counted. Its buffer is read-only."""
 
         def read() -> StoredChunk:
-            chunk = self.read_chunk(recording.id, segment, place)
+            chunk = self.read_chunk(recording, segment, place)
             # Arrays of messages share the buffer: changes to them must not change the cache.
             chunk.batch.buffer = memoryview(chunk.batch.buffer).toreadonly()
             count(chunk)
@@ -425,20 +426,17 @@ class Session:
             size_of=lambda one: len(one.batch.buffer) + _ROW_BYTES * len(one.batch),
         )
 
-    def segment(self, recording: str, number: int) -> SegmentReader:
-        """The reader of a segment of a recording, by its id. Thread safe.
+    def segment(self, recording: RecordingEntry, number: int) -> SegmentReader:
+        """The reader of a segment. Thread safe.
 
         A `ChangedError` says that it has been let go, or is another file by now.
         """
-        entry = self.entry(recording)
-        if number in entry.flushed:
-            return entry.flushed[number].reader
-        if number not in entry.logs:
-            raise _changed(entry)
+        if number in recording.flushed:
+            return recording.flushed[number].reader
         try:
-            return self.shared.segment(entry, number)
+            return self.shared.segment(recording, number)
         except SegmentError:
-            self._check_same(entry, number)
+            self._check_same(recording, number)
             raise
 
     def hold(self, recording: RecordingEntry, segments: Iterable[int]) -> None:
@@ -449,17 +447,19 @@ class Session:
         has_let_go = len(recording.logs) <= max(recording.logs, default=-1)
         if recording.status in UNFINISHED and has_let_go:
             for number in segments:
-                self.segment(recording.id, number)
+                self.segment(recording, number)
 
-    def read_chunk(self, recording: str, number: int, place: ChunkPlace) -> StoredChunk:
-        """Read a chunk of a segment of a recording, by its id."""
+    def read_chunk(self, recording: RecordingEntry, number: int, place: ChunkPlace) -> StoredChunk:
+        """Read a chunk of a segment of a recording."""
         return self._read(recording, number, lambda reader: reader.read_chunk(place))
 
-    def _read(self, recording: str, number: int, read: Callable[[SegmentReader], _T]) -> _T:
+    def _read(
+        self, recording: RecordingEntry, number: int, read: Callable[[SegmentReader], _T]
+    ) -> _T:
         try:
             return read(self.segment(recording, number))
         except SegmentError:
-            self._check_same(self.entry(recording), number)
+            self._check_same(recording, number)
             raise
 
     def _check_same(self, entry: RecordingEntry, number: int, problem: str = "") -> None:

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from hybridlog.columns.tables import Tables
     from hybridlog.query.question import RecordedChannel
     from hybridlog.record.running import RunningRecording
+    from hybridlog.snapshot import Snapshot
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.segments.segment_reader import SegmentReader
@@ -42,17 +43,18 @@ class Shared:
         channels: Channels of recordings by id and topic, and the entry that they are of.
         epochs: Where header stamps of recordings start again, by id, and the entry they are of.
         following: Held while running recordings are looked at, and while the newest state changes.
-        index, now, catch_up, replace_latest, recover: As of `OpenStore`.
+        latest: The newest state; None before it is asked for.
+        index, now, catch_up, recover: As of `OpenStore`.
     """
 
     index: Any
     now: Callable[[], Any]
     catch_up: Callable[..., Any]
-    replace_latest: Callable[..., None]
     recover: Callable[[], None]
 
     def __init__(self, directory: StoreDirectory) -> None:
         self._process = os.getpid()
+        self.latest: Snapshot | None = None
         self.is_closed = False
         self.directory = directory
         self.catalog = Catalog(directory.path, directory.cells)

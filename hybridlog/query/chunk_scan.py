@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.messages import Batch
     from hybridlog_storage.segments.chunk import StoredChunk
-    from hybridlog_storage.segments.chunk_table import ChunkPlace
 
 _LOOK_AHEAD = 4
 _MIN_THREADED_BYTES = 4 << 20  # starting threads takes as long as reading a megabyte
@@ -224,11 +223,12 @@ class ChunkScan:
         """The same, after a bucket was asked for many of them at once."""
         room = _FETCHED_BYTES if self._reads_ahead else _MERGED_BYTES
         while group := list(_up_to(tasks, room)):
-            by_segment: dict[tuple[str, int], list[ChunkPlace]] = {}
+            by_segment: dict[tuple[str, int], list[ChunkTask]] = {}
             for task in group:
-                by_segment.setdefault(task.key[:2], []).append(task.chunk.place)
-            for segment, places in by_segment.items():
-                self._session.segment(*segment).fetch(places)
+                by_segment.setdefault(task.key[:2], []).append(task)
+            for own in by_segment.values():
+                reader = self._session.segment(own[0].scan.recording, own[0].chunk.segment)
+                reader.fetch([task.chunk.place for task in own])
             yield from group
 
     def _load(self, task: ChunkTask) -> _Loaded:
@@ -237,7 +237,7 @@ class ChunkScan:
             count = self._plan.counters.add_chunk
             chunk = self._session.chunk(task.scan.recording, segment, place, count)
         else:
-            chunk = self._session.read_chunk(task.scan.recording.id, segment, place)
+            chunk = self._session.read_chunk(task.scan.recording, segment, place)
         undecided = self._plan.filtered(task)
         run = self._wanted(task, chunk, undecided)
         run, unreadable, expired = self._filtered(run, undecided)

@@ -161,7 +161,7 @@ class RangeResolver:
         for chunk in self._session.chunks(recording, [number], None, "log"):
             from hybridlog.schema.codec import stamps_of
 
-            batch = self._session.read_chunk(recording.id, chunk.segment, chunk.place).batch
+            batch = self._session.read_chunk(recording, chunk.segment, chunk.place).batch
             batch = batch.take(np.flatnonzero(batch.channel == number))
             times = stamps_of(channel.codec, batch)[1]
             yield from (int(times.min()), int(times.max())) if len(times) else ()

@@ -449,7 +449,7 @@ class Rows:
         """Log times in the windows of a part that some parts of chunks have, sorted."""
         found = [np.empty(0, np.int64)]
         for segment, chunk, channel in held[["segment", "chunk", "channel"]].tolist():
-            reader = self.session.segment(part.recording.id, segment)
+            reader = self.session.segment(part.recording, segment)
             read_before = reader.bytes_read
             found.append(self.session.times(part.recording, segment, chunk)[channel])
             self.counters.bytes_read += reader.bytes_read - read_before
