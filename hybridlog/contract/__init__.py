@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -26,6 +25,17 @@ if TYPE_CHECKING:
 MAX_RULES: Final = 1000
 """Predicates and offsets of a contract: each is a question."""
 _REGULAR_FROM: Final = 10  # messages from which a rate is a rule
+
+
+class Duration(int):
+    """Nanoseconds, written like `500ms` or `-1ms`."""
+
+
+class Share(float):
+    """From 0 to 1, written like `95%`."""
+
+
+_Count = Annotated[int, Meta(ge=0)]
 
 
 class TopicRules(Struct, frozen=True):
@@ -49,19 +59,26 @@ class TopicRules(Struct, frozen=True):
     """
 
     type: str | None = None
-    rate: float | None = None
-    tolerance: float = 0.1
-    longest_gap: int | None = None
-    jitter: int | None = None
-    late_start: int | None = None
-    early_stop: int | None = None
-    lost: int | None = None
-    least_age: int | None = None
-    greatest_age: int | None = None
+    rate: Annotated[float, Meta(gt=0, le=1e9)] | None = None
+    tolerance: Share = Share(0.1)
+    longest_gap: Duration | None = None
+    jitter: Duration | None = None
+    late_start: Duration | None = None
+    early_stop: Duration | None = None
+    lost: _Count | None = None
+    least_age: Duration | None = None
+    greatest_age: Duration | None = None
     stamps_in_order: bool = False
-    offset: Mapping[str, int] = field(default_factory=dict)
-    share: Mapping[str, float] = field(default_factory=dict)
+    offset: Mapping[str, Duration] = field(default_factory=dict)
+    share: Mapping[str, Share] = field(default_factory=dict)
     optional: bool = False
+
+    def __post_init__(self) -> None:
+        for predicate in map(parse, self.share):
+            if predicate.is_across:
+                raise ValueError("share: it is of two topics: leave the other topic out")
+            if not predicate.asks_fields:
+                raise ValueError("share: it is not about fields of the message")
 
 
 class Contract(Struct, frozen=True):
@@ -102,27 +119,32 @@ class Contract(Struct, frozen=True):
 
 
 def _rules(topic: str, given: Mapping[str, Any]) -> TopicRules:
-    values: dict[str, Any] = {}
-    for key, value in given.items():
-        if key not in _KINDS:
-            raise UsageError(f"{topic}: there is no rule `{key}`; there are {listed(_KINDS, 20)}")
-        try:
-            if key in _BY_NAME:
-                values[key] = {one: _KINDS[key](own) for one, own in convert(value, _Named).items()}
-                for predicate in values[key] if key == "share" else ():
-                    _check_predicate(predicate)
-            else:
-                values[key] = _KINDS[key](value)
-        except (HybridlogError, ValueError, ValidationError) as error:
-            raise UsageError(f"{topic}: {key}: {error}") from error
-    return TopicRules(**values)
+    known = TopicRules.__struct_fields__
+    for key in given:
+        if key not in known:
+            raise UsageError(f"{topic}: there is no rule `{key}`; there are {listed(known, 20)}")
+    try:
+        return convert(given, TopicRules, strict=False, dec_hook=_value)
+    except (HybridlogError, ValidationError) as error:
+        raise UsageError(f"{topic}: {error}") from error
+
+
+def _value(kind: type[Any], given: object) -> object:
+    text = str(given).strip()
+    try:
+        if kind is Share:
+            return kind(parse_share(text))
+        sign = -1 if text.startswith("-") else 1
+        return kind(sign * parse_duration(text.removeprefix("-")))
+    except HybridlogError as error:
+        raise ValueError(str(error)) from error
 
 
 class _Given(Struct, forbid_unknown_fields=True):
     """A contract as it is written."""
 
     topics: dict[str, dict[str, Any] | None]
-    lost: Annotated[int, Meta(ge=0)] | None = None
+    lost: _Count | None = None
 
 
 def parse_share(text: str) -> float:
@@ -135,40 +157,6 @@ def parse_share(text: str) -> float:
     if not 0 <= found <= 1:
         raise UsageError(f"{text!r} is no share: write 95% or 0.95.")
     return found
-
-
-def _duration(value: object) -> int:
-    return parse_duration(value if isinstance(value, int) else str(value))
-
-
-def _age(value: object) -> int:
-    text = str(value).strip()
-    return -parse_duration(text[1:]) if text.startswith("-") else parse_duration(text)
-
-
-def _check_predicate(text: str) -> None:
-    predicate = parse(text)
-    if predicate.is_across:
-        raise UsageError("it is of two topics: leave the other topic out")
-    if not predicate.asks_fields:
-        raise UsageError("it is not about fields of the message")
-
-
-_Named = dict[str, int | str]
-_BY_NAME: Final = ("offset", "share")
-"""Rules with a value for each topic, or each predicate."""
-_KINDS: Final[Mapping[str, Callable[[Any], Any]]] = {
-    "type": partial(convert, type=str),
-    "rate": partial(convert, type=Annotated[float, Meta(gt=0, le=1e9)], strict=False),
-    "tolerance": lambda value: parse_share(str(value)),
-    "lost": partial(convert, type=Annotated[int, Meta(ge=0)]),
-    "least_age": _age,
-    "greatest_age": _age,
-    "stamps_in_order": partial(convert, type=bool),
-    "optional": partial(convert, type=bool),
-    "share": lambda value: parse_share(str(value)),
-    **dict.fromkeys(("longest_gap", "jitter", "late_start", "early_stop", "offset"), _duration),
-}
 
 
 def contract_of(topics: Sequence[TopicCheck]) -> str:

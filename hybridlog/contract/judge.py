@@ -15,7 +15,7 @@ from hybridlog.arrays.message_arrays import plain_type
 from hybridlog.query.answers.completeness import completeness_of
 from hybridlog.query.answers.marks import marks_in
 from hybridlog.query.planner import log_times
-from hybridlog.query.query import Query, tables_of
+from hybridlog.query.query import Query
 from hybridlog.query.times import format_duration
 from hybridlog.record.marks import CONTRACT
 from hybridlog_storage.errors import WhereError
@@ -122,12 +122,10 @@ def _of_stamps(rules: TopicRules, query: Query) -> Iterator[_Verdict]:
     if not limited and not rules.stamps_in_order:
         return
     (topic,) = query.topics
-    unset, pieces = 0, [np.empty((2, 0), np.int64)]
-    for table in tables_of(query.fields("stamp")):
-        rows = table.select(["log_time", "stamp"]).drop_null()
-        unset += table.num_rows - rows.num_rows
-        pieces.append(np.array([column.cast("int64").to_numpy() for column in rows.columns]))
-    time, stamp = np.concatenate(pieces, axis=1)
+    table = query.fields("stamp").to_arrow().select(["log_time", "stamp"])
+    rows = table.drop_null()
+    unset = table.num_rows - rows.num_rows
+    time, stamp = (column.cast("int64").to_numpy() for column in rows.columns)
     without = f"; {unset} without a stamp that is set" if unset else ""
     for name, limit in limited.items():
         found, holds = "no header stamps", False
