@@ -73,13 +73,12 @@ class Capture:
         on_written: Callable[[], None] | None = None,
         no_index: Callable[[str], bool] | None = None,
         is_ring: bool = False,
-        check: Callable[[Snapshot], None] | None = None,
+        check: Callable[[Snapshot], None] = lambda _: None,
         make_room: Callable[[], bool] = lambda: False,
     ) -> None:
         self.catalog = catalog
         self._directory = directory
         self._make_room = make_room
-        self._no_index = no_index or (lambda _: False)
         rules = Rules.of(directory.settings.retention)
         largest = int(min(settings.segment_size, rules.segment_size))
         settings = replace(settings, segment_size=largest)
@@ -91,8 +90,7 @@ class Capture:
                 with directory.manifests.creating() as create:
                     # Of two processes that record the same content now, one is refused.
                     recorded = known()
-                    if check is not None:
-                        check(recorded)
+                    check(recorded)
                     manifest = Manifest(
                         recording,
                         free_name_in(recorded.summaries, name),
@@ -100,7 +98,13 @@ class Capture:
                         source=convert(dict(source), Source),
                         tags={text(key): text(value) for key, value in tags.items()},
                     )
-                    self.entry = self._begin(create, manifest)
+                    # First the recording's folder, locked, then its manifest.
+                    lock = directory.writing(
+                        recording, wait_s=LOCK_WAIT_S, records=True, makes=True
+                    )
+                    self._held.enter_context(lock)
+                    create(manifest)
+                    self.entry = put_entry(directory, catalog, recording)
             except BaseException:
                 with suppress(HybridlogError):
                     directory.manifests.remove(recording)
@@ -112,7 +116,7 @@ class Capture:
             folder,
             recording_metadata(self.entry.manifest),
             settings,
-            no_index=self._no_index,
+            no_index=no_index or (lambda _: False),
             is_named=lambda topic: rules.topic_rule(topic) is not None,
             is_latched=lambda channel: depth_of(channel) > 0,
             latched_apart=is_ring,
@@ -208,11 +212,3 @@ class Capture:
         with suppress(HybridlogError):
             self.catalog.remove(entry.id)
         self._held.close()
-
-    def _begin(self, create: Callable[[Manifest], None], manifest: Manifest) -> RecordingEntry:
-        """Create and lock the recording's folder, then its manifest."""
-        recording = manifest.id
-        lock = self._directory.writing(recording, wait_s=LOCK_WAIT_S, records=True, makes=True)
-        self._held.enter_context(lock)
-        create(manifest)
-        return put_entry(self._directory, self.catalog, recording)

@@ -145,7 +145,7 @@ def record(
         },
         settings=options.settings,
         no_index=options.no_index,
-        check=None if options.again else partial(_refuse_known, source, fingerprint),
+        check=partial(_check_new, source, fingerprint, options),
     )
     try:
         copy = _Copy(source, capture.writer, options)
@@ -311,11 +311,13 @@ def _identity(fingerprint: Fingerprint) -> dict[str, object]:
     return {"fingerprint": fingerprint.whole, **parts}
 
 
-def _refuse_known(source: Source, fingerprint: Fingerprint, snapshot: Snapshot) -> None:
+def _check_new(
+    source: Source, fingerprint: Fingerprint, options: RecordOptions, snapshot: Snapshot
+) -> None:
     whole = snapshot.by_fingerprint.get(fingerprint.whole)
     found = [whole] if whole else [*map(snapshot.by_fingerprint.get, fingerprint.parts)]
     names = dict.fromkeys(repr(one.name) for one in found if one is not None)
-    if found and None not in found:
+    if found and None not in found and not options.again:
         raise AlreadyRecordedError(
             f"{source.path} is in the store already, as {listed(names)}. "
             "Use --again to record it once more."
