@@ -17,10 +17,12 @@ from typing import (
 
 from hybridlog.index.access import again_if_lost
 from hybridlog.index.of_store import Index
+from hybridlog.maintenance import edit as edits
 from hybridlog.opened import OpenStore
 from hybridlog.query.choice import Choice, choose
 from hybridlog.query.query import Query, narrowed, of_now
 from hybridlog.query.question import Question
+from hybridlog.recordings import Recordings
 from hybridlog.session import Asked, Session
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.disk.directory import StoreDirectory
@@ -51,7 +53,6 @@ if TYPE_CHECKING:
     from hybridlog.query.question import Clock
     from hybridlog.query.times import DurationLike, TimeLike
     from hybridlog.record.recorder import RecordOptions, RecordReport
-    from hybridlog.recordings import Recordings
     from hybridlog.sql.engine import SqlAnswer, SqlEngine
     from hybridlog.tf.tree import FrameTree
     from hybridlog.training.lerobot import LerobotOptions, LerobotReport
@@ -252,7 +253,6 @@ class Store:
     def choose(self, choice: Choice) -> Recordings:
         """The recordings that satisfy a choice; see `recordings`."""
         from hybridlog.query.planner import recordings_with_any
-        from hybridlog.recordings import Recordings
 
         chosen = choose(self.session, choice, recordings_with_any)
         return Recordings(self._source, chosen.summaries, chosen.problem)
@@ -670,7 +670,6 @@ class Store:
             UsageError: A rule is malformed.
             StoreError: Another process deletes here, too; or the store is read-only.
         """
-        from hybridlog.maintenance.edit import remove_if
         from hybridlog.maintenance.keep import Keeper, KeepReport
         from hybridlog.maintenance.retention import Rules
 
@@ -678,7 +677,7 @@ class Store:
         wanted = Rules.of(self.directory.settings.retention if rules is None else rules)
         if self.directory.is_remote or not dry_run:
             self.directory.check_writable()
-        keeper = Keeper(self.directory, partial(remove_if, self.shared))
+        keeper = Keeper(self.directory, partial(edits.remove_if, self.shared))
         if dry_run:
             return KeepReport(keeper.plan(wanted))
         self._to_change()
@@ -700,22 +699,16 @@ class Store:
         Log times are as for `Query.between`, None for no bound; `topics` are full names, None for
         all. Returns the name of the pin; TimeError for a range that is empty, or outside.
         """
-        from hybridlog.maintenance.edit import pin
-
-        return pin(self._to_change(), recording, (begin, end), topics, reason)
+        return edits.pin(self._to_change(), recording, (begin, end), topics, reason)
 
     def unpin(self, *names: str) -> None:
         """Remove pins; UsageError if there is none of a name."""
-        from hybridlog.maintenance.edit import unpin
-
-        unpin(self._to_change(), names)
+        edits.unpin(self._to_change(), names)
 
     def remove(self, recording: str) -> None:
         """Delete a recording, by name or id; StoreError if it is being written."""
-        from hybridlog.maintenance.edit import remove_if
-
         shared = self._to_change()
-        remove_if(shared, shared.now().entry(recording).id)
+        edits.remove_if(shared, shared.now().entry(recording).id)
 
     def edit(
         self,
@@ -738,10 +731,10 @@ class Store:
         Raises:
             UsageError: A tag to remove does not exist, or something is empty or no text.
         """
-        from hybridlog.maintenance.edit import edit
-
         gone = [untag] if isinstance(untag, str) else [*untag]
-        return edit(self._to_change(), recording, name=name, note=note, tag=tag or {}, untag=gone)
+        return edits.edit(
+            self._to_change(), recording, name=name, note=note, tag=tag or {}, untag=gone
+        )
 
     def mark(
         self,
@@ -765,18 +758,14 @@ class Store:
             TimeError: A time is invalid or outside the recording, or `until` before `moment`.
             StoreError: It has 10,000 marks already, or the store cannot be written.
         """
-        from hybridlog.maintenance.edit import mark
-
-        return mark(self._to_change(), recording, (moment, until), note, tags or {})
+        return edits.mark(self._to_change(), recording, (moment, until), note, tags or {})
 
     def unmark(self, recording: str, note: str, moment: TimeLike | None = None) -> RecordingEntry:
         """Remove marks of a text that somebody set, at a log time, None for any.
 
         TimeError for an invalid time, UsageError without such a mark.
         """
-        from hybridlog.maintenance.edit import unmark
-
-        return unmark(self._to_change(), recording, moment, note)
+        return edits.unmark(self._to_change(), recording, moment, note)
 
     def copy(
         self,
