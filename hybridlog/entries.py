@@ -37,7 +37,6 @@ from hybridlog_storage.errors import (
 from hybridlog_storage.manifest import (
     File,
     Manifest,
-    Source,
     free_name,
 )
 from hybridlog_storage.messages import (
@@ -69,6 +68,7 @@ _ANOTHER: Final = "it is another file than the one listed"
 _TRIES = 10  # to read a recording while its files are replaced
 _GONE: Final = {"expired": (EXPIRED_IDS, EXPIRED), "elsewhere": (2 * EXPIRED_IDS, NOT_COPIED)}
 """Added to the channel ids of a file that is gone, and the encoding that these channels get."""
+_SOURCE: Final = {"path": "", "kind": "", "profile": "", "bytes": 0}
 _SAID: Final = ("id", "name", "tags", "source", "created")
 
 
@@ -154,11 +154,6 @@ def summary_by(seen: Seen) -> tuple[RecordingSummary, frozenset[TopicType]]:
     return summary_of(shown, seen.look), topic_types(shown)
 
 
-def _problem(size: int | None, wanted: int) -> str:
-    """The problem of a file of a size, None for a missing one; empty if there is none."""
-    return "" if size == wanted else "is missing" if size is None else "has another size"
-
-
 def _logs(
     path: Path, manifest: Manifest, listing: Listing, damage: Damage
 ) -> tuple[dict[int, File], list[truth.Loss]]:
@@ -167,8 +162,11 @@ def _logs(
     rows, suspects = manifest.rows, {number for number, _ in damage}
     for number, log in sorted(manifest.logs.items()):
         files = [log] if log.is_here else rows[number]
-        problems = ((one.name, _problem(listing.sizes.get(one.name), one.bytes)) for one in files)
-        reason = "; ".join(f"{name} {problem}" for name, problem in problems if problem)
+        reason = "; ".join(
+            f"{one.name} {'has another size' if one.name in listing.sizes else 'is missing'}"
+            for one in files
+            if listing.sizes.get(one.name) != one.bytes
+        )
         if not reason and number in suspects:
             reason, own = _losses_of_chunks(path / files[0].name, manifest, log, damage)
             lost += own
@@ -286,12 +284,13 @@ def _hash_of(topics: frozenset[TopicType]) -> str:
 
 def summary_of(entry: RecordingEntry, look: str = "") -> RecordingSummary:
     """The summary of a recording; `look` is as of `StoreDirectory.looks`."""
-    gone = expired_messages(entry)
+    gone, source = expired_messages(entry), entry.manifest.source
+    parts = {"parts": [*source.parts]} if source.parts else {}
     return RecordingSummary(
         id=entry.id,
         name=entry.name,
         tags=entry.tags,
-        source=_source_of(entry.manifest.source),
+        source={**_SOURCE, **to_builtins(source), **parts},
         created=entry.created,
         status=entry.status,
         span=entry.span,
@@ -315,15 +314,6 @@ def topic_types(entry: RecordingEntry) -> frozenset[TopicType]:
     found = {TopicType(c.topic, c.message_encoding, c.schema or "", c.type) for c in entry.channels}
     lost = entry.topics - {topic.topic for topic in found}
     return frozenset(found | {TopicType(topic, "", "", "") for topic in lost})
-
-
-_SOURCE = {"path": "", "kind": "", "profile": "", "bytes": 0}
-
-
-def _source_of(source: Source) -> dict[str, Any]:
-    """A source as the catalog keeps it, in JSON."""
-    said = {**_SOURCE, **to_builtins(source)}
-    return {**said, "parts": [*source.parts]} if source.parts else said
 
 
 def lost_in_crash(manifest: Manifest, after: Sealed) -> list[truth.Loss]:

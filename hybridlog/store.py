@@ -254,8 +254,7 @@ class Store:
         """The recordings that satisfy a choice; see `recordings`."""
         from hybridlog.query.planner import recordings_with_any
 
-        chosen = choose(self.session, choice, recordings_with_any)
-        return Recordings(self._source, chosen.summaries, chosen.problem)
+        return Recordings(self._source, *choose(self.session, choice, recordings_with_any))
 
     def entry(self, recording: str) -> RecordingEntry:
         """The entry of a recording, by its id or its name.

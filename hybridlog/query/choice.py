@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 from msgspec import Struct
 from msgspec.structs import replace
@@ -123,18 +123,16 @@ def _tags(given: Tags) -> tuple[tuple[str, str | None], ...]:
     return pairs
 
 
-class Chosen(NamedTuple):
-    """The recordings of a choice, oldest first; the `problem` is why there is none, or empty."""
+def choose(
+    session: Session, choice: Choice, answering: Answering | None = None
+) -> tuple[list[RecordingSummary], str]:
+    """The recordings of a store that satisfy a choice, oldest first, and why there is none.
 
-    summaries: list[RecordingSummary]
-    problem: str
-
-
-def choose(session: Session, choice: Choice, answering: Answering | None = None) -> Chosen:
-    """The recordings of a store that satisfy a choice; `answering` is needed for `where`."""
+    `answering` is needed for `where`.
+    """
     choosing = _Choosing(session, answering)
     if not choosing.left and not choice.is_everything:
-        return Chosen([], session.when_empty)
+        return [], session.when_empty
     conditions: list[str] = []
     for found, condition, wanted, known in choosing.steps(choice):
         conditions.append(condition)
@@ -142,8 +140,8 @@ def choose(session: Session, choice: Choice, answering: Answering | None = None)
         choosing.left = [one for one in choosing.left if one.id in remaining]
         if not choosing.left:
             problem = f"There is no recording {', '.join(conditions)}"
-            return Chosen([], f"{problem}; {meant(wanted, known)}" if known else f"{problem}.")
-    return Chosen(choosing.left, "")
+            return [], f"{problem}; {meant(wanted, known)}" if known else f"{problem}."
+    return choosing.left, ""
 
 
 def topics_of_types(session: Session, types: Sequence[str], recordings: Sequence[str]) -> list[str]:

@@ -272,10 +272,10 @@ class Query:
         Raises:
             TopicError: no such recording exists, or none has the topic.
         """
-        chosen = choose(self.source.now(), Choice.of(names))
-        if chosen.problem:
-            raise TopicError(chosen.problem)
-        ids = [summary.id for summary in chosen.summaries]
+        summaries, problem = choose(self.source.now(), Choice.of(names))
+        if problem:
+            raise TopicError(problem)
+        ids = [summary.id for summary in summaries]
         return self._with(recordings=self.source.now().about(self.topics, ids).recordings)
 
     def during(self, intervals: Intervals) -> Query:
