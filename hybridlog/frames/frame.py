@@ -91,20 +91,14 @@ def _is_plain(chunk: pa.Array[Any]) -> bool:
 
 
 def _arrays(chunk: pa.Array[Any]) -> NDArray[Any]:
-    """The lists of a chunk as arrays, one for all if they are equal; None for null."""
+    """The lists of a chunk as arrays; None for null."""
     values = chunk.flatten().to_numpy(zero_copy_only=False)
     values.flags.writeable = False
     lengths, missing = lengths_of(chunk), missing_of(chunk)
     cells = np.empty(len(chunk), object)
     width = int(lengths[0])
     if width and missing is None and bool((lengths == width).all()):
-        table, bits = values.reshape(-1, width), values.view(f"u{values.itemsize}")
-        if np.array_equal(bits[:width], bits[-width:]) and np.array_equal(
-            bits[width:], bits[:-width]
-        ):
-            cells.fill(table[0])  # such as covariances
-        else:
-            cells[:] = list(table)
+        cells[:] = list(values.reshape(-1, width))
         return cells
     ends = np.cumsum(lengths).tolist()
     cells[:] = [values[begin:end] for begin, end in pairwise([0, *ends])]

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.dataset as ds
 from msgspec import Struct, field
 from msgspec.structs import replace
@@ -18,17 +17,17 @@ from msgspec.structs import replace
 from hybridlog.columns.fields import without
 from hybridlog.columns.layout import POINTS
 from hybridlog.columns.points import NEEDED, PointColumns, is_cloud
-from hybridlog.columns.rows import LeftFields
+from hybridlog.columns.rows import LeftFields, rows_of
 from hybridlog.frames.answer import FIXED
 from hybridlog.query.planner import Planner
 from hybridlog.query.question import Counters, Question
 from hybridlog.query.rows import RowBatch, Rows
 from hybridlog.schema.arrow_types import has_empty, is_array
-from hybridlog.schema.codec import stamp_array
 from hybridlog.schema.column import STAMP
 from hybridlog.schema.states import State
 from hybridlog.sql.columns import OWN, ViewColumn, merged, view_columns
 from hybridlog_storage.errors import extra
+from hybridlog_storage.segments.chunk import Placed
 from hybridlog_storage.times import BEGIN, END, touches
 
 with extra("sql", "SQL needs DuckDB"):
@@ -152,15 +151,16 @@ class TopicView:
             if table is not None and table.table.points is not None:
                 found.append(table.table.points)
             elif any(is_cloud(channel.channel) for channel in part.channels):
-                clouds = (_with_points(one).type for one in self._decoded(part))
+                clouds = (one.type for one in self._decoded(part, _with_points))
                 found += islice(
                     (one.field(POINTS).type for one in clouds if POINTS in one.names), 1
                 )
         return found
 
-    def _decoded(self, part: Part) -> Iterator[Any]:
+    def _decoded(self, part: Part, fields: Callable[[Decoded], Any] | None = None) -> Iterator[Any]:
         """The fields of messages in chunks."""
-        return ViewRows(self._session, pa.schema([]), {}, Reading()).fields(part)
+        read = ViewRows(self._session, pa.schema([]), {}, Reading())
+        return map(fields or _fields_of, read.decoded(part))
 
     def rows(self, schema: pa.Schema, limits: Limits, reading: Reading) -> Iterator[pa.RecordBatch]:
         """Rows for a query, with those columns; their first error is noted."""
@@ -285,11 +285,11 @@ class ViewRows(Rows):
         """The rows of a topic of a recording, in order."""
         return (found.records for found in self._lasting(part, self._rows))
 
-    def fields(self, part: Part) -> Iterator[Any]:
-        """All fields of the messages of a part in chunks."""
+    def decoded(self, part: Part) -> Iterator[Decoded]:
+        """The messages of a part in chunks, with all fields."""
         for channel, run in self._by_channel(part):
             if channel.codec.indexed:
-                yield _fields_of(channel.codec.columns_of(run.batch, None))[0]
+                yield channel.codec.columns_of(run.batch, None)
 
     def _rows(self, part: Part) -> Iterator[RowBatch]:
         found = self.tabled(part)
@@ -327,35 +327,28 @@ class ViewRows(Rows):
 
     def _decoded(self, channel: RecordedChannel, run: MessageRun) -> pa.RecordBatch:
         """The rows of messages of one channel."""
-        batch, count, paths = run.batch, len(run.batch), self._paths
-        errors = np.full(count, None, object)
-        whole = summaries = pa.nulls(count, pa.struct([]))
+        count, paths, decoded = len(run.batch), self._paths, None
         if channel.codec.indexed:
             if paths is not None:
                 paths = [*paths, STAMP, *(NEEDED if self._has_points else ())]
-            decoded = channel.codec.columns_of(batch, paths)
-            self.counters.payload_bytes += batch.payload_bytes * (not channel.is_reduced)
-            for bad in decoded.unreadable:
-                errors[bad.rows] = bad.reason
-            if len(decoded.rows):
-                found = _fields_of(decoded)
-                whole, summaries = (without(one, decoded.rows, count) for one in found)
-                whole = _with_points(whole) if self._has_points else whole
-        stamp, error = stamp_array(whole), pa.array(errors, pa.string())
-        has_no_time = np.full(count, not channel.channel.has_publish_time)
-        topic, unreadable = channel.channel.topic, count - error.null_count
+            decoded = channel.codec.columns_of(run.batch, paths)
+            self.counters.payload_bytes += run.batch.payload_bytes * (not channel.is_reduced)
+        none = np.zeros(count, np.int64)
+        own, whole = rows_of(
+            Placed(run.batch, run.seq, none.astype(np.int32), none, none, none),
+            decoded,
+            channel.state,
+            has_publish_time=channel.channel.has_publish_time,
+            columns=_with_points if self._has_points else _fields_of,
+        )
+        summaries = whole
+        if decoded is not None and isinstance(decoded.records, LeftFields):
+            summaries = without(decoded.records.both()[1], decoded.rows, count)
+        topic, unreadable = channel.channel.topic, count - own["error"].null_count
         if unreadable:
             self._reading.absent[topic, State.UNREADABLE] += unreadable
         if channel.is_reduced and (self._arrays or self._has_points):
             self._reading.absent[topic, channel.state] += count - unreadable
-        own = {
-            "t": pa.array(batch.log_time),
-            "seq": pa.array(run.seq),
-            "pub": pa.array(batch.publish_time, mask=has_no_time),
-            "stamp": pa.nulls(count, pa.int64()) if stamp is None else stamp.view(pa.int64()),
-            "state": pc.if_else(error.is_null(), str(channel.state), State.UNREADABLE.value),
-            "error": error,
-        }
         return self._batch(channel.recording, own, whole, summaries)
 
     def _batch(
@@ -378,13 +371,13 @@ class ViewRows(Rows):
         return pa.RecordBatch.from_arrays(arrays, schema=self._schema)
 
 
-def _fields_of(decoded: Decoded) -> tuple[Any, Any]:
-    """The fields of decoded messages, and the same with the summaries of arrays that are gone."""
-    if isinstance(decoded.records, LeftFields):
-        return decoded.records.both()
-    found = decoded.arrow()
-    return found, found
+def _fields_of(decoded: Decoded) -> Any:
+    """The fields of decoded messages; arrays that are gone are null."""
+    records = decoded.records
+    return records.both()[0] if isinstance(records, LeftFields) else decoded.arrow()
 
 
-def _with_points(fields: pa.StructArray) -> pa.StructArray:
+def _with_points(decoded: Decoded) -> Any:
+    """The fields, and the points of clouds."""
+    fields = _fields_of(decoded)
     return PointColumns().with_points(fields, fields)

@@ -5,7 +5,7 @@ An epoch begins where header stamps start again, as after a reset of a simulatio
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import combinations
 from typing import TYPE_CHECKING, Final
@@ -102,25 +102,19 @@ def epochs_of(session: Session, recording: str) -> Epochs:
         found: Epochs = known[1]
         return found
     kinds = {channel.topic: plain_type(channel.type) for channel in entry.channels}
-    skews: dict[str, list[int]] = defaultdict(list)
-    for channel in entry.channels:
-        ends = (channel.stats.skew_min, channel.stats.skew_max)
-        if entry.is_decoded and channel.stats.stamped:
-            skews[channel.topic] += [skew for skew in ends if skew is not None]
-    if not entry.is_decoded:
-        channels = session.channels_of(entry, {*kinds})
-        has = [c for c in channels if any(path.path == STAMP for path in c.codec.paths())]
-        skews |= {one.channel.topic: [] for one in has}
-    may_fall = not (entry.is_decoded and skews) or any(
-        max(skew, default=0) - min(skew, default=0) > _FALL_NS for skew in skews.values()
-    )
+    stats = [channel.stats for channel in entry.channels if channel.stats.stamped]
+    spreads = [(one.skew_max or 0) - (one.skew_min or 0) for one in stats]
+    may_fall = not (entry.is_decoded and spreads) or max(spreads) > _FALL_NS
     begins = np.empty(0, np.int64)
     if may_fall and kinds.get("/clock") == "rosgraph_msgs/Clock":
         log_time, clock = _stamps(session, recording, "/clock", "clock")
         begins = log_time[1:][np.diff(clock) < 0]
     elif may_fall:
-        moving = [t for t, kind in kinds.items() if kind in TYPES and not t.endswith("tf_static")]
-        topics = [*((topic, "stamp") for topic in skews), *((topic, "") for topic in moving)]
+        channels = session.channels_of(entry, {*kinds})
+        has = (c for c in channels if any(path.path == STAMP for path in c.codec.paths()))
+        topics = dict.fromkeys((one.channel.topic, "stamp") for one in has)
+        moving = (t for t, kind in kinds.items() if kind in TYPES and not t.endswith("tf_static"))
+        topics |= dict.fromkeys((topic, "") for topic in moving)
         begins = found_in([_stamps(session, recording, *one) for one in topics])
     found = Epochs(summary.name, begins)
     session.shared.epochs[recording] = entry, found
@@ -138,7 +132,8 @@ def _stamps(session: Session, recording: str, topic: str, field: str) -> Stamps:
             log_time, stamp = (column.cast(pa.int64()).to_numpy() for column in rows.columns)
             found.append((log_time, stamp))
     log_time, stamp = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    return log_time, stamp
+    is_set = (stamp != 0) | (field == "clock")
+    return log_time[is_set], stamp[is_set]
 
 
 def found_in(topics: Sequence[Stamps]) -> Times:
