@@ -170,7 +170,7 @@ def test_odd_values_stay_apart(tmp_path: Path) -> None:
 
 def test_a_late_key_and_a_late_type(tmp_path: Path, limit: Limit) -> None:
 
-    limit(output_held_bytes=0, frame_block_rows=1)
+    limit(output_held_bytes=1, frame_block_rows=1)
     with hl.open(tmp_path / "store", create=True) as store:
         with store.start("x") as recorder:
             for n in range(600):

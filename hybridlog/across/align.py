@@ -523,13 +523,12 @@ class Aligned:
 
         return to_polars(self.to_arrow())
 
-    def schema(self) -> pa.Schema | None:
-        """Columns where only messages determine them, which are read; None otherwise."""
+    @property
+    def is_fixed(self) -> bool:
+        """True if definitions fix the columns; else they may change between tables."""
         questions = [self._base.question, *(other.question for other in self._beside)]
         known = (self._session.field_types(q.topics, q.recordings) for q in questions)
-        if all(types is not None for types in known):
-            return None
-        return common_schema(self.to_tables())
+        return None not in known
 
 
 class RegularTimes:

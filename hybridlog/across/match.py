@@ -20,8 +20,8 @@ import pyarrow as pa
 
 from hybridlog.schema.arrow_columns import numbers
 from hybridlog.schema.arrow_types import COMPUTED_AS, is_number, numpy_type
-from hybridlog.tf.transform import Transform
-from hybridlog.tf.transform import interpolated as slerp
+from hybridlog.tf.tree import Transform
+from hybridlog.tf.tree import interpolated as slerp
 from hybridlog_storage.times import BEGIN
 
 if TYPE_CHECKING:

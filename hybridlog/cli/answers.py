@@ -112,18 +112,22 @@ class Tabular(Forced, AsJson):
     def answer(
         self,
         tables: Iterable[pa.Table],
-        schema: Callable[[], pa.Schema | None] = lambda: None,
         completeness: Callable[[], Completeness] | None = None,
         noun: str = "row",
+        *,
+        is_fixed: bool = False,
     ) -> int:
-        """Print or write tables, at least one, all rows or nothing; returns their number."""
+        """Print or write tables, at least one, all rows or nothing; returns their number.
+
+        If they are fixed, the first one has all columns in their types.
+        """
         form, limit = self.to_form, self.limit
         if limit is not None or form == SCREEN:
             tables = _limited(tables, SCREEN_ROWS + 1 if limit is None else limit)
         if form == SCREEN:
             return _print_rows(_checked(tables, completeness), limit, noun)
         answer = _rows(tables)
-        answer.schema = schema() if OUTPUTS[form].content == "table" else None
+        answer.is_fixed = is_fixed
         return _write(answer, form, self.place, completeness) or 0
 
 
@@ -263,14 +267,13 @@ def _answer_of(
         return log_of(query, front if content == "log" else Front(latched=False), extras)
     if question.frame is not None:
         return _rows(tables_of(query))
-    from hybridlog.frames.answer import schema_of
+    from hybridlog.frames.answer import is_fixed
     from hybridlog.frames.lines import lines
     from hybridlog.query.planner import Planner
 
     planner = Planner(query.source.now(), question, query.counters)
     if content == "table":
-        schema = schema_of(planner)
-        return Answer(tables=tables_of(query), schema=schema)
+        return Answer(tables=tables_of(query), is_fixed=is_fixed(planner))
     query.counters.reset()
     return Answer(lines=lines(planner))
 

@@ -13,7 +13,7 @@ from hybridlog.arrays.message_arrays import (
     positions,
     to_numpy,
 )
-from hybridlog.tf.transform import placed
+from hybridlog.tf.tree import placed
 from hybridlog_storage.errors import PayloadError
 
 if TYPE_CHECKING:

@@ -80,8 +80,6 @@ def _places(
     answer: Answer, choose: Callable[[Sequence[str]], list[str]]
 ) -> Iterator[tuple[pa.Table, list[str]]]:
     """The tables that have rows, and the columns that are written."""
-    if answer.schema is not None:
-        choose(answer.schema.names)
     topics: set[str] = set()
     for table in answer.tables:
         if not table.num_rows:

@@ -7,6 +7,7 @@ import os
 import secrets
 import shutil
 import tempfile
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
@@ -18,7 +19,7 @@ from hybridlog_storage.disk.unfinished import undone
 from hybridlog_storage.errors import NO_SPACE, SourceError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Iterator
     from typing import IO
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
@@ -49,50 +50,43 @@ def spool(path: Path) -> tuple[Path, str | None]:
 
     Its name can be removed once it is open.
     """
-    try:
-        with path.open("rb") as source:
-            size = zstandard.frame_content_size(source.read(32))
-            source.seek(0)
-            return _to_temporary(path, max(size, 0), partial(_unpack, source))
-    except OSError as error:
-        raise cannot_open(path, error) from error
+    with _temporary(path) as (made, source, target, room):
+        return made, _unpack(source, target, room)
 
 
 def copy_start(path: Path, count: int) -> Path:
     """Copy the first `count` bytes of a file to a temporary one."""
-    try:
-        with path.open("rb") as source:
-            return _to_temporary(path, count, partial(_copy, source, count))[0]
-    except OSError as error:
-        raise cannot_open(path, error) from error
+    with _temporary(path, count) as (made, source, target, _):
+        shutil.copyfileobj(source, target)
+        target.truncate(count)
+    return made
 
 
-def _to_temporary(
-    path: Path, size: int, fill: Callable[[IO[bytes], int], str | None]
-) -> tuple[Path, str | None]:
-    """Create and fill a temporary file."""
+@contextmanager
+def _temporary(path: Path, size: int = 0) -> Iterator[tuple[Path, BinaryIO, IO[bytes], int]]:
+    """A file, and a new temporary one for so many bytes, at least, of its content.
+
+    The last value is the room for it, bytes.
+    """
     folder = Path(tempfile.gettempdir())
     room = shutil.disk_usage(folder).free - _MIN_FREE_BYTES
-    if size > room:
-        raise _no_room(path, folder)
     made = folder / f"hybridlog-{secrets.token_hex(8)}"
     with undone(partial(made.unlink, missing_ok=True)):
         try:
-            with open(made, "xb", opener=_private) as target:
-                return made, fill(target, room)
+            if size > room:
+                raise OSError(errno.ENOSPC, "no space left")
+            with (
+                path.open("rb") as source,
+                open(made, "xb", opener=lambda name, flags: os.open(name, flags, 0o600)) as target,
+            ):
+                yield made, source, target, room
         except OSError as error:
-            if error.errno in NO_SPACE:
-                raise _no_room(path, folder) from error
-            raise
-
-
-def _private(path: str, flags: int) -> int:
-    return os.open(path, flags, 0o600)
-
-
-def _copy(source: BinaryIO, count: int, target: IO[bytes], _: int) -> None:
-    shutil.copyfileobj(source, target)
-    target.truncate(count)
+            if error.errno not in NO_SPACE:
+                raise cannot_open(path, error) from error
+            raise SourceError(
+                f"{path}: has to be unpacked to read it, and {folder} has no room for that; make "
+                "room there, or set TMPDIR to a folder that has it"
+            ) from error
 
 
 def _unpack(source: BinaryIO, target: IO[bytes], room: int) -> str | None:
@@ -115,10 +109,3 @@ def _unpack(source: BinaryIO, target: IO[bytes], room: int) -> str | None:
             data = frame.unused_data if frame.eof else source.read(_PIECE)
         data = data or source.read(_PIECE)
     return None
-
-
-def _no_room(path: Path, folder: Path) -> SourceError:
-    return SourceError(
-        f"{path}: has to be unpacked to read it, and {folder} has no room for that; make room "
-        "there, or set TMPDIR to a folder that has it"
-    )

@@ -1,8 +1,8 @@
 """Writes tables: Parquet, Arrow IPC, CSV, and numpy's .npz.
 
-Tables arrive in pieces. The first pieces, up to a limit, are held back to learn the
-columns, so a column may appear late or be empty at first. After that a missing column is
-null, and a new one is an error, because these formats fix their columns.
+Tables arrive in pieces, and these formats fix their columns before the first row. Where no
+definition tells them, all pieces go to a temporary file first, so that a column may appear late,
+be empty at first, or change its type. A missing column is null.
 
 In an .npz file, all rows of which are held in memory, is one array for each column, readable
 without pickle:
@@ -25,7 +25,9 @@ from __future__ import annotations
 
 import io
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from itertools import chain
+from tempfile import SpooledTemporaryFile
 from typing import IO, TYPE_CHECKING, Any, Protocol, TypeAlias, cast
 
 import numpy as np
@@ -60,7 +62,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 HELD_BYTES = 32 << 20
-"""Default limit of the pieces held back to learn the columns, bytes."""
+"""Limit of the pieces held in memory to learn the columns, bytes; more go to a file."""
 GROUP_BYTES = 32 << 20
 GROUP_ROWS = 1 << 17
 _LONG_ROW = 1 << 20
@@ -139,54 +141,48 @@ def _write(
 
 def groups(answer: Answer, form: str) -> Iterator[pa.Table]:
     """The rows in tables of the same columns, each of many rows; at least one, possibly empty."""
-    schema, written, rows, size = answer.schema, 0, 0, 0
-    pieces: list[pa.Table] = []
+    with SpooledTemporaryFile(HELD_BYTES) as spool:
+        if answer.is_fixed or answer.is_live:
+            tables = iter(answer.tables)
+            first = next(tables, pa.table({}))
+            schema, tables = first.schema, chain((first,), tables)
+        else:
+            schema = common_schema(_spooled(answer.tables, spool))
+            tables = _unspooled(spool)
+        # `empty_table` knows no lists of extension types
+        none = pa.Table.from_arrays([pa.nulls(0, one.type) for one in schema], schema=schema)
+        pieces, rows, size, given = [none], 0, 0, 0
+        for table in tables:
+            if late := [name for name in table.column_names if name not in schema.names]:
+                raise UsageError(
+                    f"column {late[0]!r} first appears after {given + rows} rows, and a {form} "
+                    "file fixes its columns before; leave it out with --fields, or write "
+                    "--format jsonl"
+                )
+            columns = [column_of(table, one) for one in schema]
+            pieces.append(pa.Table.from_arrays(columns, schema=schema))
+            rows, size = rows + table.num_rows, size + table.nbytes
+            if answer.is_live or size >= GROUP_BYTES or rows >= GROUP_ROWS:
+                yield pa.concat_tables(pieces)
+                pieces, rows, size, given = [none], 0, 0, given + rows
+        if rows or not given:
+            yield pa.concat_tables(pieces)
 
-    def group() -> pa.Table:
-        assert schema is not None
-        if not pieces:  # `empty_table` knows no lists of extension types
-            return pa.Table.from_arrays([pa.nulls(0, one.type) for one in schema], schema=schema)
-        return pa.concat_tables([_fitted(one, schema, form, 0) for one in pieces])
 
-    for table in answer.tables:
-        pieces.append(table if schema is None else _fitted(table, schema, form, written + rows))
-        size += table.nbytes
-        rows += table.num_rows
-        is_full = size >= GROUP_BYTES or rows >= GROUP_ROWS
-        if answer.is_live or (size >= HELD_BYTES if schema is None else is_full):
-            schema = schema or common_schema(pieces)
-            yield group()
-            written += rows
-            rows = size = 0
-            pieces.clear()
-    if pieces or not written:
-        schema = schema or common_schema(pieces)
-        yield group()
+def _spooled(tables: Iterable[pa.Table], spool: Any) -> Iterator[pa.Table]:
+    """Tables, each written to a temporary file."""
+    for table in tables:
+        yield table
+        with pa.ipc.new_stream(spool, table.schema) as stream:
+            stream.write_table(table)
 
 
-def _fitted(table: pa.Table, schema: pa.Schema, form: str, before: int) -> pa.Table:
-    """The table with exactly the columns of the file, behind some rows."""
-    if table.schema.equals(schema):
-        return table
-    known = set(schema.names)
-    for name in table.column_names:
-        if name not in known:
-            raise UsageError(
-                f"column {name!r} first appears after {before} rows, and a {form} file fixes its "
-                "columns before; leave it out with --fields, or write --format jsonl"
-            )
-    columns = []
-    for field in schema:
-        try:
-            columns.append(column_of(table, field))
-        except pa.ArrowException as error:
-            raise UsageError(
-                f"column {field.name!r} is {field.type} at first and "
-                f"{table.schema.field(field.name).type} later, "
-                f"which does not fit ({error}); leave it out with --fields, or write each "
-                "part into a file of its own with --between"
-            ) from error
-    return pa.Table.from_arrays(columns, schema=schema)
+def _unspooled(spool: Any) -> Iterator[pa.Table]:
+    """The tables in a temporary file."""
+    end = spool.tell()
+    spool.seek(0)
+    while spool.tell() < end:
+        yield pa.ipc.open_stream(spool).read_all()
 
 
 def _open_parquet(sink: Sink, table: pa.Table) -> _ArrowFile:

@@ -66,7 +66,7 @@ class Answer(Struct, kw_only=True):
     Attributes:
         lines: Objects as lines of JSON without their ends, some at a time.
         tables: Rows, at least one table; columns are matched by name.
-        schema: Columns of the tables, if they are known before.
+        is_fixed: The first table has all columns in their types.
         batches: Messages as they came, and the channels that `batch.channel` indexes.
         points: Points, their topic, type and log time (ns), a message at a time.
         messages: Messages that are images.
@@ -79,7 +79,7 @@ class Answer(Struct, kw_only=True):
 
     lines: Iterable[Iterable[Line]] = ()
     tables: Iterable[pa.Table] = ()
-    schema: pa.Schema | None = None
+    is_fixed: bool = False
     batches: Iterable[tuple[Batch, Sequence[Channel]]] = ()
     points: Iterable[tuple[NDArray[Any], str, str, int]] = ()
     messages: Iterable[Message] = ()

@@ -15,7 +15,6 @@ from hybridlog.index.indexing import rows_by_channel
 from hybridlog.query.rows import summaries_in
 from hybridlog.schema.arrow_columns import OFFSET_LIMIT, TIME, numbers, structs
 from hybridlog.schema.arrow_types import (
-    common_schema,
     common_type,
     converted,
     has_empty,
@@ -96,13 +95,9 @@ def stream(planner: Planner, *, at_once: bool = False) -> Iterator[pa.Table]:
         yield _table(blocks, question)
 
 
-def schema_of(planner: Planner) -> pa.Schema | None:
-    """The columns of an answer if they depend on the content of its messages; else None.
-
-    Messages whose fields no definition fixes are read for this.
-    """
-    is_fixed = all(channel.encoding in FIXED for channel in planner.examples)
-    return None if is_fixed else common_schema(stream(planner))
+def is_fixed(planner: Planner) -> bool:
+    """True if definitions fix the columns of an answer: its first table has them all."""
+    return all(channel.encoding in FIXED for channel in planner.examples)
 
 
 def _table(blocks: list[Block], question: Question) -> pa.Table:

@@ -27,7 +27,7 @@ from hybridlog.message import messages_in
 from hybridlog.query.planner import Planner
 from hybridlog.query.times import decoded_time
 from hybridlog.tf.reader import Trees
-from hybridlog.tf.transform import Transform, placed, unknown
+from hybridlog.tf.tree import Transform, placed, unknown
 from hybridlog_storage.errors import DefinitionError, PayloadError, TopicError, UsageError
 
 if TYPE_CHECKING:

@@ -23,8 +23,7 @@ from hybridlog.query.planner import Planner, log_times
 from hybridlog.query.question import Counters, Question
 from hybridlog.query.times import format_time
 from hybridlog.schema.column import STAMP
-from hybridlog.tf.transform import Transform, unknown
-from hybridlog.tf.tree import Frame, FrameTree, Lookup
+from hybridlog.tf.tree import Frame, FrameTree, Lookup, Transform, unknown
 from hybridlog.wording import counted, listed
 from hybridlog_storage.errors import TopicError
 from hybridlog_storage.times import BEGIN, END

@@ -18,7 +18,6 @@ from hybridlog.cli.app import app
 from hybridlog_storage.errors import (
     HybridlogError,
     IncompleteError,
-    ResourceError,
     UsageError,
 )
 from tests import places
@@ -68,22 +67,12 @@ def test_a_time_that_python_lacks(root: Path, odd: str) -> None:
 
 def test_files(root: Path, tmp_path: Path) -> None:
     query = "select t, name, header, tags, words, 1.5::decimal(4, 2) as d from large order by t"
-    tables = {}
-    for suffix in ("parquet", "arrow", "csv"):
+    for suffix in ("parquet", "arrow"):
         path = tmp_path / f"answer.{suffix}"
         run(root, query, "-o", path)
-        read = {
-            "parquet": pa.parquet.read_table,
-            "csv": pa.csv.read_csv,
-            "arrow": lambda p: pa.ipc.open_file(p).read_all(),
-        }[suffix]
-        tables[suffix] = read(path)
         with pytest.raises(UsageError, match="exists; --force overwrites it"):
             run(root, query, "-o", path)
-    assert {table.num_rows for table in tables.values()} == {LARGE + 40}
-    assert tables["parquet"].to_pylist()[5:9] == tables["arrow"].to_pylist()[5:9]
-    assert tables["csv"].column("t").to_pylist() == tables["arrow"].column("t").to_pylist()
-    assert json.loads(tables["csv"].column("header")[3].as_py())["frame_id"] == "map"
+    assert pa.parquet.read_table(tmp_path / "answer.parquet").num_rows == LARGE + 40
     printed = run(root, "select 1 as a, 'x,y' as b", "-F", "csv").stdout
     assert printed == '"a","b"\n1,"x,y"\n'
 
@@ -148,9 +137,6 @@ def test_standard_input(root: Path) -> None:
 def test_limits(root: Path) -> None:
     with pytest.raises(HybridlogError, match=r"stopped after 0\.2 s"):
         run(root, ENDLESS, "--timeout", "200ms")
-    large = "select a.range, list(b.range) from range(9000) a, range(20000) b group by all"
-    with pytest.raises(ResourceError, match="more than 64 MiB"):
-        run(root, large, "--memory", "64MiB")
     with pytest.raises(UsageError, match="is no size"):
         run(root, "select 1", "--memory", "much")
 

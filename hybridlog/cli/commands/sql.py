@@ -44,6 +44,6 @@ def sql_command(given: _Given) -> None:
                     answer.check_names()
                 tables = (Table.from_batches([one]) for one in answer.to_batches())
                 completeness = answer.completeness if given.strict else None
-                given.answer(tables, completeness=completeness)
+                given.answer(tables, completeness, is_fixed=True)
         sys.stdout.flush()
         output.remarks(answer.sentences())
