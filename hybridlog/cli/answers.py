@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from hybridlog.attachments import Extras
-    from hybridlog.formats.writing import Answer, Front, Line, Target
+    from hybridlog.formats.slices import Front
+    from hybridlog.formats.writing import Answer, Line, Target
     from hybridlog.message import Message
     from hybridlog.query.answers.completeness import Completeness
     from hybridlog.query.answers.follow import Following
@@ -202,7 +203,7 @@ def write_answer(
     settings: Mapping[str, Any] | None = None,
 ) -> None:
     """Write an answer, all or nothing; its counters are about what was written."""
-    from hybridlog.formats.writing import IN_FORCE
+    from hybridlog.formats.slices import IN_FORCE
 
     counters, in_frame = query.counters, query.question.frame is not None
     answer = _answer_of(query, form, target, front or IN_FORCE, extras)
@@ -247,7 +248,8 @@ def _answer_of(
     query: Query, form: str, target: Target, front: Front, extras: Extras | None
 ) -> Answer:
     """The answer in the form that a format takes."""
-    from hybridlog.formats.writing import Answer, Front, log_of
+    from hybridlog.formats.slices import Front, log_of
+    from hybridlog.formats.writing import Answer
     from hybridlog.query.query import tables_of
 
     content, question = OUTPUTS[form].content, query.question

@@ -159,7 +159,10 @@ def groups(answer: Answer, form: str) -> Iterator[pa.Table]:
                     "file fixes its columns before; leave it out with --fields, or write "
                     "--format jsonl"
                 )
-            columns = [column_of(table, one) for one in schema]
+            try:
+                columns = [column_of(table, one) for one in schema]
+            except pa.ArrowException as error:
+                raise UsageError(f"a column has another type than at first: {error}") from error
             pieces.append(pa.Table.from_arrays(columns, schema=schema))
             rows, size = rows + table.num_rows, size + table.nbytes
             if answer.is_live or size >= GROUP_BYTES or rows >= GROUP_ROWS:

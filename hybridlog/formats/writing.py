@@ -1,4 +1,4 @@
-"""Base of all writers: answers in the forms that they take, slices, and atomic output files.
+"""Base of all writers: answers in the forms that they take, and atomic output files.
 
 A file appears under its name only when it is complete: it is written beside the target,
 synced, and renamed on `commit`. `abort` removes it, and so does an interruption at any
@@ -9,17 +9,13 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import hashlib
 import os
-import pickle
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from copy import copy
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, Final, Self, TypeAlias
+from typing import TYPE_CHECKING, Any, BinaryIO, Self, TypeAlias
 
 from msgspec import Struct, field
 
-from hybridlog.query.planner import Planner
 from hybridlog_storage.disk.unfinished import Unfinished, beside
 from hybridlog_storage.errors import (
     NO_SPACE,
@@ -35,7 +31,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.message import Message
-    from hybridlog.query.query import Query
     from hybridlog_storage.messages import Batch, Buffer, Channel
     from hybridlog_storage.segments.segment_format import Attachment
 
@@ -311,50 +306,3 @@ def explain(error: OSError, name: str) -> HybridlogError:
     if error.errno in _WRONG_PLACE:
         return UsageError(f"cannot write {name}: {reason}")
     return HybridlogError(f"writing {name} failed: {reason}")
-
-
-class Front(Struct, frozen=True):
-    """Latched messages from before the time range, and whether these keep their log time."""
-
-    latched: bool = True
-    original_times: bool = False
-
-
-IN_FORCE: Final = Front()
-"""The latched messages that are in force, at the beginning of the slice."""
-
-
-def batches_of(query: Query, front: Front) -> Iterator[tuple[Batch, Sequence[Channel]]]:
-    """The messages of a slice in the order of the file, many at once."""
-    before = copy(query)
-    if front.latched:
-        for batch, channels in before.latched(original_times=front.original_times):
-            yield batch, [c.channel for c in channels]
-    for batch, channels in query.batches():
-        yield batch, [c.channel for c in channels]
-    query.counters.add(before.counters)
-
-
-def fingerprint(query: Query) -> str:
-    """A digest of a question and of the state of its recordings, in hexadecimal digits.
-
-    As long as it is the same, so is the answer.
-    """
-    states = [
-        (o.id, o.look, o.status, o.messages, o.extent)
-        for o in query.source.now().summaries_of(query.question)
-    ]
-    return hashlib.sha256(pickle.dumps((query.question, states), protocol=5)).hexdigest()
-
-
-def profile_of(query: Query) -> str:
-    """The MCAP profile of a slice: `ros1` or `ros2`, empty for others and for a mixture."""
-    examples = Planner(query.source.now(), query.question).examples
-    spoken = [channel for channel in examples if channel.stats.messages] or examples
-    encodings = {channel.channel.message_encoding for channel in spoken}
-    return {"ros1": "ros1", "cdr": "ros2"}.get(encodings.pop(), "") if len(encodings) == 1 else ""
-
-
-def log_of(query: Query, front: Front = IN_FORCE, extras: Any = None) -> Answer:
-    """A slice as a log."""
-    return Answer(batches=batches_of(query, front), extras=extras, profile=profile_of(query))

@@ -320,14 +320,9 @@ class Trees:
 
     def check(self, topic: str | None, frame: str) -> None:
         """Refuse a frame that a topic's tree has in no epoch."""
-        for epoch in reversed(range(len(self.epochs.begins) + 1)):
-            try:
-                self.tree(topic, epoch).check(frame)
-            except TopicError:
-                if not epoch:
-                    raise
-            else:
-                return
+        trees = [self.tree(topic, epoch) for epoch in range(len(self.epochs.begins) + 1)]
+        if not any(frame.removeprefix("/") in tree.names for tree in trees):
+            trees[0].check(frame)
 
     def _read(self, topics: Sequence[str], epoch: int) -> FrameTree:
         if not topics:

@@ -22,7 +22,8 @@ from msgspec.structs import replace
 
 from hybridlog import __version__
 from hybridlog.arrays.video import pyav
-from hybridlog.formats.writing import failures, fingerprint, new_directory
+from hybridlog.formats.slices import fingerprint
+from hybridlog.formats.writing import failures, new_directory
 from hybridlog.query.pieces import pieces
 from hybridlog.query.query import Query, narrowed
 from hybridlog.query.question import Question

@@ -32,7 +32,7 @@ from hybridlog_storage.errors import (
 )
 
 if TYPE_CHECKING:
-    from hybridlog.formats.writing import Front
+    from hybridlog.formats.slices import Front
     from hybridlog.query.query import Query
     from hybridlog.store import Store
 
@@ -111,7 +111,7 @@ class _Given(Topics, Latched, Forced, _Training):
     @property
     def front(self) -> Front:
         """The messages from before the range."""
-        from hybridlog.formats.writing import Front
+        from hybridlog.formats.slices import Front
 
         return Front(latched=not self.no_latched, original_times=self.original_times)
 

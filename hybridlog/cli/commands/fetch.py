@@ -147,7 +147,7 @@ def _answer(query: Query, choices: _Choices) -> Query:
     """
     form, strict = choices.to_form, choices.strict
     if form != SCREEN:
-        from hybridlog.formats.writing import Front
+        from hybridlog.formats.slices import Front
 
         is_one = choices.at is not None and form != "mp4"  # the answer is one message
         front = Front(latched=not (choices.no_latched or is_one))

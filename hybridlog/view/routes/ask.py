@@ -180,7 +180,7 @@ def _question(context: Context, params: RequestParams) -> PageQuestion:
 def pieces_of(query: Query) -> Pieces:
     """An MCAP file in pieces; a piece is made when it is asked for."""
     from hybridlog.formats.mcap.writer import McapWriter
-    from hybridlog.formats.writing import log_of
+    from hybridlog.formats.slices import log_of
 
     written, log = io.BytesIO(), log_of(query)
     with McapWriter(written, profile=log.profile) as writer:
