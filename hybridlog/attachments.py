@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from hybridlog.formats.writing import Sink
-from hybridlog.query.ranges import RangeResolver
+from hybridlog.query.planner import bounds_in, resolved
 from hybridlog.schema.states import State, state_of
 from hybridlog_storage.errors import SegmentError
 
@@ -151,7 +151,7 @@ def extras_of(session: Session, question: Question) -> Extras:
     """Attachments and metadata records that belong to the answer of a question as a slice."""
     found = Extras([], [], [], 0, [])
     left_out = 0
-    for summary, bounds, _ in RangeResolver(session, question).resolve():
+    for summary, *_ in resolved(session, question):
         entry = session.entry_of(summary)
         found.channels.extend(
             channel
@@ -159,9 +159,10 @@ def extras_of(session: Session, question: Question) -> Extras:
             if state_of(channel.message_encoding) is State.WHOLE
         )
         found.metadata.extend(metadata_of(session, entry, found.problems))
-        end = None if bounds is None or question.clock != "log" else bounds[1]
+        is_cut = question.bounds is not None and question.clock == "log"
+        end = bounds_in(session, question, summary)[1] if is_cut else float("inf")
         for attachment in attachments_of(session, entry):
-            if end is None or attachment.log_time_ns < end:
+            if attachment.log_time_ns < end:
                 found.attachments.append(attachment)
             else:
                 left_out += 1

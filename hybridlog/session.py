@@ -292,13 +292,13 @@ class Session:
         recordings: tuple[str, ...] | None,
     ) -> Predicate:
         """A predicate, or a MongoDB filter, on some topics of some recordings."""
-        from hybridlog.query.predicate.mongo_filter import from_json, mongo_filter
+        from hybridlog.query.predicate.mongo_filter import mongo_filter
         from hybridlog.query.predicate.parser import is_filter, parse
         from hybridlog.query.predicate.types import check
 
         types = self.field_types(topics, recordings)
         if not isinstance(given, str) or is_filter(given):
-            return mongo_filter(from_json(given) if isinstance(given, str) else given, types)
+            return mongo_filter(given, types)
         found = parse(given)
         check(found, types)
         return found

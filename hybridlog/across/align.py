@@ -21,9 +21,8 @@ from hybridlog.frames.names import free_name
 from hybridlog.query.answers.completeness import completeness_of
 from hybridlog.query.answers.lost import lost_times
 from hybridlog.query.intervals import Intervals, joined
-from hybridlog.query.planner import Planner, log_times
+from hybridlog.query.planner import Planner, bounds_in, log_spans, log_times, resolved
 from hybridlog.query.question import Counters
-from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import DurationLike, format_duration, parse_duration
 from hybridlog.schema.arrow_columns import DURATION, numbers
 from hybridlog.schema.arrow_types import column_of, common_schema
@@ -466,11 +465,11 @@ class Aligned:
         self.rows, self._empty = 0, Counter()
         base = self._base
         several = len(self._session.summaries_of(base.question)) > 1
-        chosen = RangeResolver(self._session, base.question).resolve()
-        for summary, bounds, _ in chosen if limit != 0 else ():
+        chosen = resolved(self._session, base.question)
+        for summary, *_ in chosen if limit != 0 else ():
             span = None if summary.status in UNFINISHED else summary.extent
-            if bounds is not None and base.question.clock == "log":
-                span = bounds
+            if base.question.bounds is not None and base.question.clock == "log":
+                span = bounds_in(self._session, base.question, summary)
             for one in self._beside:
                 one.enter(summary.id, span)
             for times, table in base.rows(summary.id):
@@ -545,7 +544,7 @@ class RegularTimes:
         self.question = question
         self.step = step
         spans: dict[str, list[tuple[int, int]]] = {}
-        for summary, span in RangeResolver(session, question).spans():
+        for summary, span in log_spans(session, question):
             spans.setdefault(summary.id, []).append(span)
         self._spans = spans
         rows = sum((end - begin) // step for found in spans.values() for begin, end in found)

@@ -18,9 +18,8 @@ from hybridlog.across.align import TopicReader
 from hybridlog.message import messages_in
 from hybridlog.query.answers.completeness import completeness_of
 from hybridlog.query.answers.video import picture_of
-from hybridlog.query.planner import Planner
+from hybridlog.query.planner import Planner, bounds_in, resolved
 from hybridlog.query.question import Counters
-from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import DurationLike, parse_duration
 from hybridlog.wording import counted
 from hybridlog_storage.errors import StoreError, TimeError, UsageError
@@ -159,9 +158,11 @@ class Synced(Sequence[tuple["Message", ...]]):
         _, time, number = map(int, times[:, row])
         span = np.array([span_of(time, time)], np.int64)
         (summary,) = session.summaries_of(replace(question, recordings=(recording,)))
-        ranges = RangeResolver(session, question)
-        bounds = None if question.bounds is None else ranges.bounds_in(summary)
-        runs = Planner(session, question, self.counters).kept(summary, bounds, span)
+        bounds = None
+        if not question.is_by_log_time:
+            bounds = bounds_in(session, question, summary)
+        planner = Planner(session, question, self.counters)
+        runs = planner.scan([*planner.parts_in(summary, span, bounds)], keeps=True).runs()
         messages = [one for run in runs for one in messages_in(run, picture_of(session))]
         if number >= len(messages):
             raise StoreError(
@@ -174,7 +175,7 @@ class Synced(Sequence[tuple["Message", ...]]):
 def _in_range(session: Session, question: Question) -> list[str]:
     """Ids of the recordings that a question's range touches, oldest first."""
     with suppress(TimeError):
-        return [one.summary.id for one in RangeResolver(session, question).resolve()]
+        return [one.summary.id for one in resolved(session, question)]
     return []
 
 

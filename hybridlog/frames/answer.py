@@ -80,10 +80,10 @@ def stream(planner: Planner, *, at_once: bool = False) -> Iterator[pa.Table]:
     is a table of the columns, then one of what is read at a time.
     """
     question = planner.question
-    part = None if question.reverse else planner.only_part()
+    parts = [] if question.reverse or len(planner.resolved) > 1 else planner.split()
     blocks: list[Block] = []
     rows, size, given = 0, 0, False
-    for group in _groups(planner, None if part is None else [part]):
+    for group in _groups(planner, parts if len(parts) == 1 else None):
         for block in group:
             blocks.append(block)
             rows, size = rows + len(block.log_time), size + block.size

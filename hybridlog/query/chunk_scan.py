@@ -13,6 +13,8 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from itertools import groupby
+from operator import itemgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -44,20 +46,20 @@ ChunkKey = tuple[str, int, int]
 
 
 class RecordingScan(Struct, frozen=True):
-    """The chunks of a recording to read for some channels: their ids and places in the plan.
+    """The chunks of a recording to read for some channels: their ids and places in the scan.
 
-    `windows` are of log time: int64[n, 2], apart and in order; `bounds` are of the plan's clock.
-    None is all times, ns.
+    `windows` are of log time: int64[n, 2], apart and in order; `bounds` are of the scan's clock,
+    where that is another one. None is all times, ns.
     """
 
     recording: RecordingEntry
     channels: Mapping[int, int]
-    bounds: Span | None
     chunks: Sequence[Chunk]
     windows: NDArray[np.int64] | None = None
+    bounds: Span | None = None
 
 
-class ChunkTask(Struct, frozen=True):
+class _Task(Struct, frozen=True):
     """A chunk to read, and the messages wanted from it."""
 
     scan: RecordingScan
@@ -75,56 +77,22 @@ class MessageRun(Struct, frozen=True):
     Attributes:
         batch: The messages; `channel` is the index of each message's channel in `channels`.
         seq: int64[n], arrival numbers in their recordings.
+        holds: bool[n], where the predicate holds; None for messages of which all do.
     """
 
     batch: Batch
     seq: NDArray[np.int64]
     channels: Sequence[RecordedChannel]
+    holds: NDArray[np.bool_] | None = None
 
     def take(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> MessageRun:
         """The chosen rows."""
-        return MessageRun(self.batch.take(rows), self.seq[rows], self.channels)
+        holds = None if self.holds is None else self.holds[rows]
+        return MessageRun(self.batch.take(rows), self.seq[rows], self.channels, holds)
 
 
-class ScanPlan(Struct):
-    """Everything to read, in order.
-
-    Attributes:
-        filters: By index of a channel the part whose predicate is asked of each message.
-        offsets: Payload offsets of the other messages that are wanted, by chunk; int64[k].
-        is_chosen: Only messages with offsets, or which a filter accepts, are wanted.
-        reverse: Latest message first.
-        counters: Count what is read.
-    """
-
-    channels: list[RecordedChannel]
-    scans: list[RecordingScan]
-    clock: Clock = "log"
-    filters: Mapping[int, Part] = field(default_factory=dict)
-    offsets: Mapping[ChunkKey, NDArray[np.int64]] = field(default_factory=dict)
-    is_chosen: bool = False
-    reverse: bool = False
-    counters: Counters = field(default_factory=Counters)
-
-    def tasks(self) -> list[ChunkTask]:
-        """The chunks to read, in the order of the scan."""
-        found = [
-            ChunkTask(scan, chunk)
-            for scan in self.scans
-            for chunk in scan.chunks
-            if scan.windows is None or touches(scan.windows, chunk.first, chunk.last)
-        ]
-        if self.is_chosen:
-            found = [task for task in found if task.key in self.offsets or self.filtered(task)]
-        if self.reverse:
-            return sorted(found, key=lambda t: (-t.chunk.last, t.key))
-        return sorted(found, key=lambda t: (t.chunk.first, t.key))
-
-    def filtered(self, task: ChunkTask) -> list[int]:
-        """Indexes of the channels on whose messages in a chunk filters decide."""
-        own = task.scan.channels
-        held = (own[channel] for channel in task.chunk.place.channels if channel in own)
-        return [index for index in held if index in self.filters]
+_Loaded = tuple[MessageRun, "StoredChunk", int, int]
+"""Messages and their chunk, messages unreadable for the predicate, those of them that expired."""
 
 
 def with_payloads(run: MessageRun, counters: Counters) -> MessageRun:
@@ -138,164 +106,170 @@ def with_payloads(run: MessageRun, counters: Counters) -> MessageRun:
     return run.take(~np.isin(run.batch.channel, gone))
 
 
-class ChunkScan:
-    """Executes a plan; reading `ahead` is unnecessary for a caller that takes few messages.
+class ChunkScan(Struct):
+    """Everything to read, in order.
 
-    One who looks around in a log `keeps` chunks in the cache. Their buffers are read-only.
+    Attributes:
+        filters: By index of a channel the part whose predicate is asked of each message.
+        offsets: Payload offsets of the other messages that are wanted, by chunk; int64[k].
+        is_chosen: Only messages with offsets, or which a filter accepts, are wanted.
+        marks: Messages that a filter does not accept are there, too: `MessageRun.holds` tells.
+        reverse: Latest message first.
+        ahead: Read ahead, which is unnecessary for a caller that takes few messages.
+        keeps: Keep chunks in the cache, for one who looks around. Their buffers are read-only.
+        counters: Count what is read.
     """
 
-    def __init__(
-        self,
-        plan: ScanPlan,
-        session: Session,
-        *,
-        ahead: bool = True,
-        keeps: bool = False,
-    ) -> None:
-        self._plan = plan
-        self._session = session
-        self._reads_ahead = ahead and not keeps
-        self._keeps = keeps
+    session: Session
+    channels: Sequence[RecordedChannel]
+    scans: Sequence[RecordingScan]
+    counters: Counters
+    clock: Clock = "log"
+    filters: Mapping[int, Part] = field(default_factory=dict)
+    offsets: Mapping[ChunkKey, NDArray[np.int64]] = field(default_factory=dict)
+    is_chosen: bool = False
+    marks: bool = False
+    reverse: bool = False
+    ahead: bool = True
+    keeps: bool = False
 
     def runs(self) -> Iterator[MessageRun]:
         """All messages, in order."""
         started = time.monotonic()
-        plan = self._plan
         waiting: list[MessageRun] = []
         ready: list[MessageRun] = []
         size = 0
         try:
-            for _, run, following in self.loaded():
+            for run, following in self.loaded():
                 if len(run.batch):
                     waiting.append(run)
                 now, waiting = self._split(waiting, following)
                 ready += now
                 size += sum(len(one.batch.buffer) for one in now)
                 # Decoding each small chunk by itself costs more than copying it.
-                if ready and (size >= _MERGED_BYTES or not self._reads_ahead):
-                    plan.counters.elapsed_s = time.monotonic() - started
-                    yield in_order(ready, plan)
+                if ready and (size >= _MERGED_BYTES or self.keeps or not self.ahead):
+                    self.counters.elapsed_s = time.monotonic() - started
+                    yield in_order(ready, reverse=self.reverse)
                     ready, size = [], 0
             if ready:
-                yield in_order(ready, plan)
+                yield in_order(ready, reverse=self.reverse)
         finally:
-            plan.counters.elapsed_s = time.monotonic() - started
+            self.counters.elapsed_s = time.monotonic() - started
 
-    def loaded(self) -> Iterator[tuple[ChunkTask, MessageRun, ChunkTask | None]]:
-        """Each chunk, its wanted messages, and the chunk after it."""
-        tasks = self._plan.tasks()
-        size = sum(task.chunk.place.length for task in tasks)
-        if size < _MIN_THREADED_BYTES or not self._reads_ahead:
-            yield from self._ahead(tasks, lambda task: partial(self._load, task))
-            return
-        with ThreadPoolExecutor(2, thread_name_prefix="hybridlog-read") as pool:
-            try:
-                yield from self._ahead(tasks, lambda task: pool.submit(self._load, task).result)
-            finally:
-                pool.shutdown(cancel_futures=True)
+    def loaded(self) -> Iterator[tuple[MessageRun, Chunk | None]]:
+        """The wanted messages of each chunk, and the chunk after it."""
+        tasks, counters = self._tasks(), self.counters
+        is_large = sum(task.chunk.place.length for task in tasks) >= _MIN_THREADED_BYTES
+        upcoming = self._announced(tasks) if self.session.directory.is_remote else iter(tasks)
+        loading: deque[tuple[_Task, Callable[[], _Loaded]]] = deque()
+        pool = ThreadPoolExecutor(2, thread_name_prefix="hybridlog-read")
+        try:
+            while True:
+                while len(loading) < _LOOK_AHEAD and (task := next(upcoming, None)) is not None:
+                    is_early = is_large and self.ahead and not self.keeps
+                    load = partial(self._load, task)
+                    loading.append((task, pool.submit(load).result if is_early else load))
+                if not loading:
+                    return
+                check_wanted()
+                run, chunk, unreadable, expired = loading.popleft()[1]()
+                if not self.keeps:
+                    counters.add_chunk(chunk)
+                counters.unreadable += unreadable
+                counters.without_arrays += expired
+                yield run, loading[0][0].chunk if loading else None
+        finally:
+            pool.shutdown(cancel_futures=True)
 
-    def _ahead(
-        self, tasks: list[ChunkTask], start: Callable[[ChunkTask], Callable[[], _Loaded]]
-    ) -> Iterator[tuple[ChunkTask, MessageRun, ChunkTask | None]]:
-        counters = self._plan.counters
-        upcoming = iter(tasks)
-        if self._session.directory.is_remote:
-            upcoming = self._announced(upcoming)
-        loading: deque[tuple[ChunkTask, Callable[[], _Loaded]]] = deque()
-        while True:
-            while len(loading) < _LOOK_AHEAD:
-                wanted = next(upcoming, None)
-                if wanted is None:
-                    break
-                loading.append((wanted, start(wanted)))
-            if not loading:
-                return
-            check_wanted()
-            task, loaded = loading.popleft()
-            run, chunk, unreadable, expired = loaded()
-            if not self._keeps:
-                counters.add_chunk(chunk)
-            counters.unreadable += unreadable
-            counters.without_arrays += expired
-            yield task, run, loading[0][0] if loading else None
+    def _tasks(self) -> list[_Task]:
+        """The chunks to read, in the order of the scan."""
+        found = [
+            _Task(scan, chunk)
+            for scan in self.scans
+            for chunk in scan.chunks
+            if scan.windows is None or touches(scan.windows, chunk.first, chunk.last)
+        ]
+        if self.is_chosen:
+            found = [task for task in found if task.key in self.offsets or self._filtering(task)]
+        if self.reverse:
+            return sorted(found, key=lambda t: (-t.chunk.last, t.key))
+        return sorted(found, key=lambda t: (t.chunk.first, t.key))
 
-    def _announced(self, tasks: Iterator[ChunkTask]) -> Iterator[ChunkTask]:
-        """The same, after a bucket was asked for many of them at once."""
-        room = _FETCHED_BYTES if self._reads_ahead else _MERGED_BYTES
-        while group := list(_up_to(tasks, room)):
-            by_segment: dict[tuple[str, int], list[ChunkTask]] = {}
-            for task in group:
-                by_segment.setdefault(task.key[:2], []).append(task)
-            for own in by_segment.values():
-                reader = self._session.segment(own[0].scan.recording, own[0].chunk.segment)
-                reader.fetch([task.chunk.place for task in own])
+    def _filtering(self, task: _Task) -> list[int]:
+        """Indexes of the channels on whose messages in a chunk filters decide."""
+        own = task.scan.channels
+        held = (own[channel] for channel in task.chunk.place.channels if channel in own)
+        return [index for index in held if index in self.filters]
+
+    def _announced(self, tasks: Sequence[_Task]) -> Iterator[_Task]:
+        """The chunks, after a bucket was asked for many of them at once."""
+        room = _FETCHED_BYTES if self.ahead and not self.keeps else _MERGED_BYTES
+        ends = np.cumsum([task.chunk.place.length for task in tasks]) // room
+        for _, numbered in groupby(zip(ends.tolist(), tasks, strict=True), itemgetter(0)):
+            group = [task for _, task in numbered]
+            for segment, own in groupby(sorted(group, key=_key), lambda task: task.key[:2]):
+                places = [(task.scan.recording, task.chunk.place) for task in own]
+                reader = self.session.segment(places[0][0], segment[1])
+                reader.fetch([place for _, place in places])
             yield from group
 
-    def _load(self, task: ChunkTask) -> _Loaded:
+    def _load(self, task: _Task) -> _Loaded:
         segment, place = task.chunk.segment, task.chunk.place
-        if self._keeps:
-            count = self._plan.counters.add_chunk
-            chunk = self._session.chunk(task.scan.recording, segment, place, count)
+        if self.keeps:
+            count = self.counters.add_chunk
+            chunk = self.session.chunk(task.scan.recording, segment, place, count)
         else:
-            chunk = self._session.read_chunk(task.scan.recording, segment, place)
-        undecided = self._plan.filtered(task)
-        run = self._wanted(task, chunk, undecided)
-        run, unreadable, expired = self._filtered(run, undecided)
+            chunk = self.session.read_chunk(task.scan.recording, segment, place)
+        filtering = self._filtering(task) if self.filters else []
+        run = self._wanted(task, chunk, filtering)
+        run, unreadable, expired = self._filtered(run, filtering)
         return run, chunk, unreadable, expired
 
-    def _wanted(
-        self,
-        task: ChunkTask,
-        chunk: StoredChunk,
-        undecided: Sequence[int],
-    ) -> MessageRun:
-        batch, seq = chunk.batch, chunk.seq
+    def _wanted(self, task: _Task, chunk: StoredChunk, filtering: Sequence[int]) -> MessageRun:
+        batch, scan = chunk.batch, task.scan
         table = np.full(int(batch.channel.max()) + 1, -1, np.int32)
-        for channel_id, index in task.scan.channels.items():
+        for channel_id, index in scan.channels.items():
             if channel_id < len(table):
                 table[channel_id] = index
-        if batch.left is not None and not {*task.chunk.place.channels} & {*task.scan.channels}:
+        if batch.left is not None and not {*task.chunk.place.channels} & {*scan.channels}:
             raise StoreError(
-                f"Payloads of recording {task.scan.recording.name!r} were deleted while it was "
+                f"Payloads of recording {scan.recording.name!r} were deleted while it was "
                 "read. Ask again."
             )
         channel = table[batch.channel]
         mask = channel >= 0
-        if self._plan.is_chosen:
-            offsets = self._plan.offsets.get(task.key, np.empty(0, np.int64))
-            mask &= np.isin(channel, undecided) | np.isin(batch.places[0], offsets)
-        bounds = task.scan.bounds
-        if bounds is not None:
-            mask &= self._inside(batch, channel, mask, bounds)
-        windows = task.scan.windows
-        if windows is not None:
-            mask &= inside(batch.log_time, windows)
-        if mask.all() and not self._keeps:
+        if self.is_chosen:
+            offsets = self.offsets.get(task.key, np.empty(0, np.int64))
+            mask &= np.isin(channel, filtering) | np.isin(batch.places[0], offsets)
+        if scan.bounds is not None:
+            mask &= self._inside(batch, channel, mask, scan.bounds)
+        if scan.windows is not None:
+            mask &= inside(batch.log_time, scan.windows)
+        if mask.all() and not self.keeps:
             batch.channel = channel
-            return MessageRun(batch, seq, self._plan.channels)
+            return MessageRun(batch, chunk.seq, self.channels)
         rows = np.flatnonzero(mask)
         own = batch.take(rows)
         own.channel = channel[rows]
-        return MessageRun(own, seq[rows], self._plan.channels)
+        return MessageRun(own, chunk.seq[rows], self.channels)
 
-    def _filtered(self, run: MessageRun, undecided: Sequence[int]) -> tuple[MessageRun, int, int]:
+    def _filtered(self, run: MessageRun, filtering: Sequence[int]) -> tuple[MessageRun, int, int]:
         """The messages that satisfy the predicate, and numbers as of `matches`."""
-        if not undecided or not len(run.batch):
-            return run, 0, 0
         holds = np.ones(len(run.batch), np.bool_)
         unreadable = expired = 0
-        from hybridlog.query.predicate.evaluate import matches
+        for index in {*filtering}.intersection(distinct(run.batch.channel).tolist()):
+            from hybridlog.query.predicate.evaluate import matches
 
-        for index in distinct(run.batch.channel).tolist():
-            if index in undecided:
-                rows = np.flatnonzero(run.batch.channel == index)
-                channel = self._plan.channels[index]
-                part = self._plan.filters[index]
-                holds[rows], lacking, gone = matches(
-                    part, channel, run.batch.take(rows), run.seq[rows]
-                )
-                unreadable, expired = unreadable + lacking, expired + gone
-        return (run if holds.all() else run.take(holds)), unreadable, expired
+            rows = np.flatnonzero(run.batch.channel == index)
+            own = run.take(rows)
+            found = matches(self.filters[index], self.channels[index], own.batch, own.seq)
+            holds[rows], lacking, gone = found
+            unreadable, expired = unreadable + lacking, expired + gone
+        if self.marks:
+            run = MessageRun(run.batch, run.seq, run.channels, holds)
+        elif not holds.all():
+            run = run.take(holds)
+        return run, unreadable, expired
 
     def _inside(
         self,
@@ -305,25 +279,20 @@ class ChunkScan:
         bounds: Span,
     ) -> NDArray[np.bool_]:
         begin, end = bounds
-        if self._plan.clock == "log":
-            times = batch.log_time
-        elif self._plan.clock == "publish":
-            times = batch.publish_time
-        else:
+        times, is_timed = batch.publish_time, mask
+        if self.clock == "header":
             from hybridlog.schema.codec import stamps_of
 
-            times = np.zeros(len(batch), np.int64)
-            has_stamp = np.zeros(len(batch), np.bool_)
+            times, is_timed = np.zeros(len(batch), np.int64), np.zeros(len(batch), np.bool_)
             for index in distinct(channel[mask]).tolist():
                 rows = np.flatnonzero(mask & (channel == index))
-                stamped, stamps = stamps_of(self._plan.channels[index].codec, batch.take(rows))
-                times[rows[stamped]], has_stamp[rows[stamped]] = stamps, True
-            mask = mask & has_stamp
+                stamped, stamps = stamps_of(self.channels[index].codec, batch.take(rows))
+                times[rows[stamped]], is_timed[rows[stamped]] = stamps, True
         times = placed(times)
-        return mask & (times >= begin) & (times < end)
+        return is_timed & (times >= begin) & (times < end)
 
     def _split(
-        self, waiting: list[MessageRun], following: ChunkTask | None
+        self, waiting: list[MessageRun], following: Chunk | None
     ) -> tuple[list[MessageRun], list[MessageRun]]:
         """The messages that no later chunk can precede, and the rest."""
         if following is None:
@@ -331,11 +300,7 @@ class ChunkScan:
         ready, rest = [], []
         for run in waiting:
             times = run.batch.log_time
-            now = (
-                times > following.chunk.last
-                if self._plan.reverse
-                else times < following.chunk.first
-            )
+            now = times > following.last if self.reverse else times < following.first
             if now.all():
                 ready.append(run)
             elif now.any():
@@ -346,32 +311,26 @@ class ChunkScan:
         return ready, rest
 
 
-def _up_to(tasks: Iterator[ChunkTask], room: int) -> Iterator[ChunkTask]:
-    """The next chunks, until they have so many bytes."""
-    for task in tasks:
-        yield task
-        room -= task.chunk.place.length
-        if room <= 0:
-            return
+def _key(task: _Task) -> ChunkKey:
+    return task.key
 
 
-_Loaded = tuple[MessageRun, "StoredChunk", int, int]
-"""Messages and their chunk, messages unreadable for the predicate, those of them that expired."""
-
-
-def in_order(runs: list[MessageRun], plan: ScanPlan) -> MessageRun:
-    """Merge runs, sorted by log time, recording and arrival."""
-    keys = np.array([int(channel.recording.key, 16) for channel in plan.channels], np.uint64)
+def in_order(runs: Sequence[MessageRun], *, reverse: bool = False) -> MessageRun:
+    """Merge runs of equal channels, sorted by log time, recording and arrival."""
+    channels = runs[0].channels
+    keys = np.array([int(channel.recording.key, 16) for channel in channels], np.uint64)
     times = np.concatenate([r.batch.log_time for r in runs])
-    channels = np.concatenate([r.batch.channel for r in runs])
+    of = np.concatenate([r.batch.channel for r in runs])
     seq = np.concatenate([r.seq for r in runs])
-    order = order_of(times, keys[channels], seq)
-    if order is None and len(runs) == 1 and not plan.reverse:
+    order = order_of(times, keys[of], seq)
+    if order is None and len(runs) == 1 and not reverse:
         return runs[0]
     if order is None:
         order = np.arange(len(times))
-    if plan.reverse:
+    if reverse:
         order = order[::-1]
     if len(runs) == 1:
         return runs[0].take(order)
-    return MessageRun(interleave([r.batch for r in runs], order), seq[order], plan.channels)
+    marked = [r.holds for r in runs if r.holds is not None]
+    holds = np.concatenate(marked)[order] if marked else None
+    return MessageRun(interleave([r.batch for r in runs], order), seq[order], channels, holds)

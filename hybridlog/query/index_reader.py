@@ -77,7 +77,7 @@ def documents(session: Session, parts: Sequence[Part]) -> dict[Part, int]:
 def _lacks_fields(part: Part) -> bool:
     """True if documents may lack the fields: those of unreadable messages."""
     is_open = part.recording.status == "open"
-    return is_open or not part.has_fields or any(stats.unreadable for stats in part.stats)
+    return is_open or not part.has_fields or any(one.stats.unreadable for one in part.channels)
 
 
 def _numbers(
@@ -160,13 +160,13 @@ def _queries(parts: Sequence[Part], own: Filter) -> list[Query]:
     found: list[Query] = []
     for part in parts:
         condition: Filter = {"_meta.rec": part.recording.key}
-        if part.clock != "log" and part.bounds is not None:
+        if part.bounds is not None:
             begin, end = part.bounds
             name = STAMP if part.clock == "header" else "_meta.pub"
             unset = {"$ne": 0} if part.clock == "header" else {}
             condition[name] = {"$gte": begin, "$lte" if end == END else "$lt": end, **unset}
         # Of an open recording, more may have come.
-        span = (0, END) if part.recording.status == "open" else part.span or (0, 0)
+        span = (0, END) if part.recording.status == "open" else part.span
         for low, high in np.clip(part.log_windows, *span).tolist():
             if low < high:
                 window = between(low, high if high < END else None)

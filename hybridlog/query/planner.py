@@ -7,28 +7,27 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Sequence
-from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from msgspec.structs import replace
 
-from hybridlog.query.chunk_scan import ChunkScan, MessageRun
-from hybridlog.query.question import Counters, Part
-from hybridlog.query.ranges import RangeResolver
+from hybridlog.query.question import Counters, Part, windows_in
 from hybridlog.query.rows import RowBatch, Rows
+from hybridlog.query.times import format_time, is_early, is_relative, parse_range, parse_time
 from hybridlog.schema.column import STAMP
 from hybridlog.schema.states import GONE
 from hybridlog.snapshot import UNFINISHED, differing
+from hybridlog.wording import listed
 from hybridlog_storage.cache import lazy
-from hybridlog_storage.errors import TopicError, UsageError
-from hybridlog_storage.times import END
+from hybridlog_storage.errors import TimeError, TopicError, UsageError
+from hybridlog_storage.times import BEGIN, END, span_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.query.chunk_scan import ScanPlan
-    from hybridlog.query.question import Question, RecordedChannel, Span
+    from hybridlog.query.chunk_scan import MessageRun
+    from hybridlog.query.question import Clock, Question, RecordedChannel, Span
     from hybridlog.schema.states import State
     from hybridlog.session import Session
     from hybridlog_storage.summary import RecordingSummary
@@ -36,6 +35,9 @@ if TYPE_CHECKING:
 _GROUP_GROWTH = 64  # so many times more recordings are planned after each group
 _MAX_GROUP = 4096  # recordings planned at once, if they do not overlap
 _READ_AHEAD_FROM = 50  # messages; nothing is read ahead for fewer
+_MAX_NAMES = 5  # recordings in a message
+_MAX_LOOKED_AT = 100
+_FAR_NS = 10 * 365 * 86_400 * 10**9
 
 
 class Planner(Rows):
@@ -46,7 +48,11 @@ class Planner(Rows):
     ) -> None:
         super().__init__(session, Counters() if counters is None else counters)
         self.question = question
-        self._ranges = RangeResolver(session, question)
+
+    @lazy
+    def resolved(self) -> list[Resolved]:
+        """The recordings to ask, oldest first, each with its range."""
+        return resolved(self.session, self.question)
 
     def parts(self) -> list[Part]:
         """The question, split by recording and topic, where it may have an answer.
@@ -57,28 +63,24 @@ class Planner(Rows):
 
     def split(self) -> list[Part]:
         """The same, of which nothing was asked yet."""
-        return [part for one in self._ranges.resolve() for part in self.parts_in(*one)]
-
-    def only_part(self) -> Part | None:
-        """The only part of the question; None if it has several, or none."""
-        found = self._ranges.resolve()
-        parts = [*self.parts_in(*found[0])] if len(found) == 1 else []
-        return parts[0] if len(parts) == 1 else None
+        return [part for one in self.resolved for part in self.parts_in(*one)]
 
     def parts_in(
-        self, summary: RecordingSummary, bounds: Span | None, windows: NDArray[np.int64] | None
+        self,
+        summary: RecordingSummary,
+        windows: NDArray[np.int64] | None = None,
+        bounds: Span | None = None,
     ) -> Iterator[Part]:
-        """The parts of the question in one recording."""
-        recording = self.session.entry_of(summary)
-        wanted = set(self.question.topics)
+        """The parts of the question in one recording; ranges are as of `Part`."""
+        recording, question = self.session.entry_of(summary), self.question
         by_topic: dict[str, list[RecordedChannel]] = defaultdict(list)
-        for channel in self.session.channels_of(recording, wanted):
+        for channel in self.session.channels_of(recording, {*question.topics}):
             self._check_clock(channel)
             by_topic[channel.channel.topic].append(channel)
-        clock, predicate = self.question.clock, self.question.predicate
+        range_ = windows, bounds, question.clock
         for topic, channels in by_topic.items():
             if any(c.stats.messages for c in channels):  # else nothing was sent on the topic
-                yield Part(recording, topic, tuple(channels), bounds, clock, windows, predicate)
+                yield Part(recording, topic, tuple(channels), question.predicate, *range_)
 
     def channels(self) -> list[RecordedChannel]:
         """Every channel of the question."""
@@ -103,7 +105,7 @@ class Planner(Rows):
     @lazy
     def ranks(self) -> dict[str, int]:
         """The place of each recording among those asked, by its key; ties are in this order."""
-        keys = sorted(resolved.summary.key for resolved in self._ranges.resolve())
+        keys = sorted(one.summary.key for one in self.resolved)
         return {key: rank for rank, key in enumerate(keys)}
 
     # Answers.
@@ -119,40 +121,27 @@ class Planner(Rows):
 
     def runs(self) -> Iterator[MessageRun]:
         """The messages of the answer, in order."""
-        question = self.question
+        question, runs = self.question, self._runs()
         if question.limit == 0:
-            self._ranges.resolve()  # a range that is outside is refused all the same
+            _ = self.resolved  # a range that is outside is refused all the same
             return
-        runs = self._runs()
         for run in runs if question.returns_all else _decimated(runs, question):
             self.counters.add_messages(run.batch)
             yield run
 
     def _runs(self) -> Iterator[MessageRun]:
         """All messages that match, in order; recordings are read when their turn comes."""
-        limit = self.question.limit
+        limit, reverse = self.question.limit, self.question.reverse
         ahead = limit is None or limit > _READ_AHEAD_FROM
-        for group in self.groups():
-            yield from ChunkScan(self.plan(group), self.session, ahead=ahead).runs()
+        for group in self._groups():
+            yield from self.scan(group, reverse=reverse, ahead=ahead).runs()
 
-    def kept(
-        self, summary: RecordingSummary, bounds: Span | None, windows: NDArray[np.int64] | None
-    ) -> Iterator[MessageRun]:
-        """The messages of a part of a recording, in order; `ChunkScan` keeps their chunks."""
-        plan = self.plan([*self.parts_in(summary, bounds, windows)])
-        return ChunkScan(plan, self.session, keeps=True).runs()
-
-    def plan(self, parts: Sequence[Part]) -> ScanPlan:
-        """The plan for reading the matching messages of some parts, in the answer's order."""
-        parts = self.fitting(self.decided(parts))
-        return self.again(partial(self.chunk_plan, reverse=self.question.reverse), parts)
-
-    def groups(self) -> Iterator[list[Part]]:
+    def _groups(self) -> Iterator[list[Part]]:
         """The parts in groups, those that overlap in time together, in the answer's order.
 
         The first group is small, so that the first message needs few recordings.
         """
-        found = self._ranges.resolve()
+        found = self.resolved
         # In the order of the answer; going back, a recording begins with its last message.
         spans = [
             (one.extent[0], END if one.status in UNFINISHED else one.extent[1]) for one, *_ in found
@@ -161,12 +150,11 @@ class Planner(Rows):
         if self.question.reverse:
             first, last = -last, -first
         order = np.argsort(first, kind="stable")
-        reached = np.maximum.accumulate(last[order]) if len(order) else last
-        edges = np.flatnonzero(first[order][1:] > reached[:-1]) + 1
+        is_apart = first[order][1:] > np.maximum.accumulate(last[order])[:-1]
+        edges = np.append(np.flatnonzero(is_apart) + 1, len(order))
         begin, most = 0, 1
         while begin < len(order):
-            row = int(np.searchsorted(edges, begin + most))
-            end = int(edges[row]) if row < len(edges) else len(order)
+            end = int(edges[edges.searchsorted(min(begin + most, len(order)))])
             rows = order[begin:end].tolist()
             yield [part for row in rows for part in self.parts_in(*found[row])]
             begin, most = end, min(most * _GROUP_GROWTH, _MAX_GROUP)
@@ -231,21 +219,141 @@ def log_times(
 def _decimated(runs: Iterator[MessageRun], question: Question) -> Iterator[MessageRun]:
     """Every n-th message of each topic, up to the limit."""
     seen: Counter[str] = Counter()
-    given = 0
+    every, left = question.every, question.limit
     for run in runs:
         keep = np.ones(len(run.batch), np.bool_)
-        channels: dict[str, list[int]] = defaultdict(list)
-        for number in np.unique(run.batch.channel).tolist() if question.every > 1 else ():
-            channels[run.channels[number].channel.topic].append(number)
-        for topic, own in channels.items():
+        numbers = np.unique(run.batch.channel).tolist() if every > 1 else ()
+        topics = {number: run.channels[number].channel.topic for number in numbers}
+        for topic in {*topics.values()}:
+            own = [number for number, name in topics.items() if name == topic]
             rows = np.flatnonzero(np.isin(run.batch.channel, own))
-            keep[rows] = (seen[topic] + np.arange(len(rows))) % question.every == 0
+            keep[rows] = (seen[topic] + np.arange(len(rows))) % every == 0
             seen[topic] += len(rows)
-        rows = np.flatnonzero(keep)
-        if question.limit is not None:
-            rows = rows[: question.limit - given]
-        given += len(rows)
+        rows = np.flatnonzero(keep)[:left]
         if len(rows):
             yield run if len(rows) == len(run.batch) else run.take(rows)
-        if question.limit is not None and given >= question.limit:
+        left = None if left is None else left - len(rows)
+        if left == 0:
             return
+
+
+# The range of a question in each recording.
+
+
+class Resolved(NamedTuple):
+    """A recording that a question asks, with `windows` and `bounds` as of `Part`."""
+
+    summary: RecordingSummary
+    windows: NDArray[np.int64] | None
+    bounds: Span | None
+
+
+def resolved(session: Session, question: Question) -> list[Resolved]:
+    """The recordings to ask, oldest first; without reading their entries."""
+    during, is_log = question.during, question.clock == "log"
+    chosen = session.summaries_of(question)
+    if during is not None:
+        named = {*during.recordings}
+        chosen = [one for one in chosen if one.id in named]
+    # Without relative times, the range is the same in each.
+    shared = None if any(map(is_relative, question.bounds or ())) else bounds_in(session, question)
+    found: list[Resolved] = []
+    for one in chosen:
+        windows = None if during is None else during.of_recording(one.id)
+        if question.bounds is None:
+            found.append(Resolved(one, windows, None))
+            continue
+        span = begin, end = shared or bounds_in(session, question, one)
+        first, behind = one.extent
+        if begin < end and not (is_log and (begin >= behind or end <= first)):
+            own = (windows_in(windows, span), None) if is_log else (windows, span)
+            found.append(Resolved(one, *own))
+    if question.bounds is not None and chosen and during is None:
+        _check(session, question, chosen, found)
+    return found
+
+
+def _check(
+    session: Session,
+    question: Question,
+    chosen: Sequence[RecordingSummary],
+    found: Sequence[Resolved],
+) -> None:
+    """Refuse a range without a recording, or one that begins far before any first message, ns."""
+    begin, stop = question.bounds or (None, None)
+    if found and question.clock == "log" and is_early(begin):
+        at = parse_time(begin, start=None, end=None)
+        if min(one.summary.extent[0] for one in found) - at > _FAR_NS:
+            raise TimeError(
+                f"{begin} is {format_time(at)}, long before any message; +{begin} is that long "
+                "after the beginning of a recording."
+            )
+    if not found:
+        spans = [_clock_span(session, question, one) for one in chosen[:_MAX_LOOKED_AT]]
+        start, end = min(low for low, _ in spans), max(high for _, high in spans)
+        parse_range(begin, stop, start=start, end=end)
+        names = listed((one.name for one in chosen), _MAX_NAMES)
+        raise TimeError(
+            f"Nothing was recorded between {begin} and {stop}: {names} spans {format_time(start)} "
+            f"to {format_time(end)}."
+        )
+
+
+def bounds_in(
+    session: Session, question: Question, recording: RecordingSummary | None = None
+) -> Span:
+    """The range on the question's clock in one recording, ns; without one, if it is in all.
+
+    It may be empty: for example `2025-01-01` to `end`, in a recording of 2024.
+    """
+    begin, stop = question.bounds or (None, None)
+    start = end = None
+    if recording is not None and question.bounds is not None:
+        start, end = _clock_span(session, question, recording)
+    return (
+        BEGIN if begin is None else parse_time(begin, start=start, end=end),
+        END if stop is None else parse_time(stop, start=start, end=end),
+    )
+
+
+def log_spans(session: Session, question: Question) -> list[tuple[RecordingSummary, Span]]:
+    """The log time `[begin, end)`, ns, of each recording of a question."""
+    if not question.is_by_log_time:
+        raise UsageError(f"Intervals use log time; a range cannot use the {question.clock} clock.")
+    return [
+        (one.summary, (low, high))
+        for one in resolved(session, question)
+        if one.summary.span is not None
+        for low, high in windows_in(one.windows, one.summary.extent).tolist()
+    ]
+
+
+def _clock_span(session: Session, question: Question, recording: RecordingSummary) -> Span:
+    """`[first, end)` of the question's topics, on its clock."""
+    if question.clock == "log":
+        return recording.extent
+    channels = session.channels_of(session.entry_of(recording), {*question.topics})
+    ends = [time for one in channels for time in _ends(session, one, question.clock)]
+    return span_of(min(ends), max(ends)) if ends else recording.extent
+
+
+def _ends(session: Session, channel: RecordedChannel, clock: Clock) -> Iterator[int]:
+    """First and last time of a channel on another clock, perhaps of each chunk.
+
+    Where its statistics do not have them, the messages are read.
+    """
+    from hybridlog.schema.codec import stamps_of
+
+    recording, stats, number = channel.recording, channel.stats, channel.channel_id
+    if clock == "publish" and channel.channel.has_publish_time:
+        for segment, _, _ in recording.spans_with([number]):
+            parts = session.chunk_table(recording, segment).parts
+            own = parts[parts["channel"] == number]
+            yield from (*own["first_publish"].tolist(), *own["last_publish"].tolist())
+    elif clock == "header" and recording.is_decoded:
+        yield from (time for time in (stats.first_stamp, stats.last_stamp) if time is not None)
+    elif clock == "header":
+        for chunk in session.chunks(recording, [number], None, "log"):
+            batch = session.read_chunk(recording.id, chunk.segment, chunk.place).batch
+            own = batch.take(np.flatnonzero(batch.channel == number))
+            yield from stamps_of(channel.codec, own)[1].tolist()

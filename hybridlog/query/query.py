@@ -21,7 +21,7 @@ from msgspec.structs import asdict, replace
 
 from hybridlog.query.choice import Choice, choose
 from hybridlog.query.planner import Planner
-from hybridlog.query.question import Clock, Counters, Question
+from hybridlog.query.question import Clock, Counters, Question, windows_in
 from hybridlog.query.times import parse_duration, parse_time
 from hybridlog.wording import Rows, listed, meant
 from hybridlog_storage.errors import (
@@ -711,8 +711,9 @@ def spans_of(query: Query) -> dict[str, Span]:
     """
     found: dict[str, Span] = {}
     for part in Planner(query.source.now(), query.question).split():
-        extent = part.extent
-        if extent is not None:
+        cut = windows_in(part.windows, part.span)
+        if len(cut):
+            extent = int(cut[0, 0]), int(cut[-1, 1])
             low, high = found.get(part.recording.id, extent)
             found[part.recording.id] = min(low, extent[0]), max(high, extent[1])
     return found

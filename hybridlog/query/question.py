@@ -123,17 +123,17 @@ class Part(Struct, frozen=True, eq=False, dict=True):
     """The part of a question for one topic of one recording.
 
     Attributes:
-        bounds: `[begin, end)` of `clock`, ns; None for all times.
         windows: int64[n, 2], `[begin, end)` of log time, disjoint, in order; None for all times.
+        bounds: `[begin, end)` of the `clock`, where that is not the log's, ns; None for all times.
     """
 
     recording: RecordingEntry
     topic: str
     channels: tuple[RecordedChannel, ...]
-    bounds: Span | None
-    clock: Clock
-    windows: NDArray[np.int64] | None
     predicate: Predicate | None
+    windows: NDArray[np.int64] | None = None
+    bounds: Span | None = None
+    clock: Clock = "log"
 
     @property
     def is_unbounded(self) -> bool:
@@ -141,19 +141,9 @@ class Part(Struct, frozen=True, eq=False, dict=True):
         return self.bounds is None and self.windows is None
 
     @property
-    def is_by_log_time(self) -> bool:
-        """True if the bounds, if any, refer to log time."""
-        return self.bounds is None or self.clock == "log"
-
-    @property
-    def stats(self) -> list[ChannelStats]:
-        """Statistics of its channels."""
-        return [channel.stats for channel in self.channels]
-
-    @property
     def messages(self) -> int:
         """Messages of the topic in the recording, at any time."""
-        return sum(stats.messages for stats in self.stats)
+        return sum(channel.stats.messages for channel in self.channels)
 
     @property
     def needs_index(self) -> bool:
@@ -173,7 +163,7 @@ class Part(Struct, frozen=True, eq=False, dict=True):
     @lazy
     def log_windows(self) -> NDArray[np.int64]:
         """int64[n, 2]: the log time of the part; bounds of another clock do not restrict it."""
-        return windows_in(self.windows, self.bounds if self.clock == "log" else None)
+        return windows_in(self.windows)
 
     @property
     def log_span(self) -> Span:
@@ -181,34 +171,12 @@ class Part(Struct, frozen=True, eq=False, dict=True):
         windows = self.log_windows
         return (int(windows[0, 0]), int(windows[-1, 1])) if len(windows) else (0, 0)
 
-    @property
-    def share(self) -> float:
-        """Fraction of the topic's time in the part, 0 to 1."""
-        low, high = self.span or (0, 0)
-        cut = self._cut
-        return float((cut[:, 1] - cut[:, 0]).sum()) / (high - low) if len(cut) else 0.0
-
-    @property
-    def extent(self) -> Span | None:
-        """Log time of the topic's messages in the part, ns; None without any.
-
-        Bounds of another clock do not restrict it.
-        """
-        cut = self._cut
-        return (int(cut[0, 0]), int(cut[-1, 1])) if len(cut) else None
-
     @lazy
-    def _cut(self) -> NDArray[np.int64]:
-        """`log_windows`, cut to the topic's messages."""
-        cut = np.clip(self.log_windows, *(self.span or (0, 0)))
-        return cut[cut[:, 1] > cut[:, 0]]
-
-    @lazy
-    def span(self) -> Span | None:
-        """Log time of the topic's messages in the recording, ns; None without any."""
-        firsts = [s.first for s in self.stats if s.first is not None]
-        lasts = [s.last for s in self.stats if s.last is not None]
-        return span_of(min(firsts), max(lasts)) if firsts else None
+    def span(self) -> Span:
+        """Log time of the topic's messages in the recording, ns; empty without any."""
+        ends = [end for one in self.channels for end in (one.stats.first, one.stats.last)]
+        known = [end for end in ends if end is not None]
+        return span_of(min(known), max(known)) if known else (0, 0)
 
 
 class Counters(Struct):
@@ -309,10 +277,9 @@ def _arrow_type(codec: Codec, fields: frozenset[str] | None) -> Any:
     return codec.columns_of(no_messages(), fields).arrow().type
 
 
-def windows_in(windows: NDArray[np.int64] | None, bounds: Span | None) -> NDArray[np.int64]:
-    """int64[n, 2]: what windows and bounds have in common; None for all times."""
-    found = np.array([[BEGIN, END]], np.int64) if windows is None else windows
-    found = found if bounds is None else np.clip(found, *bounds)
+def windows_in(windows: NDArray[np.int64] | None, bounds: Span = (BEGIN, END)) -> NDArray[np.int64]:
+    """int64[n, 2]: what windows (None for all times) and bounds have in common."""
+    found = np.array([bounds], np.int64) if windows is None else np.clip(windows, *bounds)
     return found[found[:, 1] > found[:, 0]]
 
 

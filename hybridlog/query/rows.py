@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 import numpy as np
 from msgspec.structs import replace
 
-from hybridlog.query.chunk_scan import ChunkKey, ChunkScan, RecordingScan, ScanPlan
+from hybridlog.query.chunk_scan import ChunkKey, ChunkScan, RecordingScan
 from hybridlog.query.predicate.tree import is_meta
 from hybridlog_storage.errors import ChangedError, SegmentError, StoreError
 from hybridlog_storage.times import inside, placed
@@ -51,9 +51,8 @@ class RowBatch(NamedTuple):
     records: Any = None
     summaries: Mapping[str, Any] = MappingProxyType({})
 
-    def after(self, last: tuple[int, int]) -> RowBatch:
+    def after(self, time: int, seq: int) -> RowBatch:
         """Those behind a log time and an arrival number."""
-        time, seq = last
         is_before = (self.log_time < time) | ((self.log_time == time) & (self.seq <= seq))
         begin = int(np.count_nonzero(is_before))
         records = None if self.records is None else self.records[begin:]
@@ -66,65 +65,53 @@ class _UndecidedError(StoreError):
     """The columns of a table cannot decide a predicate."""
 
 
-class Tabled(NamedTuple):
-    """A part of a question, as asked, with its table."""
-
-    part: Part
-    table: TopicTable
-
-
 class Rows:
     """Rows for the parts of one question; `counters` count what they cost."""
 
     def __init__(self, session: Session, counters: Counters) -> None:
         self.session = session
         self.counters = counters
-        self._tabled: dict[Part, Tabled | None] = {}
+        self._tables: dict[Part, TopicTable | None] = {}
         self._counts: dict[Part, tuple[int, int]] = {}  # matching ones, and unreadable ones
 
     # The rule.
 
-    def tabled(self, part: Part, fields: Collection[str] | None = ()) -> Tabled | None:
-        """The part with its table, if that has the fields (None: all).
+    def tabled(self, part: Part, fields: Collection[str] | None = ()) -> TopicTable | None:
+        """The table of a part, if that has the fields (None: all).
 
         Whether it decides the predicate shows when it is read.
         """
-        if part not in self._tabled:
-            self._tabled[part] = self._find(part)
-        found = self._tabled[part]
-        return found if found is not None and _holds(found, fields) else None
+        if part not in self._tables:
+            self._tables[part] = self._find(part)
+        found = self._tables[part]
+        return found if found is not None and _holds(found, part, fields) else None
 
-    def _find(self, part: Part) -> Tabled | None:
-        asked = () if part.predicate is None else part.predicate.fields()
-        asks_fields = part.predicate is not None and part.predicate.asks_fields
+    def _find(self, part: Part) -> TopicTable | None:
+        predicate = part.predicate
+        asks_fields = predicate is not None and predicate.asks_fields
+        asks_publish = predicate is not None and "_meta.pub" in predicate.fields()
         # A table does not say which messages have a publish time, and may be older than the
         # package that reads the messages.
         if (
-            not part.is_by_log_time
+            part.bounds is not None
             or (asks_fields and not part.has_fields)
-            or (
-                "_meta.pub" in asked
-                and len({c.channel.has_publish_time for c in part.channels}) > 1
-            )
+            or (asks_publish and len({c.channel.has_publish_time for c in part.channels}) > 1)
         ):
             return None
         table = self.session.table(part.recording, part.topic)
-        if table is None or (table.unreadable and part.predicate is None):
-            return None  # fields of such messages are not in the table
-        if not table.has_fields and any(c.codec.indexed for c in part.channels):
-            return None  # it is older than a definition
-        return Tabled(part, table)
+        # Without fields of unreadable messages, or older than a definition.
+        if table is not None and (
+            (table.unreadable and predicate is None)
+            or (not table.has_fields and any(c.codec.indexed for c in part.channels))
+        ):
+            return None
+        return table
 
     # Answers.
 
     def count_of(self, parts: Sequence[Part]) -> int:
         """Number of matching messages in all parts."""
-        return self.again(self._count, parts)
-
-    def fitting(self, parts: Sequence[Part]) -> list[Part]:
-        """The parts without those of which a file of tables tells that nothing matches."""
-        self._count_by_file([part for part in parts if not part.needs_index])
-        return [part for part in parts if self._counts.get(part) != (0, 0)]
+        return self._again(self._count, parts)
 
     def outcomes(self, part: Part) -> Iterator[RowBatch]:
         """For each message of the part's topic and time, whether it matches."""
@@ -143,6 +130,52 @@ class Rows:
         With `partial`, also those that have lost arrays with their payloads: null there.
         """
         return self._lasting(part, lambda own: self._values(own, fields, partial=partial))
+
+    def scan(self, parts: Sequence[Part], **how: bool) -> ChunkScan:
+        """Reads the matching messages of some parts; `how` is as of `ChunkScan`."""
+        parts = self.fitting(self.decided(parts))
+        return self._again(lambda known: self.chunk_scan(known, **how), parts)
+
+    def fitting(self, parts: Sequence[Part]) -> list[Part]:
+        """The parts without those of which a file of tables tells that nothing matches.
+
+        Of whole parts that lie in one file, the predicate is evaluated once for all rows.
+        """
+        by_file: dict[int, list[tuple[Part, TopicTable]]] = defaultdict(list)
+        for part in parts:
+            # What is meta is known of the part, not of a row.
+            if (
+                part.predicate is None
+                or part in self._counts
+                or not part.is_unbounded
+                or part.needs_index
+                or any(map(is_meta, part.predicate.fields()))
+            ):
+                continue
+            table = self.tabled(part)
+            if table is not None and len(table.files) == 1:
+                by_file[table.files[0].number].append((part, table))
+        for group in by_file.values():
+            if len(group) > 1:
+                with suppress(StoreError):  # then part by part
+                    self._count_in_file(group)
+        return [part for part in parts if self._counts.get(part) != (0, 0)]
+
+    def _count_in_file(self, group: Sequence[tuple[Part, TopicTable]]) -> None:
+        first, table = group[0]
+        whole = self.session.tables.whole(table.files[0])
+        sums, before = [np.zeros((2, 1), np.int64)], [0]
+        for rows, holds in self._scanned(first, whole):
+            before.append(before[-1] + len(rows))
+            both = np.stack([holds, rows.is_unreadable()])
+            sums.append(sums[-1][:, -1:] + np.cumsum(both, axis=1))
+        total = np.concatenate(sums, axis=1)
+        for part, table in group:
+            if part.field_types == first.field_types:
+                begin = np.array([before[p.group] + p.begin for p in table.parts])
+                end = begin + [p.rows for p in table.parts]
+                matched, unreadable = (total[:, end] - total[:, begin]).sum(axis=1).tolist()
+                self._counts[part] = matched, unreadable
 
     # Filters of MongoDB.
 
@@ -168,15 +201,14 @@ class Rows:
 
     # Files that go, and tables that cannot tell.
 
-    def again(self, ask: Callable[[Sequence[Part]], _T], parts: Sequence[Part]) -> _T:
+    def _again(self, ask: Callable[[Sequence[Part]], _T], parts: Sequence[Part]) -> _T:
         """Ask about parts; again about those whose files were replaced, or whose table failed."""
         before = self.counters.copy()
         for _ in range(_RENEWALS):
             try:
                 return ask(parts)
             except ChangedError:
-                self._set_back(before)
-                parts = [*map(self._renewed, parts)]
+                parts = self._renewed(parts, before)
         return ask(parts)
 
     def _lasting(self, part: Part, ask: Callable[[Part], Iterator[RowBatch]]) -> Iterator[RowBatch]:
@@ -184,32 +216,31 @@ class Rows:
         last: tuple[int, int] | None = None
         (part,) = self.decided([part])
         before = self.counters.copy()
-        for turn in range(_RENEWALS + 1):
+        for left in range(_RENEWALS, -1, -1):
             try:
                 for found in ask(part):
-                    rest = found if last is None else found.after(last)
+                    rest = found if last is None else found.after(*last)
                     if len(rest.log_time):
                         last = int(rest.log_time[-1]), int(rest.seq[-1])
                         yield rest
                 return
             except ChangedError:
-                if turn == _RENEWALS:
+                if not left:
                     raise
-                self._set_back(before)
-                part = self._renewed(part)
+                (part,) = self._renewed([part], before)
 
-    def _set_back(self, before: Counters) -> None:
-        """Count anew the messages that are read again."""
+    def _renewed(self, parts: Sequence[Part], before: Counters) -> list[Part]:
+        """The same parts of their recordings as these are now; counts what is read again anew."""
         self.counters.unreadable = before.unreadable
         self.counters.without_arrays = before.without_arrays
-
-    def _renewed(self, part: Part) -> Part:
-        """The same part of its recording as that is now."""
-        recording = self.session.entry(part.recording.id)
-        if recording is part.recording:
-            return part
-        channels = self.session.channels_of(recording, [part.topic])
-        return replace(part, recording=recording, channels=tuple(channels))
+        found = []
+        for part in parts:
+            recording = self.session.entry(part.recording.id)
+            if recording is not part.recording:
+                channels = self.session.channels_of(recording, [part.topic])
+                part = replace(part, recording=recording, channels=tuple(channels))  # noqa: PLW2901
+            found.append(part)
+        return found
 
     # Rows of tables, then those of chunks.
 
@@ -217,31 +248,37 @@ class Rows:
         total = 0
         left: list[Part] = []
         for part in parts:
-            if part.predicate is None and part.is_by_log_time:
+            if part.predicate is None and part.bounds is None:
                 total += part.messages if part.is_unbounded else self._count_by_time(part)
             elif part in self._counts:
                 matched, unreadable = self._counts[part]
                 total += matched
                 self.counters.unreadable += unreadable
             else:
-                found = self.tabled(part)
-                total += sum(int(holds.sum()) for _, holds in self._in_table(found))
-                left += [part] if found is None else []
+                table = self.tabled(part)
+                total += sum(int(holds.sum()) for _, holds in self._in_table(part, table))
+                left += [part] if table is None else []
         return total + (self.count_in_chunks(left) if left else 0)
 
+    def count_in_chunks(self, parts: Sequence[Part]) -> int:
+        """Read the messages of some parts and count those that match."""
+        scan = self.chunk_scan(parts, tabled=False)
+        return sum(len(run.batch) for run, _ in scan.loaded())
+
     def _outcomes(self, part: Part) -> Iterator[RowBatch]:
-        found = self.tabled(part)
-        for rows, holds in self._in_table(found):
+        table = self.tabled(part)
+        for rows, holds in self._in_table(part, table):
             yield RowBatch(rows.t, rows.seq, holds)
-        if found is not None:
+        if table is not None:
             return
-        if part.predicate is None and part.is_by_log_time:
+        if part.predicate is None and part.bounds is None:
             with suppress(SegmentError):
                 time = self._times(part, self._held(part))
                 yield RowBatch(time, np.zeros_like(time), np.ones(len(time), np.bool_))
                 return
-        for channel, run in self._by_channel(part):
-            yield RowBatch(run.batch.log_time, run.seq, self._decided(part, channel, run))
+        for run in self.chunk_scan([part], tabled=False, marks=True).runs():
+            assert run.holds is not None
+            yield RowBatch(run.batch.log_time, run.seq, run.holds)
 
     def _values(
         self, part: Part, fields: Collection[str] | None, *, partial: bool
@@ -250,11 +287,11 @@ class Rows:
 
         summaries = summaries_in(fields, part.field_types)
         wanted = None if fields is None else {*fields} - summaries
-        found = self.tabled(part, wanted)
-        if found is not None and not all(map(found.table.has, summaries)):
-            found = None
-        kind = None if fields is None or found is None else found.table.fields(fields)
-        for rows, holds in self._in_table(found, fields):
+        table = self.tabled(part, wanted)
+        if table is not None and not all(map(table.has, summaries)):
+            table = None
+        kind = None if fields is None or table is None else table.fields(fields)
+        for rows, holds in self._in_table(part, table, fields):
             chosen = rows if holds.all() else rows.take(np.flatnonzero(holds))
             # Without the columns that only the predicate needs.
             records = chosen.records
@@ -262,8 +299,7 @@ class Rows:
             yield RowBatch(chosen.t, chosen.seq, holds[holds], records)
         arrays = {path.rpartition(".")[0] for path in summaries}
         wanted = None if wanted is None else wanted | arrays
-        for channel, run in self._by_channel(part) if found is None else ():
-            own = run.take(self._decided(part, channel, run))
+        for channel, own in self._by_channel(part) if table is None else ():
             decoded, made = channel.codec.columns_of(own.batch, wanted), {}
             self.counters.unreadable += len(own.batch) - len(decoded.rows)
             if channel.is_reduced:
@@ -281,25 +317,36 @@ class Rows:
             times = own.batch.log_time[good], own.seq[good]
             yield RowBatch(*times, np.ones(len(good), np.bool_), decoded.arrow(), made)
 
+    def _by_channel(self, part: Part) -> Iterator[tuple[RecordedChannel, MessageRun]]:
+        """The matching messages of a part in chunks, in order, of one channel at a time."""
+        for run in self.chunk_scan([part], tabled=False).runs():
+            edges = [0, *(np.flatnonzero(np.diff(run.batch.channel)) + 1), len(run.batch)]
+            for begin, end in pairwise(edges):
+                own = run if len(edges) == 2 else run.take(np.arange(begin, end))
+                yield own.channels[int(own.batch.channel[0])], own
+
     # Tables.
 
     def _in_table(
-        self, found: Tabled | None, fields: Collection[str] | None = (), own: Collection[str] = ()
+        self,
+        part: Part,
+        table: TopicTable | None,
+        fields: Collection[str] | None = (),
+        own: Collection[str] = (),
     ) -> Iterator[tuple[TableRows, NDArray[np.bool_]]]:
-        """Rows of the part's time in its table, with the outcome for each; None without a table.
+        """Rows of a part's time in its table, with the outcome for each; None without a table.
 
         `own` are columns of the table itself. Unreadable ones are counted. Of a table that is
         damaged or cannot tell, a `ChangedError` says that it is left.
         """
-        if found is None:
+        if table is None:
             return
-        part, table = found.part, found.table
         try:
             for rows, holds in self._scanned(part, table, fields, own):
                 self.counters.unreadable += int(rows.is_unreadable().sum())
                 yield rows, holds
         except StoreError as error:
-            self._tabled[part] = None
+            self._tables[part] = None
             if not isinstance(error, _UndecidedError):
                 self.session.tables.reject(part.recording, part.topic)
             raise ChangedError(f"The table of {part.topic} is left. Ask again.") from error
@@ -324,44 +371,13 @@ class Rows:
             self.counters.bytes_read += size * len(rows) // max(table.rows, 1)
             yield rows, _decided(part, rows)
 
-    def _count_by_file(self, parts: Sequence[Part]) -> None:
-        """Count whole parts that lie in one file: the predicate is evaluated once for all rows."""
-        by_file: dict[int, list[Tabled]] = defaultdict(list)
-        for part in parts:
-            if part.predicate is None or part in self._counts or not part.is_unbounded:
-                continue
-            if any(map(is_meta, part.predicate.fields())):
-                continue  # known of the part, not of a row
-            found = self.tabled(part)
-            if found is not None and len(found.table.files) == 1:
-                by_file[found.table.files[0].number].append(found)
-        for group in by_file.values():
-            if len(group) > 1:
-                with suppress(StoreError):  # then part by part
-                    self._count_in_file(group)
-
-    def _count_in_file(self, group: Sequence[Tabled]) -> None:
-        (first, table), types = group[0], group[0].part.field_types
-        whole = self.session.tables.whole(table.files[0])
-        sums, before = [np.zeros((2, 1), np.int64)], [0]
-        for rows, holds in self._scanned(first, whole):
-            before.append(before[-1] + len(rows))
-            both = np.stack([holds, rows.is_unreadable()])
-            sums.append(sums[-1][:, -1:] + np.cumsum(both, axis=1))
-        total = np.concatenate(sums, axis=1)
-        for part, table in group:
-            if part.field_types == types:
-                begin = np.array([before[p.group] + p.begin for p in table.parts])
-                end = begin + [p.rows for p in table.parts]
-                matched, unreadable = (total[:, end] - total[:, begin]).sum(axis=1).tolist()
-                self._counts[part] = matched, unreadable
-
     # Chunks.
 
-    def chunk_plan(self, parts: Sequence[Part], *, reverse: bool = False) -> ScanPlan:
-        """The plan for reading the matching messages of some parts from chunks.
+    def chunk_scan(self, parts: Sequence[Part], *, tabled: bool = True, **how: bool) -> ChunkScan:
+        """Reads the matching messages of some parts from chunks.
 
-        Where a table decides, it says where they are; else filters decide on what is read.
+        Where a table decides, it says where they are; else, and without `tabled`, filters decide
+        on what is read. `how` is as of `ChunkScan`.
         """
         channels: list[RecordedChannel] = []
         filters: dict[int, Part] = {}
@@ -370,69 +386,50 @@ class Rows:
         for part in parts:
             _, indexes = of_recording.setdefault(part.recording.id, (part, {}))
             asks = part.predicate is not None
-            found = self.tabled(part) if asks else None
-            for key, own in self._offsets(found).items() if found is not None else ():
+            table = self.tabled(part) if asks and tabled else None
+            for key, own in self._offsets(part, table).items():
                 offsets[key].append(own)
             for channel in part.channels:
                 indexes[channel.channel_id] = len(channels)
-                if asks and found is None:
+                if asks and table is None:
                     filters[len(channels)] = part
                 channels.append(channel)
-        return ScanPlan(
+        return ChunkScan(
+            self.session,
             channels,
             [self._scan(part, indexes) for part, indexes in of_recording.values()],
+            self.counters,
             parts[0].clock if parts else "log",
-            filters=filters,
-            offsets={key: np.concatenate(own) for key, own in offsets.items()},
-            is_chosen=any(part.predicate is not None for part in parts),
-            reverse=reverse,
-            counters=self.counters,
+            filters,
+            {key: np.concatenate(own) for key, own in offsets.items()},
+            not how.get("marks") and any(part.predicate is not None for part in parts),
+            **how,
         )
 
-    def _offsets(self, found: Tabled) -> dict[ChunkKey, NDArray[np.int64]]:
-        """Payload offsets of the matching messages that a table has, by chunk."""
-        places = [
-            places_of(rows.own["ref"])[holds] for rows, holds in self._in_table(found, own=("ref",))
-        ]
-        none = np.empty((0, 3), np.int64)
-        return offsets_by_chunk(found.part.recording.id, np.concatenate([none, *places]))
+    def _offsets(self, part: Part, table: TopicTable | None) -> dict[ChunkKey, NDArray[np.int64]]:
+        """Payload offsets of the matching messages that a table has, by chunk, sorted."""
+        columns = [np.empty((3, 0), np.int64)]
+        for rows, holds in self._in_table(part, table, own=("ref",)):
+            ref = rows.own["ref"]
+            own = [ref.field(n).to_numpy(zero_copy_only=False) for n in ("seg", "chunk", "off")]
+            columns.append(np.stack(own).astype(np.int64)[:, holds])
+        places = np.concatenate(columns, axis=1)
+        segment, chunk, offset = places[:, np.lexsort(places[::-1])]
+        edges = np.flatnonzero((np.diff(segment) != 0) | (np.diff(chunk) != 0)) + 1
+        return {
+            (part.recording.id, int(segment[own[0]]), int(chunk[own[0]])): offset[own]
+            for own in np.split(np.arange(len(offset)), edges)
+            if len(own)
+        }
 
     def _scan(self, part: Part, indexes: dict[int, int]) -> RecordingScan:
         """The chunks of a recording that may hold wanted messages."""
-        bounds, clock = part.bounds, part.clock
-        if part.windows is not None and part.is_by_log_time:
-            bounds, clock = part.log_span, "log"
-        is_empty = bounds is not None and bounds[0] >= bounds[1]
-        chunks = (
-            [] if is_empty else self.session.chunks(part.recording, list(indexes), bounds, clock)
-        )
-        self.session.hold(part.recording, {chunk.segment for chunk in chunks})
-        return RecordingScan(part.recording, indexes, part.bounds, chunks, part.windows)
-
-    def count_in_chunks(self, parts: Sequence[Part]) -> int:
-        """Read the messages of some parts and count those that match."""
-        scan = ChunkScan(self.chunk_plan(parts), self.session)
-        return sum(len(run.batch) for _, run, _ in scan.loaded())
-
-    def _by_channel(self, part: Part) -> Iterator[tuple[RecordedChannel, MessageRun]]:
-        """The messages of a part in order, whether they match or not, of one channel at a time."""
-        plan = self.chunk_plan([replace(part, predicate=None)])
-        for run in ChunkScan(plan, self.session).runs():
-            edges = [0, *(np.flatnonzero(np.diff(run.batch.channel)) + 1), len(run.batch)]
-            for begin, end in pairwise(edges):
-                own = run if len(edges) == 2 else run.take(np.arange(begin, end))
-                yield plan.channels[int(own.batch.channel[0])], own
-
-    def _decided(self, part: Part, channel: RecordedChannel, run: MessageRun) -> NDArray[np.bool_]:
-        """bool[n], true for matching messages; those that cannot be tested are counted."""
-        if part.predicate is None:
-            return np.ones(len(run.batch), np.bool_)
-        from hybridlog.query.predicate.evaluate import matches
-
-        holds, unreadable, lacking = matches(part, channel, run.batch, run.seq)
-        self.counters.unreadable += unreadable
-        self.counters.without_arrays += lacking
-        return holds
+        session, ids = self.session, [*indexes]
+        bounds = part.bounds or (None if part.windows is None else part.log_span)
+        clock = "log" if part.bounds is None else part.clock
+        chunks = session.chunks(part.recording, ids, bounds, clock)
+        session.hold(part.recording, {chunk.segment for chunk in chunks})
+        return RecordingScan(part.recording, indexes, chunks, part.windows, part.bounds)
 
     # Times alone.
 
@@ -469,25 +466,6 @@ def summaries_in(fields: Collection[str] | None, types: Mapping[str, str] | None
     return {path for path in fields or () if is_summary(path, types or {})}
 
 
-def places_of(references: Any) -> NDArray[np.int64]:
-    """Segment, chunk and payload offset of messages, int64[n, 3], from a table's column `ref`."""
-    columns = [references.field(n).to_numpy(zero_copy_only=False) for n in ("seg", "chunk", "off")]
-    return np.stack(columns, axis=1).astype(np.int64)
-
-
-def offsets_by_chunk(
-    recording: str, places: NDArray[np.int64]
-) -> dict[ChunkKey, NDArray[np.int64]]:
-    """Payload offsets of messages by chunk, sorted; places are as of `places_of`, in any order."""
-    places = places[np.lexsort((places[:, 2], places[:, 1], places[:, 0]))]
-    edges = np.flatnonzero(np.any(places[1:, :2] != places[:-1, :2], axis=1)) + 1
-    return {
-        (recording, int(group[0, 0]), int(group[0, 1])): group[:, 2]
-        for group in np.split(places, edges)
-        if len(group)
-    }
-
-
 def _decided(part: Part, rows: TableRows) -> NDArray[np.bool_]:
     readable = ~rows.is_unreadable()
     if part.predicate is None:
@@ -501,16 +479,16 @@ def _decided(part: Part, rows: TableRows) -> NDArray[np.bool_]:
     return found.holds & readable
 
 
-def _holds(found: Tabled, fields: Collection[str] | None) -> bool:
+def _holds(table: TopicTable, part: Part, fields: Collection[str] | None) -> bool:
     """True if a table holds some fields, or all, in full: no array that is a summary there."""
     from hybridlog.columns.fields import names_of
 
-    types = found.part.field_types
+    types = part.field_types
     if fields is not None and not fields:
         return True
     if types is None or summaries_in(fields, types):
         return False
-    return not any(found.table.is_cut(names_of(one) if one else ()) for one in fields or [""])
+    return not any(table.is_cut(names_of(one) if one else ()) for one in fields or [""])
 
 
 def _paths(table: TopicTable, part: Part) -> set[str]:

@@ -17,11 +17,12 @@ from msgspec.structs import replace
 
 from hybridlog.columns.layout import column_names
 from hybridlog.query.answers.marks import marks_in
-from hybridlog.query.ranges import RangeResolver
+from hybridlog.query.planner import resolved
+from hybridlog.query.question import windows_in
 from hybridlog.sql.views import TopicView
 from hybridlog_storage.catalog import ChannelStats
 from hybridlog_storage.mongo.index_documents import collection_of
-from hybridlog_storage.times import BEGIN, END
+from hybridlog_storage.times import BEGIN, END, touches
 
 if TYPE_CHECKING:
     from hybridlog.query.question import Question
@@ -62,7 +63,7 @@ class StoreContent:
         self.snapshot = session.look()
         self.summaries = session.some(scope.recordings)
         topics = self.snapshot.topics_of(self.summaries)
-        found = RangeResolver(session, replace(scope, topics=tuple(topics))).resolve()
+        found = resolved(session, replace(scope, topics=tuple(topics)))
         self.resolved = {one.summary.id: one for one in found}
         # Of names that differ in case, the one in lower case stays as it is.
         known = sorted(topics, key=lambda topic: (topic.casefold(), topic.swapcase()))
@@ -280,8 +281,8 @@ def _marks(content: StoreContent) -> Iterator[Mapping[str, Any]]:
     names = {one.id: one.name for one in content.summaries}
     for mark in marks_in(content.session, [*names]):
         one = content.resolved.get(mark.recording)
-        begin, end = (0, 0) if one is None else one.bounds or (BEGIN, END)
-        if content.scope.bounds is not None and not begin <= mark.begin < end:
+        windows = windows_in(None if one is None else one.windows, (BEGIN, END) if one else (0, 0))
+        if content.scope.bounds is not None and not touches(windows, mark.begin, mark.begin):
             continue
         yield {
             "log_time": mark.begin // 1000,

@@ -20,7 +20,7 @@ from hybridlog.columns.points import NEEDED, PointColumns, is_cloud
 from hybridlog.columns.rows import LeftFields, rows_of
 from hybridlog.frames.answer import FIXED
 from hybridlog.query.planner import Planner
-from hybridlog.query.question import Counters, Question
+from hybridlog.query.question import Counters, Question, windows_in
 from hybridlog.query.rows import RowBatch, Rows
 from hybridlog.schema.arrow_types import has_empty, is_array
 from hybridlog.schema.column import STAMP
@@ -39,8 +39,8 @@ if TYPE_CHECKING:
 
     from hybridlog.columns.tables import TopicTable
     from hybridlog.query.chunk_scan import MessageRun
+    from hybridlog.query.planner import Resolved
     from hybridlog.query.question import Part, RecordedChannel, Span
-    from hybridlog.query.ranges import Resolved
     from hybridlog.schema.codec import Decoded
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
@@ -136,7 +136,7 @@ class TopicView:
         for part in self._planner.split():
             table = self._planner.tabled(part)
             if table is not None:
-                found += table.table.whole_types()
+                found += table.whole_types()
             else:
                 found += (one.type for one in self._decoded(part))
         return found
@@ -148,8 +148,8 @@ class TopicView:
         found = []
         for part in self._planner.split():
             table = self._planner.tabled(part)
-            if table is not None and table.table.points is not None:
-                found.append(table.table.points)
+            if table is not None and table.points is not None:
+                found.append(table.points)
             elif any(is_cloud(channel.channel) for channel in part.channels):
                 clouds = (one.type for one in self._decoded(part, _with_points))
                 found += islice(
@@ -187,9 +187,9 @@ class TopicView:
             reading.topics.add(self.topic)
             part = self._part(one)
             if part is not None:
-                span = Limits(part.bounds or (BEGIN, END)).common(limits).span
-                bounds = None if span == (BEGIN, END) else span
-                yield from read.read(replace(part, bounds=bounds))
+                if limits.span != (BEGIN, END):
+                    part = replace(part, windows=windows_in(part.windows, limits.span))
+                yield from read.read(part)
 
 
 def _is_fixed(channel: RecordedChannel) -> bool:
@@ -292,12 +292,12 @@ class ViewRows(Rows):
                 yield channel.codec.columns_of(run.batch, None)
 
     def _rows(self, part: Part) -> Iterator[RowBatch]:
-        found = self.tabled(part)
-        if found is not None and not self._has_all(found.table, part):
-            found = None
-        groups = [] if found is None else found.table.parts
+        table = self.tabled(part)
+        if table is not None and not self._has_all(table, part):
+            table = None
+        groups = [] if table is None else table.parts
         own = {*_TABLE_OWN.intersection(self._schema.names), *[POINTS] * self._has_points}
-        for rows, holds in self._in_table(found, self._paths, own):
+        for rows, holds in self._in_table(part, table, self._paths, own):
             span = np.array([[rows.t[0], rows.t[-1] + 1]])
             self._reading.groups |= {
                 (one.file.path, one.group) for one in groups if touches(span, one.first, one.last)
@@ -312,7 +312,7 @@ class ViewRows(Rows):
                 records = pa.StructArray.from_arrays(arrays, fields=fields)
             made = self._batch(part.recording, columns, records, records)
             yield RowBatch(rows.t, rows.seq, holds, made)
-        for channel, run in self._by_channel(part) if found is None else ():
+        for channel, run in self._by_channel(part) if table is None else ():
             made = self._decoded(channel, run)
             yield RowBatch(run.batch.log_time, run.seq, np.ones(len(run.seq), np.bool_), made)
 

@@ -16,10 +16,9 @@ from msgspec import Struct
 from hybridlog.across.match import match
 from hybridlog.drawing.images import shown_pixels
 from hybridlog.query.periods import GAP_PERIODS, usual_period
-from hybridlog.query.planner import log_times
+from hybridlog.query.planner import log_spans, log_times
 from hybridlog.query.query import Query
 from hybridlog.query.question import Question
-from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import format_time
 from hybridlog.schema.arrow_types import is_list, is_numeric
 from hybridlog_storage.errors import DefinitionError, PayloadError, TopicError, UsageError
@@ -75,7 +74,7 @@ def episodes(
     gaps, by part.
     """
     name, query = piece
-    for summary, (begin, end) in RangeResolver(query.source.now(), query.question).spans():
+    for summary, (begin, end) in log_spans(query.source.now(), query.question):
         times, read = {}, {}
         for topic in features.images.values():
             times[topic] = _times(_query(query.source.now(), summary.id, topic, begin, end))

@@ -50,12 +50,8 @@ X = parse("x < 1").root
             And((near("/odom", "v > 1 or v < 0"), A)),
         ),
         (
-            "/odom: v > 1 or v < 0 and w < 2 and /a: b == 1",
-            Or((near("/odom", "v > 1"), And((near("/odom", "v < 0 and w < 2"), A)))),
-        ),
-        (
-            "/odom: v > 0.5 and (w < 2 or /a: b == 1)",
-            And((ODOM, Or((near("/odom", "w < 2"), A)))),
+            "/odom: v > 1 or v < 0 and w < 2 and (not /a: b == 1)",
+            And((near("/odom", "v > 1 or v < 0 and w < 2"), Not(A))),
         ),
         ("/odom: not v > 1 or /a: b == 1", Or((near("/odom", "not v > 1"), A))),
         (
@@ -96,7 +92,7 @@ def test_predicates_without_topics(text: str) -> None:
         ("x > 1 or y > 2 and /odom: v > 1", "joined by `and`"),
         ("x > 1 /odom: v > 1", "expected 'and'"),
         ("x > (1 /odom: v > 1)", "expected a value"),
-        ("/odom: (v > 1 and /a: b == 1)", "cannot stand behind this one"),
+        ("/odom: (v > 1 and /a: b == 1)", "expected '\\)' here"),
         ("/odom: not /a: b == 1", "cannot stand behind this one"),
         ("and /odom: v > 1", "expected an operator"),
         ("(/odom: v > 1", "expected '\\)'"),

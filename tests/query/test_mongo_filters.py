@@ -271,11 +271,10 @@ def test_what_mongodb_does_not_understand(store: hl.Store, own: dict[str, object
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("{x: 1}", "is JSON, such as"),
-        ('{"x": 1} and x > 2', "is JSON, such as"),
+        ("{x: 1}", "Expecting property name"),
+        ('{"x": 1} and x > 2', "Extra data"),
         ('{"xx": 1}', "no field xx"),
         ('{"x":' * 50_000 + "1" + "}" * 50_000, "deeply"),
-        ('{"x": {"$not":' * 101 + '{"$gt": 1}' + "}}" * 101, "not allowed"),
         ('{"s": "' + "x" * 2_000_000 + '"}', "too large"),
         ('{"x": 99999999999999999999}', "64 bits"),
     ],

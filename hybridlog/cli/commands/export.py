@@ -168,11 +168,10 @@ def _write_log(query: Query, form: str, path: Path, given: _Given) -> None:
 
 def _write_tables(store: Store, query: Query, form: str, directory: Path, given: _Given) -> None:
     """Write one file a topic, except topics that do not fit or have no message in the range."""
+    from hybridlog.query.planner import resolved
     from hybridlog.query.query import narrowed
-    from hybridlog.query.ranges import RangeResolver
 
-    # Refuses a range without any message.
-    RangeResolver(query.source.now(), query.question).resolve()
+    resolved(query.source.now(), query.question)  # refuses a range without any message
     topics: Sequence[str] = query.topics
     if OUTPUTS[form].content == "video":
         from hybridlog.arrays.message_arrays import IMAGES

@@ -21,10 +21,9 @@ from hybridlog.query.answers.lost import (
     losses_in,
     number_of,
 )
-from hybridlog.query.planner import Planner
+from hybridlog.query.planner import Planner, bounds_in, resolved
 from hybridlog.query.predicate.tree import is_meta
 from hybridlog.query.question import field_types
-from hybridlog.query.ranges import RangeResolver
 from hybridlog.record.losses import Cause
 from hybridlog.schema.states import CAUSES, GONE, State, without_fields, without_payload
 from hybridlog.snapshot import UNFINISHED
@@ -153,7 +152,7 @@ def completeness_of(
     for name, rows in by_recording.items():
         sentences += about_losses(name, [*rows.values()])
     if gone:
-        found = RangeResolver(session, question).resolve()
+        found = resolved(session, question)
         sentences += [f"{what}." for one in found for what in copies_of(session.entry_of(one[0]))]
     with suppress(TimeError):  # nothing is in the range
         for one, _ in reversed(answered):
@@ -294,7 +293,7 @@ def _reaches_past(session: Session, question: Question, one: RecordingSummary) -
     """True if a question is about times after the last flush of a recording."""
     begin, end = BEGIN, END
     if question.bounds is not None and question.clock == "log":
-        begin, end = RangeResolver(session, question).bounds_in(one)
+        begin, end = bounds_in(session, question, one)
     if question.during is not None:
         windows = question.during.of_recording(one.id)
         end = min(end, int(windows[-1, 1])) if len(windows) else begin

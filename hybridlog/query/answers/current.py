@@ -23,14 +23,12 @@ from hybridlog.query.chunk_scan import (
     ChunkScan,
     MessageRun,
     RecordingScan,
-    ScanPlan,
     in_order,
     with_payloads,
 )
 from hybridlog.query.latching import KEEP_ALL, depth_of, is_key_frame, is_video, publisher_of
-from hybridlog.query.planner import Planner
-from hybridlog.query.question import Counters, Question
-from hybridlog.query.ranges import RangeResolver
+from hybridlog.query.planner import Planner, log_spans, resolved
+from hybridlog.query.question import Counters, Question, windows_in
 from hybridlog.query.times import TimeLike, parse_time
 from hybridlog_storage.errors import ResourceError, SegmentError
 from hybridlog_storage.messages import interleave
@@ -56,17 +54,15 @@ def message_at(
         if start < end and start <= latest:
             candidates.append((latest, start, one))
     planner = Planner(session, replace(question, reverse=True, limit=1), counters)
-    best: tuple[tuple[int, str, int], Message] | None = None
+    found: dict[tuple[int, str, int], Message] = {}
     # Ask the recording that could hold the latest message first: it usually does.
     for latest, start, one in sorted(candidates, key=itemgetter(0), reverse=True):
-        if best is not None and latest < best[0][0]:
+        if found and latest < max(found)[0]:
             break
-        found = _last_of(planner, one, (start, latest))
-        if found is not None:
-            place = found.log_time_ns, one.key, found.seq
-            if best is None or place > best[0]:
-                best = place, found
-    return best[1] if best is not None else None
+        message = _last_of(planner, one, (start, latest))
+        if message is not None:
+            found[message.log_time_ns, one.key, message.seq] = message
+    return found[max(found)] if found else None
 
 
 def _last_of(planner: Planner, summary: RecordingSummary, span: Span) -> Message | None:
@@ -79,16 +75,13 @@ def _last_of(planner: Planner, summary: RecordingSummary, span: Span) -> Message
         return None
     # The chunk that begins last by then has a message by then, so none before it is wanted.
     firsts = session.parts(recording, ids, (max(begins), min(latest + 1, END)))["first"]
-    begun = firsts[firsts <= latest]
-    near = int(begun.max()) if len(begun) else max(begins)
+    near = int(firsts[firsts <= latest].max(initial=max(begins)))
     for begin in (near, *earlier(near, start)):
-        for run in planner.kept(summary, span_of(begin, latest), None):
+        parts = planner.parts_in(summary, windows_in(None, span_of(begin, latest)))
+        for run in planner.scan([*parts], reverse=True, keeps=True).runs():
             planner.counters.add_messages(run.batch.take(slice(1)))
             return next(messages_in(run, picture_of(session)))
     return None
-
-
-_FIRST_LOOK = 1 << 30  # ns, about a second
 
 
 def in_force(
@@ -125,13 +118,16 @@ def _beginnings(session: Session, question: Question) -> Iterator[tuple[Recordin
     By another clock, the range begins with the first message of the answer.
     """
     if question.is_by_log_time:
-        yield from RangeResolver(session, question).beginnings()
+        begins: dict[str, int] = {}
+        for one, (begin, _) in log_spans(session, question):
+            if begins.setdefault(one.id, begin) == begin and one.extent[0] < begin:
+                yield one, begin
         return
-    for summary, _, _ in RangeResolver(session, question).resolve():
-        if _latching(session, question, session.entry_of(summary), END):
-            first = replace(question, recordings=(summary.id,), limit=1, every=1, reverse=False)
+    for one, *_ in resolved(session, question):
+        if _latching(session, question, session.entry_of(one), END):
+            first = replace(question, recordings=(one.id,), limit=1, every=1, reverse=False)
             for run in Planner(session, first).runs():
-                yield summary, int(run.batch.log_time[0])
+                yield one, int(run.batch.log_time[0])
 
 
 def _latching(
@@ -161,27 +157,25 @@ def _last_messages(
     found: list[MessageRun] = []
     for indexes in publishers.values():
         chunks = session.chunks(recording, [*indexes], (BEGIN, begin), "log")
-        scan = RecordingScan(recording, indexes, (BEGIN, begin), chunks)
-        plan = ScanPlan(channels, [scan], reverse=True, counters=counters)
-        found += _of_publisher([channels[index] for index in indexes.values()], plan, session)
+        one = RecordingScan(recording, indexes, chunks, windows_in(None, (BEGIN, begin)))
+        scan = ChunkScan(session, channels, [one], counters, reverse=True, ahead=False)
+        found += _of_publisher([channels[index] for index in indexes.values()], scan)
         if sum(run.batch.payload_bytes for run in found) > latching.MAX_HELD:
             raise ResourceError(
                 f"What is in force at the beginning has more than {latching.MAX_HELD >> 20} MiB: "
                 "leave latched messages and frames out (--no-latched)."
             )
-    found = [one for run in found if len((one := with_payloads(run, counters)).batch)]
-    return in_order(found, ScanPlan(channels, [])) if found else None
+    found = [own for run in found if len((own := with_payloads(run, counters)).batch)]
+    return in_order(found) if found else None
 
 
-def _of_publisher(
-    channels: Sequence[RecordedChannel], plan: ScanPlan, session: Session
-) -> list[MessageRun]:
+def _of_publisher(channels: Sequence[RecordedChannel], scan: ChunkScan) -> list[MessageRun]:
     """The last messages of publishers that displace one another, or of video from a key frame."""
     is_of_video = is_video(channels[0].channel)
     left = KEEP_ALL if is_of_video else max(depth_of(one.channel) for one in channels)
     found: list[MessageRun] = []
     size = 0
-    for run in ChunkScan(plan, session, ahead=False).runs():
+    for run in scan.runs():
         rows = range(len(run.batch))
         key = next(filter(partial(_is_key, run), rows), None) if is_of_video else None
         chosen = np.array(rows if key is None else rows[: key + 1])[:left]
@@ -202,20 +196,14 @@ def _is_key(run: MessageRun, row: int) -> bool:
 def next_time(session: Session, recording: RecordingEntry, topic: str, moment: int) -> int | None:
     """The least log time of a topic's messages from a time on, ns; None without any.
 
-    No payload is read for it. A time with a damaged chunk is left out.
+    No payload is read for it. A damaged chunk is left out.
     """
-    planner = Planner(session, Question((topic,), (recording.id,)))
-    if recording.span is None or not session.channels_of(recording, [topic]):
-        return None
-    begin, stop = min(max(moment, recording.span[0]), END - 1), span_of(*recording.span)[1]
-    width = _FIRST_LOOK
-    for part in planner.split():
-        while begin < stop:
-            end = min(begin + width, END)
-            with suppress(SegmentError):
-                times = planner.times(replace(part, bounds=(begin, end)))
-                times = times[times >= moment]  # ranges place the last time before another one
-                if len(times):
-                    return int(times[0])
-            begin, width = end, 4 * width
-    return None
+    ids = [one.channel_id for one in session.channels_of(recording, [topic])]
+    held = session.parts(recording, ids, (moment, END))
+    found: list[int] = held["first"][held["first"] >= moment].tolist()
+    begun = held[held["first"] < moment]
+    for segment, chunk, channel in begun[["segment", "chunk", "channel"]].tolist():
+        with suppress(SegmentError):
+            times = session.times(recording, segment, chunk)[channel]
+            found += times[times >= moment][:1].tolist()
+    return min(found, default=None)

@@ -17,11 +17,12 @@ from hybridlog.message import messages_in
 from hybridlog.query.answers.completeness import flush_interval_ns
 from hybridlog.query.answers.video import picture_of
 from hybridlog.query.chunk_columns import ChunkColumns
-from hybridlog.query.chunk_scan import ChunkScan, RecordingScan
-from hybridlog.query.planner import Planner
-from hybridlog.query.ranges import RangeResolver
+from hybridlog.query.chunk_scan import RecordingScan
+from hybridlog.query.planner import Planner, bounds_in, resolved
+from hybridlog.query.question import windows_in
 from hybridlog.query.topics import later
 from hybridlog.record.marks import MARKS_SEGMENT, without_marks
+from hybridlog_storage.cache import lazy
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.stopping import pause, safe_point
 
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from hybridlog.message import Message
     from hybridlog.query.chunk_columns import Chunk
     from hybridlog.query.chunk_scan import MessageRun
+    from hybridlog.query.planner import Resolved
     from hybridlog.query.question import Counters, Part, Question, Span
     from hybridlog.session import Asked, Session
     from hybridlog_storage.catalog import RecordingEntry
@@ -48,7 +50,6 @@ class Arrivals(Planner):
         self, session: Session, question: Question, counters: Counters, takes: Callable[[str], bool]
     ) -> None:
         super().__init__(session, question, counters)
-        self._ranges = RangeResolver(session, replace(question, bounds=None))
         self._chunks: dict[str, list[Chunk]] = {}  # that have just come, by recording
         self._takes = takes
         self._bounds: dict[str, Span] = {}
@@ -70,11 +71,18 @@ class Arrivals(Planner):
             entry = session.entry_of(one)
             if self.question.bounds and one.span is not None and one.id not in self._bounds:
                 # The beginning that a time may be relative to is known now.
-                self._bounds[one.id] = RangeResolver(session, self.question).bounds_in(one)
+                self._bounds[one.id] = bounds_in(session, self.question, one)
             bounds = self._bounds.get(one.id)
             self._chunks[one.id] = chunks = [*self._arrivals(entry, bounds)]
-            parts += self.parts_in(one, bounds, None) if chunks else ()
-        return ChunkScan(self.plan(parts), session).runs(), any(map(self._goes_on, summaries))
+            is_log = self.question.is_by_log_time
+            ranges = (windows_in(None, bounds), None) if is_log and bounds else (None, bounds)
+            parts += self.parts_in(one, *ranges) if chunks else ()
+        return self.scan(parts).runs(), any(map(self._goes_on, summaries))
+
+    @lazy
+    def resolved(self) -> list[Resolved]:
+        """The recordings, whatever the range is: it may have no beginning yet."""
+        return resolved(self.session, replace(self.question, bounds=None))
 
     def tabled(self, part: Part, fields: Collection[str] | None = ()) -> None:
         """No tables: they have older messages, too."""
@@ -83,7 +91,7 @@ class Arrivals(Planner):
         """Reads only the chunks that have just come."""
         new = self._chunks[part.recording.id]
         chunks = [chunk for chunk in new if not indexes.keys().isdisjoint(chunk.place.channels)]
-        return RecordingScan(part.recording, indexes, part.bounds, chunks)
+        return RecordingScan(part.recording, indexes, chunks, part.windows, part.bounds)
 
     def _goes_on(self, one: RecordingSummary) -> bool:
         """True if more messages of the question may come."""

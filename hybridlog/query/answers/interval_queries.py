@@ -17,11 +17,10 @@ from hybridlog.columns.fields import joined
 from hybridlog.query.answers.lost import lost_times
 from hybridlog.query.answers.marks import mark_topics, marks
 from hybridlog.query.intervals import Intervals, changing, clipped, holding
-from hybridlog.query.planner import Planner
+from hybridlog.query.planner import Planner, log_spans
 from hybridlog.query.predicate.tree import And, Condition, Near, Node, Not, Or, Predicate, nodes
 from hybridlog.query.predicate.types import check
-from hybridlog.query.question import Counters
-from hybridlog.query.ranges import RangeResolver
+from hybridlog.query.question import Counters, windows_in
 from hybridlog.query.times import TIME_LIMIT, DurationLike, parse_duration
 from hybridlog.schema.arrow_types import is_list, lengths_of
 from hybridlog.schema.column import ranges
@@ -60,7 +59,7 @@ class IntervalQueries:
         lost = lost_times(self._session, everywhere)
         if state != "unknown":
             return Intervals(self.held(max_gap, lost, is_held=state == "held"))
-        spans = RangeResolver(self._session, self._question).spans()
+        spans = log_spans(self._session, self._question)
         known = [*self.held(max_gap, lost), *self.held(max_gap, lost, is_held=False)]
         return Intervals((one.id, np.array([[*span, 0]], np.int64)) for one, span in spans).without(
             Intervals(known)
@@ -130,12 +129,12 @@ class IntervalQueries:
 
     def _spans(self) -> Iterator[tuple[Part, Span]]:
         """The one part of each recording, without a time range, with each span of the question."""
-        resolved = RangeResolver(self._session, self._question).spans()
+        resolved = log_spans(self._session, self._question)
         # All stored messages of the topic may be lost: then nothing is known of its state.
         found = [
             (part, [span for _, span in spans])
             for summary, spans in groupby(resolved, key=itemgetter(0))
-            for part in self._planner.parts_in(summary, None, None)
+            for part in self._planner.parts_in(summary)
         ]
         # MongoDB is asked once for all.
         parts = self._planner.decided([part for part, _ in found])
@@ -221,7 +220,7 @@ def _at(times: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _bounded(part: Part, span: Span) -> Part:
-    return replace(part, bounds=span, clock="log", windows=None)
+    return replace(part, windows=windows_in(None, span))
 
 
 # Conditions on other topics: each becomes the log time around the messages that satisfy it.
@@ -292,7 +291,7 @@ def _question_about(
         return found
     if {*found.topics} <= {*mark_topics(session)}:
         return found  # marks may last
-    spans = RangeResolver(session, question).spans()
+    spans = log_spans(session, question)
     rows = ((one.id, np.array([[begin, end, 0]], np.int64)) for one, (begin, end) in spans)
     near = Intervals(rows).widened(after, before).merged()
     return replace(found, during=near)

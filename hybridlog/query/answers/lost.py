@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from hybridlog.query.intervals import Intervals
+from hybridlog.query.planner import resolved
 from hybridlog.query.question import windows_in
-from hybridlog.query.ranges import RangeResolver
 from hybridlog.record.losses import CRASH, Cause, losses_of
 from hybridlog.wording import counted, listed
 from hybridlog_storage.times import BEGIN, END, span_of
@@ -115,11 +115,11 @@ def losses_in(session: Session, question: Question) -> Iterator[tuple[RecordingE
     A lost manifest leaves open what was lost: one more row.
     """
     doubtful = {entry.id: entry for entry in session.doubtful(question)}
-    for summary, bounds, windows in RangeResolver(session, question).resolve() if doubtful else ():
+    for summary, windows, _ in resolved(session, question) if doubtful else ():
         entry = doubtful.get(summary.id)
         if entry is None:
             continue
-        chosen = windows_in(windows, bounds if question.clock == "log" else None)
+        chosen = windows_in(windows)
         ledger = losses_of(entry)
         if "unproven" in {entry.status, entry.manifest.status}:
             ledger += [{"cause": MANIFEST_LOST, "count": None, "topic": None}]

@@ -18,8 +18,8 @@ from msgspec.structs import replace
 
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.periods import GAP_PERIODS, mean_rate, usual_period
-from hybridlog.query.planner import Planner
-from hybridlog.query.ranges import RangeResolver
+from hybridlog.query.planner import Planner, log_spans, resolved
+from hybridlog.query.question import windows_in
 from hybridlog.query.times import DurationLike, parse_duration
 from hybridlog.schema.definition_text import NUMBERS
 from hybridlog.wording import listed
@@ -223,7 +223,7 @@ def gaps(
         raise UsageError(f"A number of periods is more than 0, not {periods}.")
     planner = Planner(session, question, counters)
     found: list[tuple[str, Times]] = []
-    for summary, rows in groupby(RangeResolver(session, question).spans(), itemgetter(0)):
+    for summary, rows in groupby(log_spans(session, question), itemgetter(0)):
         own = [(span, planner.times(p)) for _, span in rows for p in _parts(planner, summary, span)]
         limit = float(least)
         if periods is not None:
@@ -248,17 +248,17 @@ def check(
     from hybridlog.query.latching import depth_of
 
     _check_all(question)
-    planner, ranges = Planner(session, question, counters), RangeResolver(session, question)
+    planner = Planner(session, question, counters)
     lost: dict[tuple[str, str], list[int | None]] = defaultdict(list)
     for row in completeness_of(session, question).rows:
         lost[row["recording"], row["topic"]].append(row["count"])
     silent = (
         (recording, (0, 0))
-        for recording, bounds, windows in ranges.resolve()
-        if recording.span is None and bounds is None and windows is None
+        for recording, windows, _ in resolved(session, question)
+        if recording.span is None and windows is None
     )
     found = []
-    for summary, span in [*ranges.spans(), *silent]:
+    for summary, span in [*log_spans(session, question), *silent]:
         parts = {part.topic: part for part in _parts(planner, summary, span)}
         entry = session.entry_of(summary)
         for topic in sorted({*question.topics} & entry.topics):
@@ -292,10 +292,10 @@ def _check_all(question: Question) -> None:
 
 def _parts(planner: Planner, summary: RecordingSummary, span: Span) -> list[Part]:
     """The topics of a question that have messages in a recording, in a span of it."""
-    parts = [*planner.parts_in(summary, None, None)]
+    parts = [*planner.parts_in(summary)]
     if planner.question.is_unbounded:  # then the catalog knows their numbers
         return parts
-    return [replace(part, bounds=span, clock="log") for part in parts]
+    return [replace(part, windows=windows_in(None, span)) for part in parts]
 
 
 def _end(summary: RecordingSummary, span: Span) -> int:

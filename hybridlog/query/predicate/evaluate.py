@@ -10,7 +10,7 @@ import math
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import product
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeGuard
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -388,11 +388,6 @@ def statistic_of(values: Sequence[object], stat: Stat) -> float | None:
 # Exact comparisons of numbers and strings of any types.
 
 
-def is_number(value: object) -> TypeGuard[float]:
-    """True if a value is an integer or a float; booleans are neither."""
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
 def to_numpy(values: Any) -> NDArray[Any]:
     """An Arrow array as one of numpy."""
     found: NDArray[Any] = values.to_numpy(zero_copy_only=False)
@@ -448,52 +443,38 @@ def single(value: Value) -> Value:
 def _compared(values: Any, order: str, value: Value) -> Any:
     """Mask of the values that an order holds for; False for values of another kind."""
     kind = kind_of(values)
-    wanted = {bool: "b", str: "U"}.get(type(value), "ifO" if is_number(value) else "")
+    wanted = {bool: "b", str: "U"}.get(type(value), "ifO")
     if not kind or kind not in wanted:
         return False
+    if kind in "bU":
+        assert isinstance(values, pa.Array)
+        return to_numpy(getattr(pc, _ORDERS[order].__name__)(values, pa.scalar(value, values.type)))
     if kind == "O":
         return _ORDERS[order](values, value).astype(np.bool_)
-    if kind in "bU":
-        return to_numpy(getattr(pc, _ORDERS[order].__name__)(values, pa.scalar(value, values.type)))
-    compare = _integers_compared if kind == "i" else _floats_compared
+    compare = _floats_compared if kind == "f" else _integers_compared
     return compare(_plain(values), order, value)  # type: ignore[arg-type]
 
 
 def _integers_compared(numbers: NDArray[Any], order: str, value: float) -> Any:
     """Compare integers with any number, exactly."""
-    limit: int
-    if isinstance(value, int):
-        limit = value
-    elif math.isnan(value):
-        return False
-    elif math.isinf(value):
-        return order in ({"<", "<="} if value > 0 else {">", ">="})
-    elif value.is_integer():
-        limit = int(value)
-    elif order == "==":
-        return False
-    else:  # between two integers: x < 1.5 becomes x < 2, x <= 1.5 becomes x <= 1
-        limit = (math.ceil if order in {"<", ">="} else math.floor)(value)
-    info = np.iinfo(numbers.dtype)
-    if limit > info.max:
-        return order in {"<", "<="}
-    if limit < info.min:
-        return order in {">", ">="}
-    return _ORDERS[order](numbers, numbers.dtype.type(limit))
+    if isinstance(value, float) and math.isinf(value):
+        value = 2**64 if value > 0 else -(2**64)
+    if isinstance(value, float):
+        if math.isnan(value) or (order == "==" and not value.is_integer()):
+            return False
+        # Between two integers: x < 1.5 becomes x < 2, x <= 1.5 becomes x <= 1.
+        value = (math.ceil if order in {"<", ">="} else math.floor)(value)
+    return _ORDERS[order](numbers, value)
 
 
 def _floats_compared(numbers: NDArray[Any], order: str, value: float) -> Any:
     """Compare floats with any number, exactly."""
-    wide = numbers.astype(np.float64, copy=False)
-    near = nearest(value)
-    if math.isnan(near):
-        return np.isnan(wide) if order == "==" else False
-    if near == value:
-        return _ORDERS[order](wide, near)
+    wide, near = numbers.astype(np.float64, copy=False), nearest(value)
     if order == "==":
-        return False
+        return np.isnan(wide) if math.isnan(near) else (wide == near) & (near == value)
     # No double lies between both, so it is on the other side or it is not.
-    order = order[0] if (order[0] == "<") == (near > value) else f"{order[0]}="
+    if near != value and not math.isnan(near):
+        order = order[0] if (order[0] == "<") == (near > value) else f"{order[0]}="
     return _ORDERS[order](wide, near)
 
 

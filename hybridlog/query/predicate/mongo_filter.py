@@ -1,7 +1,7 @@
 """Checks MongoDB filters that a user wrote, before they are handed to MongoDB as they are.
 
-Only operators that compare values are allowed, on fields that exist, and no code. Patterns have
-RE2's syntax, so no search takes forever. What is written wrongly otherwise MongoDB says itself.
+Only operators that compare values are allowed, on fields that exist; values are data, and never
+run. Patterns have RE2's syntax. What is written wrongly otherwise MongoDB says itself.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping
-from typing import Any, cast
+from typing import Any
 
 import bson
 from bson.codec_options import CodecOptions, TypeRegistry
@@ -43,57 +43,39 @@ _PLAIN = {
     *("$exists", "$type", "$size", "$mod"),
     *("$bitsAllSet", "$bitsAllClear", "$bitsAnySet", "$bitsAnyClear"),
 }
-_FLAGS = {"i": re.IGNORECASE, "m": re.MULTILINE, "s": re.DOTALL, "": re.UNICODE}
+_FLAGS = re.IGNORECASE | re.MULTILINE | re.DOTALL | re.UNICODE
 _PLACE = re.compile(r"0|[1-9][0-9]{0,8}")
 
 Filter = dict[str, object]
-_Path = tuple[str, ...]
-
-
-def from_json(text: str) -> Filter:
-    """A filter from JSON.
-
-    Raises:
-        WhereError: it is no JSON, or too large.
-    """
-    if len(text) > MAX_BYTES:
-        raise _refused((), "it is too large")
-    try:
-        found: Filter = json.loads(text)
-    except RecursionError:
-        raise _refused((), "it is nested too deeply") from None
-    except ValueError as error:
-        raise WhereError(
-            f'a MongoDB filter is JSON, such as {{"n": {{"$gt": 3}}}}: {error}'
-        ) from None
-    return found
+_Paths = dict[str, bool]
+"""The paths that a filter asks for, and whether for their values."""
 
 
 def mongo_filter(
-    query: Mapping[str, object], types: FieldTypes | Mapping[str, str] | None
+    query: str | Mapping[str, object], types: FieldTypes | Mapping[str, str] | None
 ) -> Predicate:
-    """A filter, as pymongo takes it, as a predicate that MongoDB answers.
+    """A filter, as pymongo takes it or in JSON, as a predicate that MongoDB answers.
 
     It is copied as BSON, so numpy's scalars are numbers and tuples are lists.
     """
-    if not isinstance(query, Mapping):
-        raise WhereError(f"a filter is a mapping, not {type(query).__name__}")
+    paths: _Paths = {}
     try:
+        if isinstance(query, str):
+            query = json.loads(query)
+        if not isinstance(query, Mapping):
+            raise WhereError(f"a filter is a mapping, not {type(query).__name__}")
         content = bson.encode(query, codec_options=_CODEC)
-        if len(content) > MAX_BYTES:
-            raise _refused((), "it is too large")
         found = bson.decode(content)
-        checker = _Checker()
-        checker.query(found, ())
+        _check_query(found, paths, ())
     except RecursionError:
         raise _refused((), "it is nested too deeply") from None
-    except UnicodeError:
-        raise _refused((), "it has a text that is not valid Unicode") from None
     except (BSONError, OverflowError, TypeError, ValueError) as error:
         raise _refused((), str(error)) from None
-    asked = (Condition(_field(path), "exists") for path in checker.paths if not _is_id(path))
+    if len(content) > MAX_BYTES:
+        raise _refused((), "it is too large")
+    asked = (Condition(_field(path), "exists") for path in paths if not _is_id(path))
     check(Predicate(And(tuple(asked)), str(query)), types)
-    root = MongoFilter(content, tuple(checker.paths.items())) if found else ALWAYS
+    root = MongoFilter(content, tuple(paths.items())) if found else ALWAYS
     return Predicate(root, str(query))
 
 
@@ -162,84 +144,51 @@ def _plain(value: Any) -> object:
 _CODEC: CodecOptions[Filter] = CodecOptions(type_registry=TypeRegistry(fallback_encoder=_plain))
 
 
-class _Checker:
-    """Checks a filter of plain values; `paths` are asked for their values, or whether they are."""
-
-    def __init__(self) -> None:
-        self.paths: dict[str, bool] = {}
-
-    def query(self, query: object, path: _Path, above: str = "") -> None:
-        """Check a filter, or several; `above` is the array that it is inside of, and a dot."""
-        for one in query if isinstance(query, list) else [query]:
-            for key, value in one.items() if isinstance(one, dict) else ():
-                place = (*path, key)
-                if key in _LOGICAL:
-                    self.query(value, place, above)
-                elif key.startswith("$"):
-                    raise _refused(place, "the operator is not allowed here")
-                else:
-                    self._condition(above + key, value, place)
-
-    def _ask(self, name: str, *, of_value: bool = True) -> None:
-        self.paths[name] = of_value or self.paths.get(name, False)
-
-    def _condition(self, name: str, value: object, path: _Path) -> None:
-        """Check what a field is compared with: a value, a pattern, or operators."""
-        if isinstance(value, Regex):
-            self._pattern(name, value, "", path)
-        elif _has_operators(value):
-            self._operators(name, cast("Filter", value), path)
-        else:
-            self._ask(name)
-            _literal(value, path)
-
-    def _operators(self, name: str, operators: Filter, path: _Path) -> None:
-        for key, value in operators.items():
-            place = (*path, key)
-            self._ask(name, of_value=key != "$exists")
-            if key == "$regex":
-                self._pattern(name, value, operators.get("$options", ""), place)
-            elif key == "$elemMatch":
-                if _has_operators(value) and _LOGICAL.isdisjoint(cast("Filter", value)):
-                    self._condition(name, value, place)
-                else:
-                    self.query(value, place, f"{name}.")
-            elif key in _OF_VALUES:
-                is_list = key in {"$in", "$nin", "$all"} and isinstance(value, list)
-                for item in cast("list[object]", value) if is_list else [value]:
-                    self._condition(name, item, place)
-            elif key in _PLAIN:
-                _literal(value, place)
-            elif key != "$options" or "$regex" not in operators:
-                raise _refused(place, "the operator is not allowed here")
-
-    def _pattern(self, name: str, value: object, options: object, path: _Path) -> None:
-        self._ask(name)
-        if isinstance(value, Regex):
-            if options or value.flags & ~sum(_FLAGS.values()):
-                raise _refused(path, "may have the options i, m and s only, and once")
-            options = "".join(letter for letter, flag in _FLAGS.items() if value.flags & flag)
-            value = value.pattern
-        if not {*str(options)} <= {*"ims"}:
-            raise _refused(path, "may have the options i, m and s only")
-        try:
-            compile_regex(f"(?{options}){value}" if options else str(value))
-        except RegexError as error:
-            raise _refused(path, f"the pattern is refused: {error}") from None
+def _check_query(query: object, paths: _Paths, place: tuple[str, ...], above: str = "") -> None:
+    """Check a filter, or several; `above` is the array that it is inside of, and a dot."""
+    for one in query if isinstance(query, list) else [query]:
+        for key, value in one.items() if isinstance(one, dict) else ():
+            if key in _LOGICAL:
+                _check_query(value, paths, (*place, key), above)
+            elif key.startswith("$"):
+                raise _refused((*place, key), "the operator is not allowed here")
+            else:
+                _check_condition(above + key, value, paths, (*place, key))
 
 
-def _literal(value: object, path: _Path) -> None:
-    """Refuse operators, patterns and code in a value to compare with."""
-    if isinstance(value, Regex | bson.Code):
-        raise _refused(path, f"a value of type {type(value).__name__} is not allowed here")
-    if isinstance(value, list):
-        for item in value:
-            _literal(item, path)
-    elif isinstance(value, dict):
-        for key, item in value.items():
-            if key.startswith("$"):
-                raise _refused((*path, key), "the operator is not allowed here")
-            _literal(item, (*path, key))
+def _check_condition(name: str, value: object, paths: _Paths, place: tuple[str, ...]) -> None:
+    """Check what a field is compared with: a value, a pattern, or operators."""
+    operators = value if _has_operators(value) else {}
+    assert isinstance(operators, dict)
+    paths[name] = paths.get(name, False) or [*operators] != ["$exists"]
+    if isinstance(value, Regex):
+        _check_pattern(value, "", place)
+    for key, item in operators.items():
+        at = (*place, key)
+        if key == "$regex":
+            _check_pattern(item, operators.get("$options", ""), at)
+        elif key == "$elemMatch" and _has_operators(item) and _LOGICAL.isdisjoint(item):
+            _check_condition(name, item, paths, at)
+        elif key == "$elemMatch":
+            _check_query(item, paths, at, f"{name}.")
+        elif key in _OF_VALUES:
+            is_list = key in {"$in", "$nin", "$all"} and isinstance(item, list)
+            for each in item if is_list else [item]:
+                _check_condition(name, each, paths, at)
+        elif key not in _PLAIN and (key != "$options" or "$regex" not in operators):
+            raise _refused(at, "the operator is not allowed here")
+
+
+def _check_pattern(value: object, options: object, place: tuple[str, ...]) -> None:
+    flags, pattern = 0, value
+    if isinstance(value, Regex):
+        flags, pattern = value.flags, value.pattern
+    if flags & ~_FLAGS or not {*str(options)} <= {*"ims"}:
+        raise _refused(place, "may have the options i, m and s only")
+    try:
+        compile_regex(str(pattern))
+    except RegexError as error:
+        raise _refused(place, f"the pattern is refused: {error}") from None
 
 
 def _has_operators(value: object) -> bool:
@@ -247,6 +196,6 @@ def _has_operators(value: object) -> bool:
     return isinstance(value, dict) and any(key.startswith("$") for key in value)
 
 
-def _refused(path: _Path, reason: str) -> WhereError:
-    place = " → ".join(part[:60] for part in path[-6:]) or "the filter"
-    return WhereError(f"filter not allowed at {place}: {reason}")
+def _refused(place: tuple[str, ...], reason: str) -> WhereError:
+    shown = " → ".join(part[:60] for part in place[-6:]) or "the filter"
+    return WhereError(f"filter not allowed at {shown}: {reason}")

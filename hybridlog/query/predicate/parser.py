@@ -34,8 +34,8 @@ The pattern of `~` is found anywhere in the string unless anchored; its backslas
 escaping of their own. It has RE2's syntax and takes linear time.
 
 `TOPIC: expression` holds for a message if another one, of that topic and near in time,
-satisfies the expression. A space follows the colon. Conditions behind a topic are about it, up to
-the next topic or the end of the brackets. Those that `and` joins are about one message of it.
+satisfies the expression. A space follows the colon. Conditions behind a topic are about one
+message of it, up to the next topic or the end of the brackets.
 
 `x.min`, `x.max`, `x.mean` and `x.n` of an array are its least and greatest finite element,
 their mean, and the number of elements. Where the types of the fields are unknown, a
@@ -50,8 +50,6 @@ import math
 import re
 from collections.abc import Callable
 from functools import lru_cache
-from itertools import groupby
-from operator import itemgetter
 from typing import Literal, NamedTuple, TypeAlias, cast
 
 from msgspec.structs import replace
@@ -78,10 +76,8 @@ from hybridlog_storage.errors import TimeError, WhereError
 MAX_LENGTH = 1_000
 """Maximum length of a pattern, characters."""
 _MAX_BYTES = 8 << 20  # of a compiled pattern; Arrow has the same limit
-_REGEX_ESCAPE = re.compile(r"\\Q.*?(?:\\E|\Z)|\\(.)", re.DOTALL)
 MAX_TEXT = 10_000
 """Maximum length of a predicate, characters."""
-_WINDOW = 100
 
 _NAME = r"(?:[^\W\d]\w*|`[^`.$\0][^`.\0]*`)"
 _SLICE = r"(?P<begin>[0-9]*)\s*(?P<colon>:)\s*(?P<end>[0-9]*)"
@@ -138,15 +134,10 @@ def is_filter(text: str) -> bool:
 def error_at(text: str, position: int, message: str) -> WhereError:
     """The error: the message, the line of the text, a caret under the place."""
     begin = text.rfind("\n", 0, position) + 1
-    finish = text.find("\n", position)
-    line = text[begin : len(text) if finish < 0 else finish]
-    column = position - begin
-    if len(line) > _WINDOW:
-        cut = max(0, column - _WINDOW // 2)
-        line, column = line[cut : cut + _WINDOW], column - cut
+    line = text[begin:].partition("\n")[0]
     # One column per character, without control characters.
     line = "".join(char if char.isprintable() else "?" for char in line)
-    return WhereError(f"{message}\n  {line}\n  {' ' * column}^")
+    return WhereError(f"{message}\n  {line}\n  {' ' * (position - begin)}^")
 
 
 def tokenize(text: str) -> list[Token]:
@@ -262,8 +253,6 @@ def compile_regex(pattern: str, max_length: int = MAX_LENGTH) -> Regex:
     """Compile a pattern in RE2's syntax, of at most so many characters."""
     if len(pattern) > max_length:
         raise RegexError(f"longer than {max_length} characters")
-    if any(escape[1] == "C" for escape in _REGEX_ESCAPE.finditer(pattern)):
-        raise RegexError("\\C matches a byte, and strings are characters")
     import re2
 
     options = re2.Options()
@@ -305,14 +294,10 @@ _VALUE_WORDS: dict[str, Value | None] = {
     "infinity": math.inf,
     "nan": math.nan,
 }
-_ENDS = frozenset({"", ")", "and", "&&", "or", "||"})
+_ENDS = frozenset({")", "and", "&&", "or", "||"})
 """Keywords behind a topic of which any message will do."""
 _ONLY_INDEXED = frozenset({"inserted_at", "error", "ref"})
 """Fields of `_meta` that index documents have and messages do not."""
-
-_OWN, _MIXED = 0, -1
-_About: TypeAlias = tuple[int, Node]
-"""A condition, and the number of the topic it is about: `_OWN`, or `_MIXED` of several."""
 
 
 def parse(text: str) -> Predicate:
@@ -335,73 +320,65 @@ class _Parser:
         self._tokens = tokenize(text)
         self._at = 0
         self._depth = 0
-        self._topics = [""]  # as written, in their order; the message itself is the first
-        self._topic = _OWN
+        self._is_of_topic = False
 
     def parse(self) -> Predicate:
         if self._peek().kind == "end":
             raise WhereError("the predicate is empty; write for example: ranges.min < 0.5")
-        root = self._whole(*self._or())
+        root = self._or()
         if self._peek().kind != "end":
             raise self._fail(self._peek(), "expected 'and', 'or' or the end here")
         return Predicate(root, self._text)
 
-    def _or(self) -> _About:
+    def _or(self) -> Node:
         return self._joined(Or, ("or", "||"), self._and)
 
-    def _and(self) -> _About:
+    def _and(self) -> Node:
         return self._joined(And, ("and", "&&"), self._factor)
 
     def _joined(
-        self, join: type[And | Or], words: tuple[str, str], item: Callable[[], _About]
-    ) -> _About:
-        """One item or several; neighbours about one topic are about one message of it."""
+        self, join: type[And | Or], words: tuple[str, str], item: Callable[[], Node]
+    ) -> Node:
+        """One item or several; those about another topic end before the next topic."""
         found = [item()]
-        while self._take(*words):
+        while not (self._is_of_topic and self._ends_topic()) and self._take(*words):
             found.append(item())
-        alike = [(topic, [one for _, one in own]) for topic, own in groupby(found, itemgetter(0))]
-        joined = [(topic, own[0] if len(own) == 1 else join(tuple(own))) for topic, own in alike]
-        if len(joined) == 1:
-            return joined[0]
-        return _MIXED, join(tuple(self._whole(*one) for one in joined))
+        return found[0] if len(found) == 1 else join(tuple(found))
 
-    def _whole(self, topic: int, node: Node) -> Node:
-        """A condition as one on the message itself."""
-        return Near(self._topics[topic], node) if topic > _OWN else node
+    def _ends_topic(self) -> bool:
+        at = self._at + 1
+        while at < len(self._tokens) and self._tokens[at].keyword in {"not", "!", "("}:
+            at += 1
+        return at < len(self._tokens) and self._tokens[at].kind == "topic"
 
-    def _factor(self) -> _About:
-        token, topic = self._peek(), self._topic
+    def _factor(self) -> Node:
+        token = self._peek()
         self._depth += 1
         if self._depth > MAX_DEPTH:
             raise self._fail(token, f"nested deeper than {MAX_DEPTH}")
+        found: Node
         if token.kind == "topic":
             found = self._near(token)
         elif self._take("not", "!"):
-            about, node = self._factor()
-            found = (
-                (about, Not(node)) if about == topic else (_MIXED, Not(self._whole(about, node)))
-            )
+            found = Not(self._factor())
         elif self._take("("):
             found = self._or()
-            if not self._take(")"):
-                raise self._fail(self._peek(), "expected ')' here")
-            self._topic = topic
+            self._close(")")
         else:
-            found = topic, self._condition()
+            found = self._condition()
         self._depth -= 1
         return found
 
-    def _near(self, token: Token) -> _About:
-        self._at += 1
-        self._topics.append(token.text)
-        self._topic = topic = len(self._topics) - 1
-        behind = self._peek()
-        if behind.kind in {"operator", "path", "end"} and behind.keyword in _ENDS:
-            return topic, ALWAYS
-        about, node = self._factor()
-        if about != topic:
+    def _near(self, token: Token) -> Near:
+        if self._is_of_topic:
             raise self._fail(token, "a condition on another topic cannot stand behind this one")
-        return topic, node
+        self._at += 1
+        item: Node = ALWAYS
+        if self._peek().kind != "end" and self._peek().keyword not in _ENDS:
+            self._is_of_topic = True
+            item = self._or()
+            self._is_of_topic = False
+        return Near(token.text, item)
 
     def _condition(self) -> Node:
         token = self._peek()
@@ -423,14 +400,14 @@ class _Parser:
             return first
         if second_order not in _TURNED:
             raise self._fail(self._peek(), "only <, <=, > and >= can follow here")
-        return And((first, self._compare(field, second_order)))
+        return And((first, self._comparison(field, second_order)))
 
     def _of_field(self, field: Field) -> Node:
         token = self._peek()
         if (order := self._order()) is not None:
             behind = self._peek()
             if behind.kind != "path" or behind.keyword in _VALUE_WORDS:
-                return self._compare(field, order)
+                return self._comparison(field, order)
             other = self._field()
             compared = Condition(field, order, other=other, position=behind.position)
             return And((compared, Condition(other, "exists")))
@@ -448,32 +425,23 @@ class _Parser:
             "or missing (of a bool: field == true)",
         )
 
-    def _compare(self, field: Field, order: Order) -> Condition:
+    def _comparison(self, field: Field, order: Order) -> Condition:
         position = self._peek().position
-        value = self._value()
-        return _compare(self._text, field, order, value, position)
+        return _compare(self._text, field, order, self._value(), position)
 
     def _member(self, field: Field, token: Token, *, negated: bool) -> Node:
-        closing = {"[": "]", "(": ")"}.get(self._peek().keyword)
-        if closing is None:
+        if not self._take("["):
             raise self._fail(self._peek(), "expected a list here: [1, 2]")
-        self._at += 1
-        values: list[Value | None] = []
-        while not self._take(closing):
-            if values and not self._take(","):
-                raise self._fail(self._peek(), f"expected ',' or '{closing}' here")
-            if values and self._take(closing):
-                break
+        values = [self._value()]
+        while self._take(","):
             values.append(self._value())
-        if not values:
-            raise self._fail(token, "the list is empty")
+        self._close("]")
         known = tuple(value for value in values if value is not None)
         op: Op = "not in" if negated else "in"
-        found: Node = Condition(field, op, known, position=token.position)
+        found = Condition(field, op, known, position=token.position)
         if len(known) < len(values) and not negated:
-            missing = Condition(field, "missing")
-            found = Or((missing, found)) if known else missing
-        return found if known or not negated else Condition(field, "exists")
+            return Or((Condition(field, "missing"), found))
+        return found
 
     def _match(self, field: Field, *, negated: bool) -> Node:
         token = self._peek()
@@ -495,8 +463,7 @@ class _Parser:
         self._at += 1
         if token.keyword == "abs" and self._take("("):
             found = self._field()
-            if not self._take(")"):
-                raise self._fail(self._peek(), "expected ')' here")
+            self._close(")")
             return replace(found, is_absolute=True)
         if token.path[0] == "_meta" and not _ONLY_INDEXED.isdisjoint(token.path[1:2]):
             path = Field(token.path).path
@@ -522,10 +489,7 @@ class _Parser:
         if token.keyword in _VALUE_WORDS:
             return _VALUE_WORDS[token.keyword]
         if token.kind == "path":
-            raise self._fail(
-                token,
-                "expected a value here (strings need quotes)",
-            )
+            raise self._fail(token, "expected a value here (strings need quotes)")
         raise self._fail(token, "expected a value here")
 
     def _order(self) -> Order | None:
@@ -541,6 +505,10 @@ class _Parser:
         is_one = self._peek().keyword in words
         self._at += is_one
         return is_one
+
+    def _close(self, bracket: str) -> None:
+        if not self._take(bracket):
+            raise self._fail(self._peek(), f"expected '{bracket}' here")
 
     def _fail(self, token: Token, message: str) -> WhereError:
         return error_at(self._text, token.position, message)

@@ -410,7 +410,7 @@ def test_reduced_json_has_summaries(where: str, holds: bool) -> None:
     batch = Batch(payload, zero, zero + len(payload), zero, zero, zero, zero)
     entry = RecordingEntry(Manifest(f"a-{0:016x}", "a", 0), "complete")
     recorded = RecordedChannel(entry, 0, left_channel(channel, REDUCED), ChannelStats())
-    part = Part(entry, "/r", (recorded,), None, "log", None, parse(where))
+    part = Part(entry, "/r", (recorded,), parse(where))
     found, unreadable, lacking = matches(part, recorded, batch, zero)
     assert found.tolist() == [holds]
     assert unreadable == lacking == ("r." not in where)

@@ -57,9 +57,9 @@ ANYTHING = dict.fromkeys(
         ("5 == x", "x == 5"),
         ("0 < x < 5", "x > 0 and x < 5"),
         ("1 <= x < 2", "x >= 1 and x < 2"),
-        ("x IN [1, 2.5, -3,]", "x in [1, 2.5, -3]"),
-        ("x not in ('a')", "x not in ['a']"),
-        ("x not in ('a', 2)", "x not in ['a', 2]"),
+        ("x IN [1, 2.5, -3]", "x in [1, 2.5, -3]"),
+        ("x in [1, null]", "x missing or x in [1]"),
+        ("x not in [null, 1]", "x not in [1]"),
         ("in in[1]", "in in [1]"),
         ("s ~ '^\\d+\"$'", 's ~ "^\\d+\\"$"'),
         ("s ~ 'slip: '", "s ~ 'slip: '"),
@@ -68,8 +68,6 @@ ANYTHING = dict.fromkeys(
         ("x MISSING", "x missing"),
         ("x == null", "x missing"),
         ("x != null", "x exists"),
-        ("x in [null, 1]", "x missing or x in [1]"),
-        ("x not in [null]", "x exists"),
         ("x == true", "x == true"),
         ("x == 0x1F", "x == 31"),
         ("x == 1e-3", "x == 0.001"),
@@ -125,7 +123,6 @@ def test_nan() -> None:
         ("x < true", "order", 4),
         ("x ~ 'ab(?=c)'", "refused: .*without looking around", 4),
         (r"x ~ '(a)\1'", "back references", 4),
-        (r"x ~ 'a\C'", "matches a byte", 4),
         ("x ~ 'a{1001}'", "invalid repetition size", 4),
         ("x ~ 'a++'", "bad repetition operator", 4),
         ("x ~ '[b-a]'", "invalid character class range", 4),
@@ -146,7 +143,8 @@ def test_nan() -> None:
         ("`$where` == 1", "no meaning", 0),
         ("`a.b` == 1", "no meaning", 0),
         ("`` == 1", "no meaning", 0),
-        ("x in []", "list is empty", 2),
+        ("x in []", "expected a value", 6),
+        ("x in (1, 2)", "expected a list", 5),
         ("x in 5", "expected a list", 5),
         ("x between 5 and 3", "expected an operator", 2),
         ("x not 5", "expected 'in'", 6),
@@ -175,7 +173,6 @@ def test_errors_point_at_the_place(where: str, message: str, column: int | None)
     if column is not None:
         assert len(caret) - 3 == column, str(caught.value)
         assert line[2:] in where
-    assert len(line) <= 110
 
 
 def test_limits() -> None:
@@ -325,11 +322,6 @@ conditions = (
         st.sampled_from(["==", "!="]),
         st.none(),
     )
-    | st.tuples(
-        st.sampled_from(["in", "not in"]),
-        st.sampled_from(["z", "a.min", "m.q.min"]),
-        st.just([None, 1]) | st.just([None]),
-    )
     | comparisons(["abs(x)", "abs(i)", "abs(a)", "abs(m.v)", "abs(a.min)"], finite.map(abs))
     | st.tuples(st.just("fields"), st.permutations(["x", "i", "z", "o.y"]), orders)
     | st.tuples(
@@ -438,7 +430,8 @@ def holds(question: Question, document: Document) -> bool:
         case ("not", inner):
             return not holds(inner, document)
         case ("fields", [left, right, *_], order):
-            sides = [leaves(document, path) for path in (left, right)]
+            both = (leaves(document, path) for path in (left, right))
+            sides = [[leaf for leaf in side if leaf is not None] for side in both]
             if not all(sides):
                 return False
             one, other = (side[0] for side in sides)

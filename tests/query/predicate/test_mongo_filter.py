@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from bson import Code, Regex
+from bson import Regex
 
 from hybridlog.query.predicate.mongo_filter import MAX_DEPTH, mongo_filter
 from hybridlog_storage.errors import WhereError
@@ -29,10 +29,7 @@ Document = dict[str, object]
         ({"a": {"$all": [{"$elemMatch": {"$where": "1"}}]}}, r"\$where"),
         ({"a": {"$not": {"$where": "1"}}}, r"\$where"),
         ({"a": {"$eq": {"$where": "1"}}}, r"\$where"),
-        ({"a": {"b": {"$gt": 1}}}, r"\$gt"),
         ({"a": {"$gt": 1, "b": 2}}, "a → b: .* not allowed"),
-        ({"a": Code("x")}, "Code"),
-        ({"a": [Code("x", {})]}, "Code"),
         ({"a": {"$regex": "(?=a)"}}, "RE2"),
         ({"a": {"$elemMatch": {"b": {"$regex": "(?=a)"}}}}, "RE2"),
         ({"a": {"$in": [re.compile("(?=a)")]}}, "RE2"),
@@ -47,8 +44,8 @@ Document = dict[str, object]
         ({"a": {1, 2}}, "set"),
         ({"a": 1j}, "complex"),
         ({"a": np.zeros(3)}, "ndarray"),
-        ({"a": "\ud800"}, "Unicode"),
-        ({"\ud800": 1}, "Unicode"),
+        ({"a": "\ud800"}, "surrogates"),
+        ({"\ud800": 1}, "surrogates"),
         ({"a\0": 1}, "NUL"),
         ({5: 1}, "string keys"),
         ({"a": "x" * 2_000_000}, "too large"),
