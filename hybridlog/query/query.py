@@ -606,8 +606,7 @@ class Query:
     def completeness(self) -> Completeness:
         """Completeness of the last answer, or, without one, of an answer given now.
 
-        Losses of topics in conditions count as an unknown number. Its sentences also tell of
-        topics that lack fields of the predicate.
+        Losses of topics in conditions count as an unknown number.
         """
         from hybridlog.query.answers.completeness import completeness_of
 

@@ -84,18 +84,6 @@ def test_what_a_predicate_did_not_see(
     assert query.where("_meta.t > 0").counters.unreadable == 0
 
 
-def test_a_topic_that_lacks_a_field_of_the_predicate(store: hl.Store) -> None:
-    query = store.topic("/n", "/near").where("n > 2")
-    assert query.count() == 3
-    assert [*query.completeness().sentences][1:] == ["No message of /near has a field 'n'."]
-    # A field that is said to be missing is not missed.
-    absent = store.topic("/n", "/near").where("n missing")
-    assert absent.count() == 6
-    assert [*absent.completeness().sentences] == [
-        "1 message could not be tested: no definition that fits."
-    ]
-
-
 def test_messages_at_no_time_of_the_header_clock(store: hl.Store) -> None:
     for query, want in (
         (store.topic("/early").clock("header").between("start", "end"), 5),

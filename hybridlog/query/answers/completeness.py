@@ -22,8 +22,7 @@ from hybridlog.query.answers.lost import (
     number_of,
 )
 from hybridlog.query.planner import Planner, bounds_in, resolved
-from hybridlog.query.predicate.tree import is_meta
-from hybridlog.query.question import field_types
+from hybridlog.query.question import windows_in
 from hybridlog.record.losses import Cause
 from hybridlog.schema.states import CAUSES, GONE, State, without_fields, without_payload
 from hybridlog.snapshot import UNFINISHED
@@ -32,7 +31,7 @@ from hybridlog_storage.errors import HybridlogError, IncompleteError, TimeError,
 from hybridlog_storage.times import BEGIN, END
 
 if TYPE_CHECKING:
-    from hybridlog.query.question import Counters, Question, RecordedChannel
+    from hybridlog.query.question import Counters, Question
     from hybridlog.session import Session
     from hybridlog_storage.summary import RecordingSummary
 
@@ -137,26 +136,23 @@ def completeness_of(
     answered = [(question, counters), *others]
     given = 0 if counters is None else counters.messages
     is_full = question.limit is not None and given >= question.limit and not question.reverse
-    gone, unread = _gone(session, question), _unreadable_recordings(session, question)
-    unwritten = [] if is_full else _unwritten(session, [one for one, _ in answered])
+    gone, unread = _gone(session, question), _unread(session, question)
+    unwritten = [] if is_full else [*_unwritten(session, [one for one, _ in answered])]
     unindexed = _unindexed(session, answered)
+    left_out = [one for asked in answered for one in _left_out(session, *asked)]
     late = [*(_not_written(*one) for one in unwritten), *_not_indexed(unindexed)]
-    costs = [(one, cost) for one, cost in answered if cost is not None]
-    sentences = [text for one, cost in costs for text in _left_out(session, one, cost)]
-    ledgers = [[*_rows_of(session, one)] for one, _ in answered]
+    ledgers = [[*losses_in(session, one)] for one, _ in answered]
     lost = [row for row in ledgers[0] if row["cause"] not in NOT_LOST]
     by_recording: dict[str, dict[Any, Mapping[str, Any]]] = defaultdict(dict)
     for row in (row for rows in ledgers for row in rows):  # one of unknown topics is in several
         by_recording[row["recording"]][(*row.items(),)] = row
-    sentences += [*late, *unread]
+    sentences = [*(text for text, _ in left_out), *late, *unread]
     for name, rows in by_recording.items():
         sentences += about_losses(name, [*rows.values()])
-    if gone:
-        found = resolved(session, question)
-        sentences += [f"{what}." for one in found for what in copies_of(session.entry_of(one[0]))]
-    with suppress(TimeError):  # nothing is in the range
-        for one, _ in reversed(answered):
-            sentences += _remarks(session, one)
+    for summary, *_ in resolved(session, question) if gone else ():
+        sentences += [f"{what}." for what in copies_of(session.entry_of(summary))]
+    for one, _ in answered:
+        sentences += _unstamped(session, one)
     is_exact = not unread and all(row["count"] is not None for row in lost)
     is_exact &= all(row["cause"] in NOT_LOST for rows in ledgers[1:] for row in rows)
     dropped = sum(row["count"] or 0 for row in ledgers[0] if row["cause"] == Cause.DEGRADE)
@@ -170,26 +166,9 @@ def completeness_of(
         rows=tuple(lost),
         unwritten=None if None in numbers else sum(number or 0 for number in numbers),
         unindexed=unindexed.total(),
-        problems=(*dict.fromkeys(late), *_undecided([cost for _, cost in costs])),
+        problems=(*dict.fromkeys(late), *(text for text, is_problem in left_out if is_problem)),
         sentences=tuple(dict.fromkeys(sentences)),
     )
-
-
-def _rows_of(session: Session, question: Question) -> Iterator[Mapping[str, Any]]:
-    """Rows of the ledger about a question, with the name of their recording."""
-    with suppress(TimeError):  # nothing is in the range
-        yield from ({"recording": e.name, **row} for e, row in losses_in(session, question))
-
-
-def _undecided(costs: Sequence[Counters]) -> Iterator[str]:
-    """Messages that lack what was asked for."""
-    if number := sum(number for cost in costs for _, number in cost.no_transform):
-        yield f"{counted(number, 'message')} without a transform."
-    if number := sum(cost.without_arrays for cost in costs):
-        yield (
-            f"{counted(number, 'message')} could not be tested: their arrays were deleted, or not "
-            "copied yet."
-        )
 
 
 # Messages without payload, and those that could not be read.
@@ -198,10 +177,9 @@ def _undecided(costs: Sequence[Counters]) -> Iterator[str]:
 def _gone(session: Session, question: Question) -> Counter[State]:
     """Number of messages in the range of a question whose payloads are gone, by state."""
     summaries = session.snapshot().summaries
-    if not any(one.expired or one.not_copied or one.status in UNFINISHED for one in summaries):
-        return Counter()
-    with suppress(TimeError, TopicError):  # nothing is in the range, or has this clock
-        return +Planner(session, question).count_expired()
+    if any(one.expired or one.not_copied or one.status in UNFINISHED for one in summaries):
+        with suppress(TimeError, TopicError):  # nothing is in the range, or has this clock
+            return +Planner(session, question).count_expired()
     return Counter()
 
 
@@ -212,43 +190,44 @@ def _payloads_gone(found: Completeness | Counters) -> Iterator[str]:
     yield from (without_payload(number, state) for state, number in numbers.items() if number)
 
 
-def _left_out(session: Session, question: Question, counters: Counters) -> Iterator[str]:
-    """Messages that an answer could not read or has no payload of."""
-    expired = ""
-    if counters.lacking or counters.without_arrays:  # a copy may be waiting for them
-        gone = _gone(session, question)
-        expired = ", or ".join(CAUSES[state] for state in gone) or CAUSES[State.REDUCED]
+def _left_out(
+    session: Session, question: Question, counters: Counters | None
+) -> Iterator[tuple[str, bool]]:
+    """What an answer could not read or has no payload of; true of what was asked for."""
+    if counters is None:
+        return
     predicate, unreadable = question.predicate, counters.unreadable - counters.without_arrays
     if unreadable > 0 and (predicate is None or not predicate.asks_fields):
-        yield f"{unfit(unreadable)}: not in this answer; --format raw, mcap or bag gives payloads."
+        how = "--format raw, mcap or bag gives payloads"
+        yield f"{unfit(unreadable)}: not in this answer; {how}.", False
     elif unreadable > 0:
         what = "fields in the index" if predicate and predicate.filters else "definition that fits"
-        yield f"{counted(unreadable, 'message')} could not be tested: no {what}."
-    if number := counters.without_arrays:
-        yield f"{counted(number, 'message')} could not be tested: their arrays were {expired}."
-    for gone_ones in _payloads_gone(counters):
-        yield f"{gone_ones}: not in this answer; --where and --fields find the fields."
-    if counters.lacking:
-        yield f"{without_fields(counters.lacking, State.EXPIRED, expired)}; these are null."
+        yield f"{counted(unreadable, 'message')} could not be tested: no {what}.", False
+    if counters.lacking or counters.without_arrays:  # a copy may be waiting for them
+        causes = [CAUSES[state] for state in _gone(session, question) or [State.REDUCED]]
+        why = ", or ".join(causes)
+        if number := counters.without_arrays:
+            text = f"{counted(number, 'message')} could not be tested: their arrays were {why}."
+            yield text, True
+        if number := counters.lacking:
+            yield f"{without_fields(number, State.EXPIRED, why)}; these are null.", False
+    for gone in _payloads_gone(counters):
+        yield f"{gone}: not in this answer; --where and --fields find the fields.", False
     reasons: Counter[str] = Counter()
-    for why, number in counters.no_transform:
-        reasons[why] += number
-    for why, number in reasons.items():
-        yield f"{counted(number, 'message')} without a transform {why}."
-    yield from counters.of_frames
+    for reason, number in counters.no_transform:
+        reasons[reason] += number
+    for reason, number in reasons.items():
+        yield f"{counted(number, 'message')} without a transform {reason}.", True
+    yield from ((text, False) for text in counters.of_frames)
 
 
-def _unreadable_recordings(session: Session, question: Question) -> list[str]:
+def _unread(session: Session, question: Question) -> list[str]:
     """A sentence about recordings that cannot be read, if a question is about all."""
-    known = session.snapshot().by_id
-    number = sum(one not in known for one in [*session.shared.repairs.unreadable])
+    number = len({*session.shared.repairs.unreadable} - session.snapshot().by_id.keys())
     if not number or question.recordings is not None:
         return []
-    are = "is" if number == 1 else "are"
-    return [
-        f"{counted(number, 'recording')} cannot be read and {are} left out; `hybridlog verify` "
-        "says why."
-    ]
+    which = f"{counted(number, 'recording')} cannot be read and {'is' if number == 1 else 'are'}"
+    return [f"{which} left out; `hybridlog verify` says why."]
 
 
 # Messages that are not written or not indexed yet.
@@ -262,20 +241,21 @@ def flush_interval_ns(recording: RecordingSummary) -> int:
 
 def _unwritten(
     session: Session, questions: Sequence[Question]
-) -> list[tuple[RecordingSummary, int | None]]:
+) -> Iterator[tuple[RecordingSummary, int | None]]:
     """Messages that are not written yet, where questions reach past the last flush.
 
     None for an unknown number, of a recorder that does not answer.
     """
-    running: dict[str, RecordingSummary] = {}
     topics: dict[str, set[str]] = defaultdict(set)
     for question in questions:
         for one in session.summaries_of(question):
             if one.status == "open" and _reaches_past(session, question, one):
-                running[one.id] = one
                 topics[one.id].update(question.topics)
-    found = ((one, _taken(session, one, topics[one.id])) for one in running.values())
-    return [(one, number) for one, number in found if number != 0]
+    for recording, own in topics.items():
+        summary = session.snapshot().by_id[recording]
+        number = _taken(session, summary, own)
+        if number != 0:
+            yield summary, number
 
 
 def _taken(session: Session, recording: RecordingSummary, topics: set[str]) -> int | None:
@@ -291,13 +271,10 @@ def _taken(session: Session, recording: RecordingSummary, topics: set[str]) -> i
 
 def _reaches_past(session: Session, question: Question, one: RecordingSummary) -> bool:
     """True if a question is about times after the last flush of a recording."""
-    begin, end = BEGIN, END
-    if question.bounds is not None and question.clock == "log":
-        begin, end = bounds_in(session, question, one)
-    if question.during is not None:
-        windows = question.during.of_recording(one.id)
-        end = min(end, int(windows[-1, 1])) if len(windows) else begin
-    return end > (begin if one.span is None else max(begin, one.span[1]))
+    during = None if question.during is None else question.during.of_recording(one.id)
+    is_log = question.is_by_log_time
+    windows = windows_in(during, bounds_in(session, question, one) if is_log else (BEGIN, END))
+    return len(windows) > 0 and (one.span is None or int(windows[-1, 1]) > one.span[1])
 
 
 def _not_written(recording: RecordingSummary, messages: int | None) -> str:
@@ -324,42 +301,21 @@ def _unindexed(
 
 def _not_indexed(lacks: Counter[str]) -> Iterator[str]:
     if total := lacks.total():
-        are = "is" if total == 1 else "are"
         yield (
-            f"{counted(total, 'message')} of {listed(lacks, MAX_NAMES)} {are} not in the index, "
-            "nor in this answer of MongoDB; `hybridlog index rebuild` brings in those of "
-            "recordings that have ended."
+            f"{counted(total, 'message')} of {listed(lacks, MAX_NAMES)} "
+            f"{'is' if total == 1 else 'are'} not in the index, nor in this answer of MongoDB; "
+            "`hybridlog index rebuild` brings in those of recordings that have ended."
         )
 
 
-# What may not have been meant.
-
-
-def _remarks(session: Session, question: Question) -> Iterator[str]:
-    """Messages at no time of the header clock, and topics without a field of the predicate."""
-    topics = {*question.topics}
-    if question.clock == "header" and question.bounds is not None:
-        entries = map(session.entry_of, session.summaries_of(question)[:_MAX_RECORDINGS])
-        channels = (
-            c for one in entries if one.is_decoded for c in session.channels_of(one, topics)
-        )
-        stats = [channel.stats for channel in channels]
-        if missing := sum(one.messages - one.stamped + one.unset for one in stats):
-            are = "message is" if missing == 1 else "messages are"
-            none = "no header stamp, or one of zero"
-            yield f"{missing} {are} at no time of the header clock: {none}."
-    conditions = () if question.predicate is None else question.predicate.conditions()
-    asked = [one.field for one in conditions if one.operands and not is_meta(one.field.path)]
-    if not asked:
+def _unstamped(session: Session, question: Question) -> Iterator[str]:
+    """Messages at no time of the header clock."""
+    if question.clock != "header" or question.bounds is None:
         return
-    from hybridlog.frames.names import is_part  # most questions need none of it
-
-    by_topic: dict[str, list[RecordedChannel]] = defaultdict(list)
-    for channel in Planner(session, question).examples:
-        by_topic[channel.channel.topic].append(channel)
-    for topic, own in by_topic.items():
-        known = field_types(tuple(one for one in own if one.codec.indexed)) or {}
-        plain = [name.replace("[]", "") for name in known]
-        for path in dict.fromkeys(one.names for one in asked if known):
-            if not any(is_part(path, name) for name in plain):
-                yield f"No message of {topic} has a field {path!r}."
+    entries = map(session.entry_of, session.summaries_of(question)[:_MAX_RECORDINGS])
+    channels = [session.channels_of(one, {*question.topics}) for one in entries if one.is_decoded]
+    stats = [channel.stats for own in channels for channel in own]
+    if missing := sum(one.messages - one.stamped + one.unset for one in stats):
+        are = "message is" if missing == 1 else "messages are"
+        none = "no header stamp, or one of zero"
+        yield f"{missing} {are} at no time of the header clock: {none}."

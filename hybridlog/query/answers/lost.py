@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from shlex import quote
 from typing import TYPE_CHECKING, Any, Final
 
@@ -13,7 +14,8 @@ from hybridlog.query.planner import resolved
 from hybridlog.query.question import windows_in
 from hybridlog.record.losses import CRASH, Cause, losses_of
 from hybridlog.wording import counted, listed
-from hybridlog_storage.times import BEGIN, END, span_of
+from hybridlog_storage.errors import TimeError
+from hybridlog_storage.times import BEGIN, END, span_of, touches
 
 if TYPE_CHECKING:
     from hybridlog.query.question import Question, Span
@@ -109,43 +111,44 @@ def _coverage(entry: RecordingEntry, losses: Collection[Row]) -> str:
     return f"{in_words(losses)} ({share:.2f} % there)"
 
 
-def losses_in(session: Session, question: Question) -> Iterator[tuple[RecordingEntry, Row]]:
-    """Rows of the ledger about topics and times of a question, those of a recording together.
+def losses_in(session: Session, question: Question) -> Iterator[Row]:
+    """Rows of the ledger about topics and times of a question, with their `recording`'s name."""
+    with suppress(TimeError):  # nothing is in the range
+        yield from ({"recording": entry.name, **row} for entry, row in _losses(session, question))
+
+
+def _losses(session: Session, question: Question) -> Iterator[tuple[RecordingEntry, Row]]:
+    """The rows, those of a recording together.
 
     A lost manifest leaves open what was lost: one more row.
     """
     doubtful = {entry.id: entry for entry in session.doubtful(question)}
     for summary, windows, _ in resolved(session, question) if doubtful else ():
         entry = doubtful.get(summary.id)
-        if entry is None:
-            continue
-        chosen = windows_in(windows)
-        ledger = losses_of(entry)
-        if "unproven" in {entry.status, entry.manifest.status}:
+        ledger = [] if entry is None else losses_of(entry)
+        if entry is not None and "unproven" in {entry.status, entry.manifest.status}:
             ledger += [{"cause": MANIFEST_LOST, "count": None, "topic": None}]
         for row in ledger:
-            span = _span_of(entry, row)
-            is_inside = span is None or bool(
-                ((chosen[:, 0] <= span[1]) & (span[0] < chosen[:, 1])).any()
-            )
-            if is_inside and row["count"] != 0 and row.get("topic") in {None, *question.topics}:
+            assert entry is not None
+            first, last = _span_of(entry, row)
+            is_asked = row["count"] != 0 and row.get("topic") in {None, *question.topics}
+            if is_asked and touches(windows_in(windows), first, last):
                 yield entry, row
 
 
-def _span_of(entry: RecordingEntry, row: Row) -> Span | None:
-    """First and last log time of a loss, ns; None if it may be anywhere."""
+def _span_of(entry: RecordingEntry, row: Row) -> Span:
+    """First and last log time of a loss, ns; all times if it may be anywhere."""
     if row["cause"] == CRASH and entry.span is not None:
         return min(entry.span[1] + 1, END), END
     if row.get("from") is None or row.get("to") is None:
-        return None
+        return BEGIN, END
     return int(row["from"]), int(row["to"])
 
 
 def lost_times(session: Session, question: Question) -> Intervals:
     """Log time in which messages were lost, cut to nothing; ends are included."""
-    parts = []
-    for entry, row in losses_in(session, question):
-        if row["cause"] not in NOT_LOST:
-            low, high = span_of(*(_span_of(entry, row) or (BEGIN, END)))
-            parts.append((entry.id, np.array([[low, high, 0]], np.int64)))
-    return Intervals(parts)
+    return Intervals(
+        (entry.id, np.array([[*span_of(*_span_of(entry, row)), 0]], np.int64))
+        for entry, row in _losses(session, question)
+        if row["cause"] not in NOT_LOST
+    )
