@@ -6,10 +6,12 @@ So they stand in front of the messages of a range; the frames of a video from it
 from __future__ import annotations
 
 import re
+from bisect import insort
 from collections import defaultdict
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from functools import lru_cache
-from heapq import heappop, heappush
+from itertools import groupby
+from operator import itemgetter
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -103,6 +105,7 @@ class _Held(NamedTuple):
 
     log_time: int
     number: int
+    is_key: bool
     channel: int
     publish_time: int
     sequence: int
@@ -130,7 +133,6 @@ class LatchedFront:
         self._original_times = original_times
         self._depths: list[int] = []
         self._channels: list[Channel] = []
-        self._keys: dict[Hashable, _Held] = {}
         self._publishers: list[Hashable] = []
         self._last: dict[Hashable, list[_Held]] = defaultdict(list)
         self._at_begin: list[_Held] = []
@@ -161,65 +163,46 @@ class LatchedFront:
 
     def _hold(self, batch: Batch, row: int) -> bool:
         """Hold a message; False for one that is to be written at once."""
+        number, payload = int(batch.channel[row]), bytes(batch.payload(row))
+        channel = self._channels[number]
         self._number += 1
-        channel = int(batch.channel[row])
         held = _Held(
             int(batch.log_time[row]),
             self._number,
-            channel,
+            is_video(channel) and is_key_frame(channel, payload),
+            number,
             int(batch.publish_time[row]),
             int(batch.sequence[row]),
-            bytes(batch.payload(row)),
+            payload,
         )
-        if held.log_time == self._begin:
-            if self._size + len(held.payload) > MAX_HELD:
-                return False
-            self._size += len(held.payload)
-            self._at_begin.append(held)
-            return True
-        publisher = self._publishers[channel]
-        last = self._last[publisher]
-        heappush(last, held)
-        self._size += len(held.payload)
-        if is_video(self._channels[channel]):
-            self._cut_to_key(publisher, held)
-        if len(last) > self._depths[channel]:
-            self._size -= len(heappop(last).payload)
-        while self._size > MAX_HELD and len(last) > 1:
-            self._size -= len(heappop(last).payload)
+        is_before = held.log_time < self._begin
+        if not is_before and self._size + len(payload) > MAX_HELD:
+            return False
+        last = self._last[self._publishers[number]] if is_before else self._at_begin
+        insort(last, held)
+        self._size += len(payload)
+        keys = (place for place, one in enumerate(last) if one.is_key)
+        cut = max(len(last) - self._depths[number], 0, *keys) if is_before else 0
+        self._size -= sum(len(one.payload) for one in last[:cut])
+        del last[:cut]
+        while is_before and self._size > MAX_HELD and len(last) > 1:
+            self._size -= len(last.pop(0).payload)
             self.left_out += 1
-            key = self._keys.get(publisher)
-            if key is not None and key < last[0]:
-                del self._keys[publisher]  # the rest refers to what is gone
         return True
-
-    def _cut_to_key(self, publisher: Hashable, held: _Held) -> None:
-        """Drop the frames before the last key frame, if the frame just held is one or before it."""
-        key, last = self._keys.get(publisher), self._last[publisher]
-        if is_key_frame(self._channels[held.channel], held.payload):
-            key = self._keys[publisher] = max(key or held, held)
-        while key is not None and last[0] < key:
-            self._size -= len(heappop(last).payload)
 
     def batches(self) -> Iterator[Batch]:
         """The held messages, in order; `channel` indexes the log's channels."""
         front = sorted(
             held
-            for publisher, last in self._last.items()
+            for last in self._last.values()
             for held in last
-            if publisher in self._keys or not is_video(self._channels[held.channel])
+            if last[0].is_key or not is_video(self._channels[held.channel])
         )
         self.messages += len(front)
-        group: list[_Held] = []
-        size = 0
-        for held in [*front, *self._at_begin]:
-            group.append(held)
-            size += len(held.payload)
-            if size >= _BATCH:
-                yield self._moved(_batch_of(group))
-                group, size = [], 0
-        if group:
-            yield self._moved(_batch_of(group))
+        everything = [*front, *self._at_begin]
+        ends = np.cumsum([len(held.payload) for held in everything]) // _BATCH
+        for _, group in groupby(zip(ends.tolist(), everything, strict=True), itemgetter(0)):
+            yield self._moved(_batch_of([held for _, held in group]))
 
     def _moved(self, batch: Batch) -> Batch:
         """The messages with the log time of the beginning, where they are from before it."""
