@@ -252,7 +252,9 @@ class Store:
 
     def choose(self, choice: Choice) -> Recordings:
         """The recordings that satisfy a choice; see `recordings`."""
-        return Recordings(self._source, *choose(self.session, choice))
+        from hybridlog.query.planner import recordings_with_any
+
+        return Recordings(self._source, *choose(self.session, choice, recordings_with_any))
 
     def entry(self, recording: str) -> RecordingEntry:
         """The entry of a recording, by its id or its name.

@@ -7,7 +7,7 @@ other conditions.
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -27,6 +27,7 @@ from hybridlog.wording import listed, meant
 from hybridlog_storage.errors import TimeError, TopicError, UsageError
 
 if TYPE_CHECKING:
+    from hybridlog.query.question import Question
     from hybridlog.query.times import DurationLike, TimeLike
     from hybridlog.session import Session
     from hybridlog_storage.summary import RecordingSummary
@@ -40,6 +41,8 @@ During: TypeAlias = "tuple[TimeLike | None, TimeLike | None] | None"
 _Step: TypeAlias = "tuple[Sequence[RecordingSummary], str, str, Collection[str]]"
 """Recordings that satisfy a condition; this in words; and, for a hint where there is none, the name
 that was wanted and those that there are."""
+Answering: TypeAlias = "Callable[[Session, Question], set[str]]"
+"""Returns the ids of the recordings that have a message in an answer."""
 _GLOB = frozenset("*?[")
 
 
@@ -120,9 +123,14 @@ def _tags(given: Tags) -> tuple[tuple[str, str | None], ...]:
     return pairs
 
 
-def choose(session: Session, choice: Choice) -> tuple[list[RecordingSummary], str]:
-    """The recordings of a store that satisfy a choice, oldest first, and why there is none."""
-    choosing = _Choosing(session)
+def choose(
+    session: Session, choice: Choice, answering: Answering | None = None
+) -> tuple[list[RecordingSummary], str]:
+    """The recordings of a store that satisfy a choice, oldest first, and why there is none.
+
+    `answering` is needed for `where`.
+    """
+    choosing = _Choosing(session, answering)
     if not choosing.left and not choice.is_everything:
         return [], session.when_empty
     conditions: list[str] = []
@@ -157,8 +165,9 @@ def topics_of_types(session: Session, types: Sequence[str], recordings: Sequence
 class _Choosing:
     """Narrows down the recordings of a store, one condition after the other."""
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, session: Session, answering: Answering | None) -> None:
         self._session = session
+        self._answering = answering
         self._snapshot = session.snapshot()
         self.left = self._snapshot.summaries
 
@@ -234,7 +243,6 @@ class _Choosing:
         found: list[RecordingSummary] = []
         if there:
             ids = tuple(one.id for one in there)
-            from hybridlog.query.planner import recordings_with_any
             from hybridlog.query.question import Question
 
             question = Question(topics, ids)
@@ -243,7 +251,8 @@ class _Choosing:
                 if checked.is_across:
                     raise UsageError(f"A condition for recordings is of one topic: {condition!r}.")
                 question = replace(question, predicate=checked)
-            having = recordings_with_any(self._session, question)
+            assert self._answering is not None
+            having = self._answering(self._session, question)
             found = [one for one in there if one.id in having]
         words = f"with a message for which {condition!r} holds"
         return found, words, pattern, () if there else known

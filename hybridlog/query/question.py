@@ -160,10 +160,10 @@ class Part(Struct, frozen=True, eq=False, dict=True):
         """Types of the fields by path; None where a definition does not fix them."""
         return field_types(tuple(one for one in self.channels if one.codec.indexed))
 
-    @lazy
+    @property
     def log_windows(self) -> NDArray[np.int64]:
         """int64[n, 2]: the log time of the part; bounds of another clock do not restrict it."""
-        return windows_in(self.windows)
+        return windows_in(None) if self.windows is None else self.windows
 
     @property
     def log_span(self) -> Span:

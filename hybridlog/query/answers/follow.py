@@ -22,7 +22,6 @@ from hybridlog.query.planner import Planner, bounds_in, resolved
 from hybridlog.query.question import windows_in
 from hybridlog.query.topics import later
 from hybridlog.record.marks import MARKS_SEGMENT, without_marks
-from hybridlog_storage.cache import lazy
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.stopping import pause, safe_point
 
@@ -79,7 +78,7 @@ class Arrivals(Planner):
             parts += self.parts_in(one, *ranges) if chunks else ()
         return self.scan(parts).runs(), any(map(self._goes_on, summaries))
 
-    @lazy
+    @property
     def resolved(self) -> list[Resolved]:
         """The recordings, whatever the range is: it may have no beginning yet."""
         return resolved(self.session, replace(self.question, bounds=None))
