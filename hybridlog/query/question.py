@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from msgspec import Struct
-from msgspec.structs import asdict, replace
+from msgspec.structs import replace
 
 from hybridlog.query.times import TimeLike
 from hybridlog.schema.states import State, encoding_of, state_of
@@ -230,7 +230,7 @@ class Counters(Struct):
 
     def reset(self) -> None:
         """Set every counter to zero."""
-        for name, value in asdict(Counters()).items():
+        for name, value in zip(self.__struct_fields__, self.__struct_defaults__, strict=True):
             setattr(self, name, value)
 
     def copy(self) -> Counters:
@@ -285,13 +285,18 @@ def windows_in(windows: NDArray[np.int64] | None, bounds: Span = (BEGIN, END)) -
 
 def field_types(channels: tuple[RecordedChannel, ...]) -> dict[str, str] | None:
     """Types of the fields of some channels, by path; None where no definition fixes them."""
+    return _field_types(tuple(dict.fromkeys(channel.codec for channel in channels)))
+
+
+@lru_cache(maxsize=256)
+def _field_types(codecs: tuple[Codec, ...]) -> dict[str, str] | None:
     types: dict[str, str] = {}
-    for channel in channels:
-        paths = channel.codec.paths()
-        if not paths:
-            return None
+    for codec in codecs:
+        paths = codec.paths()
         for path in paths:
             types[path.path] = _either(types.get(path.path), path.type)
+        if not paths:
+            return None
     return types or None
 
 

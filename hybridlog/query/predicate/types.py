@@ -169,7 +169,7 @@ def _problems_of(target: Field, types: FieldTypes) -> Iterator[str]:
             yield f"{before} has {size[1]} elements, numbered from 0"
     if parts[0] == "_id":
         yield "_id is no field; use _meta.t, _meta.rec and _meta.seq"
-    is_there = path in types.types.keys() | types.inner | types.arrays
+    is_there = any(path in known for known in (types.types, types.inner, types.arrays))
     if is_there or types.statistic(parts) or not (types.known or parts[0] == "_meta"):
         return
     known = types.types.keys() - ({} if path.startswith("_meta") else _META).keys()
