@@ -38,7 +38,7 @@ PLACES = {
     "ros2_pause_s": "hybridlog.live.sources.ros2.source._PAUSE_S",
     "min_threaded_bytes": "hybridlog.query.chunk_scan._MIN_THREADED_BYTES",
     "latched_held": "hybridlog.query.latching.MAX_HELD",
-    "sampled_periods": "hybridlog.query.periods._SAMPLED",
+    "sampled_periods": "hybridlog.query.intervals._SAMPLED",
     "planner_group_growth": "hybridlog.query.planner._GROUP_GROWTH",
     "document_slab_bytes": "hybridlog.schema.document._SLAB",
     "clients_wait_s": "hybridlog.index.of_store._CLIENTS_WAIT_S",

@@ -18,8 +18,7 @@ from msgspec.structs import replace
 from hybridlog.across.match import HOWS, UNKNOWN, interpolated, match, quaternion_paths
 from hybridlog.frames.answer import text_column
 from hybridlog.frames.names import free_name
-from hybridlog.query.answers.completeness import completeness_of
-from hybridlog.query.answers.lost import lost_times
+from hybridlog.query.answers.completeness import completeness_of, lost_times
 from hybridlog.query.intervals import Intervals, joined
 from hybridlog.query.planner import Planner, bounds_in, log_spans, log_times, resolved
 from hybridlog.query.question import Counters

@@ -17,7 +17,7 @@ from msgspec.structs import replace
 from hybridlog.across.align import TopicReader
 from hybridlog.message import messages_in
 from hybridlog.query.answers.completeness import completeness_of
-from hybridlog.query.answers.video import picture_of
+from hybridlog.query.answers.current import picture_of
 from hybridlog.query.planner import Planner, bounds_in, resolved
 from hybridlog.query.question import Counters
 from hybridlog.query.times import DurationLike, parse_duration

@@ -309,7 +309,7 @@ def _pictures(query: Query, form: str, target: Target, front: Front) -> Answer:
     """The images; messages that are unreadable are left out and told."""
     from hybridlog.arrays.message_arrays import IMAGES
     from hybridlog.formats.writing import Answer
-    from hybridlog.query.answers.video import frames_in_front
+    from hybridlog.query.answers.current import frames_in_front
     from hybridlog.schema.states import without_payload
 
     before: list[Message] = []

@@ -38,7 +38,7 @@ from hybridlog.live.recorder import (
     throttle_rule,
 )
 from hybridlog.live.recording import default_budget
-from hybridlog.query.answers.lost import coverage, in_words
+from hybridlog.query.answers.completeness import coverage, in_words
 from hybridlog.record.losses import Cause, losses_of
 from hybridlog_storage.errors import (
     DatabaseError,

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 from msgspec import Meta, Struct, ValidationError, convert, field
 
 from hybridlog.formats.yaml_values import YamlError, parse_yaml, read_yaml
-from hybridlog.query.periods import GAP_PERIODS
+from hybridlog.query.intervals import GAP_PERIODS
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.times import format_duration, parse_duration
 from hybridlog.record.marks import MARKS

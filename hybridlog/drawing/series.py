@@ -15,8 +15,7 @@ from msgspec import Struct
 
 from hybridlog.frames.names import FIELD, is_summary
 from hybridlog.query.answers.infer_fields import infer_fields
-from hybridlog.query.intervals import Intervals
-from hybridlog.query.periods import GAP_PERIODS, Steps
+from hybridlog.query.intervals import GAP_PERIODS, Intervals, Steps
 from hybridlog.query.query import field_types, spans_of, tables_of
 from hybridlog.query.times import TIME_LIMIT
 from hybridlog.schema.arrow_types import is_list, is_number, is_time, lengths_of

@@ -13,7 +13,7 @@ import numpy as np
 from msgspec import Struct
 
 from hybridlog.query.answers.interval_queries import IntervalQueries
-from hybridlog.query.periods import GAP_PERIODS, usual_period
+from hybridlog.query.intervals import GAP_PERIODS, usual_period
 from hybridlog.query.planner import match_times
 from hybridlog.query.question import Question
 from hybridlog_storage.errors import ResourceError, SegmentError, TopicError

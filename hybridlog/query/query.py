@@ -323,7 +323,7 @@ class Query:
         """
         self._as_they_came("Loops and `at`")
         from hybridlog.message import messages_in
-        from hybridlog.query.answers.video import picture_of
+        from hybridlog.query.answers.current import picture_of
 
         planner = self._planner()
         picture = picture_of(planner.session)

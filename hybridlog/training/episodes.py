@@ -15,7 +15,7 @@ from msgspec import Struct
 
 from hybridlog.across.match import match
 from hybridlog.drawing.images import shown_pixels
-from hybridlog.query.periods import GAP_PERIODS, usual_period
+from hybridlog.query.intervals import GAP_PERIODS, usual_period
 from hybridlog.query.planner import log_spans, log_times
 from hybridlog.query.query import Query
 from hybridlog.query.question import Question

@@ -115,8 +115,8 @@ def _show_recordings(store: Store, given: _Given) -> None:
 
 def _as_dict(store: Store, entry: RecordingEntry) -> dict[str, Any]:
     from hybridlog.entries import summary_of
-    from hybridlog.query.answers.lost import coverage
-    from hybridlog.query.periods import mean_rate
+    from hybridlog.query.answers.completeness import coverage
+    from hybridlog.query.intervals import mean_rate
     from hybridlog.schema.codecs import unindexed
     from hybridlog.schema.states import shown_channels
 
@@ -163,7 +163,7 @@ def _as_dict(store: Store, entry: RecordingEntry) -> dict[str, Any]:
 def _fields(store: Store, entry: RecordingEntry, about: dict[str, Any]) -> list[tuple[str, object]]:
     """The lines of a recording: name and value."""
     from hybridlog.entries import summary_of
-    from hybridlog.query.answers.lost import line_of
+    from hybridlog.query.answers.completeness import line_of
 
     manifest, origin = entry.manifest, entry.manifest.source
     kind = f"{origin.kind}, {output.size(origin.bytes)}" if origin.bytes else origin.kind

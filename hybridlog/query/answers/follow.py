@@ -15,7 +15,7 @@ from msgspec.structs import replace
 
 from hybridlog.message import messages_in
 from hybridlog.query.answers.completeness import flush_interval_ns
-from hybridlog.query.answers.video import picture_of
+from hybridlog.query.answers.current import picture_of
 from hybridlog.query.chunk_columns import ChunkColumns
 from hybridlog.query.chunk_scan import RecordingScan
 from hybridlog.query.planner import Planner, bounds_in, resolved

@@ -14,7 +14,7 @@ import pyarrow.compute as pc
 from msgspec.structs import replace
 
 from hybridlog.columns.fields import joined
-from hybridlog.query.answers.lost import lost_times
+from hybridlog.query.answers.completeness import lost_times
 from hybridlog.query.answers.marks import mark_topics, marks
 from hybridlog.query.intervals import Intervals, changing, clipped, holding
 from hybridlog.query.planner import Planner, log_spans

@@ -16,8 +16,7 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from hybridlog.query.intervals import Intervals
-from hybridlog.query.periods import GAP_PERIODS, mean_rate, usual_period
+from hybridlog.query.intervals import GAP_PERIODS, Intervals, mean_rate, usual_period
 from hybridlog.query.planner import Planner, log_spans, resolved
 from hybridlog.query.question import windows_in
 from hybridlog.query.times import DurationLike, parse_duration
