@@ -32,11 +32,8 @@ if TYPE_CHECKING:
 Span = tuple[int, int]
 """`[begin, end)` in nanoseconds."""
 
+_NO_ROWS = np.empty((0, 3), np.int64)
 _ROWS_PER_BATCH = 10_000  # intervals whose columns become Python numbers together
-
-
-def _no_rows() -> NDArray[np.int64]:
-    return np.empty((0, 3), np.int64)
 
 
 class Interval(Struct, frozen=True):
@@ -81,7 +78,8 @@ class Intervals:
         found: dict[str, list[Rows]] = {}
         for name, rows in parts:
             found.setdefault(name, []).append(rows)
-        self._rows = {name: _ordered(np.concatenate(rows)) for name, rows in found.items()}
+        joined_rows = ((name, np.concatenate(rows)) for name, rows in found.items())
+        self._rows = {name: r[np.lexsort((r[:, 1], r[:, 0]))] for name, r in joined_rows}
         self._columns: tuple[NDArray[np.intp], Rows] | None = None
 
     @property
@@ -165,8 +163,6 @@ class Intervals:
 
         `messages` is 0, since no messages belong to the new intervals.
         """
-        if len(other.recordings) < len(self.recordings):
-            return other.common(self)
         return self._each(
             lambda name, _: _common(self.of_recording(name), other.of_recording(name))
         )
@@ -245,7 +241,7 @@ class Intervals:
 
     def of_recording(self, recording: str) -> NDArray[np.int64]:
         """Covered time of one recording: int64[n, 2], begin and end, disjoint, in order."""
-        return joined(self._rows.get(recording, _no_rows()))[:, :2]
+        return joined(self._rows.get(recording, _NO_ROWS))[:, :2]
 
     def to_pandas(self) -> pd.DataFrame:
         """A frame: `recording`, `begin`, `end` (UTC, ns), `duration`, `messages`."""
@@ -272,15 +268,11 @@ class Intervals:
     def _all(self) -> tuple[NDArray[np.intp], Rows]:
         """All intervals in order, and the place of the recording of each in `recordings`."""
         if self._columns is None:
-            rows = np.concatenate([_no_rows(), *self._rows.values()])
+            rows = np.concatenate([_NO_ROWS, *self._rows.values()])
             codes = np.repeat(np.arange(len(self._rows)), [*map(len, self._rows.values())])
             order = np.lexsort((rows[:, 1], codes, rows[:, 0]))
             self._columns = codes[order], rows[order]
         return self._columns
-
-
-def _ordered(rows: Rows) -> Rows:
-    return rows[np.lexsort((rows[:, 1], rows[:, 0]))]
 
 
 def _common(mine: NDArray[np.int64], theirs: NDArray[np.int64]) -> Rows:
@@ -332,7 +324,7 @@ def holding(
     not count as messages.
     """
     if not len(time):
-        return np.empty((0, 3), np.int64)
+        return _NO_ROWS
     count = holds.astype(np.int64)
     count[:before] = 0
     first = run_starts(time)
@@ -352,7 +344,7 @@ def changing(time: NDArray[np.int64], pause: int) -> NDArray[np.int64]:
     after the one before.
     """
     if not len(time):
-        return np.empty((0, 3), np.int64)
+        return _NO_ROWS
     time = placed(time)
     first = np.append(0, np.flatnonzero(np.diff(time) > pause) + 1)
     steps = np.diff(first, append=len(time))

@@ -233,10 +233,6 @@ class Counters(Struct):
         for name, value in zip(self.__struct_fields__, self.__struct_defaults__, strict=True):
             setattr(self, name, value)
 
-    def copy(self) -> Counters:
-        """The same counts."""
-        return replace(self)
-
     def add(self, other: Counters) -> None:
         """Add the counts of a part of the answer; the wall time is unchanged."""
         for name in self.__struct_fields__:

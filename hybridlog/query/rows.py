@@ -203,7 +203,7 @@ class Rows:
 
     def _again(self, ask: Callable[[Sequence[Part]], _T], parts: Sequence[Part]) -> _T:
         """Ask about parts; again about those whose files were replaced, or whose table failed."""
-        before = self.counters.copy()
+        before = replace(self.counters)
         for _ in range(_RENEWALS):
             try:
                 return ask(parts)
@@ -215,7 +215,7 @@ class Rows:
         """Rows of a part, to the end if files are replaced or a table fails meanwhile."""
         last: tuple[int, int] | None = None
         (part,) = self.decided([part])
-        before = self.counters.copy()
+        before = replace(self.counters)
         for left in range(_RENEWALS, -1, -1):
             try:
                 for found in ask(part):

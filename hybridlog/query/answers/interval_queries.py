@@ -105,10 +105,10 @@ class IntervalQueries:
         found = [*(self._lasting() if are_marks else self._moments())]
         known = self._session.snapshot().by_id
         # Windows that begin together are in the order of the recordings' keys.
-        ordered = sorted(found, key=lambda item: known[item[0]].key)
+        found.sort(key=lambda item: known[item[0]].key)
         chosen = [(name, known[name]) for name, _ in found]
         whole = {name: (0, END) if one.span is None else one.extent for name, one in chosen}
-        return Intervals(ordered).widened(before, after).within(whole)
+        return Intervals(found).widened(before, after).within(whole)
 
     def _lasting(self) -> Iterator[tuple[str, NDArray[np.int64]]]:
         """Begin and end of marks, by recording."""
@@ -119,13 +119,16 @@ class IntervalQueries:
     def _moments(self) -> Iterator[tuple[str, NDArray[np.int64]]]:
         """The time of each message as an interval without length, by recording."""
         if self._question.returns_all:
-            for part in self._planner.parts():
-                yield part.recording.id, _at(self._planner.times(part))
-            return
-        for run in self._planner.runs():
-            for index in np.unique(run.batch.channel).tolist():
-                times = run.batch.log_time[run.batch.channel == index]
-                yield run.channels[index].recording.id, _at(times)
+            found = ((p.recording.id, self._planner.times(p)) for p in self._planner.parts())
+        else:
+            found = (
+                (run.channels[index].recording.id, run.batch.log_time[run.batch.channel == index])
+                for run in self._planner.runs()
+                for index in np.unique(run.batch.channel).tolist()
+            )
+        for recording, times in found:
+            begin = placed(times)
+            yield recording, np.stack([begin, begin, np.ones_like(begin)], axis=1)
 
     def _spans(self) -> Iterator[tuple[Part, Span]]:
         """The one part of each recording, without a time range, with each span of the question."""
@@ -211,12 +214,6 @@ class IntervalQueries:
             raise UsageError(
                 f"{subject} uses all messages; it cannot be combined with limit, every or reverse."
             )
-
-
-def _at(times: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Intervals without length, of a message each."""
-    begin = placed(times)
-    return np.stack([begin, begin, np.ones_like(begin)], axis=1)
 
 
 def _bounded(part: Part, span: Span) -> Part:

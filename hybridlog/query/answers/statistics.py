@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from msgspec import Struct
-from msgspec.structs import replace
 
 from hybridlog.query.intervals import GAP_PERIODS, Intervals, mean_rate, usual_period
 from hybridlog.query.planner import Planner, log_spans, resolved
@@ -28,7 +27,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from numpy.typing import NDArray
 
-    from hybridlog.query.question import Counters, Part, Question, Span
+    from hybridlog.query.question import Counters, Question, Span
     from hybridlog.session import Session
     from hybridlog_storage.summary import RecordingSummary
 
@@ -223,7 +222,11 @@ def gaps(
     planner = Planner(session, question, counters)
     found: list[tuple[str, Times]] = []
     for summary, rows in groupby(log_spans(session, question), itemgetter(0)):
-        own = [(span, planner.times(p)) for _, span in rows for p in _parts(planner, summary, span)]
+        own = [
+            (span, planner.times(part))
+            for _, span in rows
+            for part in planner.parts_in(summary, windows_in(None, span))
+        ]
         limit = float(least)
         if periods is not None:
             steps = (np.diff(times) for _, times in own)
@@ -258,7 +261,8 @@ def check(
     )
     found = []
     for summary, span in [*log_spans(session, question), *silent]:
-        parts = {part.topic: part for part in _parts(planner, summary, span)}
+        within = planner.parts_in(summary, windows_in(None, span))
+        parts = {part.topic: part for part in within}
         entry = session.entry_of(summary)
         for topic in sorted({*question.topics} & entry.topics):
             part, counts = parts.get(topic), lost[summary.name, topic]
@@ -287,14 +291,6 @@ def _check_all(question: Question) -> None:
     """Refuse a question about some messages only."""
     if not question.returns_all or question.reverse:
         raise UsageError("Statistics are of all messages: leave out limit, every and reverse.")
-
-
-def _parts(planner: Planner, summary: RecordingSummary, span: Span) -> list[Part]:
-    """The topics of a question that have messages in a recording, in a span of it."""
-    parts = [*planner.parts_in(summary)]
-    if planner.question.is_unbounded:  # then the catalog knows their numbers
-        return parts
-    return [replace(part, windows=windows_in(None, span)) for part in parts]
 
 
 def _end(summary: RecordingSummary, span: Span) -> int:
