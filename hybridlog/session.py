@@ -294,7 +294,7 @@ class Session:
         """A predicate, or a MongoDB filter, on some topics of some recordings."""
         from hybridlog.query.predicate.mongo_filter import mongo_filter
         from hybridlog.query.predicate.parser import is_filter, parse
-        from hybridlog.query.predicate.types import check
+        from hybridlog.query.predicate.tree import check
 
         types = self.field_types(topics, recordings)
         if not isinstance(given, str) or is_filter(given):

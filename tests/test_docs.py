@@ -30,7 +30,7 @@ from benchmarks.samples import Journal
 from hybridlog.cli.app import EXIT_CODES, app
 from hybridlog.query import times, topics
 from hybridlog.query.predicate.parser import parse
-from hybridlog.query.predicate.types import check
+from hybridlog.query.predicate.tree import check
 from hybridlog_storage import errors
 from hybridlog_storage.errors import HybridlogError
 from hybridlog_storage.messages import Channel, Schema

@@ -444,7 +444,7 @@ def _between(source: Source, log: LogSet, given: tuple[str, str] | None) -> tupl
 
 def _remark(path: Path, report: RecordReport) -> int:
     """Print what is odd about a recording; returns the exit code."""
-    from hybridlog.query.answers.lost import coverage
+    from hybridlog.query.answers.completeness import coverage
     from hybridlog.record.losses import losses_of
 
     entry, code = report.entry, 0

@@ -18,8 +18,17 @@ from hybridlog.query.answers.completeness import lost_times
 from hybridlog.query.answers.marks import mark_topics, marks
 from hybridlog.query.intervals import Intervals, changing, clipped, holding
 from hybridlog.query.planner import Planner, log_spans
-from hybridlog.query.predicate.tree import And, Condition, Near, Node, Not, Or, Predicate, nodes
-from hybridlog.query.predicate.types import check
+from hybridlog.query.predicate.tree import (
+    And,
+    Condition,
+    Near,
+    Node,
+    Not,
+    Or,
+    Predicate,
+    check,
+    nodes,
+)
 from hybridlog.query.question import Counters, windows_in
 from hybridlog.query.times import TIME_LIMIT, DurationLike, parse_duration
 from hybridlog.schema.arrow_types import is_list, lengths_of

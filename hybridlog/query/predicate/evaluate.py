@@ -22,17 +22,18 @@ from hybridlog.query.predicate.tree import (
     And,
     Condition,
     Field,
+    FieldTypes,
     Node,
     Not,
     Or,
     Parts,
     Predicate,
     Slice,
+    Stat,
     Value,
     is_meta,
     root_of,
 )
-from hybridlog.query.predicate.types import FieldTypes, Stat
 from hybridlog.schema.arrow_columns import json_array, lists, structs, values_array
 from hybridlog.schema.arrow_types import (
     is_array,

@@ -19,14 +19,16 @@ from bson.regex import Regex
 from hybridlog.query.predicate.parser import RegexError, compile_regex
 from hybridlog.query.predicate.tree import (
     ALWAYS,
+    STATS,
     And,
     Condition,
     Field,
+    FieldTypes,
     MongoFilter,
     Predicate,
+    check,
     is_meta,
 )
-from hybridlog.query.predicate.types import STATS, FieldTypes, check
 from hybridlog.schema.definition_text import width_of
 from hybridlog_storage.errors import WhereError
 

@@ -69,6 +69,7 @@ from hybridlog.query.predicate.tree import (
     Predicate,
     Slice,
     Value,
+    error_at,
 )
 from hybridlog.query.times import parse_duration, parse_time
 from hybridlog_storage.errors import TimeError, WhereError
@@ -129,15 +130,6 @@ class Token(NamedTuple):
 def is_filter(text: str) -> bool:
     """True if a text is a MongoDB filter rather than a predicate."""
     return text.lstrip().startswith("{")
-
-
-def error_at(text: str, position: int, message: str) -> WhereError:
-    """The error: the message, the line of the text, a caret under the place."""
-    begin = text.rfind("\n", 0, position) + 1
-    line = text[begin:].partition("\n")[0]
-    # One column per character, without control characters.
-    line = "".join(char if char.isprintable() else "?" for char in line)
-    return WhereError(f"{message}\n  {line}\n  {' ' * (position - begin)}^")
 
 
 def tokenize(text: str) -> list[Token]:
