@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 import hybridlog as hl
 from hybridlog.drawing.series import series
 from hybridlog.drawing.times import lane_of
-from hybridlog.query import periods
+from hybridlog.query import intervals
 from hybridlog.query.answers.statistics import _Running
 from hybridlog_storage.errors import TimeError, TopicError, UsageError
 from hybridlog_storage.messages import Channel
@@ -66,7 +66,7 @@ def test_of_very_many_steps_the_first_tell_the_usual_one(calls: Calls, limit: Li
     sizes: list[int] = []
     calls(periods, "usual_period", lambda steps: sizes.append(len(steps)))
     limit(sampled_periods=20)
-    steps = periods.Steps()
+    steps = intervals.Steps()
     for begin in range(0, 600, 3):
         steps.add(np.arange(begin, begin + 3, dtype=np.int64))
         assert steps.usual_period() == 1
