@@ -64,7 +64,7 @@ def test_gaps(
 
 def test_of_very_many_steps_the_first_tell_the_usual_one(calls: Calls, limit: Limit) -> None:
     sizes: list[int] = []
-    calls(periods, "usual_period", lambda steps: sizes.append(len(steps)))
+    calls(intervals, "usual_period", lambda steps: sizes.append(len(steps)))
     limit(sampled_periods=20)
     steps = intervals.Steps()
     for begin in range(0, 600, 3):
