@@ -167,35 +167,31 @@ def unescape(text: str, token: Token) -> str:
 
 
 def _token(text: str, kind: Kind, word: str, at: int) -> Token:
+    number: int | float = 0
+    try:
+        if kind == "time":
+            number = parse_time(word[2:-1], start=None, end=None)
+        elif kind == "number":
+            number = _number(word)
+    except TimeError as error:
+        raise error_at(text, at, str(error)) from None
     if kind == "path":
         return Token(kind, word, at, path=_parts(text, at, word), keyword=word.lower())
-    if kind == "number":
-        return _number(text, word, at)
-    if kind == "time":
-        try:
-            return Token(kind, word, at, parse_time(word[2:-1], start=None, end=None))
-        except TimeError as error:
-            raise error_at(text, at, str(error)) from None
-    if kind == "operator":
-        return Token(kind, word, at, keyword=word)
-    return Token(kind, word[1:-1] if kind == "string" else word[:-1], at)
+    inner = {"string": word[1:-1], "topic": word[:-1]}.get(kind, word)
+    return Token(kind, inner, at, number, keyword=word if kind == "operator" else "")
 
 
-def _number(text: str, word: str, at: int) -> Token:
+def _number(word: str) -> int | float:
+    """A number, or a duration in nanoseconds."""
     if len(word) > 400:
-        raise error_at(text, at, "the number has more than 400 characters")
+        raise TimeError("the number has more than 400 characters")
     if _INTEGER.fullmatch(word):
-        return Token("number", word, at, int(word, 16 if word[:2] in {"0x", "0X"} else 10))
-    if _FLOAT.fullmatch(word):
-        if float(word) == float("inf"):
-            problem = "the number is too large for a double; write inf if that is meant"
-            raise error_at(text, at, problem)
-        return Token("number", word, at, float(word))
-    try:
-        return Token("time", word, at, parse_duration(word))
-    except TimeError:
-        problem = f"{word!r} is neither a number nor a duration such as 500ms"
-        raise error_at(text, at, problem) from None
+        return int(word, 16 if word[:2] in {"0x", "0X"} else 10)
+    if not _FLOAT.fullmatch(word):
+        return parse_duration(word)
+    if math.isinf(float(word)):
+        raise TimeError("the number is too large for a double; write inf if that is meant")
+    return float(word)
 
 
 def _parts(text: str, begin: int, word: str) -> Parts:

@@ -131,7 +131,7 @@ def test_nan() -> None:
         ('x == "a\\q"', "escapes that JSON has not", 5),
         ('x == "\\ud800"', "escapes that JSON has not", 5),
         ("x == 'abc", "no meaning", 5),
-        ("x == 5furlongs", "nor a duration", 5),
+        ("x == 5furlongs", "is not a duration", 5),
         ("x == 1e999", "too large", 5),
         ("x == " + "9" * 500, "400 characters", None),
         ("x == t'noon'", "not a time", 5),
