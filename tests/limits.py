@@ -42,7 +42,7 @@ PLACES = {
     "planner_group_growth": "hybridlog.query.planner._GROUP_GROWTH",
     "document_slab_bytes": "hybridlog.schema.document._SLAB",
     "clients_wait_s": "hybridlog.index.of_store._CLIENTS_WAIT_S",
-    "playback_sent": "hybridlog.view.playback.server._MAX_SENT",
+    "playback_sent": "hybridlog.view.playback._MAX_SENT",
     "sql_seconds": "hybridlog.view.routes.ask.SQL_SECONDS",
     "export_piece_bytes": "hybridlog.view.routes.ask.PIECE",
     "catalog_busy_s": "hybridlog_storage.cells._WAIT_S",

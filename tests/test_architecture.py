@@ -71,7 +71,7 @@ ALLOWED = {
     "pydantic": ("hybridlog.view.tool_server",),
     "starlette": ("hybridlog.view",),
     "uvicorn": ("hybridlog.view.server",),
-    "websockets": ("hybridlog.view.playback.server",),
+    "websockets": ("hybridlog.view.playback",),
     "yaml": (
         "hybridlog.formats.rosbag2.writer",
         "hybridlog.formats.yaml_values",

@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("websockets", reason="websockets is not installed: no playback is tested")
 
 from tests.independent import Seen, read_bag
-from tests.view.playback.viewer import Viewer
+from tests.view.viewer import Viewer
 from tests.waiting import wait_for
 
 from .running import run, started

@@ -43,8 +43,7 @@ def open_command(given: _Given) -> None:
     import asyncio
 
     with extra("foxglove", "open needs websockets"):
-        from hybridlog.view.playback.server import PlaybackServer
-    from hybridlog.view.playback.played import PlayedLog
+        from hybridlog.view.playback import PlaybackServer, PlayedLog
 
     async def serve() -> None:
         stop, loop = asyncio.Event(), asyncio.get_running_loop()

@@ -21,11 +21,11 @@ pytest.importorskip("websockets", reason="websockets is not installed: no playba
 from websockets.exceptions import InvalidStatus
 
 import hybridlog as hl
-from hybridlog.view.playback.played import PlayedLog
+from hybridlog.view.playback import PlayedLog
 from hybridlog_storage.messages import Channel, Schema
 from tests.independent import Seen, read_mcap, write_mcap
 from tests.limits import Limit
-from tests.view.playback.viewer import SDK, WEBSOCKET, Data, State, Time, Viewer, served
+from tests.view.viewer import SDK, WEBSOCKET, Data, State, Time, Viewer, served
 
 S = 10**9
 BEGIN = 1_700_000_000 * S

@@ -1,6 +1,6 @@
-"""A Foxglove WebSocket server that plays a log; each viewer has a playback of its own.
+"""Plays a log to viewers over the Foxglove WebSocket protocol; each has a playback of its own.
 
-Requests of a viewer and what is due are handled in turns. The playback waits for its viewer: the
+What a viewer asks and what is due take turns in one loop. The playback waits for its viewer: the
 log time then runs slower, and no message is dropped. Only subscribed topics are read.
 """
 
@@ -10,30 +10,34 @@ import asyncio
 import base64
 import contextlib
 import json
+import math
 import secrets
 import struct
 import time
-from collections.abc import AsyncIterator, Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Generator, Iterator, Sequence
 from http import HTTPStatus
-from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple, TypeAlias
 
 import msgspec
 import numpy as np
+from msgspec.structs import replace
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 
 from hybridlog.live.sources.foxglove.protocol import MESSAGE_DATA, SUBPROTOCOLS
+from hybridlog.query.intervals import Intervals
+from hybridlog.query.latching import depth_of, is_video
+from hybridlog.query.query import Query, at_time, channels_of, narrowed, spans_of
 from hybridlog.view.guard import Admission, listen
-from hybridlog.view.playback.played import PlaybackClock
-from hybridlog_storage.errors import HybridlogError, UsageError
+from hybridlog_storage.errors import HybridlogError, TimeError, TopicError, UsageError
 
 if TYPE_CHECKING:
     from websockets.http11 import Request as HttpRequest
     from websockets.http11 import Response
     from websockets.typing import Subprotocol
 
-    from hybridlog.view.playback.played import Blocks, PlayedChannel, PlayedLog
-    from hybridlog_storage.messages import Batch
+    from hybridlog.query.question import RecordedChannel
+    from hybridlog_storage.messages import Batch, Channel
 
 _WITH_PLAYBACK: Final = SUBPROTOCOLS[0]
 _MAX_VIEWERS: Final = 16
@@ -45,6 +49,146 @@ _STEP_S: Final = 0.002  # of waiting, at least, so that many messages are sent a
 _LATE_S: Final = 0.1  # of playing; later than this, the clock waits for the viewer
 _PING_S: Final = 10.0
 _CLOSE_S: Final = 1.0
+
+
+# What is played.
+
+
+Blocks: TypeAlias = "Generator[Batch, None, None]"
+"""Messages in order of log time; `channel` is the number of the played channel, 0 for none."""
+
+
+class PlayedLog:
+    """The messages of a query, as a log that is played.
+
+    Args:
+        query: Topics, recordings, range of log time and predicate.
+
+    Attributes:
+        channels: What viewers can subscribe to, numbered from 1 on: a channel stands for those of
+            all recordings with the same topic, encoding and type. Messages whose payload was
+            dropped under pressure are not among them.
+        begin: First log time, ns.
+        end: Last log time, ns.
+
+    Raises:
+        TimeError: The range is outside of all recordings, or these have no messages.
+    """
+
+    def __init__(self, query: Query) -> None:
+        spans = spans_of(query)
+        if not spans:
+            raise TimeError("There are no messages to play.")
+        times = np.array([(begin, end, 0) for begin, end in spans.values()], np.int64)
+        self._begin, self._end = times[:, 0], times[:, 1]
+        self.begin, self.end = int(self._begin.min()), int(self._end.max()) - 1
+        whole = replace(query.question, bounds=None, during=None, clock="log")
+        self._whole = Query(query.source.now(), whole, conditions=query.conditions)
+        params = Intervals((id_, times[row : row + 1]) for row, id_ in enumerate(spans))
+        during = query.question.during
+        self._during = params if during is None else during.common(params)
+        self.channels: list[Channel] = []
+        self._ids: dict[tuple[str, int], int] = {}
+        self._latching: set[str] = set()
+        numbers: dict[object, int] = {}
+        for each in channels_of(query):
+            if each.is_reduced:
+                continue
+            own = each.channel
+            key = own.topic, own.message_encoding, own.schema
+            if key not in numbers:
+                self.channels.append(own)
+            self._ids[each.recording.id, each.channel_id] = numbers.setdefault(
+                key, len(self.channels)
+            )
+            if depth_of(own) or is_video(own):
+                self._latching.add(own.topic)
+
+    def next_covered(self, position: int) -> int:
+        """The next log time that a recording covers, ns; the same one if it is, or no more is."""
+        is_covered = (self._begin <= position) & (position < self._end)
+        later = self._begin[self._begin > position]
+        return position if is_covered.any() or not len(later) else int(later.min())
+
+    def after(self, topics: Collection[str], position: int) -> Blocks:
+        """All messages of some topics behind a log time, ns, in order."""
+        if not topics or position >= self.end:
+            return
+        query = narrowed(self._whole, *topics).during(self._during).between(position + 1, None)
+        for batch, channels in query.batches():
+            yield self._numbered(batch, channels)
+
+    def current(self, topics: Collection[str], position: int) -> Blocks:
+        """The messages of some topics that are current at a log time, ns.
+
+        They are the latched ones that a subscriber receives which joins then, the frames of
+        video from the last key frame on, and the last message of every other topic. Messages
+        from before the played range are not current, unless they are of the former two.
+        """
+        if not topics:
+            return
+        if found := self._latching.intersection(topics):
+            latched = narrowed(self._whole, *found).between(min(position + 1, self.end), None)
+            for batch, channels in latched.latched(original_times=True):
+                yield self._numbered(batch, channels)
+            if position >= self.end:
+                yield from self.after(found, self.end - 1)
+        if position >= self.begin:
+            for topic in topics:
+                if topic not in self._latching:
+                    yield from self._last(topic, position)
+
+    def _last(self, topic: str, position: int) -> Iterator[Batch]:
+        """The last message of a topic until a log time, ns, if the range has one."""
+        try:
+            query = at_time(narrowed(self._whole, topic), position)
+        except TopicError:
+            return  # the topic has none yet
+        for batch, channels in query.during(self._during).batches():
+            yield self._numbered(batch, channels)
+
+    def _numbered(self, batch: Batch, channels: Sequence[RecordedChannel]) -> Batch:
+        ids = [self._ids.get((c.recording.id, c.channel_id), 0) for c in channels]
+        return replace(batch, channel=np.array(ids, np.int32)[batch.channel])
+
+
+SLOWEST: Final = 0.01
+FASTEST: Final = 100.0
+"""Limits of the speed, in seconds of log time a second."""
+
+
+class PlaybackClock:
+    """Log time, ns, during a playback; it stands still until it runs.
+
+    Attributes:
+        speed: Seconds of log time a second.
+        is_running: The time runs.
+    """
+
+    def __init__(self, position: int, speed: float) -> None:
+        self.speed, self.is_running = 1.0, False
+        self._position = self._since = 0
+        self.set(position, speed=speed)
+
+    @property
+    def position(self) -> int:
+        """Log time now, ns."""
+        passed = time.monotonic_ns() - self._since if self.is_running else 0
+        return self._position + int(passed * self.speed)
+
+    def set(
+        self, position: int | None = None, *, runs: bool | None = None, speed: float = math.nan
+    ) -> None:
+        """Go to a log time, ns, run or stand still, and change the speed, within its limits.
+
+        What is not given stays; so does the speed if it is NaN.
+        """
+        self._position = self.position if position is None else position
+        self._since = time.monotonic_ns()
+        if runs is not None:
+            self.is_running = runs
+        if not math.isnan(speed):
+            self.speed = min(max(speed, SLOWEST), FASTEST)
 
 
 # The protocol. Times are log times in ns, speeds seconds of log time a second.
@@ -98,10 +242,10 @@ _Text = Subscribe | Unsubscribe
 Request = _Text | Control
 
 
-def _described(each: PlayedChannel) -> dict[str, Any]:
+def _described(number: int, channel: Channel) -> dict[str, Any]:
     """A channel as it is offered; one without a definition has an empty one."""
-    channel, schema = each.channel, each.channel.schema
-    found = {"id": each.id, "topic": channel.topic, "encoding": channel.message_encoding}
+    schema = channel.schema
+    found = {"id": number, "topic": channel.topic, "encoding": channel.message_encoding}
     if schema is None or not schema.encoding:
         return {**found, "schemaName": schema.name if schema else "", "schema": ""}
     text = schema.data.decode("utf-8", "replace")
@@ -261,47 +405,33 @@ class _Playback:
     def __init__(
         self, connection: ServerConnection, log: PlayedLog, speed: float, say: Callable[[str], None]
     ) -> None:
-        self._connection = connection
-        self._log = log
-        self._say = say
-        self._topics = {each.id: each.channel.topic for each in log.channels}
+        self._connection, self._log, self._say = connection, log, say
+        self._topics = {number: one.topic for number, one in enumerate(log.channels, 1)}
         self._subscriptions: dict[int, int] = {}  # their numbers by channel
-        self._turn = asyncio.Lock()
-        self._asked = asyncio.Event()
         self._clock = PlaybackClock(log.begin, speed)
         self._sent = log.begin - 1  # log time until which everything is sent
-        self._next: int | None = None  # log time of the next message that is read
         self._clock_sent_s = 0.0  # when the viewer was told the time
-        self._has_begun = self._has_ended = self._is_waiting = False
+        self._has_begun = self._has_ended = False
         self._reading: _Reading | None = None
 
     async def run(self) -> None:
-        """Play until the viewer goes."""
-        offered = [*map(_described, self._log.channels)]
+        """Play until the viewer goes: it is heard after each part of what is due."""
+        offered = [_described(number, one) for number, one in enumerate(self._log.channels, 1)]
         await self._connection.send(json.dumps({"op": "advertise", "channels": offered}))
         await self._send_state()
-        playing = asyncio.create_task(self._play())
-        try:
-            async for message in self._connection:
-                self._is_waiting = True
-                async with self._in_turn():
-                    self._is_waiting = False
-                    await self._obey(message)
-                self._asked.set()
-        finally:
-            playing.cancel()
-            with contextlib.suppress(asyncio.CancelledError, ConnectionClosed):
-                await playing
-
-    @contextlib.asynccontextmanager
-    async def _in_turn(self) -> AsyncIterator[None]:
-        """One after the other; where messages cannot be read, the playback pauses and says so."""
-        async with self._turn:
+        seconds: float | None = None
+        while True:
+            message = None
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(seconds):
+                    message = await self._connection.recv()
             try:
-                yield
-            except HybridlogError as error:
+                if message is not None:
+                    await self._obey(message)
+                seconds = await self._send_due()
+            except HybridlogError as error:  # messages cannot be read
                 self._clock.set(runs=False)
-                self._reading = None
+                self._reading = seconds = None
                 self._say(str(error))
                 await self._connection.send(problem(str(error)))
                 await self._send_state()
@@ -377,43 +507,31 @@ class _Playback:
 
     # Messages.
 
-    async def _play(self) -> None:
-        """Send what is due, until cancelled."""
-        while True:
-            async with self._in_turn():
-                await self._send_due()
-            seconds = _TICK_S if self._clock.is_running else None
-            if seconds is not None and self._next is not None:
-                ahead = (self._next - self._clock.position) / self._clock.speed / 1e9
-                seconds = min(max(ahead, _STEP_S), _TICK_S)
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(seconds):
-                    await self._asked.wait()
-            self._asked.clear()
-
-    async def _send_due(self) -> None:
-        """Send all messages until the time of the clock."""
+    async def _send_due(self) -> float | None:
+        """Send what is due, or a part of it; the seconds until more is, None if the time stands."""
         if self._reading is None and not self._clock.is_running:
-            return  # a subscriber gets all messages of this time
-        before = self._sent
-        self._next = await self._next_time()
-        while self._next is not None:
-            # Messages of the same time belong together, even if a request waits.
-            now = max(self._clock.position, self._sent)
-            if self._next > now or (self._next > self._sent and self._is_waiting):
-                break
+            return None  # a subscriber gets all messages of this time
+        before, following = self._sent, await self._next_time()
+        while following is not None and following <= max(self._clock.position, self._sent):
             assert self._reading is not None
-            batch, self._sent = self._reading.take(now)
+            batch, self._sent = self._reading.take(max(self._clock.position, self._sent))
             await self._send(batch, self._topics)
             if self._clock.position - self._sent > _LATE_S * self._clock.speed * 1e9:
                 self._clock.set(self._sent)
-            self._next = await self._next_time()
-        last = self._log.end if self._next is None else self._next - 1
+            following = await self._next_time()
+            if following != self._sent:
+                break  # messages of the same time belong together, even if a request waits
+        last = self._log.end if following is None else following - 1
         self._sent = max(self._sent, min(self._clock.position, last))
         if self._sent > before and time.monotonic() - self._clock_sent_s > _TICK_S:
             self._clock_sent_s = time.monotonic()
             await self._connection.send(time_now(self._sent))
         await self._go_on()
+        ahead = math.inf if following is None else following - self._clock.position
+        if ahead <= 0:
+            return 0.0
+        is_running = self._clock.is_running
+        return min(max(ahead / self._clock.speed / 1e9, _STEP_S), _TICK_S) if is_running else None
 
     async def _next_time(self) -> int | None:
         return await self._reading.next_time() if self._reading is not None else None

@@ -14,8 +14,7 @@ from typing import Any, NamedTuple, Self
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin, Subprotocol
 
-from hybridlog.view.playback.played import PlayedLog
-from hybridlog.view.playback.server import PlaybackServer
+from hybridlog.view.playback import PlaybackServer, PlayedLog
 
 SDK = "foxglove.sdk.v1"
 WEBSOCKET = "foxglove.websocket.v1"

@@ -1,1 +1,0 @@
-"""Playback: plays messages of a store to viewers over the Foxglove WebSocket protocol."""
