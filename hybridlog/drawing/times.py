@@ -123,25 +123,43 @@ class Match(NamedTuple):
     seq: int
 
 
+class Episode(NamedTuple):
+    """Matches of one interval in which the predicate holds: the first, its end, their number."""
+
+    first: Match
+    end: int
+    n: int
+
+
 class Matches:
     """The messages of one topic of one recording that satisfy a predicate, in memory.
 
     A picture of them at any zoom reads nothing. The query has no time range, `limit` and `every`;
     more than `MAX_MATCHES` are refused.
+
+    Attributes:
+        episodes: Number of episodes. A match beside others of its time, which end it, is one.
+        size: Memory, bytes.
     """
 
     def __init__(self, query: Query) -> None:
         found = [*_bounded(match_times(query.source.now(), query.question, query.counters))]
-        self._times = np.concatenate([np.empty(0, np.int64), *(one.log_time for one in found)])
-        self._seqs = np.concatenate([np.empty(0, np.int64), *(one.seq for one in found)])
+        none = np.empty(0, np.int64)
+        self._times = np.concatenate([none, *(one.log_time for one in found)])
+        self._seqs = np.concatenate([none, *(one.seq for one in found)])
         queries = IntervalQueries(query.source.now(), query.question, query.counters)
         held = [rows[:, :2].copy() for _, rows in queries.held(None)]
         self._held = np.concatenate([np.empty((0, 2), np.int64), *held])
-
-    @property
-    def size(self) -> int:
-        """Its memory, bytes."""
-        return self._times.nbytes + self._seqs.nbytes + self._held.nbytes
+        own = np.searchsorted(self._held[:, 0], placed(self._times), "right") - 1
+        ends = np.append(self._held[:, 1], 0)[own]
+        is_alone = placed(self._times) >= ends
+        is_first = np.append(True, own[1:] != own[:-1])[: len(own)] | is_alone
+        is_first[1:] |= is_alone[:-1]
+        self._firsts = np.flatnonzero(is_first)
+        self._ends = np.maximum(ends, self._times)[self._firsts]
+        self.episodes = len(self._firsts)
+        arrays = (self._times, self._seqs, self._held, self._firsts, self._ends)
+        self.size = sum(one.nbytes for one in arrays)
 
     def ticks(self, edges: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Log time of the first match, ns, and number of matches, of each pixel that has any.
@@ -150,7 +168,7 @@ class Matches:
         """
         begins = np.searchsorted(placed(self._times), edges)
         counts = np.diff(begins)
-        return placed(self._times)[begins[:-1][counts > 0]], counts[counts > 0]
+        return self._times[begins[:-1][counts > 0]], counts[counts > 0]
 
     def bands(self, span: Span, width: int) -> NDArray[np.int64]:
         """The intervals in which the predicate holds, joined where a picture cannot tell.
@@ -166,22 +184,25 @@ class Matches:
         begins = np.concatenate([[True], found[1:, 0] - found[:-1, 1] >= width])
         return np.stack([found[begins, 0], found[np.append(begins[1:], True), 1]], axis=1)
 
-    def beside(self, place: Match, count: int, *, earlier: bool) -> list[Match]:
-        """The first matches behind a place, or the last ones in front of it, in order.
+    def beside(self, place: Match, count: int, *, earlier: bool) -> list[Episode]:
+        """The first episodes behind a place, or the last ones in front of it, in order.
 
-        The place is a match, which is not among them, or a time with the arrival number -1.
+        The place is the first match of one, which is not among them, or a time with the arrival
+        number -1.
         """
         begin = self.count_before(place if earlier else Match(place.time, place.seq + 1))
-        rows = slice(max(begin - count, 0), begin) if earlier else slice(begin, begin + count)
-        return [*map(Match, self._times[rows].tolist(), self._seqs[rows].tolist())]
+        last = begin if earlier else begin + count
+        rows = slice(max(begin - count, 0) if earlier else begin, last)
+        firsts = self._firsts[rows]
+        numbers = np.diff(np.append(self._firsts, len(self._times)))[rows]
+        matches = map(Match, self._times[firsts].tolist(), self._seqs[firsts].tolist())
+        return [*map(Episode, matches, self._ends[rows].tolist(), numbers.tolist())]
 
     def count_before(self, place: Match) -> int:
-        """Number of matches in front of a place; see `beside`."""
-        low, high = (int(np.searchsorted(self._times, place.time, side)) for side in _SIDES)
-        return low + int(np.searchsorted(self._seqs[low:high], place.seq))
-
-
-_SIDES: Final = ("left", "right")
+        """Number of episodes that begin in front of a place; see `beside`."""
+        times, seqs = self._times[self._firsts], self._seqs[self._firsts]
+        low, high = np.searchsorted(times, place.time), np.searchsorted(times, place.time, "right")
+        return int(low + np.searchsorted(seqs[low:high], place.seq))
 
 
 def _bounded(found: Iterable[RowBatch]) -> Iterator[RowBatch]:

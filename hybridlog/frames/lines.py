@@ -180,8 +180,7 @@ def shown(table: pa.Table, most: int) -> dict[str, Any]:
 
     `columns` are pairs of the name and whether it is a number, `columns_left_out` their number;
     `rows`, texts; `times`, the log time of each row, ns since 1970, the last one of its microsecond
-    where only a timestamp tells it, and `recordings`, the name of its recording: both empty without
-    such columns.
+    where only a timestamp tells it: empty without such a column.
     """
     first = table.select(range(min(table.num_columns, most)))
     return {
@@ -192,7 +191,6 @@ def shown(table: pa.Table, most: int) -> dict[str, Any]:
         "columns_left_out": table.num_columns - first.num_columns,
         "rows": cells(first, exact=True),
         "times": _times(table),
-        "recordings": _values(table, "recording", pa.types.is_string),
     }
 
 

@@ -4,23 +4,26 @@ from __future__ import annotations
 
 import asyncio
 import json
-import re
 import struct
 import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from copy import copy
-from typing import TYPE_CHECKING, Any, Final, TypeAlias
+from functools import wraps
+from inspect import signature
+from typing import TYPE_CHECKING, Annotated, Any, Final, TypeAlias, get_origin, get_type_hints
 
-from msgspec import Struct
+from msgspec import Meta, Struct, ValidationError, convert, defstruct
+from msgspec.structs import asdict
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 from starlette.routing import Route
 
 from hybridlog.query.answers.current import next_time
+from hybridlog.query.predicate.parser import MAX_TEXT
 from hybridlog.query.times import TIME_LIMIT
 from hybridlog_storage.errors import (
     HybridlogError,
@@ -51,19 +54,43 @@ REFRESH_S: Final = 2.0
 """Time from one look for new recordings to the next, at least."""
 
 
+MAX_OFFSET: Final = TIME_LIMIT - 1
+"""Greatest time since the start of a recording, ns."""
+MAX_PIXELS: Final = 8192
+"""Greatest width that is drawn."""
+
+# Types of parameters; times are since the start of the recording, ns.
+Text: TypeAlias = Annotated[str, Meta(max_length=1024)]
+Question: TypeAlias = Annotated[str, Meta(max_length=MAX_TEXT)]
+Offset: TypeAlias = Annotated[int, Meta(ge=-MAX_OFFSET, le=MAX_OFFSET)]
+Pixels: TypeAlias = Annotated[int, Meta(ge=1, le=MAX_PIXELS)]
+Seq: TypeAlias = Annotated[int, Meta(ge=-1, le=END)]
+
+
+def moment_of(start: int, offset: int) -> int:
+    """A time since the start, ns, as one since 1970, cut to what is a time."""
+    return min(max(start + offset, 0), TIME_LIMIT - 1)
+
+
+def part_of(start: int, begin: int, end: int) -> tuple[int, int]:
+    """A range of times since the start, ns, as one since 1970, cut to what is a time; not empty."""
+    if end <= begin:
+        raise UsageError("end is greater than begin.")
+    last = TIME_LIMIT - 1
+    return min(max(start + begin, 0), last - 1), min(max(start + end, 1), last)
+
+
 class Context:
     """The store that is shown.
 
     Attributes:
         store: That store; at one moment while an answer is worked out.
         turns: Held by each answer that is worked out.
-        matching: Held while matches are looked for.
     """
 
     def __init__(self, store: Store) -> None:
         self.store = store
         self.turns = threading.BoundedSemaphore(MAX_WORKING)
-        self.matching = threading.Lock()
         self._looking, self._looked = threading.Lock(), time.monotonic()
 
     def of_now(self) -> Context:
@@ -76,10 +103,6 @@ class Context:
         found.store = self.store.snapshot()
         return found
 
-    def recording(self, params: RequestParams) -> RecordingEntry:
-        """The recording that the parameter `recording` names by its id or name."""
-        return self.store.entry(params.text("recording"))
-
     def query(self, recording: RecordingEntry, *topics: str) -> Query:
         """A query about topics, by their full names, of one recording."""
         known = {channel.topic for channel in recording.channels}
@@ -88,10 +111,10 @@ class Context:
                 raise TopicError(f"{recording.name} has no topic {topic!r}.")
         return self.store.query(topics, [recording.id])
 
-    def topic(self, params: RequestParams) -> tuple[RecordingEntry, Query]:
-        """The recording, and a query about its topic that the parameter `topic` names."""
-        recording = self.recording(params)
-        return recording, self.query(recording, params.text("topic"))
+    def topic(self, recording: str, topic: str) -> tuple[RecordingEntry, Query]:
+        """A recording by its id or name, and a query about a topic of it."""
+        entry = self.store.entry(recording)
+        return entry, self.query(entry, topic)
 
 
 def start_of(recording: RecordingEntry | RecordingSummary) -> int:
@@ -106,40 +129,67 @@ def extent(recording: RecordingEntry) -> tuple[int, int]:
     return (begin, end) if begin < end else (recording.created, recording.created)
 
 
-Answer: TypeAlias = "Callable[[Context, RequestParams], Any]"
-"""Works out an answer: plain values, which become JSON, or a response."""
+def route(
+    path: str, turns: threading.Semaphore | None = None
+) -> Callable[[Callable[..., Any]], Route]:
+    """Makes a route of a function that works out an answer: plain values, or a response.
 
-
-def route(path: str, answer: Answer, turns: threading.Semaphore | None = None) -> Route:
-    """A route that answers in a thread when it is its turn, and stops when the client has gone.
-
-    The path is that below the token. The turns are the context's, unless others are given.
+    It takes the context, and the parameters of the request by the names and types of its own. It
+    runs in a thread when it is its turn, of the context's unless others are given, and stops when
+    the client has gone. The path is that below the token.
     """
 
-    def answered(request: Request, given_up: threading.Event) -> Response:
-        context: Context = request.app.state.context
-        params = RequestParams(request.query_params)
-        try:
-            with until_given_up(given_up), held(turns or context.turns):
-                found = answer(context.of_now(), params)
-            return found if isinstance(found, Response) else json_response(found)
-        except HybridlogError as error:
-            return error_response(error)
-        except GivenUpError:
-            return error_response(ResourceError("The query was stopped."))
+    def made(answer: Callable[..., Any]) -> Route:
+        taken = _taken_by(answer)
 
-    async def endpoint(request: Request) -> Response:
-        given_up = threading.Event()
-        watching = asyncio.create_task(_wait_until_gone(request, given_up))
-        try:
-            return await run_in_threadpool(answered, request, given_up)
-        finally:
-            given_up.set()
-            watching.cancel()
-            with suppress(asyncio.CancelledError):
-                await watching
+        def answered(request: Request, given_up: threading.Event) -> Response:
+            context: Context = request.app.state.context
+            try:
+                given = taken(request.query_params)
+                with until_given_up(given_up), held(turns or context.turns):
+                    found = answer(context.of_now(), **given)
+                return found if isinstance(found, Response) else json_response(found)
+            except HybridlogError as error:
+                return error_response(error)
+            except GivenUpError:
+                return error_response(ResourceError("The query was stopped."))
 
-    return Route(path, endpoint, name=path)
+        @wraps(answer)
+        async def endpoint(request: Request) -> Response:
+            given_up = threading.Event()
+            watching = asyncio.create_task(_wait_until_gone(request, given_up))
+            try:
+                return await run_in_threadpool(answered, request, given_up)
+            finally:
+                given_up.set()
+                watching.cancel()
+                with suppress(asyncio.CancelledError):
+                    await watching
+
+        return Route(path, endpoint, name=path)
+
+    return made
+
+
+def _taken_by(answer: Callable[..., Any]) -> Callable[[QueryParams], dict[str, Any]]:
+    """What takes the parameters of an answer from a request; wrong and missing ones are refused."""
+    kinds = get_type_hints(answer, include_extras=True)
+    _, *own = signature(answer).parameters.values()
+    fields = [
+        (one.name, kinds[one.name], *([] if one.default is one.empty else [one.default]))
+        for one in own
+    ]
+    form = defstruct("Parameters", fields, kw_only=True)
+    lists = {name for name, kind in get_type_hints(answer).items() if get_origin(kind) is list}
+
+    def taken(given: QueryParams) -> dict[str, Any]:
+        values = {name: given.getlist(name) if name in lists else given[name] for name in given}
+        try:
+            return asdict(convert(values, form, strict=False))
+        except ValidationError as error:
+            raise UsageError(f"{error}.") from error
+
+    return taken
 
 
 async def _wait_until_gone(request: Request, given_up: threading.Event) -> None:
@@ -185,18 +235,18 @@ class Current(Struct, frozen=True):
     until: str | None
 
 
-def current(context: Context, params: RequestParams) -> Current:
-    """The message of the parameters `recording`, `topic`, `at` and `seq`.
+def current(context: Context, recording: str, topic: str, at: int, seq: int = END) -> Current:
+    """The message of a topic that is current at a time since the start of the recording, ns.
 
     Of several messages at that time, it is the last one whose arrival number is at most `seq`.
     """
-    recording, query = context.topic(params)
-    start = start_of(recording)
-    moment = params.moment(start)
-    message = _message(query, moment, params.integer("seq", 0, END, END))
+    entry, query = context.topic(recording, topic)
+    start = start_of(entry)
+    moment = moment_of(start, at)
+    message = _message(query, moment, seq)
     # Of messages with the same time, the last one is current: the next one is later.
     later = moment if message is None else message.log_time_ns + 1
-    until = next_time(context.store.session, recording, query.topics[0], later)
+    until = next_time(context.store.session, entry, query.topics[0], later)
     return Current(
         message,
         None if message is None else str(message.log_time_ns - start),
@@ -238,75 +288,3 @@ def packed_response(header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]
         array.astype(array.dtype.newbyteorder("<"), copy=False).tobytes() for _, array in ordered
     ]
     return Response(b"".join(parts), media_type="application/octet-stream")
-
-
-MAX_OFFSET: Final = TIME_LIMIT - 1
-"""Greatest time since the start of a recording, ns."""
-MAX_PIXELS: Final = 8192
-"""Greatest width that is drawn."""
-
-_INTEGER: Final = re.compile(r"-?\d{1,19}", re.ASCII)
-
-
-class RequestParams:
-    """The parameters of one request, as in the URL; wrong and missing ones are refused."""
-
-    def __init__(self, parameters: QueryParams) -> None:
-        self._parameters = parameters
-
-    def has(self, name: str) -> bool:
-        """True if a parameter is given."""
-        return name in self._parameters
-
-    def text(self, name: str, default: str | None = None, *, longest: int = 1024) -> str:
-        """A text, at most so long; without a default it must be given."""
-        found = self.texts(name, most=1, longest=longest)
-        if not found and default is None:
-            raise UsageError(f"The parameter {name} is missing.")
-        return found[0] if found else str(default)
-
-    def texts(self, name: str, *, most: int, longest: int = 1024) -> list[str]:
-        """All values of a parameter that may be repeated, at most so many."""
-        found = self._parameters.getlist(name)
-        if len(found) > most:
-            raise UsageError(f"{name} is given {len(found)} times, at most {most} are possible.")
-        if any(len(text) > longest for text in found):
-            raise UsageError(f"{name} is too long: at most {longest} characters.")
-        return found
-
-    def word(self, name: str, words: Collection[str], default: str) -> str:
-        """One of some words."""
-        found = self.text(name, default)
-        if found not in words:
-            raise UsageError(f"{name} is one of {', '.join(words)}.")
-        return found
-
-    def integer(self, name: str, least: int, most: int, default: int | None = None) -> int:
-        """A whole number between two bounds, both inclusive; without a default it must be given."""
-        text = self.text(name, None if default is None else str(default))
-        if not _INTEGER.fullmatch(text) or not least <= int(text) <= most:
-            raise UsageError(f"{name} is a whole number from {least} to {most}.")
-        return int(text)
-
-    def pixels(self) -> int:
-        """The width of the picture, from 1 to `MAX_PIXELS`."""
-        return self.integer("pixels", 1, MAX_PIXELS)
-
-    def offset(self, name: str) -> int:
-        """A time since the start of the recording, ns."""
-        return self.integer(name, -MAX_OFFSET, MAX_OFFSET)
-
-    def moment(self, start: int) -> int:
-        """The time `at`, ns since 1970, cut to what is a time; offsets count from `start`."""
-        return min(max(start + self.offset("at"), 0), TIME_LIMIT - 1)
-
-    def span(self, start: int) -> tuple[int, int]:
-        """The range from `begin` to `end`, ns since 1970, cut to what is a time; never empty.
-
-        Offsets count from `start`.
-        """
-        begin, end = self.offset("begin"), self.offset("end")
-        if end <= begin:
-            raise UsageError("end is greater than begin.")
-        last = TIME_LIMIT - 1
-        return min(max(start + begin, 0), last - 1), min(max(start + end, 1), last)

@@ -8,9 +8,12 @@ and come from no other origin.
 from __future__ import annotations
 
 import errno
+import os
+import re
 import secrets
 import socket
 from collections.abc import Collection
+from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 from urllib.parse import SplitResult, urlsplit
 
@@ -21,6 +24,8 @@ from starlette.responses import PlainTextResponse
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 
@@ -152,6 +157,23 @@ class Admission(Struct, frozen=True, kw_only=True):
 def new_token() -> str:
     """A random token, 128 bits as text for a URL."""
     return secrets.token_urlsafe(16)
+
+
+def token_of(path: Path) -> str:
+    """The token in a file, which only its owner can read; a new one is put into one that is new."""
+    try:
+        with suppress(FileExistsError):
+            made = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+            with os.fdopen(made, "w") as file:
+                file.write(f"{new_token()}\n")
+        is_private, token = not path.stat().st_mode & 0o077, path.read_text("ascii").strip()
+    except (OSError, UnicodeError) as error:
+        raise UsageError(f"No token can be read from {path}: {error}") from error
+    if not is_private:
+        raise UsageError(f"Others may read the token in {path}: chmod 600 {path}")
+    if not re.fullmatch(r"[\w-]{16,200}", token):
+        raise UsageError(f"{path} has no token: 16 letters, digits, - or _, or more.")
+    return token
 
 
 def listen(port: int) -> socket.socket:

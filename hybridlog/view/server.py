@@ -18,6 +18,8 @@ from hybridlog.view.context import Context, broken_response
 from hybridlog.view.guard import HOST, Admission, Guard, listen, new_token
 
 if TYPE_CHECKING:
+    from starlette.responses import Response
+
     from hybridlog.store import Store
 
 _MAX_CONNECTIONS: Final = 256
@@ -26,13 +28,13 @@ _MAX_CONNECTIONS: Final = 256
 class ViewServer:
     """A server for one open store; the port of 127.0.0.1 (0 for a free one) is taken at once.
 
-    The URL has the token.
+    The URL has the token; without one, a new one is made.
     """
 
-    def __init__(self, store: Store, port: int = 0) -> None:
+    def __init__(self, store: Store, port: int = 0, token: str = "") -> None:
         self._socket = listen(port)
         self.port: int = self._socket.getsockname()[1]
-        token = new_token()
+        token = token or new_token()
         self.url = f"http://{HOST}:{self.port}/{token}/"
         config = uvicorn.Config(
             make_app(store, Admission(port=self.port, token=token)),
@@ -73,12 +75,21 @@ ROUTES: Final = (
 _STATIC: Final = Path(__file__).parent / "static"
 
 
+class _Page(StaticFiles):
+    """The files of the page: the browser keeps them, and asks whether they have changed."""
+
+    def file_response(self, *args: Any, **options: Any) -> Response:
+        found = super().file_response(*args, **options)
+        found.headers["Cache-Control"] = "no-cache"
+        return found
+
+
 def make_app(store: Store, rules: Admission) -> Guard:
     """The application, behind its guard."""
     routes = [
         route for name in ROUTES for route in import_module(f"hybridlog.view.routes.{name}").routes
     ]
-    routes.append(Mount("/", StaticFiles(directory=_STATIC, html=True), name="page"))
+    routes.append(Mount("/", _Page(directory=_STATIC, html=True), name="page"))
     app = Starlette(routes=routes, exception_handlers={Exception: broken_response})
     app.state.context = Context(store)
     return Guard(app, rules)

@@ -9,10 +9,6 @@ from __future__ import annotations
 
 import base64
 import json
-import os
-import signal
-import subprocess
-import sys
 import tempfile
 import threading
 from inspect import signature
@@ -33,7 +29,9 @@ from pydantic import Field
 
 from hybridlog import __version__
 from hybridlog.query.predicate.parser import MAX_TEXT
+from hybridlog.view.commands import run
 from hybridlog.wording import listed
+from hybridlog_storage.errors import HybridlogError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -47,8 +45,6 @@ MAX_ROWS: Final = 200
 MAX_MESSAGES: Final = 20
 MAX_BYTES: Final = 128 << 10
 """Bytes of the text of an answer."""
-MAX_PRINTED: Final = 16 << 20
-"""Bytes that a command may print."""
 MAX_PICTURE_BYTES: Final = 2 << 20
 _TURNS: Final = 2  # commands that run at once
 _INSTRUCTIONS: Final = """\
@@ -212,41 +208,13 @@ class Tools:
         return [json.loads(line) for line in printed.splitlines()], lacks
 
     def _run(self, command: str, options: Sequence[str], *words: str) -> tuple[bytes, list[str]]:
-        """What a command prints, and its remarks; an error if it fails or takes too long."""
-        program = [sys.executable, "-m", "hybridlog", command, f"--store={self._place}"]
-        with (
-            self._turns,
-            tempfile.TemporaryFile() as remarks,
-            subprocess.Popen(  # noqa: S603 - our own program
-                [*program, *options, "--", *words],
-                cwd="/",  # nothing in an answer says where this one runs
-                env={**os.environ, "HYBRIDLOG_READ_ONLY": "1"},
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=remarks,
-            ) as child,
-        ):
-            timer = threading.Timer(self._seconds, child.kill)
-            timer.start()
-            assert child.stdout is not None
-            printed = child.stdout.read(MAX_PRINTED + 1)
-            if len(printed) > MAX_PRINTED:
-                child.kill()
-            code = child.wait()
-            timer.cancel()
-            remarks.seek(0)
-            said = remarks.read(MAX_BYTES // 2).decode(errors="replace")
-        if len(printed) > MAX_PRINTED:
-            raise ToolError("The answer is too large: name fewer columns or fields.")
-        if code == -signal.SIGKILL:
-            raise ToolError(
-                f"The answer took longer than {self._seconds:g} s, so it was given up: narrow "
-                "the question down."
-            )
-        said = said.replace(self._place, "(the store)")
-        if code:
-            raise ToolError(said)
-        return printed, said.splitlines()
+        """What a command prints, and its remarks; no path is in either."""
+        try:
+            with self._turns:
+                found, lacks = run(self._place, command, options, *words, seconds=self._seconds)
+        except HybridlogError as error:
+            raise ToolError(str(error).replace(self._place, "(the store)")) from error
+        return found, [line.replace(self._place, "(the store)") for line in lacks]
 
 
 def _given(**values: str | Sequence[str | None] | None) -> list[str]:

@@ -7,7 +7,7 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from hybridlog.drawing.times import Match, Matches, aligned
+from hybridlog.drawing.times import Episode, Match, Matches, aligned
 from hybridlog_storage.errors import ResourceError
 from tests.limits import Limit
 
@@ -67,16 +67,29 @@ def test_bands_last_until_the_recording_ends(drive: Drive) -> None:
 
 
 @pytest.mark.parametrize("count", [1, 7, 5000])
-def test_matches_step_by_step(drive: Drive, count: int) -> None:
+def test_episodes_step_by_step(drive: Drive, count: int) -> None:
+    """Each other message matches, so each match is an episode that lasts until the next message."""
     matches = Matches(drive.store.topic("drive").where(PREDICATE))
-    want = matching(drive)
-    middle = want[300]
+    ends = np.append(drive.times[1:], drive.times[-1] + 1)
+    until = dict(zip(drive.times.tolist(), ends.tolist(), strict=True))
+    want = [Episode(one, until[one.time], 1) for one in matching(drive)]
+    assert matches.episodes == len(want)
+    middle = want[300].first
     for place in (middle, Match(middle.time, -1), Match(BASE - 9, -1), Match(2**62, -1)):
-        later = [one for one in want if one > place]
-        earlier = [one for one in want if one < place]
+        later = [one for one in want if one.first > place]
+        earlier = [one for one in want if one.first < place]
         assert matches.beside(place, count, earlier=False) == later[:count]
         assert matches.beside(place, count, earlier=True) == earlier[-count:]
         assert matches.count_before(place) == len(earlier)
+
+
+def test_an_episode_is_an_interval(drive: Drive) -> None:
+    query = drive.store.topic("drive").where("linear.z > 0.5")
+    found = Matches(query).beside(Match(0, -1), 5000, earlier=False)
+    assert [(one.first.time, one.end) for one in found] == [
+        (each.begin_ns, each.end_ns) for each in query.intervals()
+    ]
+    assert sum(one.n for one in found) == query.count() > len(found)
 
 
 def test_more_matches_than_fit_are_refused(drive: Drive, limit: Limit) -> None:

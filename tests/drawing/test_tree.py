@@ -11,8 +11,8 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.drawing.tree import MAX_NODES, MAX_SHOWN, MAX_TEXT, tree
-from hybridlog.view.routes.messages import LEVELS, Kind, Line, filtered, kind_of, lines
-from tests.odd_messages import HOSTILE, LOGS, LONG, MS, START, log_time, ros_channel
+from hybridlog.view.routes.messages import beside
+from tests.odd_messages import HOSTILE, LOGS, LONG, MS, START, ros_channel
 from tests.ros_values import ROS1, ROS2, message_of, plain_of
 
 
@@ -151,80 +151,20 @@ def test_random_messages(tmp_path: Path) -> None:
                 _compare(tree(found), value)
 
 
-TOPICS = {
-    "/rosout": "rosgraph_msgs/Log",
-    "/rosout2": "rcl_interfaces/msg/Log",
-    "/fox": "foxglove.Log",
-    HOSTILE: "std_msgs/String",
-}
-
-
-def log_of(odd: hl.Store, topic: str, level: str = "", text: str = "") -> tuple[hl.Query, Kind]:
-    kind = kind_of(TOPICS[topic])
-    return filtered(odd.query([topic]), kind, level, text), kind
-
-
-def written(topic: str, numbers: range) -> list[tuple[int, str, str, str]]:
-    found = []
-    for n in numbers:
-        level, name, text = LOGS[n]
-        is_plain = topic == HOSTILE
-        found.append(
-            (log_time(n), "" if is_plain else LEVELS[level], "" if is_plain else name, text)
-        )
-    return found
-
-
-def told(some: list[Line]) -> list[tuple[int, str, str, str]]:
-    return [
-        (line["time"], line.get("level", ""), line.get("name", ""), line["text"]) for line in some
-    ]
-
-
-@pytest.mark.parametrize("topic", TOPICS)
-def test_pages_of_lines_meet_without_missing_or_repeating_one(odd: hl.Store, topic: str) -> None:
-    """Pages of 7 lines, while 5 lines share each time."""
-    log = log_of(odd, topic)
-    found: list[Line] = []
-    time, seq = 0, -1
-    while page := lines(*log, time, seq, 7):
+@pytest.mark.parametrize("topic", ["/rosout", "/rosout2", "/fox", HOSTILE])
+def test_pages_of_rows_meet_without_missing_or_repeating_one(odd: hl.Store, topic: str) -> None:
+    """Pages of 7, while 5 messages share each time."""
+    query = odd.query([topic])
+    want = [(one.log_time_ns, one.seq) for one in query]
+    assert len(want) >= len(LOGS)
+    found: list[tuple[int, int]] = []
+    place = 0, -1
+    while page := [(one.log_time_ns, one.seq) for one in beside(query, *place, 7)]:
         found += page
-        time, seq = page[-1]["time"], page[-1]["seq"]
-    if topic == "/rosout":
-        cut = found.pop()
-        assert (cut["problem"], cut["time"]) == (True, log_time(len(LOGS)))
-        assert "cannot be read" in cut["text"]
-    assert told(found) == written(topic, range(len(LOGS)))
-    assert not any("problem" in line or "cut" in line for line in found)
-    back: list[Line] = []
-    time, seq = found[-1]["time"] + 1, 0
-    while page := lines(*log, time, seq, 7, before=True):
-        back = page + back
-        time, seq = page[0]["time"], page[0]["seq"]
-    assert back == found
-
-
-@pytest.mark.parametrize("topic", [name for name in TOPICS if name != HOSTILE])
-@pytest.mark.parametrize("level", ["debug", "warning", "fatal"])
-def test_lines_of_a_level_and_above(odd: hl.Store, topic: str, level: str) -> None:
-    log = log_of(odd, topic, level)
-    wanted = [
-        row for row in written(topic, range(len(LOGS))) if row[1] in LEVELS[LEVELS.index(level) :]
-    ]
-    assert told(lines(*log, 0, -1, 1000)) == wanted
-    assert log[0].count() == len(wanted)
-
-
-@pytest.mark.parametrize(
-    "text",
-    ["line 12", "LINE 12", '"quoted" \\', "(100%)", "é\n<b>", ".*", "[", "...", "NODE_2", "\0"],
-)
-def test_lines_with_a_text(odd: hl.Store, text: str) -> None:
-    for topic in ("/rosout", "/fox", HOSTILE):
-        log = log_of(odd, topic, text=text)
-        wanted = [
-            row
-            for row in written(topic, range(len(LOGS)))
-            if text.lower() in row[2].lower() or text.lower() in row[3].lower()
-        ]
-        assert told(lines(*log, 0, -1, 1000)) == wanted
+        place = page[-1]
+    assert found == want
+    found, place = [], (want[-1][0] + 1, 0)
+    while page := [(m.log_time_ns, m.seq) for m in beside(query, *place, 7, before=True)]:
+        found = page + found
+        place = page[0]
+    assert found == want

@@ -28,9 +28,10 @@ TIMES = [START + n * STEP for n in range(COUNT)]
 OFFSETS = [str(time - BOOT) for time in TIMES]
 DEFINITION = (
     b"uint64 id\nint64 sid\nfloat64 longitude\nfloat64 latitude\nfloat32 f\nuint64[2] ids\n"
+    b"uint8 even\n"
 )
 NUMBERS: dict[str, Any] = {"recording": "jump", "topic": "/num"}
-MATCHES = {**NUMBERS, "where": "longitude > 13"}
+MATCHES = {**NUMBERS, "where": "even == 1"}
 
 
 def row(n: int) -> dict[str, Any]:
@@ -41,7 +42,13 @@ def row(n: int) -> dict[str, Any]:
         "latitude": 52.520008123456789,
         "f": float(np.float32(0.1 + n / 1000)),
         "ids": [2**64 - 1 - n, 2**53 + 1],
+        "even": int(n % 2 == 0),
     }
+
+
+def packed(n: int) -> bytes:
+    *plain, ids, even = row(n).values()
+    return struct.pack("<Qqddf2QB", *plain, *ids, even)
 
 
 @pytest.fixture(scope="module")
@@ -53,12 +60,10 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
             with made.start(label) as recording:
                 recording.write(boot, b"\0", log_time=BOOT)
                 for n, time in enumerate(TIMES):
-                    payload = struct.pack("<Qqddf2Q", *list(row(n).values())[:-1], *row(n)["ids"])
-                    recording.write(numbers, payload, log_time=time + (label == "other"))
+                    recording.write(numbers, packed(n), log_time=time + (label == "other"))
         with made.start("twins") as recording:
             for n in range(12):
-                payload = struct.pack("<Qqddf2Q", *list(row(n).values())[:-1], *row(n)["ids"])
-                recording.write(numbers, payload, log_time=START + n // 3)
+                recording.write(numbers, packed(n), log_time=START + n // 3)
         yield made
 
 
@@ -72,28 +77,37 @@ def message_at(client: TestClient, at: str) -> dict[str, Any]:
     return {**found, "id": found["tree"]["items"][0]["text"]}
 
 
-def test_a_match_leads_to_its_message(client: TestClient) -> None:
-    listed = client.get("match-list", params={**MATCHES, "at": 0, "count": COUNT}).json()
-    assert [at for at, _ in listed["rows"]] == OFFSETS
-    for n, (at, _) in enumerate(listed["rows"]):
-        found = message_at(client, at)
-        assert (found["time"], found["id"]) == (at, str(row(n)["id"]))
-        assert found["until"] == (OFFSETS[n + 1] if n + 1 < COUNT else None)
+def test_an_episode_leads_to_its_first_message(client: TestClient) -> None:
+    """Every other message matches: each is an episode, until the next message."""
+    found = client.get("episodes", params={**MATCHES, "at": 0, "count": COUNT}).json()
+    assert (found["before"], found["all"]) == (0, COUNT // 2)
+    times = [*zip(OFFSETS[::2], OFFSETS[1::2], strict=True)]
+    assert [(at, end, n) for at, end, _, n in found["rows"]] == [(*one, 1) for one in times]
+    for n, (at, *_) in zip(range(0, COUNT, 2), found["rows"], strict=True):
+        shown = message_at(client, at)
+        assert (shown["time"], shown["id"]) == (at, str(row(n)["id"]))
+        assert shown["until"] == OFFSETS[n + 1]
         after = {**MATCHES, "at": int(at) + 1, "count": 1}
-        later = client.get("match-list", params=after).json()["rows"]
-        assert [at for at, _ in later] == OFFSETS[n + 1 : n + 2]
+        later = client.get("episodes", params=after).json()["rows"]
+        assert [one[0] for one in later] == OFFSETS[n + 2 : n + 3]
 
 
-def test_a_match_leads_to_its_message_among_others_of_its_time(client: TestClient) -> None:
+def test_an_episode_leads_to_its_message_among_others_of_its_time(client: TestClient) -> None:
+    """Three messages share each time; where the last one does not match, nothing holds."""
     asked = {**MATCHES, "recording": "twins"}
-    rows = client.get("match-list", params={**asked, "at": 0}).json()["rows"]
-    assert [at for at, _ in rows] == [str(n // 3) for n in range(12)]
-    for n, (at, seq) in enumerate(rows):
+    rows = client.get("episodes", params={**asked, "at": 0}).json()["rows"]
+    assert [(at, end, n) for at, end, _, n in rows] == [
+        ("0", "1", 2),
+        ("1", "1", 1),
+        ("2", "3", 2),
+        ("3", "3", 1),
+    ]
+    for n, (at, _, seq, _) in zip((0, 4, 6, 10), rows, strict=True):
         found = client.get("message", params={**asked, "at": at, "seq": seq}).json()
         assert (found["seq"], found["tree"]["items"][0]["text"]) == (seq, str(row(n)["id"]))
         assert found["until"] == (str(n // 3 + 1) if n < 9 else None)
-    before = {**asked, "at": 1, "seq": rows[2][1]}  # of the time before
-    assert client.get("message", params=before).json()["seq"] == rows[2][1]
+    before = {**asked, "at": 2, "seq": rows[1][2]}  # of the time before
+    assert client.get("message", params=before).json()["seq"] == rows[1][2] + 1  # the last one
 
 
 def test_values_of_a_plot_are_exact(client: TestClient) -> None:
@@ -120,53 +134,47 @@ def test_times_of_a_track_are_exact(client: TestClient) -> None:
     assert [str(time) for time in times] == OFFSETS
 
 
-SQL = "select {} from num where recording = 'jump' order by t"
+SQL = "select {} from num order by t"
 
 
 @pytest.mark.parametrize("column", ["t", "log_time", "t, log_time", "log_time, recording"])
 def test_rows_of_sql_lead_to_their_time(client: TestClient, column: str) -> None:
-    found = client.get("sql", params={"text": SQL.format(column)}).json()
+    found = client.get("sql", params={"recording": "jump", "text": SQL.format(column)}).json()
     # A timestamp leads behind all messages of its microsecond, at most to the last one of all.
     late = [str(min(time // 1000 * 1000 + 999, TIMES[-1]) - BOOT) for time in TIMES]
     assert found["at"] == (OFFSETS if column.startswith("t") else late)
-    assert found["recordings"] == ["jump"] * COUNT
 
 
 @pytest.mark.parametrize(
     "text",
     [
-        "select t from num order by t",  # of two recordings
-        "select 1700000000123456789 as t",  # of no recording
-        "select t, 'none' as recording from num where recording = 'jump'",
-        "select t + 1000000000 as t from num where recording = 'jump'",
-        "select 9000000000000000000 as t, 'jump' as recording",
-        "select timestamp '9999-01-01' as log_time, 'jump' as recording",
-        "select null::bigint as t, 'jump' as recording",
+        "select t + 1000000000 as t from num",
+        "select 9000000000000000000 as t",
+        "select timestamp '9999-01-01' as log_time",
+        "select null::bigint as t",
     ],
 )
 def test_other_rows_of_sql_lead_nowhere(client: TestClient, text: str) -> None:
-    found = client.get("sql", params={"text": text}).json()
+    found = client.get("sql", params={"recording": "jump", "text": text}).json()
     assert found["rows"]
     assert {*found["at"]} == {None}
 
 
 def test_values_of_sql_are_exact(client: TestClient) -> None:
     text = "select id, sid, longitude, f, {'at': latitude} as at from num where t = "
-    found = client.get("sql", params={"text": f"{text}{TIMES[7]} limit 1"}).json()
+    found = client.get(
+        "sql", params={"recording": "jump", "text": f"{text}{TIMES[7]} limit 1"}
+    ).json()
     want = row(7)
     values = [str(want[name]) for name in ("id", "sid", "longitude")]
     assert found["rows"] == [[*values, "0.107", f"{{at: {want['latitude']}}}"]]
 
 
-def test_a_row_of_sql_leads_into_its_recording(client: TestClient) -> None:
-    where = "where recording <> 'twins'"
-    text = f"select t, recording from num {where} order by t, recording limit 4"
-    found = client.get("sql", params={"text": text}).json()
-    assert found["recordings"] == ["jump", "other", "jump", "other"]
-    assert found["at"] == [str(int(OFFSETS[n // 2]) + n % 2) for n in range(4)]
-    boots = client.get("sql", params={"text": "select log_time, recording from boot"}).json()
-    assert boots["at"] == ["999", "999"]
-    assert sorted(boots["recordings"]) == ["jump", "other"]
+def test_sql_asks_the_recording_of_the_page(client: TestClient) -> None:
+    for label in ("jump", "other"):
+        text = "select count(*), any_value(recording) from num"
+        found = client.get("sql", params={"recording": label, "text": text}).json()
+        assert found["rows"] == [[str(COUNT), label]]
 
 
 MS = 10**6
@@ -222,14 +230,13 @@ def test_messages_at_the_ends_of_time(clocks: TestClient, label: str) -> None:
     for n in (0, 7, SENT - 3):  # the last time counts as the one before it
         found = clocks.get("message", params={**asked, "at": at[n]}).json()
         assert (found["time"], found["until"]) == (str(at[n]), str(at[n + 1]))
-    rows = clocks.get("match-list", params={**asked, "where": "v > 5", "at": at[-2], "count": 9})
-    assert [int(time) for time, _ in rows.json()["rows"]] == at[-2:]
-    assert rows.json()["before"] == SENT - 8
-    asked = {**asked, "where": "v > 5", "at": at[-1], "seq": 2**62, "direction": "earlier"}
-    rows = clocks.get("match-list", params={**asked, "count": 1}).json()
-    assert (rows["rows"][0][0], rows["before"]) == (str(at[-1]), SENT - 7)
-    text = f"select t, v from v where recording = '{label}' order by t desc limit 2"
-    found = clocks.get("sql", params={"text": text}).json()
+    found = clocks.get("episodes", params={**asked, "where": "v > 5", "at": at[-1]}).json()
+    assert (found["rows"], found["all"]) == ([], 1)
+    asked = {**asked, "where": "v > 5", "at": at[-1], "direction": "earlier"}
+    (episode,) = clocks.get("episodes", params={**asked, "count": 1}).json()["rows"]
+    assert (episode[0], episode[3]) == (str(at[6]), SENT - 6)
+    text = "select t, v from v order by t desc limit 2"
+    found = clocks.get("sql", params={"recording": label, "text": text}).json()
     assert found["at"] == [str(at[-1]), str(at[-2])]
 
 
@@ -241,11 +248,11 @@ def asked_on(page: Page, url: str, recording: str, *panels: dict[str, Any]) -> N
 
 
 def click(page: Page, n: int) -> None:
-    page.get_by_role("complementary").get_by_role("button", name=f"#{n + 1} ").first.click()
+    page.get_by_role("complementary").get_by_role("button", name=f"#{n // 2 + 1} ").first.click()
 
 
 def is_shown(page: Page, n: int) -> None:
-    page.locator("li[aria-current]", has_text=f"#{n + 1} ").wait_for()
+    page.locator("li[aria-current]", has_text=f"#{n // 2 + 1} ").wait_for()
     page.locator(".tree .leaf", has_text=f"id{row(n)['id']}").first.wait_for()
 
 
@@ -269,12 +276,12 @@ def test_the_page_shows_what_is_clicked(page: Page, store: hl.Store) -> None:
 
     with served(store) as url:
         asked_on(page, url, "jump", *panels)
-        for n in (2, 99, 50):
+        for n in (2, 98, 50):
             click(page, n)
             check(n)
         page.locator("body").press("n")
-        check(51)
-        for n in range(50, 40, -1):
+        check(52)
+        for n in range(50, 40, -2):
             page.keyboard.press("p")
             check(n)
         page.keyboard.press("End")

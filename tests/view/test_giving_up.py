@@ -15,11 +15,12 @@ import hybridlog as hl
 from benchmarks.simulator.write import write_bag
 from hybridlog.view import context
 from hybridlog.view.guard import Admission
+from hybridlog.view.routes import ask
 from hybridlog.view.server import make_app
 from hybridlog_storage.cache import Kind
 from tests.limits import Limit
 from tests.view.conftest import PORT, ROBOT, TOKEN
-from tests.view.test_ask import asked_for
+from tests.view.test_ask import ENDLESS, asked_for
 
 if TYPE_CHECKING:
     pass
@@ -32,14 +33,16 @@ NEAR = {**SCAN, "where": "ranges.min < 0.8"}
 QUESTIONS: dict[str, dict[str, Any]] = {
     "ask": {**NEAR, "where": "ranges[7] < 0.8"},
     "matches": {**NEAR, **WHOLE},
-    "match-list": {**NEAR, "at": 0},
+    "episodes": {**NEAR, "at": 0},
     "series": {**SCAN, **WHOLE, "field": "ranges.min"},
     "track": {"recording": "robot", "topic": "/odom", "pixels": 100},
-    "log": {"recording": "robot", "topic": "/rosout", "at": 0, "after": 9},
-    "log/count": {"recording": "robot", "topic": "/rosout", "text": "e"},
+    "rows": {"recording": "robot", "topic": "/rosout", "field": "msg", "at": 0, "after": 9},
     "recordings": {"where": "scan: ranges.min < 0.5"},
     "timeline": {**WHOLE, **SCAN},
-    "sql": {"text": "select sum(a.range * b.range) from range(10000000) a, range(1000000) b"},
+    "sql": {
+        "recording": "robot",
+        "text": ENDLESS,
+    },
 }
 
 
@@ -110,7 +113,7 @@ def test_a_question_that_is_given_up_waits_for_nothing(demo_store: hl.Store) -> 
             held.enter_context(shared.turns)
         said = asked_for(app, "ask", NEAR, leaves_after=0.1)
         assert b"The query was stopped" in said[1]["body"]
-    with shared.matching:
+    with ask._matching:
         said = asked_for(app, "matches", QUESTIONS["matches"], leaves_after=0.1)
         assert b"The query was stopped" in said[1]["body"]
     said = asked_for(app, "matches", QUESTIONS["matches"], leaves_after=20.0)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import asyncio
 import http.client
 import json
-import re
 import socket
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from importlib import import_module
+from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.parse import quote, urlencode, urlsplit
@@ -294,24 +294,17 @@ USUAL = {
     "place": "3",
     "around": "/base/scan",
 }
-_READ = re.compile(r'params\.[a-z]+\(\s*"(\w+)"')
 
 
 def asked_by_routes() -> list[tuple[str, list[str]]]:
-    """Path of each route with the parameters that its module, or what it shares, reads."""
-    view = Path(guard.__file__).parent
-    common = {"recording", "topic", "at", "begin", "end", "pixels"}
-    for path in view.glob("*.py"):
-        common |= set(_READ.findall(path.read_text()))
+    """Path of each route with its parameters."""
     found = []
     for name in ROUTES:
-        module = import_module(f"hybridlog.view.routes.{name}")
-        assert module.__file__ is not None
-        own = set(_READ.findall(Path(module.__file__).read_text()))
-        found += [(one.path, sorted(common | own)) for one in module.routes]
-    plain = [(path, names if path != "/sql" else ["text"]) for path, names in found]
-    assert {"/recordings", "/points", "/track"} <= {path for path, _ in plain}
-    return plain
+        for one in import_module(f"hybridlog.view.routes.{name}").routes:
+            _, *names = signature(one.endpoint).parameters
+            found.append((one.path, names))
+    assert {"/recordings", "/points", "/track"} <= {path for path, _ in found}
+    return found
 
 
 def test_absurd_parameters_break_nothing(door: Door, capfd: pytest.CaptureFixture[str]) -> None:

@@ -99,8 +99,8 @@ def test_a_damaged_chunk_is_told(tmp_path: Path, asking: Asking) -> None:
             ("message", "/own", {"at": S}),
             ("image", "/own", {"at": S}),
             ("series", "/own", {"field": "id", "begin": 0, "end": 6 * S, "pixels": 10}),
-            ("log", "/rosout", {"at": S, "before": 5}),
-            ("log", "/rosout", {"at": S, "after": 5, "text": "line"}),
+            ("rows", "/rosout", {"at": S, "before": 5, "field": "msg"}),
+            ("rows", "/rosout", {"at": S, "after": 5, "field": "msg", "where": "msg ~ 'line'"}),
         ):
             answer = client.get(page, params={"recording": "odd", "topic": topic, **asked})
             assert answer.status_code == 400, page

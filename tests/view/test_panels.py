@@ -88,7 +88,7 @@ def test_hostile_names_and_values_are_text(page: Page, odd_url: str) -> None:
 
 def test_a_plot(page: Page, demo_store: hl.Store, start: int, demo_url: str) -> None:
     fields = ["twist.twist.linear.x", "pose.pose.position.y"]
-    page.set_viewport_size({"width": 460, "height": 900})  # fewer pixels than messages
+    page.set_viewport_size({"width": 460, "height": 1000})  # fewer pixels than messages
     opened(page, demo_url, "robot", ("plot", "/odom", {"fields": fields}), at=7 * S)
     plot = panel(page, "plot")
     chart = plot.locator(".chart")

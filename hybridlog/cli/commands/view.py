@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
 from hybridlog.cli import output
-from hybridlog.cli.options import AsJson, InStore, Served, command, one_recording
+from hybridlog.cli.options import AsJson, InStore, Served, command, one_recording, option
 from hybridlog.cli.signals import ended_by_signal
 from hybridlog_storage.errors import extra
 
@@ -13,6 +14,11 @@ from hybridlog_storage.errors import extra
 class _Given(InStore, AsJson, Served):
     recording: str | None = one_recording(
         "Show this one first; without, the list of recordings.", "[RECORDING]"
+    )
+    token: Path | None = option(
+        "Take the token of the address from this file, which is made if it is not there: with "
+        "--port, links stay right after a restart.",
+        "FILE",
     )
 
 
@@ -26,9 +32,11 @@ def view_command(given: _Given) -> None:
     from urllib.parse import quote
 
     with extra("view", "The view needs starlette and uvicorn"):
+        from hybridlog.view.guard import token_of
         from hybridlog.view.server import ViewServer
     with given.opened() as store:
-        server = ViewServer(store, given.port or 0)
+        token = token_of(given.token) if given.token is not None else ""
+        server = ViewServer(store, given.port or 0, token)
         url = server.url
         if given.recording is not None:
             entry = store.entry(given.recording)

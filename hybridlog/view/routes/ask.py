@@ -7,83 +7,90 @@ import io
 import re
 import shlex
 import threading
-from collections.abc import AsyncIterator, Generator, Sequence
-from typing import TYPE_CHECKING, Any, Final, TypeAlias
+from collections.abc import AsyncIterator, Generator
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeAlias
 
-from msgspec import Struct
-from msgspec.structs import replace
+from msgspec import Meta
 from starlette.concurrency import run_in_threadpool
-from starlette.responses import StreamingResponse
+from starlette.responses import Response, StreamingResponse
 
 from hybridlog.drawing.times import Match, Matches, aligned
-from hybridlog.query.predicate.parser import MAX_TEXT
 from hybridlog.query.times import format_time
-from hybridlog.view.context import route, start_of
-from hybridlog.view.sql_process import in_process, program, sql_answer
+from hybridlog.view.commands import run
+from hybridlog.view.context import (
+    Context,
+    Offset,
+    Pixels,
+    Question,
+    Seq,
+    Text,
+    moment_of,
+    part_of,
+    route,
+    start_of,
+)
 from hybridlog_storage.stopping import held
-from hybridlog_storage.times import END
 
 if TYPE_CHECKING:
-    from starlette.responses import Response
-
     from hybridlog.query.query import Query
     from hybridlog.query.question import Span
     from hybridlog.store import Store
-    from hybridlog.view.context import Context, RequestParams
-    from hybridlog_storage.catalog import RecordingEntry
 
 MAX_TOPICS: Final = 200
 """Greatest number of topics that are named; without any, all are meant."""
-_EVERY_TOPIC: Final = "**"
-_NO_NAME: Final = re.compile(r"[^\w.+-]+")
+Topics: TypeAlias = Annotated[list[Text], Meta(max_length=MAX_TOPICS)]
+Within: TypeAlias = Annotated[str, Meta(max_length=64)]
 
 
-class PageQuestion(Struct, frozen=True):
+class PageQuestion:
     """A question about one recording.
 
-    Attributes:
-        topics: Full names; none for all.
+    Args:
+        recording: Its id or name.
+        topic: Full names of topics; none for all.
         where: Predicate, empty for every message.
         within: Greatest distance in time of messages of other topics, empty without any.
+        begin: Beginning of its part of the recording, ns since its start; None for all of it.
+        end: End of that, not included.
+
+    Attributes:
+        recording: The recording.
         span: Log time `[begin, end)`, ns; None for all of it.
     """
 
-    store: Store
-    recording: RecordingEntry
-    topics: tuple[str, ...]
-    where: str
-    within: str
-    span: Span | None
+    def __init__(
+        self,
+        context: Context,
+        recording: str,
+        topic: list[str],
+        *,
+        where: str,
+        within: str,
+        begin: int | None = None,
+        end: int | None = None,
+    ) -> None:
+        self.store, self.recording = context.store, context.store.entry(recording)
+        self.topics = tuple(dict.fromkeys(topic))
+        self.where, self.within = where.strip(), within
+        self.span: Span | None = None
+        if begin is not None or end is not None:
+            self.span = part_of(start_of(self.recording), begin or 0, end or 0)
+        known = {channel.topic for channel in self.recording.channels}
+        self._query = context.query(self.recording, *(self.topics or sorted(known)))
 
     def query(self) -> Query:
         """Its messages."""
-        query = self.store.query(self._topics(), [self.recording.id])
+        query = self._query
         if self.span is not None:
             # First, so that conditions on other topics are asked in this range only.
             query = query.between(*self.span)
-        if self.where:
-            query = query.where(self.where, self.within or None)
-        return query
-
-    def told(self) -> dict[str, Any]:
-        """The number of its messages, losses and remarks, its command line, file and program."""
-        query = self.query()
-        count = query.count()
-        found = query.completeness()
-        return {
-            "count": count,
-            "lost": found.describe(count) if found.has_losses else None,
-            "remarks": found.sentences,
-            "python": self.python(),
-            "command": self.command(),
-            "name": self.file_name(),
-        }
+        return query.where(self.where, self.within or None) if self.where else query
 
     def command(self) -> str:
         """The command line that writes it to a file of `file_name`."""
         words = ["hybridlog", "fetch", "--store", self.store.directory.place]
         words += ["-r", self.recording.name]
-        for topic in self.topics or [_EVERY_TOPIC]:
+        for topic in self.topics or ["**"]:
             words += ["-t", topic]
         if self.span is not None:
             words += ["--between", *map(format_time, self.span)]
@@ -110,29 +117,48 @@ class PageQuestion(Struct, frozen=True):
             "    for message in messages.limit(10):\n"
             "        print(message.log_time_ns, message.topic)\n"
         )
-        return program(self.store, body)
+        return _program(self.store, body)
 
     def file_name(self) -> str:
         """The name of its file: recording and range."""
         begin, end = self.span or self.recording.extent
         times = "_".join(format_time(time).replace(":", "") for time in (begin, end))
-        return f"{_NO_NAME.sub('_', self.recording.name)}_{times}.mcap"
-
-    def _topics(self) -> Sequence[str]:
-        return self.topics or sorted({channel.topic for channel in self.recording.channels})
+        name = re.sub(r"[^\w.+-]+", "_", self.recording.name)
+        return f"{name}_{times}.mcap"
 
 
-def question_of(context: Context, params: RequestParams) -> PageQuestion:
-    """The question of a request, about all times.
+def _program(store: Store, body: str) -> str:
+    """A program that opens a store; `body` is indented."""
+    path = store.directory.place
+    return f"import hybridlog as hl\n\nwith hl.open({path!r}) as store:\n{body}"
 
-    It has the parameters `recording`, `topic`, repeated, `where` and `within`.
-    """
-    recording = context.recording(params)
-    topics = tuple(dict.fromkeys(params.texts("topic", most=MAX_TOPICS)))
-    context.query(recording, *topics)
-    where = params.text("where", "", longest=MAX_TEXT).strip()
-    within = params.text("within", "", longest=64)
-    return PageQuestion(context.store, recording, topics, where, within, None)
+
+@route("/ask")
+def ask(
+    context: Context,
+    *,
+    recording: Text,
+    topic: Topics = [],  # noqa: B006 - a default of the structure, which copies it
+    where: Question = "",
+    within: Within = "",
+    begin: Offset | None = None,
+    end: Offset | None = None,
+) -> dict[str, Any]:
+    """The number of messages, with losses and remarks; the command line and Python for them."""
+    asked = PageQuestion(
+        context, recording, topic, where=where, within=within, begin=begin, end=end
+    )
+    query = asked.query()
+    count = query.count()
+    found = query.completeness()
+    return {
+        "count": count,
+        "lost": found.describe(count) if found.has_losses else None,
+        "remarks": found.sentences,
+        "python": asked.python(),
+        "command": asked.command(),
+        "name": asked.file_name(),
+    }
 
 
 PIECE: Final = 256 << 10
@@ -144,17 +170,24 @@ Pieces: TypeAlias = "Generator[bytes, None, None]"
 _streams = asyncio.Semaphore(MAX_STREAMS)
 
 
-def ask(context: Context, params: RequestParams) -> dict[str, Any]:
-    """The number of messages, with losses and remarks; the command line and Python for them."""
-    return _question(context, params).told()
-
-
-def file(context: Context, params: RequestParams) -> Response:
+@route("/export")
+def file(
+    context: Context,
+    *,
+    recording: Text,
+    topic: Topics = [],  # noqa: B006
+    where: Question = "",
+    within: Within = "",
+    begin: Offset | None = None,
+    end: Offset | None = None,
+) -> Response:
     """A part of a recording as an MCAP file, made while it is sent."""
-    question = _question(context, params)
-    pieces = pieces_of(question.query())
+    asked = PageQuestion(
+        context, recording, topic, where=where, within=within, begin=begin, end=end
+    )
+    pieces = pieces_of(asked.query())
     first = next(pieces)  # most errors come before it, and can still be told
-    headers = {"Content-Disposition": f'attachment; filename="{question.file_name()}"'}
+    headers = {"Content-Disposition": f'attachment; filename="{asked.file_name()}"'}
     sent = _sent(first, pieces)
     return StreamingResponse(sent, headers=headers, media_type="application/octet-stream")
 
@@ -168,13 +201,6 @@ async def _sent(piece: bytes, rest: Pieces) -> AsyncIterator[bytes]:
                 piece = await run_in_threadpool(next, rest, b"")
     finally:
         rest.close()
-
-
-def _question(context: Context, params: RequestParams) -> PageQuestion:
-    question = question_of(context, params)
-    if params.has("begin") or params.has("end"):
-        question = replace(question, span=params.span(start_of(question.recording)))
-    return question
 
 
 def pieces_of(query: Query) -> Pieces:
@@ -196,20 +222,28 @@ def pieces_of(query: Query) -> Pieces:
 # Matches and SQL.
 
 MAX_LISTED: Final = 200
-"""Greatest number of matches that are listed at once."""
-SQL_SECONDS: Final = 60
-"""Seconds that a query in SQL may take."""
+"""Greatest number of episodes that are listed at once."""
+_matching = threading.Lock()  # held while matches are looked for
 
 
-def matches(context: Context, params: RequestParams) -> dict[str, Any]:
+@route("/matches")
+def matches(
+    context: Context,
+    *,
+    recording: Text,
+    topic: Text,
+    begin: Offset,
+    end: Offset,
+    pixels: Pixels,
+    where: Question = "",
+    within: Within = "",
+) -> dict[str, Any]:
     """The matches in a range by pixel, and the bands in which the predicate holds."""
-    question = _of_topic(context, params)
-    start = start_of(question.recording)
-    span = params.span(start)
-    edges = aligned(span, params.pixels())
-    matching = _matches(context, question)
-    first, counts = matching.ticks(edges)
-    bands = matching.bands(span, int(edges[1] - edges[0]))
+    found, start = _matches(context, recording, topic, where, within)
+    span = part_of(start, begin, end)
+    edges = aligned(span, pixels)
+    first, counts = found.ticks(edges)
+    bands = found.bands(span, int(edges[1] - edges[0]))
     return {
         "first": (first - start).tolist(),
         "counts": counts.tolist(),
@@ -217,48 +251,86 @@ def matches(context: Context, params: RequestParams) -> dict[str, Any]:
     }
 
 
-def match_list(context: Context, params: RequestParams) -> dict[str, Any]:
-    """Some matches behind or in front of a place, and how many are in front of them."""
-    question = _of_topic(context, params)
-    start = start_of(question.recording)
-    place = Match(params.moment(start), params.integer("seq", -1, END, -1))
-    count = params.integer("count", 1, MAX_LISTED, MAX_LISTED)
-    matching = _matches(context, question)
-    is_earlier = params.word("direction", ("later", "earlier"), "later") == "earlier"
-    found = matching.beside(place, count, earlier=is_earlier)
+@route("/episodes")
+def episodes(
+    context: Context,
+    *,
+    recording: Text,
+    topic: Text,
+    at: Offset,
+    seq: Seq = -1,
+    count: Annotated[int, Meta(ge=1, le=MAX_LISTED)] = MAX_LISTED,
+    direction: Literal["later", "earlier"] = "later",
+    where: Question = "",
+    within: Within = "",
+) -> dict[str, Any]:
+    """Some episodes behind or in front of a place, how many are in front of them, and in all.
+
+    An episode is a row of matches: times of its first match and of its end, arrival number of that
+    match, number of matches.
+    """
+    found, start = _matches(context, recording, topic, where, within)
+    place = Match(moment_of(start, at), seq)
+    rows = found.beside(place, count, earlier=direction == "earlier")
     return {
-        "rows": [[str(one.time - start), one.seq] for one in found],
-        "before": matching.count_before(found[0]) if found else None,
+        "rows": [[str(e.first.time - start), str(e.end - start), e.first.seq, e.n] for e in rows],
+        "before": found.count_before(rows[0].first) if rows else None,
+        "all": found.episodes,
     }
 
 
-def _of_topic(context: Context, params: RequestParams) -> PageQuestion:
-    """A question about one topic."""
-    params.text("topic")
-    return question_of(context, params)
-
-
-def _matches(context: Context, question: PageQuestion) -> Matches:
-    recording = question.recording
+def _matches(
+    context: Context, name: str, topic: str, where: str, within: str
+) -> tuple[Matches, int]:
+    """The matches of a question about one topic, and the start of its recording."""
+    asked = PageQuestion(context, name, [topic], where=where, within=within)
+    recording = asked.recording
     state = recording.status, recording.messages, frozenset(recording.digests.items())
-    key = recording.id, state, (question.topics, question.where, question.within)
-    with held(context.matching):  # a second client that asks the same waits
+    key = recording.id, state, (topic, asked.where, within)
+    with held(_matching):  # a second client that asks the same waits
         made = context.store.shared.cache.made
-        return made(
-            "matches", *key, make=lambda: Matches(question.query()), size_of=lambda one: one.size
+        found = made(
+            "matches", *key, make=lambda: Matches(asked.query()), size_of=lambda one: one.size
         )
+    return found, start_of(recording)
 
 
-def sql(context: Context, params: RequestParams) -> dict[str, Any]:
-    """The first rows of a query in SQL."""
-    text = params.text("text", longest=MAX_TEXT)
-    return in_process(context.store, sql_answer, text, SQL_SECONDS)
+SQL_SECONDS: Final = 60
+"""Seconds that a query in SQL may take."""
+SQL_MEMORY: Final = 512 << 20
+"""Bytes that DuckDB may use."""
+SQL_ROWS: Final = 1000
+SQL_COLUMNS: Final = 200
+_MICROSECOND: Final = 1000  # ns
 
 
-routes = [
-    route("/ask", ask),
-    route("/export", file),
-    route("/matches", matches),
-    route("/match-list", match_list),
-    route("/sql", sql, threading.BoundedSemaphore(1)),
-]
+@route("/sql", threading.BoundedSemaphore(1))
+def sql(context: Context, *, recording: Text, text: Question) -> dict[str, Any]:
+    """The first rows of a query in SQL about a recording; with times, their moments in it."""
+    import pyarrow as pa
+
+    from hybridlog.frames.lines import shown
+
+    store, entry = context.store, context.store.entry(recording)
+    options = [f"--recording={entry.id}", "--format=arrow", f"--limit={SQL_ROWS + 1}"]
+    bounds = [f"--memory={SQL_MEMORY}", f"--timeout={SQL_SECONDS}s"]
+    place = store.directory.address
+    printed, remarks = run(place, "sql", [*options, *bounds], text, seconds=SQL_SECONDS + 5)
+    table = pa.ipc.open_file(printed).read_all()
+    found = shown(table.slice(0, SQL_ROWS), SQL_COLUMNS)
+    first, last = entry.span or (0, -1)
+    body = f"    print(store.sql({text!r}, recordings={entry.name!r}).to_pandas())\n"
+    return found | {
+        "at": [
+            None
+            if time is None or not first <= time < last + _MICROSECOND
+            else str(min(time, last) - first)
+            for time in found.pop("times")
+        ],
+        "more": table.num_rows > SQL_ROWS,
+        "remarks": remarks,
+        "python": _program(store, body),
+    }
+
+
+routes = [ask, file, matches, episodes, sql]

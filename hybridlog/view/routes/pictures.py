@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from math import isfinite
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final, TypeAlias
 
 import numpy as np
+from msgspec import Meta
 from msgspec.structs import asdict
 from starlette.responses import Response
 
@@ -16,10 +17,17 @@ from hybridlog.drawing.series import series as read_series
 from hybridlog.drawing.times import aligned, lane_of
 from hybridlog.drawing.track import track
 from hybridlog.view.context import (
+    MAX_OFFSET,
+    Context,
+    Offset,
+    Pixels,
+    Seq,
+    Text,
     current,
     extent,
     json_response,
     packed_response,
+    part_of,
     route,
     start_of,
 )
@@ -29,11 +37,10 @@ from hybridlog_storage.errors import (
     PayloadError,
     UsageError,
 )
+from hybridlog_storage.times import END
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-    from hybridlog.view.context import Context, RequestParams
 
 MAX_LANES: Final = 64
 """Topics of one picture."""
@@ -42,33 +49,32 @@ MAX_BINS: Final = 1 << 17
 MAX_FIELDS: Final = 16
 """Most fields of one plot."""
 _GREATEST_EXACT: Final = 1 << 53
+Lanes: TypeAlias = Annotated[list[Text], Meta(max_length=MAX_LANES)]
+Fields: TypeAlias = Annotated[list[Text], Meta(max_length=MAX_FIELDS)]
 
 
-def timeline(context: Context, params: RequestParams) -> Response:
-    """Messages of some topics by bin, as bytes.
-
-    Parameters are `recording`, `begin` and `end` (ns since its start), `pixels` (most bins that
-    fit between them), and `topic`, repeated.
+@route("/timeline")
+def timeline(
+    context: Context, *, recording: Text, topic: Lanes, begin: Offset, end: Offset, pixels: Pixels
+) -> Response:
+    """Messages of some topics by bin, as bytes; `pixels` is the most bins that fit in the range.
 
     The header has `start` (ns since 1970, as text), `begin` of the first bin, `width` of a bin,
     and `lanes`: `exact` (false for estimates) and `period`, the usual time from one message to
     the next, 0 if unknown. Times are ns. The arrays of lane n are `counts n`, an integer a bin, and
     `gaps n`, pairs: first bin, and the one behind the last.
     """
-    recording = context.recording(params)
-    topics = params.texts("topic", most=MAX_LANES)
-    pixels = params.pixels()
-    if len(topics) * pixels > MAX_BINS:
-        raise UsageError(f"At most {MAX_BINS // max(len(topics), 1)} pixels for as many topics.")
-    start = start_of(recording)
-    span = params.span(start)
-    edges, lanes = aligned(span, pixels), []
+    entry = context.store.entry(recording)
+    if len(topic) * pixels > MAX_BINS:
+        raise UsageError(f"At most {MAX_BINS // max(len(topic), 1)} pixels for as many topics.")
+    start = start_of(entry)
+    edges, lanes = aligned(part_of(start, begin, end), pixels), []
     arrays: dict[str, NDArray[Any]] = {}
-    for number, topic in enumerate(topics):
-        lane = lane_of(context.store.session, recording, topic)
+    for number, name in enumerate(topic):
+        lane = lane_of(context.store.session, entry, name)
         period = lane.period()
         lanes.append({"exact": lane.exact, "period": period})
-        silent = lane.gaps(edges, extent(recording), period).astype(np.uint32)
+        silent = lane.gaps(edges, extent(entry), period).astype(np.uint32)
         arrays |= {f"counts {number}": _small(lane.counts(edges)), f"gaps {number}": silent}
     head = {
         "start": str(start),
@@ -85,19 +91,29 @@ def _small(counts: NDArray[np.int64]) -> NDArray[Any]:
     return np.minimum(counts, (1 << 32) - 1).astype(np.min_scalar_type(min(most, (1 << 32) - 1)))
 
 
-def fields(context: Context, params: RequestParams) -> dict[str, Any]:
+@route("/fields")
+def fields(context: Context, *, recording: Text, topic: Text) -> dict[str, Any]:
     """The fields of a topic that can be drawn, and their types."""
-    _, query = context.topic(params)
+    _, query = context.topic(recording, topic)
     found = fields_of(known_fields(query), iter(query.limit(1)))
     return {"fields": [{"path": path, "type": kind} for path, kind in found]}
 
 
-def series(context: Context, params: RequestParams) -> dict[str, Any]:
+@route("/series")
+def series(
+    context: Context,
+    *,
+    recording: Text,
+    topic: Text,
+    begin: Offset,
+    end: Offset,
+    pixels: Pixels,
+    field: Fields,
+) -> dict[str, Any]:
     """Least and greatest values by pixel, or each value if there are few."""
-    recording, query = context.topic(params)
-    start = start_of(recording)
-    wanted = params.texts("field", most=MAX_FIELDS)
-    found = read_series(query, wanted, pixels=params.pixels(), span=params.span(start))
+    entry, query = context.topic(recording, topic)
+    start = start_of(entry)
+    found = read_series(query, field, pixels=pixels, span=part_of(start, begin, end))
     if len(found) > MAX_FIELDS:
         raise UsageError(f"These are {len(found)} fields, at most {MAX_FIELDS} fit in a plot.")
     return {
@@ -121,9 +137,12 @@ def _value(number: float) -> float | str:
     return float(number) if is_float else str(int(number))
 
 
-def image(context: Context, params: RequestParams) -> Response:
+@route("/image")
+def image(
+    context: Context, *, recording: Text, topic: Text, at: Offset, seq: Seq = END
+) -> Response:
     """The picture as a file; as JSON, why there is none. Headers say when it is current."""
-    found = current(context, params)
+    found = current(context, recording, topic, at, seq)
     answer: Response = json_response({})
     if found.message is not None:
         try:
@@ -136,15 +155,22 @@ def image(context: Context, params: RequestParams) -> Response:
     return answer
 
 
-def points_at(context: Context, params: RequestParams) -> Response:
-    """The points of the message that is current at a time.
+@route("/points")
+def points_at(
+    context: Context,
+    *,
+    recording: Text,
+    topic: Text,
+    at: Offset,
+    seq: Seq = END,
+    value: Text = "",
+    limit: Annotated[int, Meta(ge=1, le=MAX_POINTS)] = MAX_POINTS,
+) -> Response:
+    """The points of the message that is current at a time, at most so many.
 
-    Parameters: `recording`, `topic`, `at`; `value`, the name of the values to colour by;
-    `limit`, the greatest number of points.
+    They have the values of that name, to colour by.
     """
-    limit = params.integer("limit", 1, MAX_POINTS, MAX_POINTS)
-    value = params.text("value", "")
-    shown = current(context, params)
+    shown = current(context, recording, topic, at, seq)
     header: dict[str, Any] = {"time": shown.time, "until": shown.until}
     if shown.message is None:
         return packed_response(header, {})
@@ -164,18 +190,23 @@ def points_at(context: Context, params: RequestParams) -> Response:
     return packed_response(header, {"xyz": xyz, **values})
 
 
-def track_of(context: Context, params: RequestParams) -> Response:
+@route("/track")
+def track_of(
+    context: Context,
+    *,
+    recording: Text,
+    topic: Text,
+    pixels: Pixels,
+    begin: Offset = -MAX_OFFSET,
+    end: Offset = MAX_OFFSET,
+) -> Response:
     """The track of a topic in metres, of a receiver from its first fix, and the times.
 
-    Parameters: `recording`, `topic`, `pixels`; `begin` and `end` for a part of the time. A time
-    is the sum of `times` and `rests`: a float64 is too coarse far from the start.
+    A time is the sum of `times` and `rests`: a float64 is too coarse far from the start.
     """
-    recording, query = context.topic(params)
-    start = start_of(recording)
-    span = None
-    if params.has("begin") or params.has("end"):
-        span = params.span(start)
-    found = track(query, pixels=params.pixels(), span=span)
+    entry, query = context.topic(recording, topic)
+    start = start_of(entry)
+    found = track(query, pixels=pixels, span=part_of(start, begin, end))
     offsets, xy = found.pop("times") - start, found.pop("xy")
     header = {**found, "grid": None if found["grid"] is None else asdict(found["grid"])}
     times = offsets.astype(np.float64)
@@ -187,11 +218,4 @@ def track_of(context: Context, params: RequestParams) -> Response:
     return packed_response(header, arrays)
 
 
-routes = [
-    route("/timeline", timeline),
-    route("/fields", fields),
-    route("/series", series),
-    route("/image", image),
-    route("/points", points_at),
-    route("/track", track_of),
-]
+routes = [timeline, fields, series, image, points_at, track_of]

@@ -3,26 +3,26 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from itertools import islice
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeAlias
+
+from msgspec import Meta
 
 from hybridlog.query.answers.marks import marks_in
 from hybridlog.query.choice import Choice
 from hybridlog.record.losses import losses_of
 from hybridlog.schema.states import encoding_of, shown_channels
-from hybridlog.view.context import Context, extent, route, start_of
+from hybridlog.view.context import Context, Text, extent, route, start_of
 from hybridlog_storage.catalog import ChannelStats
 from hybridlog_storage.manifest import MAX_MARKS
 
 if TYPE_CHECKING:
-    from hybridlog.view.context import RequestParams
     from hybridlog_storage.catalog import RecordingEntry
+    from hybridlog_storage.manifest import Manifest
     from hybridlog_storage.summary import RecordingSummary
 
 _MAX_ROWS: Final = 200
-_MAX_CONDITIONS: Final = 16
-
 
 _KEYS: Final[Mapping[str, Callable[[RecordingSummary], Any]]] = {
     "start": start_of,
@@ -35,15 +35,35 @@ _KEYS: Final[Mapping[str, Callable[[RecordingSummary], Any]]] = {
 """Keys to order recordings by."""
 
 
-def recordings(context: Context, params: RequestParams) -> dict[str, Any]:
+_Some: TypeAlias = Annotated[list[Text], Meta(max_length=16)]
+
+
+@route("/recordings")
+def recordings(
+    context: Context,
+    *,
+    first: Annotated[int, Meta(ge=0, le=1 << 31)] = 0,
+    count: Annotated[int, Meta(ge=1, le=_MAX_ROWS)] = _MAX_ROWS,
+    order: Literal["start", "name", "duration", "topics", "messages", "size"] = "start",
+    direction: Literal["up", "down"] = "down",
+    name: Text = "",
+    tag: _Some = [],  # noqa: B006 - defaults of a structure, which copies them
+    topic: _Some = [],  # noqa: B006
+    type: _Some = [],  # noqa: A002, B006 - its name in addresses
+    where: _Some = [],  # noqa: B006
+    begin: Text = "",
+    end: Text = "",
+) -> dict[str, Any]:
     """A part of the recordings that satisfy some conditions, in some order."""
-    first = params.integer("first", 0, 1 << 31, 0)
-    count = params.integer("count", 1, _MAX_ROWS, _MAX_ROWS)
-    key = _KEYS[params.word("order", _KEYS, "start")]
-    is_ascending = params.word("direction", ("up", "down"), "down") == "up"
+    during = (begin or None, end or None) if begin or end else None
+    # Globs for names that contain any of the words.
+    names = [
+        word if {*word} & {*"*?"} else f"*{word.replace('[', '[[]')}*" for word in name.split()
+    ]
+    choice = Choice.of(names, tag=tag, has=topic, type=type, during=during, where=where)
     store = context.store
-    summaries = store.choose(_choice(params)).summaries
-    ordered = sorted(summaries, key=key, reverse=not is_ascending)
+    summaries = store.choose(choice).summaries
+    ordered = sorted(summaries, key=_KEYS[order], reverse=direction == "down")
     shown = ordered[first : first + count]
     return {
         "store": store.directory.place,
@@ -56,9 +76,10 @@ def recordings(context: Context, params: RequestParams) -> dict[str, Any]:
     }
 
 
-def recording(context: Context, params: RequestParams) -> dict[str, Any]:
-    """One recording: its topics, marks, losses and times."""
-    entry = context.recording(params)
+@route("/recording")
+def recording_of(context: Context, *, recording: Text) -> dict[str, Any]:
+    """One recording: its topics, marks, losses, what has expired, and times."""
+    entry = context.store.entry(recording)
     start = start_of(entry)
     begin, end = extent(entry)
     return {
@@ -78,26 +99,9 @@ def recording(context: Context, params: RequestParams) -> dict[str, Any]:
             for one in islice(marks_in(context.store.session, [entry.id]), MAX_MARKS)
         ],
         "losses": [_loss(loss, start) for loss in losses_of(entry)],
+        "gone": _gone(entry.manifest, start),
         "topics": _topics(entry, start),
     }
-
-
-def _choice(params: RequestParams) -> Choice:
-    begin, end = params.text("begin", ""), params.text("end", "")
-    return Choice.of(
-        _globs(params.text("name", "")),
-        tag=params.texts("tag", most=_MAX_CONDITIONS),
-        has=params.texts("topic", most=_MAX_CONDITIONS),
-        type=params.texts("type", most=_MAX_CONDITIONS),
-        during=(begin or None, end or None) if begin or end else None,
-        where=params.texts("where", most=_MAX_CONDITIONS),
-    )
-
-
-def _globs(text: str) -> Sequence[str]:
-    """Globs for names that contain any of the words."""
-    words = text.split()
-    return [word if set(word) & set("*?") else f"*{word.replace('[', '[[]')}*" for word in words]
 
 
 def _row(summary: RecordingSummary) -> dict[str, Any]:
@@ -128,6 +132,24 @@ def _loss(loss: Mapping[str, Any], start: int) -> dict[str, Any]:
     }
 
 
+def _gone(manifest: Manifest, start: int) -> list[dict[str, Any]]:
+    """The stretches of topics of which only fields are left, and whether the rest has expired."""
+    found: list[dict[str, Any]] = []
+    last: dict[tuple[str, str], tuple[int, dict[str, Any]]] = {}
+    for file in (file for file in manifest.logs.values() if not file.is_here):
+        for number, part in file.parts.items():
+            if part.first is None or part.last is None:
+                continue
+            topic = manifest.channels[number].topic
+            group, stretch = last.get((topic, str(file.gone)), (-1, {}))
+            if group + 1 < file.group or not stretch:
+                stretch = {"topic": topic, "begin": part.first - start, "cause": str(file.gone)}
+                found.append(stretch)
+            stretch["end"] = max(part.last - start, stretch.get("end", part.last - start))
+            last[topic, str(file.gone)] = file.group, stretch
+    return found
+
+
 def _topics(entry: RecordingEntry, start: int) -> list[dict[str, Any]]:
     found: dict[str, dict[str, Any]] = {}
     totals: dict[str, ChannelStats] = defaultdict(ChannelStats)
@@ -148,4 +170,4 @@ def _topics(entry: RecordingEntry, start: int) -> list[dict[str, Any]]:
     return [found[topic] for topic in sorted(found)]
 
 
-routes = [route("/recordings", recordings), route("/recording", recording)]
+routes = [recordings, recording_of]

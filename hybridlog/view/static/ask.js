@@ -3,7 +3,6 @@
 import { ApiError, Question, isAborted } from "./api.js";
 import { element, fill, notice } from "./dom.js";
 import { exportForm } from "./export.js";
-import { questionHistory } from "./history.js";
 import { matchList } from "./match_list.js";
 import { drawMatches, predicate } from "./matches.js";
 import { sqlTable } from "./sql_table.js";
@@ -37,7 +36,6 @@ export function mountAsk(main, recording) {
     size: 10,
     maxlength: 64,
   });
-  const history = questionHistory();
   const list = matchList(recording);
   const files = exportForm(recording);
   const told = element("span", { class: "told", role: "status" });
@@ -115,7 +113,6 @@ export function mountAsk(main, recording) {
       return;
     }
     if (within.hidden) question.within = "";
-    history.add(question);
     if (JSON.stringify(state.get("ask")) === JSON.stringify(question)) answer();
     else state.set({ ask: question }, { isStep: true });
   }
@@ -124,7 +121,7 @@ export function mountAsk(main, recording) {
   async function answer() {
     asking.stop();
     const question = state.get("ask");
-    list.show(null);
+    list.show(false);
     steps.hidden = true;
     copy.hidden = clear.hidden = !question;
     fill(body);
@@ -151,7 +148,7 @@ export function mountAsk(main, recording) {
     if (!asked) throw new ApiError("Choose a topic for the question.");
     const found = await asking.ask("ask", asked);
     tell(found);
-    list.show(found.count);
+    list.show(true);
   }
 
   /** Counts again what has been recorded since. */
@@ -161,7 +158,7 @@ export function mountAsk(main, recording) {
     try {
       const found = await asking.update("ask", asked);
       tell(found);
-      list.update(found.count);
+      list.update();
     } catch (error) {
       // The next update may be answered.
       if (!isAborted(error) && !(error instanceof ApiError)) throw error;
@@ -176,10 +173,10 @@ export function mountAsk(main, recording) {
   }
 
   async function answerSql(question) {
-    const found = await asking.ask("sql", { text: question.text });
+    const found = await asking.ask("sql", { recording: recording.info.id, text: question.text });
     python = found.python;
     told.textContent = "";
-    fill(body, sqlTable(recording, found));
+    fill(body, sqlTable(found));
   }
 
   function topics() {
@@ -208,10 +205,6 @@ export function mountAsk(main, recording) {
     if (event.key === "Escape") {
       event.stopPropagation();
       text.blur();
-    } else if (event.key === "ArrowUp" || event.key === "ArrowDown") {
-      event.preventDefault();
-      const found = history.step(event.key === "ArrowUp" ? -1 : 1, written());
-      if (found) write(found);
     }
   }
 

@@ -1,10 +1,11 @@
-/** Follows a recording that goes on: asks how far it is, once a second while the page is seen. */
+/** Keeps a recording up to date while the page is seen: its messages, marks, losses, what expires. */
 
 import { ApiError, get } from "./api.js";
 import { lastTime, show, visible } from "./range.js";
 import * as state from "./state.js";
 
-const EVERY_MS = 1000;
+const EVERY_MS = 1000; // while it is being recorded
+const ENDED_MS = 3000;
 
 /** What the server says of a recording, with times as BigInt. */
 export function timed(found) {
@@ -15,12 +16,12 @@ export function timed(found) {
 
 /** Keeps `recording.info` up to date. Returns a function that ends this. */
 export function followLive(recording) {
-  let timer = 0;
+  let known = "";
   const stop = new AbortController();
-  if (recording.info.status === "open") {
-    if (state.get("at") === 0n) state.set({ at: lastTime(recording) });
-    timer = setTimeout(look, EVERY_MS);
-  }
+  const isOpen = () => recording.info.status === "open";
+  if (isOpen() && state.get("at") === 0n) state.set({ at: lastTime(recording) });
+  const wait = () => setTimeout(look, isOpen() ? EVERY_MS : ENDED_MS);
+  let timer = wait();
   return () => {
     clearTimeout(timer);
     stop.abort();
@@ -33,17 +34,18 @@ export function followLive(recording) {
       // A server that does not answer now may do so later.
       if (!(error instanceof ApiError) && error.name !== "AbortError") throw error;
     }
-    if (!stop.signal.aborted && recording.info.status === "open") timer = setTimeout(look, EVERY_MS);
+    if (!stop.signal.aborted) timer = wait();
   }
 
   async function update() {
     const parameters = { recording: recording.info.id };
-    const found = timed(await get("recording", parameters, { signal: stop.signal }));
-    const { info } = recording;
-    if (found.messages === info.messages && found.status === info.status) return;
+    const found = await get("recording", parameters, { signal: stop.signal });
+    const text = JSON.stringify(found);
+    if (text === known) return;
+    known = text;
     recording.isUpdating = true;
     try {
-      take(found);
+      take(timed(found));
     } finally {
       recording.isUpdating = false;
     }
@@ -56,7 +58,7 @@ export function followLive(recording) {
     const before = info.end;
     moveStart(BigInt(found.start));
     Object.assign(info, found);
-    if (isAtEnd) {
+    if (isAtEnd && info.end !== before) {
       const { begin, end } = visible(recording);
       const by = Number(info.end - before);
       if (state.get("begin") !== null) show(recording, begin + by, end + by);

@@ -1,40 +1,36 @@
-/** The list of matches, a page at a time, and the steps from one to the next. */
+/** The list of episodes in which the question holds, a page at a time, and the steps between them. */
 
 import { ApiError, Question, isAborted } from "./api.js";
 import { element, fill, notice } from "./dom.js";
 import { predicate } from "./matches.js";
 import { seek } from "./range.js";
 import * as state from "./state.js";
-import { count, offset } from "./words.js";
+import { count, counted, duration, offset } from "./words.js";
 
 const PAGE = 100;
 
 /**
- * A list of the matches of the question.
+ * A list of the episodes of the question: rows of matches.
  *
  * @param {Object} recording
- * @returns {{side: HTMLElement, show: function(number|null), update: function(number),
- *     step: function(string), destroy: function()}} `show` lists so many matches, null hides the
- *     list; `update` says that there are more by now; `step` moves the cursor to the `later` or
- *     `earlier` match
+ * @returns {{side: HTMLElement, show: function(boolean), update: function(),
+ *     step: function(string), destroy: function()}} `show` lists them from the first one on, or
+ *     hides the list; `update` asks again, as there may be more by now; `step` moves the cursor to
+ *     the `later` or `earlier` one
  */
 export function matchList(recording) {
   const rows = element("ol", { class: "rows" });
   const title = element("span", {});
-  const side = element(
-    "aside",
-    { class: "matches", "aria-label": "Matches", hidden: true },
-    element(
-      "header",
-      {},
-      title,
-      button("‹", "Previous page of matches", () => page("earlier")),
-      button("›", "Next page of matches", () => page("later")),
-    ),
-    rows,
+  const head = element(
+    "header",
+    {},
+    title,
+    button("‹", "Previous page of matches", () => page("earlier")),
+    button("›", "Next page of matches", () => page("later")),
   );
-  let total = 0;
-  let shown = { rows: [], before: 0 };
+  const side = element("aside", { class: "matches", "aria-label": "Matches", hidden: true }, head, rows);
+  const first = () => ({ at: recording.info.begin, seq: -1n, direction: "later" });
+  let shown = { rows: [], before: 0, all: 0 };
   const [pages, steps] = [new Question(), new Question()];
   const end = state.on(["at", "seq"], mark);
   return { side, show, update, step, destroy };
@@ -45,41 +41,36 @@ export function matchList(recording) {
     steps.stop();
   }
 
-  function show(number) {
-    total = number ?? 0;
-    side.hidden = number === null;
-    shown = { rows: [], before: 0 };
+  function show(isShown) {
+    side.hidden = !isShown;
     pages.stop();
     steps.stop();
+    shown = { rows: [], before: 0, all: 0 };
     draw();
-    if (number) load({ at: recording.info.begin, seq: -1, direction: "later" });
+    if (isShown) load(first());
   }
 
-  function update(number) {
-    if (side.hidden) return show(number); // there was an error before
-    if (number === total) return;
-    total = number;
-    const [first] = shown.rows;
-    if (!first) load({ at: recording.info.begin, seq: -1, direction: "later" }, "update");
-    else if (shown.rows.length < PAGE)
-      load({ at: first[0], seq: first[1] - 1n, direction: "later" }, "update");
-    else draw();
+  function update() {
+    if (side.hidden) return show(true); // there was an error before
+    const [top] = shown.rows;
+    return load(top ? { at: top.at, seq: top.seq - 1n, direction: "later" } : first(), "update");
   }
 
   async function load(place, ask = "ask") {
     const found = await list({ ...place, count: PAGE }, pages, ask);
-    if (!found?.rows.length) return;
+    if (!found || (!found.rows.length && shown.rows.length)) return;
     shown = found;
     draw();
   }
 
-  /** Some matches at a place; null if there is no question, or a newer one. */
+  /** Some episodes at a place; null if there is no question, or a newer one. */
   async function list(place, question, ask) {
     const asked = predicate(recording);
     if (!asked) return null;
     try {
-      const found = await question[ask]("match-list", { ...asked, ...place });
-      return { ...found, rows: found.rows.map((row) => row.map(state.instant)) };
+      const found = await question[ask]("episodes", { ...asked, ...place });
+      const named = ([at, until, seq, matches]) => ({ at: BigInt(at), until: BigInt(until), seq: BigInt(seq), matches });
+      return { ...found, rows: found.rows.map(named) };
     } catch (error) {
       if (isAborted(error)) return null;
       if (!(error instanceof ApiError)) throw error;
@@ -90,7 +81,7 @@ export function matchList(recording) {
 
   function page(direction) {
     const edge = direction === "later" ? shown.rows.at(-1) : shown.rows[0];
-    if (edge) load({ at: edge[0], seq: edge[1], direction });
+    if (edge) load({ at: edge.at, seq: edge.seq, direction });
   }
 
   async function step(direction) {
@@ -99,49 +90,42 @@ export function matchList(recording) {
     const place = { at: isBehind ? at + 1n : at, seq: isBehind ? -1n : (seq ?? -1n) };
     const found = await list({ ...place, direction, count: 1 }, steps, "ask");
     if (!found) return;
-    if (!found.rows.length) {
-      notice(direction === "later" ? "No later match." : "No earlier match.");
-      return;
-    }
-    const [[time, own]] = found.rows;
-    seek(recording, time, own);
-    if (!shown.rows.some(([, known]) => known === own)) {
-      await load({ at: time, seq: own - 1n, direction: "later" });
-      mark();
-    }
+    const [one] = found.rows;
+    if (!one) return notice(direction === "later" ? "No later match." : "No earlier match.");
+    seek(recording, one.at, one.seq);
+    if (shown.rows.some(({ seq: known }) => known === one.seq)) return;
+    await load({ at: one.at, seq: one.seq - 1n, direction: "later" });
+    mark();
   }
 
   function draw() {
     const last = shown.before + shown.rows.length;
     title.textContent = shown.rows.length
-      ? `${count(shown.before + 1)}–${count(last)} of ${count(total)}`
-      : total
-        ? "…"
-        : "No match";
+      ? `${count(shown.before + 1)}–${count(last)} of ${counted(shown.all, "episode")}`
+      : "…";
     fill(
       rows,
-      ...shown.rows.map(([time, seq], number) =>
-        element(
-          "li",
-          {},
-          element(
-            "button",
-            { type: "button", class: "plain", onclick: () => seek(recording, time, seq) },
-            element("small", {}, `#${count(shown.before + number + 1)} `),
-            offset(time, 9),
-          ),
-        ),
-      ),
+      ...shown.rows.map(({ at, until, seq, matches }, number) => {
+        const go = () => seek(recording, at, seq);
+        const about = `${duration(Number(until - at))} · ${counted(matches, "match", "matches")}`;
+        const parts = [
+          element("small", {}, `#${count(shown.before + number + 1)} `),
+          offset(at, 9),
+          element("small", {}, ` ${about}`),
+        ];
+        return element("li", {}, element("button", { type: "button", class: "plain", onclick: go }, ...parts));
+      }),
     );
     mark();
   }
 
-  /** Marks the match at the cursor. */
+  /** Marks the episode at the cursor. */
   function mark() {
     const { at, seq } = state.get();
     [...rows.children].forEach((row, number) => {
-      const [time, own] = shown.rows[number] ?? [];
-      const isCurrent = time === at && (seq === null || seq === own);
+      const one = shown.rows[number];
+      const isHere = one.at <= at && (at < one.until || at === one.at);
+      const isCurrent = isHere && (seq === null || seq === one.seq);
       row.toggleAttribute("aria-current", isCurrent);
       if (isCurrent) keepVisible(row);
     });

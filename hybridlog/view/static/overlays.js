@@ -4,6 +4,7 @@
  *
  * @typedef {Object} Overlay
  * @property {string} title what it shows, for people
+ * @property {?string} lane the topic whose lane it is drawn on; null for all
  * @property {Array<[number, number]>} ticks time and count, ns since the start, in order
  * @property {Array<[number, number]>} bands begin and end, ns since the start, in order
  */

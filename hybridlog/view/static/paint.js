@@ -30,17 +30,19 @@ export class Colours {
 
 let patterns = null;
 
-/** Patterns for gaps (thin stripes) and for losses (cross-hatched). */
+/** Patterns for gaps (thin stripes), losses (cross-hatched) and what has expired (lines). */
 export function hatches(context, paints) {
   if (patterns?.paints !== paints) {
-    const gap = hatch(context, 7, paints.faint, 0.45, false);
-    const lost = hatch(context, 6, paints.warn, 0.9, true);
-    patterns = { paints, gap, lost };
+    const gap = hatch(context, 7, paints.faint, 0.45, (size) => [[size, 0]]);
+    const lost = hatch(context, 6, paints.warn, 0.9, (size) => [[size, 0], [0, size]]);
+    const gone = hatch(context, 4, paints.text, 0.7, (size) => [[size / 2, size / 2]]);
+    patterns = { paints, gap, lost, gone };
   }
   return patterns;
 }
 
-function hatch(context, size, colour, alpha, isCrossed) {
+/** A pattern of lines: each has its heights at both sides of a tile. */
+function hatch(context, size, colour, alpha, lines) {
   const tile = document.createElement("canvas");
   tile.width = tile.height = size;
   const own = tile.getContext("2d");
@@ -49,11 +51,9 @@ function hatch(context, size, colour, alpha, isCrossed) {
   own.lineWidth = 1;
   for (const by of [-size, 0, size]) {
     own.beginPath();
-    own.moveTo(by, size);
-    own.lineTo(by + size, 0);
-    if (isCrossed) {
-      own.moveTo(by, 0);
-      own.lineTo(by + size, size);
+    for (const [left, right] of lines(size)) {
+      own.moveTo(by, left);
+      own.lineTo(by + size, right);
     }
     own.stroke();
   }

@@ -17,14 +17,16 @@ const HELP = [
   ["Home, End", "first and last message; a running recording is followed from its end"],
   ["< >", "play slower, faster"],
   ["Drag", "move the visible range; with Shift, zoom to the part that is dragged over"],
-  ["/", "ask; Enter asks, ↑ ↓ give earlier questions, Esc leaves"],
-  ["n p", "next, previous match"],
+  ["/", "ask; Enter asks, Esc leaves"],
+  ["n p", "next, previous episode of matches"],
   ["?", "this list"],
 ];
 const SIGNS = [
   ["Bar", "messages in this pixel, on a logarithmic scale; pale if it is an estimate"],
   ["Thin stripes", "gap: no message for more than five usual periods"],
   ["Cross-hatched, framed", "messages were lost"],
+  ["Lines", "payloads have expired, or are elsewhere; fields are left"],
+  ["Ticks on a lane", "warnings and errors of a log or of diagnostics"],
   ["Flag and dashed line", "mark"],
   ["Band, ticks below the axis", "a question holds, its matches"],
 ];

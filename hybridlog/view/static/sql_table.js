@@ -7,12 +7,12 @@ import { count, counted } from "./words.js";
 const TIMES = ["t", "log_time"];
 
 /** A table of an answer of the server. */
-export function sqlTable(recording, answer) {
-  const { columns, rows, at, recordings } = answer;
+export function sqlTable(answer) {
+  const { columns, rows, at } = answer;
   const cell = (text, [name, isNumber], row) => {
     const shown =
       TIMES.includes(name) && at[row]
-        ? element("button", { type: "button", class: "plain link", onclick: () => go(row) }, text)
+        ? element("button", { type: "button", class: "plain link", onclick: () => state.set({ at: state.instant(at[row]) }) }, text)
         : text;
     return element("td", { class: isNumber ? "number" : null }, shown);
   };
@@ -37,13 +37,6 @@ export function sqlTable(recording, answer) {
     ),
     element("p", { class: "summary" }, summaryOf(answer)),
   );
-
-  /** Shows the message of a row, in its recording. */
-  function go(row) {
-    const name = recordings[row];
-    if (name === recording.name) state.set({ at: state.instant(at[row]) });
-    else state.show(name, { at: state.instant(at[row]), ask: state.get("ask") });
-  }
 }
 
 function heading([name, isNumber]) {

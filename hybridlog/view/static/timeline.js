@@ -32,7 +32,8 @@ export function mountTimeline(parent, recording) {
   const canvas = element("canvas", { class: "density", tabindex: "0", role: "slider" });
   canvas.setAttribute("aria-label", "Cursor in the timeline");
   const names = element("div", { class: "names" });
-  const corner = element("div", { class: "corner" });
+  const filter = element("input", { type: "search", "aria-label": "Filter of the lanes", oninput: () => recorded() });
+  const corner = element("div", { class: "corner" }, filter);
   const scroller = element("div", { class: "lanes" }, names, canvas);
   const tip = element("div", { class: "tip", hidden: true, role: "status" });
   const section = element("section", { class: "timeline", "aria-label": "Timeline" });
@@ -81,9 +82,10 @@ export function mountTimeline(parent, recording) {
 
   /** Takes over what is known of the recording, and what has come since. */
   function recorded(isNew = false) {
-    topics = [...recording.info.topics].sort(byGroup);
-    const words = topics.length === 1 ? "topic" : "topics";
-    corner.textContent = `${count(topics.length)} ${words}`;
+    const words = filter.value.toLowerCase().split(/\s+/);
+    const isMeant = ({ topic, type }) => words.every((word) => `${topic} ${type}`.toLowerCase().includes(word));
+    topics = recording.info.topics.filter(isMeant).sort(byGroup);
+    filter.placeholder = counted(recording.info.topics.length, "topic");
     const height = rowHeight();
     for (const one of [scroller, canvas]) {
       one.style.setProperty("height", `${Math.min(topics.length, MAX_SHOWN) * height}px`);
@@ -214,6 +216,14 @@ export function mountTimeline(parent, recording) {
         if (loss.begin === null || loss.count === 0 || (loss.topic ?? topic) !== topic) continue;
         drawLoss(picture, { top, height: row - 1 }, loss, paints);
       }
+      context.fillStyle = paints.gone;
+      for (const { begin, end } of recording.info.gone.filter((one) => one.topic === topic)) {
+        context.fillRect(toX(begin), top, Math.max(toX(end) - toX(begin), 3), row - 1);
+      }
+      context.fillStyle = paints.warn;
+      for (const { ticks } of overlays.all().filter(({ lane }) => lane === topic)) {
+        for (const [time] of ticks) context.fillRect(Math.round(toX(time)) - 1, top + 1, 3, row - 3);
+      }
     });
     context.strokeStyle = paints.mark;
     context.setLineDash([4, 3]);
@@ -279,7 +289,7 @@ export function mountTimeline(parent, recording) {
       if (mark.end > mark.at) context.fillRect(toX(mark.end) - 1, AXIS - 8, 2, 8);
     }
     context.fillStyle = paints.text;
-    for (const { ticks } of overlays.all()) {
+    for (const { ticks } of overlays.all().filter(({ lane }) => !lane)) {
       for (const [time] of ticks) context.fillRect(Math.round(toX(time)) - 0.5, AXIS - 6, 1.5, 6);
     }
     context.fillStyle = paints.warn;
@@ -308,7 +318,8 @@ export function mountTimeline(parent, recording) {
     if (hover.lane !== null) lines.push(...aboutLane(topics[hover.lane].topic, time, nsPerPixel));
     const near = 4 * nsPerPixel;
     lines.push(...marks.filter((mark) => mark.at - near < time && time < mark.end + near).slice(0, 5).map(({ text }) => `Mark: ${text}`));
-    for (const { title, bands, ticks } of overlays.all()) {
+    for (const { title, lane, bands, ticks } of overlays.all()) {
+      if (lane && lane !== topics[hover.lane]?.topic) continue;
       const isIn = bands.some(([low, high]) => low <= time && time < high);
       const here = ticks.filter(([at]) => Math.abs(at - time) < near);
       const matches = here.reduce((sum, [, number]) => sum + number, 0);
@@ -345,6 +356,11 @@ export function mountTimeline(parent, recording) {
       if (time < loss.begin - 3 * nsPerPixel || time > loss.end + 3 * nsPerPixel) continue;
       const lost = loss.count === null ? "Messages" : count(loss.count);
       lines.push(`${lost} lost (${loss.cause}${loss.reason ? `: ${loss.reason}` : ""})`);
+    }
+    const gone = recording.info.gone.filter((one) => one.topic === topic && one.begin <= time && time <= one.end);
+    for (const { cause } of gone) {
+      const where = cause === "expired" ? "have expired" : "are elsewhere";
+      lines.push(`Payloads ${where}: only fields are here`);
     }
     return lines;
   }

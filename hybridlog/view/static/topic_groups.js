@@ -1,12 +1,13 @@
 /** Groups of types, so that lanes of one kind lie together. */
 
 const GROUPS = [
+  /^(Log|DiagnosticArray)$/, // what tells of trouble
   /Image|Camera|Video/,
   /Scan|Cloud|Range|Lidar|Radar|Grid/,
   /Odom|Pose|Path|NavSat|Location|GPS/i,
   /Imu|Twist|Wrench|Accel|Joint|Motor|Wheel|Command|Battery|Temperature|Magnetic|Pressure/,
   /TFMessage|Transform/,
-  /Log$|Diagnostic|String|Status|Event|Mark$/,
+  /Diagnostic|String|Status|Event|Mark$/,
 ];
 
 /** The number of the group of a type; types of no group come last. */

@@ -15,7 +15,7 @@ const accepts = ofTypes(
   "std_msgs/String",
 );
 const LEVELS = ["debug", "info", "warning", "error", "fatal"];
-/** Field with the text and the numbers of the levels by type, as the server has them. */
+/** Field with the text and the least number of each level by type. */
 const KINDS = {
   "rosgraph_msgs/Log": ["msg", [1, 2, 4, 8, 16]],
   "rcl_interfaces/Log": ["msg", [10, 20, 30, 40, 50]],
@@ -28,6 +28,7 @@ const PAGE = 200; // lines of a request
 const MAX_LINES = 2000;
 const BEYOND = 10; // lines above and below what is seen
 const TYPING = 250; // ms
+const MAX_CHARACTERS = 4000; // of a line
 
 export default {
   kind: "log",
@@ -42,14 +43,14 @@ export default {
     return [
       opening(panel),
       `query = query.between(${moment(recording, begin)}, ${moment(recording, end)})`,
-      ...conditions(panel.topic.type, level, text).map((one) => `query = query.where(${literal(one)})`),
+      ...[conditions(panel.topic.type, level, text)].filter(Boolean).map((one) => `query = query.where(${literal(one)})`),
       "for message in query.limit(1000):",
       "    print(message.log_time_ns, message.fields)",
     ].join("\n");
   },
 };
 
-/** Predicates for the lines that the filters let pass. */
+/** The predicate for the lines that the filters let pass; empty for all. */
 function conditions(type, level, text) {
   const [field, numbers] = KINDS[type.replace("/msg/", "/")];
   const found = [];
@@ -61,7 +62,12 @@ function conditions(type, level, text) {
     const fields = numbers ? [field, "name"] : [field];
     found.push(fields.map((one) => `${one} ~ ${pattern}`).join(" or "));
   }
-  return found;
+  return found.map((one) => `(${one})`).join(" and ");
+}
+
+/** A text that the server has cut has one character more. */
+function cut(text) {
+  return text.length > MAX_CHARACTERS ? `${text.slice(0, MAX_CHARACTERS)}…` : text;
 }
 
 function filtersOf({ level, text }) {
@@ -74,7 +80,8 @@ function filtersOf({ level, text }) {
 function mount(body, panel) {
   const [asking, counting] = [new Question(), new Question()];
   const asked = { recording: panel.recording.info.id, topic: panel.topic.topic };
-  const hasLevels = !/String$/.test(panel.topic.type);
+  const [field, numbers] = KINDS[panel.topic.type.replace("/msg/", "/")];
+  const fields = numbers ? [field, "name", "level"] : [field];
   let lines = [];
   let isFirst = true; // no line is before these
   let isLast = true;
@@ -110,7 +117,7 @@ function mount(body, panel) {
   );
   const whole = element("div", { class: "whole" });
   body.append(
-    element("div", { class: "filters-line" }, hasLevels ? level : null, text, number),
+    element("div", { class: "filters-line" }, numbers ? level : null, text, number),
     view,
     whole,
   );
@@ -130,9 +137,9 @@ function mount(body, panel) {
     at = panel.cursor();
     known = { ...panel.recording.info, start: panel.recording.start };
     isLoading = true;
-    const parameters = { ...asked, ...chosen(), at, before: PAGE / 2, after: PAGE / 2 };
-    await answered(asking.ask("log", parameters), (found) => {
-      [lines, isFirst, isLast] = [found.lines, found.first, found.last];
+    const parameters = { ...asked, where: chosen(), field: fields, at, before: PAGE / 2, after: PAGE / 2 };
+    await answered(asking.ask("rows", parameters), (found) => {
+      [lines, isFirst, isLast] = [found.rows, found.first, found.last];
       isLoading = false;
       point(true);
       if (panel.cursor() !== at) update();
@@ -150,13 +157,13 @@ function mount(body, panel) {
     const ask = now === tallied ? "update" : "ask";
     [tallied, isGrown] = [now, false];
     if (ask === "ask") number.textContent = "…";
-    await answered(counting[ask]("log/count", { ...asked, ...chosen() }), (found) => {
-      number.textContent = found.count === null ? "" : counted(found.count, "line");
+    await answered(counting[ask]("ask", { ...asked, where: chosen() }), (found) => {
+      number.textContent = counted(found.count, "line");
     });
   }
 
   function chosen() {
-    return { level: filters.level || null, text: filters.text || null };
+    return conditions(panel.topic.type, filters.level, filters.text);
   }
 
   /** More lines at one end; the others stay where they are seen. */
@@ -164,18 +171,18 @@ function mount(body, panel) {
     const edge = isBefore ? lines[0] : lines.at(-1);
     if (isLoading || !edge) return;
     isLoading = true;
-    const parameters = { ...asked, ...chosen(), at: edge.time, seq: edge.seq };
+    const parameters = { ...asked, where: chosen(), field: fields, at: edge.time, seq: edge.seq };
     parameters[isBefore ? "before" : "after"] = PAGE;
-    await answered(asking.ask("log", parameters), (found) => {
+    await answered(asking.ask("rows", parameters), (found) => {
       isLoading = false;
       if (isBefore) {
-        lines = [...found.lines, ...lines];
+        lines = [...found.rows, ...lines];
         isFirst = found.first;
-        view.scrollTop += found.lines.length * ROW;
+        view.scrollTop += found.rows.length * ROW;
         if (lines.length > MAX_LINES) isLast = false;
         lines = lines.slice(0, MAX_LINES);
       } else {
-        lines = [...lines, ...found.lines];
+        lines = [...lines, ...found.rows];
         isLast = found.last;
         const surplus = Math.max(lines.length - MAX_LINES, 0);
         if (surplus) isFirst = false;
@@ -190,7 +197,7 @@ function mount(body, panel) {
   async function answered(request, use) {
     try {
       const found = await request;
-      for (const line of found.lines ?? []) line.time = instant(line.time);
+      for (const line of found.rows ?? []) Object.assign(line, readable(line));
       if (!isGone) use(found);
     } catch (error) {
       if (isGone || isAborted(error)) return;
@@ -200,6 +207,13 @@ function mount(body, panel) {
       number.textContent = "";
       fill(inside, element("pre", { class: "problem", role: "alert" }, error.message));
     }
+  }
+
+  /** What a line shows: a text, and where it has them the name of the sender and a level. */
+  function readable({ time, values, problem }) {
+    const [text, name, level] = values ?? [problem];
+    const known = LEVELS.filter((_, place) => numbers && level >= numbers[place]);
+    return { time: instant(time), text: String(text), name, level: known.at(-1) };
   }
 
   function update() {
@@ -253,7 +267,7 @@ function mount(body, panel) {
     if (!lines.length && !isLoading) rows.push(element("p", {}, "No such lines."));
     fill(inside, ...rows);
     const line = lines[current];
-    whole.textContent = line ? line.text : "";
+    whole.textContent = line ? cut(line.text) : "";
   }
 
   function rowOf(line, place) {
@@ -266,10 +280,10 @@ function mount(body, panel) {
         title: line.text,
         onclick: () => panel.seek(line.time),
       },
-      element("span", { class: "time" }, offset(line.time, 9)),
-      hasLevels ? element("span", { class: "level" }, line.level ?? "") : null,
+      element("span", { class: "time" }, offset(line.time)),
+      numbers ? element("span", { class: "level" }, line.level ?? "") : null,
       line.name ? element("span", { class: "name" }, line.name) : null,
-      element("span", { class: "text" }, line.text + (line.cut ? "…" : "")),
+      element("span", { class: "text" }, cut(line.text)),
     );
     row.style.top = `${place * ROW}px`;
     return row;

@@ -11,9 +11,11 @@ import { literal, moment, opening } from "./python.js";
 const USUAL_FIELDS = 3;
 const FIRST = "ranges.min"; // how near something is
 const MAX_FIELDS = 16;
+const FIRST_PIXELS = 200; // of the picture that tells which fields move
 const COLOURS = 8; // classes `series-0` and so on of the style sheet
 const MAX_PIXELS = 4096;
 const SHARED_CURSOR = "time";
+const LETTER = 7; // pixels of a digit of a label
 const LEAST_DRAG = 5; // pixels; less is a click
 
 export default {
@@ -71,12 +73,27 @@ function mount(body, panel) {
       const found = await naming.ask("fields", asked);
       if (isGone) return;
       known = found.fields;
-      if (!fieldsOf(panel.options)) panel.setOptions({ fields: usual(known) });
+      if (!fieldsOf(panel.options)) panel.setOptions({ fields: await moving(usual(known)) });
+      if (isGone) return;
       showLegend();
       update();
     } catch (error) {
       refuse(error);
     }
+  }
+
+  /** The first of some fields whose values are not the same all the time; else the first ones. */
+  async function moving(names) {
+    if (names.length < 2) return names;
+    const { begin, end } = panel.recording.info;
+    const whole = { begin, end: end > begin ? end : begin + 1n, pixels: FIRST_PIXELS };
+    const found = await naming.ask("series", { ...asked, field: names, ...whole });
+    const moves = ({ least, greatest }) => {
+      const values = [...least, ...(greatest ?? [])].filter((value) => value !== null);
+      return values.some((value) => value !== values[0]);
+    };
+    const some = found.fields.filter(moves).map(({ field }) => field);
+    return (some.length ? some : names).slice(0, USUAL_FIELDS);
   }
 
   function fields() {
@@ -159,7 +176,7 @@ function mount(body, panel) {
       scales: { x: { time: false, auto: false }, y: { auto: false } },
       axes: [
         { ...axis, ticks, size: 28, values: (_, splits) => splits.map((ns) => timeText(ns)) },
-        { ...axis, ticks, size: 56 },
+        { ...axis, ticks, size: roomFor },
       ],
       cursor: {
         y: false,
@@ -323,6 +340,11 @@ function numberText(value, type) {
   return String(Number(value.toPrecision(digits)));
 }
 
+/** Room for the longest label of an axis, pixels. */
+function roomFor(_, labels) {
+  return Math.max(56, ...(labels ?? []).map((label) => 20 + LETTER * label.length));
+}
+
 function timeText(ns) {
   return `${Number((ns / 1e9).toPrecision(12))} s`;
 }
@@ -334,7 +356,7 @@ function usual(known) {
   const isNumber = ({ type }) => !/time|duration/.test(type);
   const lists = [known.filter((one) => isPlain(one) && isNumber(one)), known.filter(isPlain), known];
   const found = lists.find((list) => list.length) ?? [];
-  return found.slice(0, USUAL_FIELDS).map(({ path }) => path);
+  return found.slice(0, MAX_FIELDS).map(({ path }) => path);
 }
 
 /** Colours of the style sheet, as a canvas needs them. */
