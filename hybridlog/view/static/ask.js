@@ -1,7 +1,7 @@
 /** The bar that takes questions, and below it their answers. */
 
 import { ApiError, Question, isAborted } from "./api.js";
-import { element, fill, notice } from "./dom.js";
+import { button, copied, element, fill } from "./dom.js";
 import { exportForm } from "./export.js";
 import { matchList } from "./match_list.js";
 import { drawMatches, predicate } from "./matches.js";
@@ -45,7 +45,7 @@ export function mountAsk(main, recording) {
     button("‹ Previous", "Previous match (p)", () => list.step("earlier")),
     button("Next ›", "Next match (n)", () => list.step("later")),
   );
-  const copy = button("Copy as Python", "Copy the question as Python", copyPython);
+  const copy = button("Copy as Python", "Copy the question as Python", () => copied(python));
   const clear = button("Clear", "Clear the question", () => state.set({ ask: null }, { isStep: true }));
   const body = element("div", { class: "body" });
   const bar = element(
@@ -196,11 +196,6 @@ export function mountAsk(main, recording) {
     return state.get("panels")?.[0]?.topic ?? topics()[0]?.topic;
   }
 
-  async function copyPython() {
-    await navigator.clipboard.writeText(python);
-    notice("Copied as Python.");
-  }
-
   function pressed(event) {
     if (event.key === "Escape") {
       event.stopPropagation();
@@ -219,8 +214,4 @@ export function mountAsk(main, recording) {
       if (predicate(recording)) list.step(event.key === "n" ? "later" : "earlier");
     }
   }
-}
-
-function button(text, label, onclick) {
-  return element("button", { type: "button", title: label, "aria-label": label, onclick }, text);
 }

@@ -26,6 +26,17 @@ export function fill(parent, ...children) {
   parent.replaceChildren(...children.filter((child) => child !== null && child !== undefined));
 }
 
+/** A button with a text, and a label that says what it does. */
+export function button(text, label, onclick) {
+  return element("button", { type: "button", title: label, "aria-label": label, onclick }, text);
+}
+
+/** Puts a text on the clipboard. */
+export async function copied(text) {
+  await navigator.clipboard.writeText(text);
+  notice("Copied.");
+}
+
 let hiding = 0;
 
 /** Says something in the head of the page for some seconds. */

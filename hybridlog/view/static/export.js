@@ -1,7 +1,7 @@
 /** Parts of the recording as a file: the command line that writes it, and the file itself. */
 
 import { ApiError, Question, address, isAborted } from "./api.js";
-import { element, fill, notice } from "./dom.js";
+import { copied, element, fill } from "./dom.js";
 import { predicate } from "./matches.js";
 import * as state from "./state.js";
 import { counted } from "./words.js";
@@ -9,10 +9,6 @@ import { counted } from "./words.js";
 /** What can be exported, and what the server has to know for it. */
 const PARTS = {
   range: { title: "This range, all topics", ask: (asked, range) => range },
-  topic: {
-    title: "This range, the topic of the question",
-    ask: ({ topic }, range) => ({ topic, ...range }),
-  },
   matches: { title: "Matches in this range", ask: (asked, range) => ({ ...asked, ...range }) },
 };
 
@@ -97,9 +93,5 @@ export function exportForm(recording) {
 }
 
 function copy(title, text) {
-  const onclick = async () => {
-    await navigator.clipboard.writeText(text());
-    notice("Copied.");
-  };
-  return element("button", { type: "button", onclick }, title);
+  return element("button", { type: "button", onclick: () => copied(text()) }, title);
 }

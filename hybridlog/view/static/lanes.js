@@ -52,16 +52,15 @@ export class Lanes {
   constructor(recording, onChange) {
     this.recording = recording;
     this.onChange = onChange;
-    this.near = new Map();
-    this.far = new Map(); // of the whole recording, for what is not there yet
+    this.known = new Map();
     this.wanted = null;
     this.isAsking = false;
     this.stop = new AbortController();
   }
 
-  /** The lanes of a topic that are there, the one to prefer first. */
+  /** The lane of a topic, as far as it is there. */
   of(topic) {
-    return [this.near.get(topic), this.far.get(topic)].filter(Boolean);
+    return this.known.get(topic);
   }
 
   /** Asks for what a picture needs and is not there; `isNew` asks for it in any case. */
@@ -70,7 +69,7 @@ export class Lanes {
     // A range may be longer than the recording, outside of which there is nothing to ask for.
     const [low, high] = [Math.max(begin, Number(info.begin)), Math.min(end, Number(info.end))];
     const isThere = (topic) => {
-      const lane = this.near.get(topic);
+      const lane = this.known.get(topic);
       if (!lane) return false;
       const last = lane.begin + lane.width * lane.counts.length;
       const isFine = lane.width <= Math.max(widthOf(end - begin, pixels), 1);
@@ -120,17 +119,8 @@ export class Lanes {
     );
     const { start, lanes } = decoded(answer, asked);
     if (start !== this.recording.start) return; // of before the recording was known to begin earlier
-    for (const [topic, lane] of lanes) {
-      this.near.set(topic, lane);
-      if (isWhole) this.far.set(topic, lane);
-    }
+    for (const [topic, lane] of lanes) this.known.set(topic, lane);
     this.onChange();
-  }
-
-  /** Forgets all, when times count from another start. */
-  clear() {
-    this.near.clear();
-    this.far.clear();
   }
 
   destroy() {

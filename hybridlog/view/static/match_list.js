@@ -1,7 +1,7 @@
 /** The list of episodes in which the question holds, a page at a time, and the steps between them. */
 
 import { ApiError, Question, isAborted } from "./api.js";
-import { element, fill, notice } from "./dom.js";
+import { button, element, fill, notice } from "./dom.js";
 import { predicate } from "./matches.js";
 import { seek } from "./range.js";
 import * as state from "./state.js";
@@ -69,8 +69,8 @@ export function matchList(recording) {
     if (!asked) return null;
     try {
       const found = await question[ask]("episodes", { ...asked, ...place });
-      const named = ([at, until, seq, matches]) => ({ at: BigInt(at), until: BigInt(until), seq: BigInt(seq), matches });
-      return { ...found, rows: found.rows.map(named) };
+      const rows = found.rows.map((row) => [...row.slice(0, 3).map(BigInt), row[3]]);
+      return { ...found, rows: rows.map(([at, until, seq, matches]) => ({ at, until, seq, matches })) };
     } catch (error) {
       if (isAborted(error)) return null;
       if (!(error instanceof ApiError)) throw error;
@@ -138,8 +138,4 @@ export function matchList(recording) {
     if (low < side.scrollTop) side.scrollTop = low;
     else if (high > side.scrollTop + side.clientHeight) side.scrollTop = high - side.clientHeight;
   }
-}
-
-function button(text, label, onclick) {
-  return element("button", { type: "button", "aria-label": label, title: label, onclick }, text);
 }

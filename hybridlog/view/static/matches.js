@@ -78,7 +78,8 @@ function drawn(recording, name, question, lane = null) {
     const pixels = Math.min(window.innerWidth, MAX_PIXELS);
     try {
       const ask = recording.isUpdating ? "update" : "ask";
-      const { first, counts, bands } = await asking[ask]("matches", { ...asked, ...exactRange(recording), pixels });
+      const picture = { ...asked, ...exactRange(recording), pixels };
+      const { first, counts, bands } = await asking[ask]("matches", picture);
       const ticks = first.map((time, n) => [time, counts[n]]);
       const title = lane ? "Warnings and errors" : `${asked.topic}: ${asked.where}`;
       overlays.draw(name, { title, lane, ticks, bands: lane ? [] : bands });

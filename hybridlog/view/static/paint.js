@@ -65,24 +65,14 @@ function hatch(context, size, colour, alpha, lines) {
  *
  * @param {Object} picture context, width, toX, begin and end
  * @param {{top: number, height: number}} box
- * @param {Array<import("./lanes.js").Lane>} lanes the one to prefer first
+ * @param {?import("./lanes.js").Lane} lane
  * @param {Object} paints
  * @param {{begin: number, end: number}} extent of the recording, ns
  */
-export function drawLane(picture, box, lanes, paints, extent) {
-  let { begin, end } = picture;
-  const [near, far] = lanes;
-  if (!near) return;
-  const last = near.begin + near.width * near.counts.length;
-  if (far && far !== near) {
-    // What the nearer one does not cover.
-    if (near.begin > begin) drawPart(picture, box, far, paints, extent, begin, Math.min(near.begin, end));
-    if (last < end) drawPart(picture, box, far, paints, extent, Math.max(last, begin), end);
-  }
-  drawPart(picture, box, near, paints, extent, Math.max(begin, near.begin), Math.min(end, last));
-}
-
-function drawPart(picture, { top, height }, lane, paints, extent, begin, end) {
+export function drawLane(picture, { top, height }, lane, paints, extent) {
+  if (!lane) return;
+  const last = lane.begin + lane.width * lane.counts.length;
+  const [begin, end] = [Math.max(picture.begin, lane.begin), Math.min(picture.end, last)];
   if (end <= begin) return;
   const { context, toX, width, ratio } = picture;
   const { counts, gaps } = lane;

@@ -1,6 +1,6 @@
 /** The panels at the cursor: a grid, a head for each, and a menu to add one. */
 
-import { element, fill, notice } from "./dom.js";
+import { copied, element, fill, notice } from "./dom.js";
 import { exactRange } from "./range.js";
 import * as state from "./state.js";
 import image from "./panels/image.js";
@@ -132,10 +132,7 @@ export function mountPanels(main, recording) {
     const topic = topicOf(panel);
     const body = element("div", { class: "body" });
     const close = () => state.set({ panels: panels().filter((one) => !isSame(one, panel)) });
-    const copy = async () => {
-      await navigator.clipboard.writeText(kind.python(seen));
-      notice("Copied as Python.");
-    };
+    const copy = () => copied(kind.python(seen));
     const title = kind?.title ?? panel.kind;
     const frame = element(
       "article",

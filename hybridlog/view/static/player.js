@@ -1,6 +1,6 @@
 /** Play controls, and the keys that move the cursor and the visible range. */
 
-import { element, notice } from "./dom.js";
+import { button, element, notice } from "./dom.js";
 import { lastTime, pan, seek, visible, zoom } from "./range.js";
 import * as state from "./state.js";
 import { moment, offset } from "./words.js";
@@ -38,7 +38,7 @@ export function mountPlayer(parent, recording) {
   let told = 0;
   let at = Number(state.get("at")); // where it plays
 
-  const play = button("Play", toggle, "Play or pause (Space)");
+  const play = button("Play", "Play or pause (Space)", toggle);
   const rate = element(
     "select",
     { "aria-label": "Speed", title: "Speed (< and >)" },
@@ -49,16 +49,16 @@ export function mountPlayer(parent, recording) {
   const bar = element(
     "div",
     { class: "player", role: "toolbar", "aria-label": "Player" },
-    button("⇤", () => seek(recording, recording.info.begin), "First message (Home)"),
+    button("⇤", "First message (Home)", () => seek(recording, recording.info.begin)),
     play,
-    button("⇥", () => seek(recording, lastTime(recording)), "Last message (End)"),
+    button("⇥", "Last message (End)", () => seek(recording, lastTime(recording))),
     rate,
     readout,
     element("span", { class: "space" }),
-    button("−", () => zoom(recording, 2, state.get("at")), "Zoom out (−)"),
-    button("+", () => zoom(recording, 0.5, state.get("at")), "Zoom in (+)"),
-    button("All", () => state.set({ begin: null, end: null }), "Show the whole recording (0)"),
-    button("?", () => dialog.showModal(), "Keys and signs (?)"),
+    button("−", "Zoom out (−)", () => zoom(recording, 2, state.get("at"))),
+    button("+", "Zoom in (+)", () => zoom(recording, 0.5, state.get("at"))),
+    button("All", "Show the whole recording (0)", () => state.set({ begin: null, end: null })),
+    button("?", "Keys and signs (?)", () => dialog.showModal()),
   );
   parent.append(bar, dialog);
   const ends = [state.on(["at"], follow)];
@@ -145,10 +145,6 @@ export function mountPlayer(parent, recording) {
     event.preventDefault();
     actions[key]();
   }
-}
-
-function button(text, onclick, title) {
-  return element("button", { type: "button", onclick, title, "aria-label": title }, text);
 }
 
 function help() {

@@ -9,10 +9,11 @@ const TIMES = ["t", "log_time"];
 /** A table of an answer of the server. */
 export function sqlTable(answer) {
   const { columns, rows, at } = answer;
+  const go = (time) => state.set({ at: state.instant(time) });
   const cell = (text, [name, isNumber], row) => {
     const shown =
       TIMES.includes(name) && at[row]
-        ? element("button", { type: "button", class: "plain link", onclick: () => state.set({ at: state.instant(at[row]) }) }, text)
+        ? element("button", { type: "button", class: "plain link", onclick: () => go(at[row]) }, text)
         : text;
     return element("td", { class: isNumber ? "number" : null }, shown);
   };

@@ -10,7 +10,7 @@ import { mountPlayer } from "./player.js";
 import { seek, show, visible, zoom } from "./range.js";
 import * as state from "./state.js";
 import { count, counted, duration, moment, offset } from "./words.js";
-import { groupOf, shortType } from "./topic_groups.js";
+import { groupOf, shortType } from "./panels/types.js";
 
 const AXIS = 30;
 const MAX_SHOWN = 12; // lanes that are seen without scrolling
@@ -32,7 +32,8 @@ export function mountTimeline(parent, recording) {
   const canvas = element("canvas", { class: "density", tabindex: "0", role: "slider" });
   canvas.setAttribute("aria-label", "Cursor in the timeline");
   const names = element("div", { class: "names" });
-  const filter = element("input", { type: "search", "aria-label": "Filter of the lanes", oninput: () => recorded() });
+  const filtered = { "aria-label": "Filter of the lanes", oninput: () => recorded() };
+  const filter = element("input", { type: "search", ...filtered });
   const corner = element("div", { class: "corner" }, filter);
   const scroller = element("div", { class: "lanes" }, names, canvas);
   const tip = element("div", { class: "tip", hidden: true, role: "status" });
@@ -83,8 +84,8 @@ export function mountTimeline(parent, recording) {
   /** Takes over what is known of the recording, and what has come since. */
   function recorded(isNew = false) {
     const words = filter.value.toLowerCase().split(/\s+/);
-    const isMeant = ({ topic, type }) => words.every((word) => `${topic} ${type}`.toLowerCase().includes(word));
-    topics = recording.info.topics.filter(isMeant).sort(byGroup);
+    const isIn = ({ topic, type }) => (word) => `${topic} ${type}`.toLowerCase().includes(word);
+    topics = recording.info.topics.filter((one) => words.every(isIn(one))).sort(byGroup);
     filter.placeholder = counted(recording.info.topics.length, "topic");
     const height = rowHeight();
     for (const one of [scroller, canvas]) {
@@ -317,12 +318,13 @@ export function mountTimeline(parent, recording) {
     const lines = [`${offset(state.instant(time), digitsOf(nsPerPixel))}  ${moment(recording.toTime(time))}`];
     if (hover.lane !== null) lines.push(...aboutLane(topics[hover.lane].topic, time, nsPerPixel));
     const near = 4 * nsPerPixel;
-    lines.push(...marks.filter((mark) => mark.at - near < time && time < mark.end + near).slice(0, 5).map(({ text }) => `Mark: ${text}`));
+    const here = marks.filter((mark) => mark.at - near < time && time < mark.end + near);
+    lines.push(...here.slice(0, 5).map(({ text }) => `Mark: ${text}`));
     for (const { title, lane, bands, ticks } of overlays.all()) {
       if (lane && lane !== topics[hover.lane]?.topic) continue;
       const isIn = bands.some(([low, high]) => low <= time && time < high);
-      const here = ticks.filter(([at]) => Math.abs(at - time) < near);
-      const matches = here.reduce((sum, [, number]) => sum + number, 0);
+      const close = ticks.filter(([at]) => Math.abs(at - time) < near);
+      const matches = close.reduce((sum, [, number]) => sum + number, 0);
       if (matches) lines.push(`${title}: ${count(matches)} here`);
       else if (isIn) lines.push(title);
     }
@@ -336,7 +338,7 @@ export function mountTimeline(parent, recording) {
 
   function aboutLane(topic, time, nsPerPixel) {
     const lines = [topic];
-    const lane = lanes.of(topic)[0];
+    const lane = lanes.of(topic);
     if (lane) {
       const bin = Math.floor((time - lane.begin) / lane.width);
       const begin = lane.begin + bin * lane.width;
@@ -357,8 +359,8 @@ export function mountTimeline(parent, recording) {
       const lost = loss.count === null ? "Messages" : count(loss.count);
       lines.push(`${lost} lost (${loss.cause}${loss.reason ? `: ${loss.reason}` : ""})`);
     }
-    const gone = recording.info.gone.filter((one) => one.topic === topic && one.begin <= time && time <= one.end);
-    for (const { cause } of gone) {
+    for (const { cause, begin, end, topic: own } of recording.info.gone) {
+      if (own !== topic || time < begin || time > end) continue;
       const where = cause === "expired" ? "have expired" : "are elsewhere";
       lines.push(`Payloads ${where}: only fields are here`);
     }

@@ -38,12 +38,13 @@ export default {
   mount,
   python: (panel) => {
     const { level, text } = filtersOf(panel.options);
+    const where = conditions(panel.topic.type, level, text);
     const { begin, end } = panel.range();
     const { recording } = panel;
     return [
       opening(panel),
       `query = query.between(${moment(recording, begin)}, ${moment(recording, end)})`,
-      ...[conditions(panel.topic.type, level, text)].filter(Boolean).map((one) => `query = query.where(${literal(one)})`),
+      ...(where ? [`query = query.where(${literal(where)})`] : []),
       "for message in query.limit(1000):",
       "    print(message.log_time_ns, message.fields)",
     ].join("\n");

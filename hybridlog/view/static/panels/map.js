@@ -9,7 +9,7 @@ import { counted, offset } from "../words.js";
 import { literal, opening } from "./python.js";
 import { ofTypes } from "./types.js";
 
-const PIXELS = 2000; // steps of time of a track
+const PIXELS = 8192; // steps of time of a track
 const REST = 4; // times as long as the last track took
 const NEAR = 12; // pixels within which a click means the track
 const accepts = ofTypes(
@@ -60,14 +60,12 @@ function mount(body, panel) {
   body.classList.add("spatial");
   const asked = { recording: panel.recording.info.id, topic: panel.topic.topic };
 
-  let track = null; // of the whole recording
-  let detail = null; // of the visible range, if that shows more
-  let wanted = ""; // the range that was asked for last
+  let track = null;
   let messages = -1; // of the topic when the track was asked for
   let rested = 0; // when the track may be asked for again
   let timer = 0;
   let isGone = false;
-  const [asking, looking] = [new Question(), new Question()];
+  const asking = new Question();
 
   const drawn = plane(place, { label: `Track of ${panel.topic.topic}`, paint, pick });
   fit.addEventListener("click", drawn.reset);
@@ -77,7 +75,6 @@ function mount(body, panel) {
     destroy() {
       isGone = true;
       asking.stop();
-      looking.stop();
       clearTimeout(timer);
       drawn.destroy();
     },
@@ -87,9 +84,8 @@ function mount(body, panel) {
     const { topics } = panel.recording.info;
     const now = topics.find(({ topic }) => topic === panel.topic.topic)?.messages;
     clearTimeout(timer);
-    if (now === messages) look();
-    else if (performance.now() >= rested) load(now);
-    else timer = setTimeout(update, rested - performance.now());
+    if (now !== messages && performance.now() >= rested) load(now);
+    else if (now !== messages && rested < Infinity) timer = setTimeout(update, rested - performance.now());
     describe();
     drawn.redraw();
   }
@@ -102,7 +98,6 @@ function mount(body, panel) {
       const found = unpack(await asking.ask("track", { ...asked, pixels: PIXELS }, bytes));
       if (isGone) return;
       track = found;
-      wanted = "";
       problem.hidden = true;
       place.hidden = false;
       drawn.fit(boxOf(track.arrays.xy));
@@ -115,38 +110,10 @@ function mount(body, panel) {
     if (!isGone) update();
   }
 
-  /** Asks for more of the visible range than the whole track shows. */
-  async function look() {
-    const { begin, end } = panel.range();
-    const key = `${begin} ${end}`;
-    if (!track || track.exact || key === wanted) return;
-    wanted = key;
-    try {
-      const parameters = { ...asked, begin, end, pixels: PIXELS };
-      const ask = panel.recording.isUpdating ? "update" : "ask";
-      const found = unpack(await looking[ask]("track", parameters, bytes));
-      if (!found.is_geographic) detail = found;
-      else detail = found.grid ? { ...found, shift: shiftOf(found.grid) } : null;
-      drawn.redraw();
-    } catch (error) {
-      refuse(error);
-    }
-  }
-
-  /** Metres from the origin of the whole track. */
-  function shiftOf({ latitude, longitude }) {
-    const { grid } = track;
-    const turn = ((((longitude - grid.longitude + 180) % 360) + 360) % 360) - 180;
-    return [turn * grid.east, (latitude - grid.latitude) * grid.north];
-  }
-
   /** The last position of the track at the cursor or before it; null if there is none. */
   function current() {
     const cursor = panel.cursor();
-    const known = detail?.arrays.times ?? [];
-    const isInside = known.length && instant(known[0]) <= cursor && cursor <= instant(known.at(-1));
-    const part = isInside ? detail : track;
-    const { times, rests, xy } = part.arrays;
+    const { times, rests, xy } = track.arrays;
     let [low, high] = [0, times.length];
     while (low < high) {
       const middle = (low + high) >> 1;
@@ -154,17 +121,15 @@ function mount(body, panel) {
       else high = middle;
     }
     if (!low || Number.isNaN(xy[2 * low - 2])) return null;
-    const [right, up] = part.shift ?? [0, 0];
     const time = instant(times[low - 1]) + instant(rests[low - 1]);
-    return { time, x: xy[2 * low - 2] + right, y: xy[2 * low - 1] + up };
+    return { time, x: xy[2 * low - 2], y: xy[2 * low - 1] };
   }
 
   function paint(context, view) {
     if (!track) return;
     const { begin, end } = panel.range();
     line(context, view, track, { colour: view.theme.faint, width: 1 });
-    const part = detail ?? track;
-    line(context, view, part, { colour: view.theme.accent, width: 2, begin, end });
+    line(context, view, track, { colour: view.theme.accent, width: 2, begin, end });
     const found = current();
     if (!found) return;
     const [right, down] = [view.x(found.x), view.y(found.y)];
@@ -230,7 +195,7 @@ function mount(body, panel) {
 }
 
 /** Draws a track, or the part of it in a range; NaN is a gap. */
-function line(context, view, { arrays, shift = [0, 0] }, { colour, width, begin, end }) {
+function line(context, view, { arrays }, { colour, width, begin, end }) {
   const { times, xy } = arrays;
   context.strokeStyle = colour;
   context.fillStyle = colour;
@@ -244,8 +209,8 @@ function line(context, view, { arrays, shift = [0, 0] }, { colour, width, begin,
       isDown = false;
       continue;
     }
-    const right = view.x(x + shift[0]);
-    const down = view.y(xy[2 * at + 1] + shift[1]);
+    const right = view.x(x);
+    const down = view.y(xy[2 * at + 1]);
     if (isDown) context.lineTo(right, down);
     else context.moveTo(right, down);
     // A single fix between gaps is a dot.

@@ -5,7 +5,6 @@ import { element, fill } from "../dom.js";
 import { show } from "../range.js";
 import * as state from "../state.js";
 import uPlot from "../vendor/uPlot.esm.js";
-import { fieldPicker } from "./fields.js";
 import { literal, moment, opening } from "./python.js";
 
 const USUAL_FIELDS = 3;
@@ -56,9 +55,9 @@ function mount(body, panel) {
   let known = [];
   let isGone = false;
 
-  const picker = fieldPicker({
-    most: MAX_FIELDS,
-    choose: (fields) => panel.setOptions({ fields }),
+  const picker = fieldPicker((path) => {
+    const names = fields();
+    if (!names.includes(path)) panel.setOptions({ fields: [...names, path].slice(0, MAX_FIELDS) });
   });
   body.append(element("div", { class: "legend-line" }, legend, picker.dom), problem, place);
   const line = element("div", { class: "cursor-line" });
@@ -257,7 +256,7 @@ function mount(body, panel) {
       ),
     );
     fill(legend, ...chips);
-    picker.set(known, names);
+    picker.set(known);
   }
 
   /** The values below the mouse, or else at the cursor. */
@@ -281,7 +280,6 @@ function mount(body, panel) {
       asking.stop();
       naming.stop();
       watching.disconnect();
-      picker.destroy();
       scheme.removeEventListener("change", redraw);
       chart?.destroy();
     },
@@ -338,6 +336,32 @@ function numberText(value, type) {
   let digits = 1;
   while (Math.fround(value.toPrecision(digits)) !== value) digits += 1;
   return String(Number(value.toPrecision(digits)));
+}
+
+let pickers = 0;
+
+/** A field to add the path of a number in, completed by the browser; `choose` is told the path. */
+function fieldPicker(choose) {
+  const id = `fields-${(pickers += 1)}`;
+  const list = element("datalist", { id });
+  const add = () => {
+    const path = input.value.trim();
+    input.value = "";
+    if (path) choose(path);
+  };
+  const input = element("input", {
+    list: id,
+    type: "search",
+    placeholder: "Add a field",
+    "aria-label": "Add a field",
+    autocomplete: "off",
+    onchange: add,
+  });
+  return {
+    dom: element("span", { class: "picker" }, input, list),
+    set: (fields) =>
+      fill(list, ...fields.map(({ path, type }) => element("option", { value: path }, type))),
+  };
 }
 
 /** Room for the longest label of an axis, pixels. */

@@ -21,6 +21,7 @@ const accepts = ofTypes(
   "foxglove_msgs/PointCloud",
 );
 const AXES = ["x", "y", "z"];
+const SCANNER = { left: 0, right: 0, bottom: 0, top: 0 };
 const COLOUR = "rgb";
 const PLAIN = "one colour";
 /** Size of a point in pixels: fewer points are larger. */
@@ -73,10 +74,11 @@ function mount(body, panel) {
   let isGone = false;
   let asked = chosen();
 
+  const label = `Points of ${panel.topic.topic}`;
   const paints = new Colours(place);
   const endTheme = onTheme(() => {
     paints.forget();
-    drawn?.show(found.arrays.xyz, colours());
+    if (drawn) draw();
   });
   const following = follow({
     load,
@@ -135,9 +137,14 @@ function mount(body, panel) {
       drawn = made();
     }
     drawn.fit(shifted(box));
-    drawn.show(found.arrays.xyz, colours());
+    draw();
     describe();
     return undefined;
+  }
+
+  function draw() {
+    const { xyz } = found.arrays;
+    drawn.show(xyz, colours(), sizeOf(xyz.length / 3));
   }
 
   async function load3d() {
@@ -150,11 +157,11 @@ function mount(body, panel) {
 
   function made() {
     try {
-      if (!isFlat()) return deep(module, place, panel, lost);
+      if (!isFlat()) return module.scene(place, { label, lost });
     } catch (error) {
       without = `${error.message}: points are shown from above.`;
     }
-    return flat(place, panel);
+    return flat(place, label);
   }
 
   /** Browsers draw few scenes at a time, and take WebGL from the oldest one. */
@@ -177,7 +184,7 @@ function mount(body, panel) {
     if (x) {
       const own = { left: x[0], right: x[1], bottom: y[0], top: y[1], low: z[0], high: z[1] };
       // A scan is seen from its scanner.
-      if (found.flat) Object.assign(own, around(own));
+      if (found.flat) Object.assign(own, joined(own, { ...own, ...SCANNER }));
       box = box ? joined(box, own) : own;
     }
     const { value } = found;
@@ -290,13 +297,11 @@ function suggested({ names, flat: isFlat }) {
 }
 
 /** Points from above, on a plane. */
-function flat(place, panel) {
-  let xyz = new Float32Array();
-  let colours = new Uint8Array();
-  const made = plane(place, { label: `Points of ${panel.topic.topic}`, paint });
+function flat(place, label) {
+  let [xyz, colours, size] = [new Float32Array(), new Uint8Array(), 1];
+  const made = plane(place, { label, paint });
 
   function paint(context, view) {
-    const size = sizeOf(xyz.length / 3);
     let style = -1;
     for (let at = 0; at < xyz.length; at += 3) {
       const x = view.x(xyz[at]);
@@ -312,53 +317,19 @@ function flat(place, panel) {
   }
 
   return {
+    ...made,
     isFlat: true,
-    fit: made.fit,
-    reset: made.reset,
-    destroy: made.destroy,
-    show(places, own) {
-      xyz = places;
-      colours = own;
+    show(...given) {
+      [xyz, colours, size] = given;
       made.redraw();
     },
   };
 }
 
-/** Points in space. */
-function deep(module, place, panel, lost) {
-  const made = module.scene(place, { label: `Points of ${panel.topic.topic}`, lost });
-  return {
-    isFlat: false,
-    fit: made.fit,
-    reset: made.reset,
-    destroy: made.destroy,
-    show: (xyz, colours) => made.show(xyz, colours, sizeOf(xyz.length / 3)),
-    get step() {
-      return made.step;
-    },
-  };
-}
-
-function around({ left, right, bottom, top }) {
-  return {
-    left: Math.min(left, 0),
-    right: Math.max(right, 0),
-    bottom: Math.min(bottom, 0),
-    top: Math.max(top, 0),
-  };
-}
-
 function joined(a, b) {
-  const least = (name) => Math.min(a[name], b[name]);
-  const greatest = (name) => Math.max(a[name], b[name]);
-  return {
-    left: least("left"),
-    right: greatest("right"),
-    bottom: least("bottom"),
-    top: greatest("top"),
-    low: least("low"),
-    high: greatest("high"),
-  };
+  const choose = { left: Math.min, right: Math.max, bottom: Math.min, top: Math.max, low: Math.min, high: Math.max };
+  const ends = Object.entries(choose).map(([name, of]) => [name, of(a[name], b[name])]);
+  return Object.fromEntries(ends);
 }
 
 function short(number) {

@@ -26,7 +26,6 @@ const ANGLE = 50; // degrees from the bottom of the picture to its top
 const TURN = 0.008; // radians a pixel
 const KEY_TURN = 0.15; // radians
 const LINES = 20; // of the grid, each way
-const AXES = [0xd4453a, 0x4c9f38, 0x3b7dd8]; // x, y, z
 const START = { azimuth: -2.3, height: 0.55 }; // from behind, to the right and above
 
 /**
@@ -60,8 +59,7 @@ export function scene(parent, { label, lost }) {
   );
   cloud.frustumCulled = false;
   const grid = new LineSegments(new BufferGeometry(), new LineBasicMaterial());
-  const axes = new LineSegments(new BufferGeometry(), new LineBasicMaterial({ vertexColors: true }));
-  world.add(grid, axes, cloud);
+  world.add(grid, cloud);
 
   const paints = new Colours(parent);
   let eye = { ...START, distance: 10, target: [0, 0, 0] };
@@ -196,20 +194,11 @@ export function scene(parent, { label, lost }) {
       places.push(x - reach, y + by, floor, x + reach, y + by, floor);
     }
     setPlaces(grid, new Float32Array(places));
-    const length = 2 * step;
-    const ends = AXES.flatMap((_, at) => [0, 0, 0, ...[0, 1, 2].map((n) => (n === at ? length : 0))]);
-    setPlaces(axes, new Float32Array(ends));
-    const colours = AXES.flatMap((colour) => {
-      const { r, g, b } = new Color(colour);
-      return [r, g, b, r, g, b];
-    });
-    axes.geometry.setAttribute("color", new BufferAttribute(new Float32Array(colours), 3));
   }
 
   return {
-    canvas,
+    isFlat: false,
     reset,
-    fromAbove,
     /** Length of a square of the grid, metres. */
     get step() {
       return step;
@@ -235,7 +224,7 @@ export function scene(parent, { label, lost }) {
       cancelAnimationFrame(pending);
       watching.disconnect();
       endTheme();
-      for (const { geometry, material } of [cloud, grid, axes]) {
+      for (const { geometry, material } of [cloud, grid]) {
         geometry.dispose();
         material.dispose();
       }
