@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import io
 import struct
-import warnings
 from collections.abc import Sequence
-from contextlib import suppress
 from itertools import starmap
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -31,8 +29,6 @@ class Picture(Struct, frozen=True):
     data: bytes
 
 
-MAX_SHOWN: Final = 1 << 26
-"""Most pixels of a compressed picture that is for the eye."""
 # Media type, suffix, whether browsers show it, and what it begins with: bytes at offsets.
 _KINDS: Final[Sequence[tuple[str, str, bool, dict[int, bytes]]]] = (
     ("image/jpeg", ".jpg", True, {0: b"\xff\xd8\xff"}),
@@ -96,35 +92,11 @@ def _as_it_came(message: Any, *, raw: bool) -> Picture | None:
     for media_type, suffix, is_shown, marks in _KINDS:
         if all(data.startswith(mark, at) for at, mark in marks.items()):
             is_deep = suffix == ".png" and data[24:26] == _DEEP_GREY
-            if not raw and is_shown and not is_deep:
-                _check_size(data)
-                return Picture(media_type, suffix, data)
-            return Picture(media_type, suffix, data) if raw else None
+            is_meant = raw or (is_shown and not is_deep)
+            return Picture(media_type, suffix, data) if is_meant else None
     raise PayloadError(
         f"a compressed image begins like no known format; it says that it is {form[:40]!r}"
     )
-
-
-def _check_size(data: bytes) -> None:
-    """Refuse a small file that would fill the memory of the program that shows it."""
-    try:
-        from PIL import Image, UnidentifiedImageError
-    except ImportError:
-        return  # then nothing is decoded here, and the browser has its own bounds
-    size = (0, 0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        with suppress(UnidentifiedImageError, OSError, ValueError, SyntaxError, struct.error):
-            try:
-                with Image.open(io.BytesIO(data)) as image:
-                    size = image.size
-            except Image.DecompressionBombError as error:
-                raise PayloadError(f"an image is too large to be shown: {error}") from error
-    if size[0] * size[1] > MAX_SHOWN:
-        raise PayloadError(
-            f"an image of {size[0]} x {size[1]} pixels is too large to be shown; "
-            "`hybridlog fetch --format png` writes it to a file"
-        )
 
 
 def _jpeg(shown: NDArray[np.uint8]) -> bytes:

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
     from hybridlog.drawing.series import Numbers
     from hybridlog.query.query import Query
-    from hybridlog.query.question import Span
 
 _RADIUS = 6_378_137.0  # m, semi-major axis of WGS 84
 _ECCENTRICITY = 6.694379990141317e-3  # squared
@@ -88,13 +87,12 @@ def position_of(known: Mapping[str, str] | None) -> tuple[tuple[str, str], bool]
     return None
 
 
-def track(query: Query, *, pixels: int, span: Span | None = None) -> Track:
+def track(query: Query, *, pixels: int) -> Track:
     """The positions of a topic of one recording, such as NavSatFix or Odometry, over log time.
 
     A message has a fix if its position is one and its `status.status`, if there is one, is not
     negative. `pixels` are steps of time: up to six times as many messages are returned exactly. The
-    span is log time `[begin, end)`, ns; None for that of the messages. The counters of the query
-    are set to the cost.
+    counters of the query are set to the cost.
     """
     if pixels < 1:
         raise UsageError("A track has at least one pixel.")
@@ -105,7 +103,7 @@ def track(query: Query, *, pixels: int, span: Span | None = None) -> Track:
     paths, is_geographic = [*found[0]], found[1]
     if is_geographic and (known is None or _STATUS in known):
         paths.append(_STATUS)
-    narrowed, (begin, end) = over_time(query, paths, span)
+    narrowed, (begin, end) = over_time(query, paths, None)
     rows = ShownRows((begin, end), pixels, most=_POSITIONS_PER_PIXEL * pixels)
     rows.add(np.empty(0, np.int64), {"x": np.empty(0), "y": np.empty(0)})
     grid, messages, fixes = None, 0, 0

@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 
 from hybridlog.query.times import format_time
-from hybridlog.schema.arrow_types import is_numeric
+from hybridlog.schema.arrow_types import is_bytes, is_list, is_numeric
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.times import BEGIN, END
 
@@ -51,7 +51,7 @@ def tree(
     value: Any = message.content()
     for place in path:
         part = _part(value)
-        if isinstance(part, _Plain) or not 0 <= place < len(part.items):
+        if part.items is None or not 0 <= place < len(part.items):
             raise UsageError("The message has no such part.")
         value = part.items[place]
     if count is not None:
@@ -69,15 +69,18 @@ class _Walk:
         """The node of a value."""
         self.nodes -= 1
         part = _part(value)
-        if isinstance(part, _Plain):
-            return self._plain(part, begin)
+        if part.items is None:
+            shown = _cut(part.text[begin : begin + MAX_TEXT])
+            is_cut = len(shown) < len(part.text)
+            more = {"n": len(part.text), "begin": min(begin, len(part.text))} if is_cut else {}
+            return {"type": part.type, "text": shown, **more}
         size, is_object = len(part.items), part.names is not None
         found: Node = {"type": part.type, "n": size, "begin": min(begin, size)}
         if count is None:
             count = MAX_SHOWN if is_object else _SHOWN[part.is_plain]
         places = range(begin, min(begin + count, size))
         if part.is_plain:
-            found["texts"] = [_cut(_plain(part.items[place]).text) for place in places]
+            found["texts"] = [_cut(_part(part.items[place]).text) for place in places]
             return found
         if depth <= 0 or self.nodes < min(count, size):
             return found
@@ -90,74 +93,71 @@ class _Walk:
             found["items"].append({**named, **node})
         return found
 
-    def _plain(self, part: _Plain, begin: int) -> Node:
-        shown = _cut(part.text[begin : begin + MAX_TEXT])
-        found: Node = {"type": part.type, "text": shown}
-        if len(shown) < len(part.text):
-            found |= {"n": len(part.text), "begin": min(begin, len(part.text))}
-        return found
-
 
 def _cut(text: str) -> str:
     # A lone surrogate, which JSON may have, is no text of a web page.
     return text[:MAX_TEXT].encode("utf-8", "replace").decode()
 
 
-class _Plain(NamedTuple):
-    """A plain value as text."""
-
-    type: str
-    text: str
-
-
-class _Parts(NamedTuple):
-    """An object or an array.
+class _Part(NamedTuple):
+    """A plain value as text, an object or an array.
 
     Attributes:
         type: Of an array, with its length; empty for an object.
-        items: The elements, or for objects the values.
-        names: Of the fields; None for an array.
+        text: Of a plain value.
+        items: The elements, or for objects the values; None for a plain value.
+        names: Of the fields of an object.
         is_plain: An array of nothing but numbers.
     """
 
     type: str
-    items: Any
+    text: str = ""
+    items: Any = None
     names: Sequence[str] | None = None
     is_plain: bool = False
 
 
-def _part(value: Any) -> _Plain | _Parts:
+def _part(value: Any) -> _Part:
     """The form of a value."""
     if isinstance(value, pa.Scalar):
         return _of_arrow(value)
     if isinstance(value, Mapping):
-        return _Parts("", [*value.values()], [*map(str, value)])
+        return _Part("", items=[*value.values()], names=[*map(str, value)])
     if isinstance(value, bytes):
-        return _Parts(f"bytes[{len(value)}]", np.frombuffer(value, np.uint8), is_plain=True)
+        return _Part(f"bytes[{len(value)}]", items=np.frombuffer(value, np.uint8), is_plain=True)
     if not isinstance(value, list | tuple):
-        return _plain(value)
+        kind = getattr(value, "kind", "")
+        if kind in _INSTANTS:
+            return _Part(kind, _INSTANTS[kind](int(value)))
+        kinds = ((bool, "bool"), (int, "integer"), (float, "number"), (str, "string"))
+        plain = next((name for kind, name in kinds if isinstance(value, kind)), "")
+        is_numpy = isinstance(value, np.generic)
+        return _Part(value.dtype.name if is_numpy else plain, _text(value))
     simple = [v for v in value[:MAX_SHOWN] if not isinstance(v, Mapping | list | tuple | bytes)]
-    kinds = {_plain(one).type for one in simple}
-    kind = kinds.pop() if len(kinds) == 1 else ""
+    kinds_found = {_part(one).type for one in simple}
+    kind = kinds_found.pop() if len(kinds_found) == 1 else ""
     numeric = all(isinstance(v, bool | int | float) and not hasattr(v, "kind") for v in value)
-    return _Parts(f"{kind}[{len(value)}]", value, is_plain=bool(value) and numeric)
+    return _Part(f"{kind}[{len(value)}]", items=value, is_plain=bool(value) and numeric)
 
 
-def _of_arrow(value: pa.Scalar[Any]) -> _Plain | _Parts:
-    if not value.is_valid or isinstance(value, pa.StringScalar | pa.LargeStringScalar):
-        return _plain(value)
-    if isinstance(value, pa.StructScalar):
-        return _Parts("", value, [field.name for field in value.type])
-    if isinstance(value, pa.BinaryScalar | pa.LargeBinaryScalar):
+def _of_arrow(value: pa.Scalar[Any]) -> _Part:
+    kind = value.type
+    if value.is_valid and pa.types.is_struct(kind):
+        return _Part("", items=value, names=[field.name for field in kind])
+    if value.is_valid and is_bytes(kind):
         data = np.frombuffer(value.as_buffer(), np.uint8)
-        return _Parts(f"bytes[{len(data)}]", data, is_plain=True)
-    if not isinstance(value, pa.ListScalar | pa.FixedSizeListScalar | pa.LargeListScalar):
-        return _plain(value)
-    items: Any = value.values
-    name, numeric = _type_name(items.type), is_numeric(items.type) and not items.null_count
-    if numeric:
-        items = items.to_numpy(zero_copy_only=not pa.types.is_boolean(items.type))
-    return _Parts(f"{name}[{len(items)}]", items, is_plain=numeric)
+        return _Part(f"bytes[{len(data)}]", items=data, is_plain=True)
+    if value.is_valid and is_list(kind):
+        items: Any = value.values
+        name, numeric = _type_name(items.type), is_numeric(items.type) and not items.null_count
+        if numeric:
+            items = items.to_numpy(zero_copy_only=not pa.types.is_boolean(items.type))
+        return _Part(f"{name}[{len(items)}]", items=items, is_plain=numeric)
+    name = _type_name(kind)
+    if value.is_valid and name in _INSTANTS:
+        return _Part(name, _INSTANTS[name](value.value))
+    is_single = value.is_valid and pa.types.is_float32(kind)
+    return _Part(name, _text(np.float32(value.as_py()) if is_single else value.as_py()))
 
 
 def _type_name(kind: pa.DataType) -> str:
@@ -166,23 +166,6 @@ def _type_name(kind: pa.DataType) -> str:
     if pa.types.is_nested(kind):
         return ""
     return {"float": "float32", "double": "float64"}.get(str(kind), str(kind).partition("[")[0])
-
-
-def _plain(value: Any) -> _Plain:
-    """The type and the text of a plain value."""
-    if isinstance(value, pa.Scalar):
-        name = _type_name(value.type)
-        if value.is_valid and name in _INSTANTS:
-            return _Plain(name, _INSTANTS[name](value.value))
-        is_single = value.is_valid and isinstance(value, pa.FloatScalar)
-        return _Plain(name, _text(np.float32(value.as_py()) if is_single else value.as_py()))
-    kind = getattr(value, "kind", "")
-    if kind in _INSTANTS:
-        return _Plain(kind, _INSTANTS[kind](int(value)))
-    if isinstance(value, np.generic):
-        return _Plain(value.dtype.name, _text(value))
-    named = ((bool, "bool"), (int, "integer"), (float, "number"), (str, "string"))
-    return _Plain(next((name for kind, name in named if isinstance(value, kind)), ""), _text(value))
 
 
 def _text(value: Any) -> str:

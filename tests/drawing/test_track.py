@@ -139,16 +139,6 @@ def test_extremes_of_each_pixel_are_kept(store: hl.Store, pixels: int) -> None:
             assert np.isnan(got["xy"][here]).any()
 
 
-def test_a_span(store: hl.Store) -> None:
-    times, _, _ = walk()
-    begin, end = int(times[990]), int(times[1200])
-    got = track(store.topic("fix"), pixels=1000, span=(begin, end))
-    assert got["times"].tolist() == times[990:1200].tolist()
-    assert (got["messages"], got["fixes"]) == (210, 110)
-    assert track(store.topic("fix"), pixels=10, span=(0, 5))["grid"] is None
-    assert len(track(store.topic("fix"), pixels=10, span=(end, begin))["times"]) == 0
-
-
 def test_the_short_way_round(store: hl.Store) -> None:
     got = track(store.topic("other"), pixels=10)
     assert np.allclose(got["xy"][:3, 0], [0, 222.64, 222.64], atol=0.01)

@@ -17,7 +17,6 @@ from hybridlog.drawing.series import series as read_series
 from hybridlog.drawing.times import aligned, lane_of
 from hybridlog.drawing.track import track
 from hybridlog.view.context import (
-    MAX_OFFSET,
     Context,
     Offset,
     Pixels,
@@ -191,22 +190,14 @@ def points_at(
 
 
 @route("/track")
-def track_of(
-    context: Context,
-    *,
-    recording: Text,
-    topic: Text,
-    pixels: Pixels,
-    begin: Offset = -MAX_OFFSET,
-    end: Offset = MAX_OFFSET,
-) -> Response:
+def track_of(context: Context, *, recording: Text, topic: Text, pixels: Pixels) -> Response:
     """The track of a topic in metres, of a receiver from its first fix, and the times.
 
     A time is the sum of `times` and `rests`: a float64 is too coarse far from the start.
     """
     entry, query = context.topic(recording, topic)
     start = start_of(entry)
-    found = track(query, pixels=pixels, span=part_of(start, begin, end))
+    found = track(query, pixels=pixels)
     offsets, xy = found.pop("times") - start, found.pop("xy")
     header = {**found, "grid": None if found["grid"] is None else asdict(found["grid"])}
     times = offsets.astype(np.float64)

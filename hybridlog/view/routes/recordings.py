@@ -135,18 +135,18 @@ def _loss(loss: Mapping[str, Any], start: int) -> dict[str, Any]:
 def _gone(manifest: Manifest, start: int) -> list[dict[str, Any]]:
     """The stretches of topics of which only fields are left, and whether the rest has expired."""
     found: list[dict[str, Any]] = []
-    last: dict[tuple[str, str], tuple[int, dict[str, Any]]] = {}
-    for file in (file for file in manifest.logs.values() if not file.is_here):
+    last: dict[str, dict[str, Any]] = {}  # the stretch that goes on, by topic
+    for file in sorted(manifest.logs.values(), key=lambda one: one.number):
         for number, part in file.parts.items():
-            if part.first is None or part.last is None:
-                continue
             topic = manifest.channels[number].topic
-            group, stretch = last.get((topic, str(file.gone)), (-1, {}))
-            if group + 1 < file.group or not stretch:
-                stretch = {"topic": topic, "begin": part.first - start, "cause": str(file.gone)}
+            if file.is_here or part.first is None or part.last is None:
+                last.pop(topic, None)
+                continue
+            stretch = {"topic": topic, "begin": part.first - start, "cause": file.gone}
+            if topic not in last or last[topic]["cause"] != file.gone:
                 found.append(stretch)
-            stretch["end"] = max(part.last - start, stretch.get("end", part.last - start))
-            last[topic, str(file.gone)] = file.group, stretch
+                last[topic] = stretch
+            last[topic]["end"] = part.last - start
     return found
 
 

@@ -24,13 +24,18 @@ import { instant } from "../state.js";
  */
 export function follow({ load, show, fail, panel }) {
   const { recording } = panel;
-  let shown = null; // the answer, with the start that its times count from
+  let shown = null; // the answer, and what it is of
   let wanted = null;
   let isRunning = false;
   const stopped = new AbortController();
 
+  /** What an answer depends on beside the time. */
+  function basis() {
+    return JSON.stringify([String(panel.seq()), String(recording.start), recording.info.gone]);
+  }
+
   function isShown() {
-    if (!shown || shown.start !== recording.start || shown.of !== panel.seq()) return false;
+    if (shown?.of !== basis()) return false;
     return (shown.time ?? -Infinity) <= wanted && wanted < (shown.until ?? Infinity);
   }
 
@@ -38,18 +43,15 @@ export function follow({ load, show, fail, panel }) {
     if (isRunning || isShown()) return;
     isRunning = true;
     const at = wanted;
-    const { start } = recording;
-    const of = panel.seq();
+    const of = basis();
     try {
-      const answer = Object.assign(await load(at, stopped.signal), { of, start });
+      const answer = Object.assign(await load(at, stopped.signal), { of });
       for (const name of ["time", "until"]) answer[name] &&= instant(answer[name]);
       // Of a recording that goes on, later messages may come.
       if (answer.until === null && recording.info.status === "open") answer.until = at + 1n;
       if (stopped.signal.aborted) return;
-      if (start === recording.start) {
-        shown = answer;
-        show(answer);
-      }
+      shown = answer;
+      show(answer);
     } catch (error) {
       if (stopped.signal.aborted) return;
       if (!(error instanceof ApiError)) throw error;
@@ -58,7 +60,7 @@ export function follow({ load, show, fail, panel }) {
     } finally {
       isRunning = false;
     }
-    if (wanted !== at || of !== panel.seq() || start !== recording.start) ask();
+    if (wanted !== at || of !== basis()) ask();
   }
 
   return {

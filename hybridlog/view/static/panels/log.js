@@ -284,7 +284,7 @@ function mount(body, panel) {
       element("span", { class: "time" }, offset(line.time)),
       numbers ? element("span", { class: "level" }, line.level ?? "") : null,
       line.name ? element("span", { class: "name" }, line.name) : null,
-      element("span", { class: "text" }, cut(line.text)),
+      element("span", { class: "text" }, cut(line.text).replaceAll("\n", " ⏎ ")),
     );
     row.style.top = `${place * ROW}px`;
     return row;
