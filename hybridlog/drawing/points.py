@@ -48,7 +48,6 @@ Points: TypeAlias = "dict[str, Any]"
 * `origin`: metres, [0, 0, 0] unless float32 would lose millimetres without it.
 * `bases`: for each name, 0 unless float32 would lose differences without it.
 * `flat`: true if all points have the same z, as those of a scan.
-* `remarks`: sentences about what contradicts itself in the message.
 """
 
 
@@ -77,8 +76,7 @@ def points(
 
 def _drawn(decoded: Any, rows: NDArray[Any], values: Collection[str] | None, limit: int) -> Points:
     is_scan = hasattr(decoded, "ranges")
-    remarks: list[str] = []
-    least, greatest = _bounds_of_ranges(decoded, remarks)
+    least, greatest = _bounds_of_ranges(decoded)
     pose = getattr(decoded, "pose", None)
 
     def axes_of(part: NDArray[Any]) -> list[NDArray[Any]]:
@@ -115,7 +113,6 @@ def _drawn(decoded: Any, rows: NDArray[Any], values: Collection[str] | None, lim
         "origin": origin,
         "bases": {name: base for name, (_, base) in chosen_values.items()},
         "flat": is_scan if not len(xyz) else bool((xyz[:, 2] == xyz[0, 2]).all()),
-        "remarks": remarks,
     }
 
 
@@ -154,18 +151,10 @@ def _origin(axis: NDArray[Any]) -> float:
     return float(round(middle)) if far > _FAR_M and far > 2 * (high - low) else 0.0
 
 
-def _bounds_of_ranges(scan: Any, remarks: list[str]) -> tuple[np.float32, np.float32]:
-    """Least and greatest range that the scanner can measure, m."""
-    everything = np.float32(-np.inf), np.float32(np.inf)
-    if not hasattr(scan, "range_min"):
-        return everything
-    least, greatest = np.float32(scan.range_min), np.float32(scan.range_max)
-    if least < greatest:
-        return least, greatest
-    remarks.append(
-        f"range_min {least:g} is not below range_max {greatest:g}: every finite range is drawn."
-    )
-    return everything
+def _bounds_of_ranges(scan: Any) -> tuple[np.float32, np.float32]:
+    """Least and greatest range that the scanner can measure, m; none if they contradict."""
+    least, greatest = (np.float32(getattr(scan, f"range_{end}", 0)) for end in ("min", "max"))
+    return (least, greatest) if least < greatest else (np.float32(-np.inf), np.float32(np.inf))
 
 
 def _offered(rows: NDArray[Any]) -> dict[str, NDArray[Any]]:

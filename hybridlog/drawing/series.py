@@ -186,8 +186,6 @@ def _stepped(array: Any, step: int | str) -> Any:
     """An element of each list, or a field of each message; None if the type has none."""
     if array is None:
         return None
-    if isinstance(array, pa.ChunkedArray):
-        array = pa.concat_arrays(array.chunks) if array.num_chunks else pa.nulls(0, array.type)
     if isinstance(step, str):
         if not pa.types.is_struct(array.type):
             return None
@@ -239,10 +237,11 @@ def _read(tables: Iterable[pa.Table], wanted: Sequence[Wanted], rows: ShownRows)
                 if values is not None:
                     columns[path] = values
         rows.add(log_times(table), columns)
+    count = len(rows.joined()[0])
     for one, known in zip(wanted, names, strict=True):
-        if not known and len(rows.times):
+        if not known and count:
             raise TopicError(f"No message here has a field {one.text!r}.")
-        if not any(known.values()) and len(rows.times):
+        if not any(known.values()) and count:
             raise UsageError(f"{one.text} is no number: only numbers can be drawn.")
     paths = dict.fromkeys(p for known in names for p, is_number in known.items() if is_number)
     return rows.series(paths)
@@ -262,8 +261,6 @@ class ShownRows:
     `[begin, end)`, ns.
 
     Attributes:
-        times: int64[n], log times, ns.
-        columns: Values by name, n each; NaN where a message has none.
         exact: True if they are all messages.
     """
 
@@ -290,18 +287,11 @@ class ShownRows:
 
     def thin(self) -> None:
         """Leave out what a picture does not show."""
-        self._parts = [self._thinned(self.times, self.columns)]
-        self._size, self.exact = len(self.times), False
+        self._parts = [self._thinned(*self.joined())]
+        self._size, self.exact = len(self._parts[0][0]), False
 
-    @property
-    def times(self) -> NDArray[np.int64]:  # noqa: D102
-        return self._joined()[0]
-
-    @property
-    def columns(self) -> Mapping[str, Numbers]:  # noqa: D102
-        return self._joined()[1]
-
-    def _joined(self) -> _Part:
+    def joined(self) -> _Part:
+        """int64[n], log times, ns; and values by name, n each, NaN where a message has none."""
         if len(self._parts) != 1:
             times = np.concatenate([np.empty(0, np.int64), *(times for times, _ in self._parts)])
             columns = {
@@ -341,7 +331,7 @@ class ShownRows:
 
     def gaps(self) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
         """Places in front of which times without messages end, and the middles of these, ns."""
-        times = self.times
+        times, _ = self.joined()
         steps = np.diff(times)
         is_gap = steps > GAP_PERIODS * self._steps.usual_period()
         if not self.exact:  # one that has a pixel of its own
@@ -351,13 +341,13 @@ class ShownRows:
 
     def series(self, paths: Iterable[str]) -> list[Series]:
         """Columns; with an entry for each pixel if there are very many messages."""
-        times, (gaps, middles) = self.times, self.gaps()
+        (times, columns), (gaps, middles) = self.joined(), self.gaps()
         begins = np.arange(len(times)) if self.exact else self._begins(times)
         places = np.searchsorted(begins, gaps)
         shown = np.insert(times[begins], places, middles)
         found = []
         for path in paths:
-            ends = [self.columns[path]] * 2
+            ends = [columns[path]] * 2
             if not self.exact:
                 finite = np.where(np.isfinite(ends[0]), ends[0], np.nan)
                 ends = [choose.reduceat(finite, begins) for choose in _EXTREMES]

@@ -5,7 +5,7 @@ The times of a topic are read once, and kept in the cache while there is room. N
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from contextlib import suppress
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
     from hybridlog.query.query import Query
     from hybridlog.query.question import Span
-    from hybridlog.query.rows import RowBatch
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
 
@@ -143,8 +142,16 @@ class Matches:
     """
 
     def __init__(self, query: Query) -> None:
-        found = [*_bounded(match_times(query.source.now(), query.question, query.counters))]
-        none = np.empty(0, np.int64)
+        found = []
+        none, count = np.empty(0, np.int64), 0
+        for one in match_times(query.source.now(), query.question, query.counters):
+            found.append(one)
+            count += len(one.seq)
+            if count > MAX_MATCHES:
+                raise ResourceError(
+                    f"More than {MAX_MATCHES // 10**6} million messages match, too many for a "
+                    "picture: write a narrower predicate."
+                )
         self._times = np.concatenate([none, *(one.log_time for one in found)])
         self._seqs = np.concatenate([none, *(one.seq for one in found)])
         queries = IntervalQueries(query.source.now(), query.question, query.counters)
@@ -203,15 +210,3 @@ class Matches:
         times, seqs = self._times[self._firsts], self._seqs[self._firsts]
         low, high = np.searchsorted(times, place.time), np.searchsorted(times, place.time, "right")
         return int(low + np.searchsorted(seqs[low:high], place.seq))
-
-
-def _bounded(found: Iterable[RowBatch]) -> Iterator[RowBatch]:
-    count = 0
-    for one in found:
-        count += len(one.seq)
-        if count > MAX_MATCHES:
-            raise ResourceError(
-                f"More than {MAX_MATCHES // 10**6} million messages match, too many for a picture: "
-                "write a narrower predicate."
-            )
-        yield one

@@ -127,10 +127,10 @@ def track(query: Query, *, pixels: int) -> Track:
         query.counters.add(narrowed.counters)
     if not rows.exact:
         rows.thin()
-    gaps, middles = rows.gaps()
-    places = np.stack([rows.columns[name] for name in "xy"], axis=1)
+    (times, columns), (gaps, middles) = rows.joined(), rows.gaps()
+    places = np.stack([columns[name] for name in "xy"], axis=1)
     return {
-        "times": np.insert(rows.times, gaps, middles),
+        "times": np.insert(times, gaps, middles),
         "xy": np.insert(places, gaps, np.nan, axis=0),
         "grid": grid,
         "is_geographic": is_geographic,

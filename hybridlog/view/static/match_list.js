@@ -111,7 +111,7 @@ export function matchList(recording) {
         const parts = [
           element("small", {}, `#${count(shown.before + number + 1)} `),
           offset(at, 9),
-          element("small", {}, ` ${about}`),
+          element("small", { class: "about" }, about),
         ];
         return element("li", {}, element("button", { type: "button", class: "plain", onclick: go }, ...parts));
       }),

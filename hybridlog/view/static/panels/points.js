@@ -233,7 +233,7 @@ function mount(body, panel) {
   }
 
   function describe() {
-    const { shown, total, dropped, every, frame, time, origin, remarks, value } = found;
+    const { shown, total, dropped, every, frame, time, origin, value } = found;
     const left = Object.entries(dropped).map(([why, number]) => `${count(number)} ${why}`);
     const parts = [
       shown === total ? `${count(total)} points` : `${count(shown)} of ${count(total)} points`,
@@ -244,7 +244,6 @@ function mount(body, panel) {
       origin.some(Boolean) ? `from ${origin.join(", ")} m` : null,
       offset(time),
       drawn.step ? `grid ${metres(drawn.step)}` : null,
-      ...remarks,
     ];
     facts.textContent = parts.filter(Boolean).join(" · ");
     facts.title = facts.textContent;
