@@ -175,14 +175,16 @@ def _cut(text: str, most: int) -> str:
     return text if len(text) <= most else text[: most - 1] + "…"
 
 
-def shown(table: pa.Table, most: int) -> dict[str, Any]:
-    """A table for people, as plain values by name.
+def shown(content: bytes, rows: int, columns: int) -> dict[str, Any]:
+    """The first rows and columns of an Arrow file for people, as plain values by name.
 
     `columns` are pairs of the name and whether it is a number, `columns_left_out` their number;
-    `rows`, texts; `times`, the log time of each row, ns since 1970, the last one of its microsecond
-    where only a timestamp tells it: empty without such a column.
+    `rows`, texts, and whether there are `more`; `times`, the log time of each row, ns since 1970,
+    the last one of its microsecond where only a timestamp tells it: empty without such a column.
     """
-    first = table.select(range(min(table.num_columns, most)))
+    whole = pa.ipc.open_file(content).read_all()
+    table = whole.slice(0, rows)
+    first = table.select(range(min(table.num_columns, columns)))
     return {
         "columns": [
             [field.name, is_number(field.type) or pa.types.is_decimal(field.type)]
@@ -190,6 +192,7 @@ def shown(table: pa.Table, most: int) -> dict[str, Any]:
         ],
         "columns_left_out": table.num_columns - first.num_columns,
         "rows": cells(first, exact=True),
+        "more": whole.num_rows > rows,
         "times": _times(table),
     }
 

@@ -307,8 +307,6 @@ _MICROSECOND: Final = 1000  # ns
 @route("/sql", threading.BoundedSemaphore(1))
 def sql(context: Context, *, recording: Text, text: Question) -> dict[str, Any]:
     """The first rows of a query in SQL about a recording; with times, their moments in it."""
-    import pyarrow as pa
-
     from hybridlog.frames.lines import shown
 
     store, entry = context.store, context.store.entry(recording)
@@ -316,8 +314,7 @@ def sql(context: Context, *, recording: Text, text: Question) -> dict[str, Any]:
     bounds = [f"--memory={SQL_MEMORY}", f"--timeout={SQL_SECONDS}s"]
     place = store.directory.address
     printed, remarks = run(place, "sql", [*options, *bounds], text, seconds=SQL_SECONDS + 5)
-    table = pa.ipc.open_file(printed).read_all()
-    found = shown(table.slice(0, SQL_ROWS), SQL_COLUMNS)
+    found = shown(printed, SQL_ROWS, SQL_COLUMNS)
     first, last = entry.span or (0, -1)
     body = f"    print(store.sql({text!r}, recordings={entry.name!r}).to_pandas())\n"
     return found | {
@@ -327,7 +324,6 @@ def sql(context: Context, *, recording: Text, text: Question) -> dict[str, Any]:
             else str(min(time, last) - first)
             for time in found.pop("times")
         ],
-        "more": table.num_rows > SQL_ROWS,
         "remarks": remarks,
         "python": _program(store, body),
     }
