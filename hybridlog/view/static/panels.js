@@ -50,8 +50,7 @@ function firstPanels(topics) {
  * all begin late, it is the first message of any.
  */
 export function firstTime({ info }) {
-  const shown = firstPanels(info.topics).filter(({ kind }) => kind !== log.kind);
-  const names = shown.map(({ topic }) => topic);
+  const names = firstPanels(info.topics).map(({ topic }) => topic);
   const soon = info.begin + (info.end - info.begin) / 10n;
   const times = info.topics
     .filter(({ topic }) => names.includes(topic))
