@@ -986,7 +986,8 @@ def test_the_specification_names_what_there_is() -> None:
 
 
 def test_the_unit_for_systemd_starts_a_recorder() -> None:
-    from hybridlog.cli.commands.record import RecordChoices, record_command
+    from hybridlog.cli.commands.record import record_command
+    from hybridlog.cli.record_choices import RecordChoices
     from hybridlog.cli.record_live import recorder_options
 
     (unit,) = (fence for fence in fences(DOCS / "robot.md") if fence.language == "ini")

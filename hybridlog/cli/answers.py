@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -17,7 +16,7 @@ import click
 from hybridlog.cli import output
 from hybridlog.cli.options import PATH, AsJson, Forced, Topics, option
 from hybridlog.cli.output import ROWS_AT_ONCE, Bar, Column, print_table
-from hybridlog.formats import OUTPUTS, formats_of, is_directory, suffixes_of
+from hybridlog.formats import OUTPUTS, formats_of, suffixes_of
 from hybridlog_storage.errors import PayloadError, UsageError
 
 if TYPE_CHECKING:
@@ -107,8 +106,7 @@ class Tabular(Forced, AsJson):
         elif form == SCREEN:
             raise UsageError("A table is for the screen: use --format csv or parquet with -o.")
         else:
-            folder = is_directory(form, self.output)
-            check_room(self.output, force=self.force, is_directory=folder)
+            check_room(self.output, force=self.force)
 
     def answer(
         self,
@@ -308,15 +306,17 @@ def _rows(tables: Iterable[pa.Table]) -> Answer:
 def _pictures(query: Query, form: str, target: Target, front: Front) -> Answer:
     """The images; messages that are unreadable are left out and told."""
     from hybridlog.arrays.message_arrays import IMAGES
+    from hybridlog.formats.files import suffix_of
     from hybridlog.formats.writing import Answer
     from hybridlog.query.answers.current import frames_in_front
     from hybridlog.schema.states import without_payload
 
     before: list[Message] = []
-    if OUTPUTS[form].content == "video" and front.latched:
+    is_video = OUTPUTS[form].content == "video"
+    if is_video and front.latched:
         before = frames_in_front(query.source.now(), query.question)
     answer, counters = Answer(), query.counters
-    is_folder = isinstance(target, str | os.PathLike) and is_directory(form, Path(target))
+    is_folder = isinstance(target, Path) and not is_video and suffix_of(target) is None
 
     def images() -> Iterator[Message]:
         given, missing = 0, ""
@@ -415,18 +415,7 @@ def write_bytes(target: Target, content: bytes) -> None:
         sink.write(content)
 
 
-def check_room(path: Path, *, force: bool, is_directory: bool = False) -> None:
-    """Refuse to overwrite files without --force, and directories with files even with it."""
-    if not os.path.lexists(path) or (path.exists() and not path.is_file() and not path.is_dir()):
-        return  # there is nothing, or a device
-    if path.is_dir() != is_directory:
-        wrong = (
-            "a file; messages go into a directory"
-            if is_directory
-            else "a directory; name a file in it"
-        )
-        raise UsageError(f"{path} is {wrong}.")
-    if is_directory and any(path.iterdir()):
-        raise UsageError(f"{path} is not empty: remove it, or name a new directory.")
-    if not (is_directory or force):
+def check_room(path: Path, *, force: bool) -> None:
+    """Refuse to overwrite a file without --force; writers refuse directories with files."""
+    if path.is_file() and not force:
         raise UsageError(f"{path} exists; --force overwrites it.")

@@ -16,7 +16,9 @@ from msgspec.structs import asdict, replace
 
 from hybridlog.cli import output
 from hybridlog.cli.app import DIFFERENT
-from hybridlog.cli.commands.record import (
+from hybridlog.cli.commands.top import draw, summary
+from hybridlog.cli.options import parse_tags
+from hybridlog.cli.record_choices import (
     ENVIRONMENT_MASTER,
     RecordChoices,
     line_of,
@@ -24,8 +26,6 @@ from hybridlog.cli.commands.record import (
     remarks_on,
     row_of,
 )
-from hybridlog.cli.commands.top import draw, summary
-from hybridlog.cli.options import parse_tags
 from hybridlog.cli.signals import handled, write_note
 from hybridlog.contract import Contract
 from hybridlog.follow.child import Trigger

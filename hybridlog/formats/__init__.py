@@ -142,12 +142,3 @@ def formats_of(*contents: Content) -> list[str]:
 def suffixes_of(names: Iterable[str]) -> dict[str, str]:
     """Some formats by the suffixes of their files."""
     return {suffix: name for name in names for suffix in OUTPUTS[name].suffixes}
-
-
-def is_directory(name: str, path: Path) -> bool:
-    """True if a format writes a directory with a file a message to this path."""
-    if OUTPUTS[name].content == "pictures":
-        from hybridlog.formats.files import suffix_of
-
-        return suffix_of(path) is None
-    return not OUTPUTS[name].suffixes

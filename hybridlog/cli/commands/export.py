@@ -21,7 +21,7 @@ from hybridlog.cli.answers import (
 )
 from hybridlog.cli.options import Forced, Latched, Options, Topics, argument, command, option
 from hybridlog.cli.output import Bar
-from hybridlog.formats import OUTPUTS, formats_of, is_directory, suffixes_of
+from hybridlog.formats import OUTPUTS, formats_of, suffixes_of
 from hybridlog_storage.disk.unfinished import undone
 from hybridlog_storage.errors import (
     DefinitionError,
@@ -126,9 +126,8 @@ def export_command(given: _Given) -> None:
     if str(target) == "-":
         raise UsageError("export writes files; for a pipe: `hybridlog fetch '**' -F mcap -o -`.")
     form = given.form or form_of(target, suffixes_of(_LOGS))
-    is_folder = form in _LOGS and is_directory(form, target)
     if form in _LOGS and split is None:
-        check_room(target, force=given.force, is_directory=is_folder)
+        check_room(target, force=given.force)
     with given.opened(snapshot=True) as store:
         query = given.query(store)
         if not query.topics:
@@ -139,8 +138,8 @@ def export_command(given: _Given) -> None:
             _export_set(store, query, target, given)
             return
         parts = [(target, query)] if split is None else _pieces(query, split, target)
-        for path, _ in parts if split is not None and form in _LOGS else ():
-            check_room(path, force=given.force, is_directory=is_folder)
+        for path, _ in parts if form in _LOGS else ():
+            check_room(path, force=given.force)
         for path, one in parts:
             if form in _LOGS:
                 _write_log(one, form, path, given)
