@@ -30,7 +30,7 @@ from pydantic import Field
 from hybridlog import __version__
 from hybridlog.query.predicate.parser import MAX_TEXT
 from hybridlog.view.commands import run
-from hybridlog.wording import listed
+from hybridlog.wording import meant
 from hybridlog_storage.errors import HybridlogError
 
 if TYPE_CHECKING:
@@ -95,7 +95,7 @@ class _Server(MCPServer[Any]):
     ) -> CallToolResult | InputRequiredResult:
         _, *known = signature(getattr(Tools, name)).parameters if name in TOOLS else [""]
         if name in TOOLS and (unknown := [word for word in arguments if word not in known]):
-            raise ToolError(f"{name} takes {listed(known)}; not {listed(unknown)}.")
+            raise ToolError(f"{name} takes no {unknown[0]!r}: {meant(unknown[0], known)}")
         return await super().call_tool(name, arguments, context)
 
 

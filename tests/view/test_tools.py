@@ -150,7 +150,8 @@ def test_settings_name_no_path(demo_store: hl.Store, ask: Ask) -> None:
 
 
 def test_unknown_arguments_are_refused(ask: Ask) -> None:
-    assert "not wehre" in ask("fetch", topic="odom", wehre="x > 1").error
+    error = ask("fetch", topic="odom", wehre="x > 1").error
+    assert "fetch takes no 'wehre': did you mean where?" in error
 
 
 def test_large_answers_are_cut(ask: Ask) -> None:
