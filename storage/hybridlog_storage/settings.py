@@ -37,6 +37,8 @@ _URI: Final = re.compile(
     rf"({_HOST}(?:,{_HOST})*(?:/[^\s@/:?]*)?)"
     rf"(?:\?(|{_OPTION}(?:&{_OPTION})*|{_OPTION}(?:;{_OPTION})*))?"
 )
+_SECRET: Final = re.compile("(?i)[^=]*(password|passphrase)|[^=]*=.*token")
+"""An option of a URI that holds a password or a token."""
 LOGIN_CURE: Final = (
     "Name the user in the URI, mongodb://USER@host/NAME, and give the password in "
     "HYBRIDLOG_MONGO_PASSWORD: a server that --mongo or HYBRIDLOG_MONGO_URI names gets it."
@@ -138,7 +140,7 @@ def without_password(uri: str) -> str:
         )
     scheme, user, secret, place, options = found.groups("")
     mark = ";" if ";" in options else "&"
-    public = mark.join(option for option in options.split(mark) if not _is_secret(option))
+    public = mark.join(option for option in options.split(mark) if not _SECRET.match(option))
     if not secret and public == options:
         return uri
     return f"{scheme}{user}{'@' if user else ''}{place}{'?' if public else ''}{public}"
@@ -154,12 +156,6 @@ def with_password(uri: str) -> str:
         return uri
     at = found.end(2)
     return f"{uri[:at]}:{quote(password, safe='')}{uri[at:]}"
-
-
-def _is_secret(option: str) -> bool:
-    """True if an option of a URI holds a password or a token."""
-    name, _, value = option.lower().partition("=")
-    return "password" in name or "passphrase" in name or "token" in value
 
 
 def _stored_uri(file: str, mongo: str | None) -> str | None:
