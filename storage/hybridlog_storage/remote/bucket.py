@@ -110,12 +110,14 @@ class Bucket:
 
         `prefix` has whole parts of names: `recordings/` has what is below it.
         """
-
-        def listed() -> list[Object]:
-            pages = obstore.list(self._reading, prefix or None, chunk_size=_PAGE)
-            return [_object(about, str(about["path"])) for page in pages for about in page]
-
-        return self._again(prefix, listed)
+        return self._again(
+            prefix,
+            lambda: [
+                _object(about, str(about["path"]))
+                for page in obstore.list(self._reading, prefix or None, chunk_size=_PAGE)
+                for about in page
+            ],
+        )
 
     def read(self, name: str, begin: int, end: int, size: int) -> bytes:
         """Bytes `[begin, end)` of an object; `ObjectChangedError` if its size is not `size`."""
