@@ -93,8 +93,6 @@ class _Beside:
         """Hear the recorder, until it ends."""
         try:
             self._control.recv()  # that it is sealed
-            if self._follower is not None:
-                self._follower.is_stopped = True  # until it finishes
             self._ended.set()
             self._control.recv()  # until the recorder ends
         except (EOFError, OSError):

@@ -357,6 +357,6 @@ def _ends(session: Session, channel: RecordedChannel, clock: Clock) -> Iterator[
         yield from (time for time in (stats.first_stamp, stats.last_stamp) if time is not None)
     elif clock == "header":
         for chunk in session.chunks(recording, [number], None, "log"):
-            batch = session.read_chunk(recording.id, chunk.segment, chunk.place).batch
+            batch = session.read_chunk(recording, chunk.segment, chunk.place).batch
             own = batch.take(np.flatnonzero(batch.channel == number))
             yield from stamps_of(channel.codec, own)[1].tolist()
