@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 import hybridlog as hl
 from hybridlog.cli.answers import write_answer
 from hybridlog.columns.rows import reduced
-from hybridlog.formats.writing import Front
+from hybridlog.formats.slices import Front
 from hybridlog.query.latching import KEEP_ALL, LatchedFront, depth_of
 from hybridlog.query.query import Query
 from hybridlog.schema.codecs import codec_for
