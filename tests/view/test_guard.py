@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import asyncio
 import http.client
 import json
 import socket
 import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from importlib import import_module
 from inspect import signature
@@ -454,25 +452,3 @@ def test_no_upgrade_to_a_web_socket(door: Door) -> None:
     answer = door.below("recordings", {**headers, "Sec-WebSocket-Key": "x" * 24})
     assert answer.status == 200  # as without it
     assert "upgrade" not in answer.headers
-
-
-def test_answers_do_not_wait_for_acknowledgements() -> None:
-    """Of an answer in two parts, the second would come 40 ms after the first."""
-
-    async def options() -> list[int]:
-        found: list[int] = []
-
-        async def accept(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-            peer = writer.get_extra_info("socket")
-            found.append(peer.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY))
-            writer.close()
-
-        listening = guard.listen(0)
-        async with await asyncio.start_server(accept, sock=listening):
-            reader, writer = await asyncio.open_connection(*listening.getsockname())
-            await reader.read()
-            writer.close()
-        return found
-
-    with ThreadPoolExecutor(1) as pool:  # playwright has a loop in this thread
-        assert pool.submit(asyncio.run, options()).result() == [1]
