@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import io
 import struct
+import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from itertools import starmap
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -29,6 +31,8 @@ class Picture(Struct, frozen=True):
     data: bytes
 
 
+MAX_SHOWN: Final = 1 << 26
+"""Most pixels of a compressed picture that is for the eye."""
 # Media type, suffix, whether browsers show it, and what it begins with: bytes at offsets.
 _KINDS: Final[Sequence[tuple[str, str, bool, dict[int, bytes]]]] = (
     ("image/jpeg", ".jpg", True, {0: b"\xff\xd8\xff"}),
@@ -92,11 +96,36 @@ def _as_it_came(message: Any, *, raw: bool) -> Picture | None:
     for media_type, suffix, is_shown, marks in _KINDS:
         if all(data.startswith(mark, at) for at, mark in marks.items()):
             is_deep = suffix == ".png" and data[24:26] == _DEEP_GREY
-            is_meant = raw or (is_shown and not is_deep)
-            return Picture(media_type, suffix, data) if is_meant else None
+            if not raw and (is_deep or not is_shown):
+                return None
+            if not raw:
+                _check_size(data)
+            return Picture(media_type, suffix, data)
     raise PayloadError(
         f"a compressed image begins like no known format; it says that it is {form[:40]!r}"
     )
+
+
+def _check_size(data: bytes) -> None:
+    """Refuse a small file that would fill the memory of the program that shows it."""
+    try:
+        from PIL import Image, UnidentifiedImageError
+    except ImportError:
+        return  # then nothing is decoded here, and the browser has its own bounds
+    with (
+        warnings.catch_warnings(action="ignore"),
+        suppress(UnidentifiedImageError, OSError, ValueError, SyntaxError, struct.error),
+    ):
+        try:
+            with Image.open(io.BytesIO(data)) as image:
+                is_large = image.width * image.height > MAX_SHOWN
+        except Image.DecompressionBombError:
+            is_large = True
+        if is_large:
+            raise PayloadError(
+                "an image has too many pixels to be shown; `hybridlog fetch --format png` writes "
+                "it to a file"
+            )
 
 
 def _jpeg(shown: NDArray[np.uint8]) -> bytes:

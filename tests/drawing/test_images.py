@@ -316,6 +316,17 @@ def test_no_pictures(message: Any, problem: str) -> None:
         picture(message)
 
 
+@pytest.mark.parametrize("side", [8200, 14_000])
+def test_a_small_file_with_very_many_pixels_is_no_picture_for_the_eye(side: int) -> None:
+    file = io.BytesIO()
+    Pillow.new("1", (side, side)).save(file, "PNG")
+    vast = compressed("png", file.getvalue())
+    assert len(file.getvalue()) < 1 << 17
+    with pytest.raises(PayloadError, match="too many pixels to be shown"):
+        picture(vast, raw=False)
+    assert picture(vast).data == file.getvalue()
+
+
 def fetch(drive: Drive, *arguments: object, code: int = 0) -> Answer:
     return answer("fetch", *arguments, store=drive.directory, code=code)
 
