@@ -30,7 +30,7 @@ def test_a_view_holds_what_messages_say(store: hl.Store, topic: str) -> None:
     fields = {**FIELDS}
     if topic == "/mixed":  # numbers in one recording and texts in the other are JSON text
         kinds = dict(store.sql(f'select column_name, column_type from (describe "{view}")').rows())
-        assert (kinds[fields.pop("f64")], kinds["i8"]) == ("VARCHAR", "FLOAT")
+        assert (kinds[fields.pop("f64")], kinds["i8"]) == ("VARCHAR", "DOUBLE")
         texts = store.sql(f'select f64 from "{view}" order by t desc limit 2').rows()
         assert texts == [('"3.5"',), ('"2.5"',)]
     found = store.sql(EVERYTHING.format(view)).to_arrow().to_struct_array().combine_chunks()
