@@ -116,6 +116,7 @@ def test_every_answer_is_a_table_and_an_error_has_no_traceback(store: hl.Store) 
         many.intervals(),
         store.align("/many", "/a"),
         many.resample("1s"),
+        store.sync(["/many", "/a"], clock="log"),
     )
     with closing(store.sql_engine.connect()) as connection:
         for thing in (*answers, connection.query("select 1 as x, '<b>' as y")):

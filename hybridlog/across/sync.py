@@ -21,7 +21,7 @@ from hybridlog.query.answers.current import picture_of
 from hybridlog.query.planner import Planner, bounds_in, resolved
 from hybridlog.query.question import Counters
 from hybridlog.query.times import DurationLike, parse_duration
-from hybridlog.wording import counted
+from hybridlog.wording import MAX_ROWS, counted, table_html
 from hybridlog_storage.errors import StoreError, TimeError, UsageError
 from hybridlog_storage.times import span_of
 
@@ -104,6 +104,9 @@ class Synced(Sequence[tuple["Message", ...]]):
     def __repr__(self) -> str:
         left_out = ", ".join(map(str, self.left_out))
         return f"<Synced {', '.join(self.topics)}; {len(self)} sets, left out: {left_out}>"
+
+    def _repr_html_(self) -> str:
+        return table_html(repr(self), [self.topics, *self.times[:MAX_ROWS].tolist()])
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the open store."""

@@ -18,7 +18,7 @@ import numpy as np
 from msgspec import Struct, field
 
 from hybridlog.query.times import format_time, parse_time
-from hybridlog.wording import counted, listed
+from hybridlog.wording import arrow_html, counted, listed
 from hybridlog_storage.errors import TopicError, TransformError, UsageError
 
 if TYPE_CHECKING:
@@ -261,6 +261,9 @@ class Lookup(Transform, frozen=True, eq=False):
     times: Times
     missing: Mapping[str, int] = field(default_factory=dict)
 
+    def _repr_html_(self) -> str:
+        return arrow_html(counted(len(self.times), "transform"), self.to_arrow())
+
     def to_arrow(self) -> pa.Table:
         """A row for each time: translation (m), quaternion, and roll, pitch and yaw (rad)."""
         import pyarrow as pa
@@ -396,6 +399,9 @@ class FrameTree(Struct, frozen=True, eq=False):
         frames = [self.frames[name] for way in used for name in way]
         moving = [int(one.stamps[-1]) for one in frames if not one.is_static]
         return min(moving, default=int(end[0]))
+
+    def _repr_html_(self) -> str:
+        return arrow_html(counted(len(self.frames), "frame"), self.to_arrow())
 
     def to_arrow(self) -> pa.Table:
         """A row for each frame, parents first."""
