@@ -66,7 +66,6 @@ class ViewServer:
 
 ROUTES: Final = (
     "ask",
-    "messages",
     "pictures",
     "recordings",
 )

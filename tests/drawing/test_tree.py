@@ -11,7 +11,7 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.drawing.tree import MAX_NODES, MAX_SHOWN, MAX_TEXT, tree
-from hybridlog.view.routes.messages import beside
+from hybridlog.view.routes.pictures import beside
 from tests.odd_messages import HOSTILE, LOGS, LONG, MS, START, ros_channel
 from tests.ros_values import ROS1, ROS2, message_of, plain_of
 
