@@ -66,6 +66,7 @@ _FULL_BYTES = 4 << 20  # of a manifest; then another recording goes on
 _MAX_EXPECTED = 1000  # channels whose definitions are parsed before their first message
 _SEQUENCES = 1 << 32
 _HELD_SHARE = 8  # of the memory budget, for messages that come before `/clock`
+_FITS_S = 5.0  # until options that fit no topic are told
 _CLOCK_WAIT_S = 5.0
 _SLOW_WRITE_S = 2.0  # to pack and write a chunk, on a disk that is busy
 
@@ -401,6 +402,9 @@ class Recorder:
         """Compute the state, and check the limits; call it about once a second."""
         now = time.monotonic()
         elapsed = max(now - self._looked, 1e-3)
+        if self._looked < self._started + _FITS_S <= now:
+            for text in self.unfitting():
+                self.say(f"no topic fits {text} so far")
         self._looked = now
         self._check_clock(now)
         self._check_silences()
@@ -483,10 +487,18 @@ class Recorder:
             self._incidents.note(one.mark)
 
     def unfitting(self) -> list[str]:
-        """Patterns of topics to record, or to leave without documents, that nothing has fitted."""
-        chosen = self._options.matcher, self._options.no_index
+        """Options that name topics of which none has come, in words."""
+        options = self._options
+        chosen = options.matcher, options.no_index
         with self._lock:
-            return [f"'{as_text(one)}'" for all_ in chosen if all_ for one in all_.unused()]
+            topics = [name for name, one in self._topics.items() if one.has_come]
+            found = [f"'{as_text(one)}'" for all_ in chosen if all_ for one in all_.unused()]
+        rules = [
+            *((one.fits, f"'{as_text(one.pattern)}' of --throttle") for one in options.throttles),
+            *((one.fits, f"'{as_text(one.pattern)}' of --priority") for one in options.priorities),
+            *((one.fits, f"the trigger '{as_text(one.text)}'") for one in options.triggers),
+        ]
+        return found + [text for fits, text in rules if not any(map(fits, topics))]
 
     def silent(self) -> list[str]:
         """Topics that had publishers and never sent a message."""

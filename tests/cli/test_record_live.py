@@ -341,7 +341,7 @@ def test_a_disk_without_room_is_code_7(logs: Path, tmp_path: Path) -> None:
 def test_a_damaged_log_is_told_when_it_is_replayed(logs: Path, tmp_path: Path) -> None:
     done = run(
         *("record", "--replay", logs / "torn.bag", "--speed", 50, "--reserve", 0),
-        *("-t", "/nothing", "-t", "*"),
+        *("--throttle", "/nope", "5Hz", "--priority", b"b\xff", "low", "-t", "/nothing", "-t", "*"),
         store=tmp_path / "store",
         code=4,
     )
@@ -349,6 +349,8 @@ def test_a_damaged_log_is_told_when_it_is_replayed(logs: Path, tmp_path: Path) -
     assert (
         "hybridlog: an unknown number of messages lost in 1 place that cannot be read" in done.err
     )
+    assert "no topic fits '/nope' of --throttle" in done.err
+    assert "no topic fits 'b\\xff' of --priority" in done.err
     assert "no topic fits '/nothing'" in done.err
 
 

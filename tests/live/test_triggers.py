@@ -15,7 +15,7 @@ from msgspec.structs import replace
 import hybridlog as hl
 from hybridlog.follow import child
 from hybridlog.follow.child import Trigger
-from hybridlog.live.recorder import RecorderOptions
+from hybridlog.live.recorder import RecorderOptions, priority_rule, throttle_rule
 from hybridlog.live.recording import LIVE_SETTINGS
 from hybridlog.query.topics import matcher
 from hybridlog.record.marks import MARKS
@@ -130,12 +130,27 @@ def test_what_triggers_cannot_read_is_told(store: hl.Store) -> None:
     assert unread == "triggers do not see messages that cannot be read, or lack arrays"
 
 
-def test_what_names_no_topic(store: hl.Store) -> None:
-    options = RecorderOptions(reserve_bytes=0, matcher=matcher(["/scan", "/odom"]))
+def test_what_names_no_topic_is_told_soon(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    options = RecorderOptions(
+        reserve_bytes=0,
+        triggers=[Trigger.of("/nowhere: a == 1"), Trigger.of("/scan: near > 1")],
+        throttles=[throttle_rule("/cam", "5Hz"), throttle_rule("scan", "500Hz")],
+        priorities=[priority_rule("b\udcff", "low")],
+        matcher=matcher(["/scan", "/odom"]),
+    )
     recorded = Recorded(store, options)
     assert recorded.recorder.wants("/scan", "")
     recorded.speaker.say(scan_channel(), scan(0, 10))
-    assert recorded.recorder.unfitting() == ["'/odom'"]
+    names = ["'/odom'", "'/cam' of --throttle", "'b\\xff' of --priority"]
+    names.append("the trigger '/nowhere: a == 1'")
+    assert recorded.recorder.unfitting() == names
+    recorded.recorder.look()
+    assert not any("fits" in text for text in recorded.said)
+    monkeypatch.setattr("hybridlog.live.recorder._FITS_S", 0.0)
+    recorded.recorder._looked = recorded.recorder._started - 1
+    recorded.recorder.look()
+    told = [text for text in recorded.said if "fits" in text]
+    assert told == [f"no topic fits {name} so far" for name in names]
     recorded.recorder.stop()
 
 
