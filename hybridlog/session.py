@@ -310,8 +310,12 @@ class Session:
         known = self.shared.schemas
         own = [one for one in recording.channels if topics is None or one.topic in topics]
         defined = [one for one in own if one.schema is not None]
-        if any(one.schema not in known for one in defined):
-            known |= schemas_in(self.directory, recording, defined)
+        wanted = {one.schema for one in defined if one.schema is not None} - known.keys()
+        known |= self.catalog.schemas(wanted)
+        if wanted - known.keys():
+            found = schemas_in(self.directory, recording, defined)
+            known |= found
+            self.catalog.put_schemas(found.values())
         if any(one.schema not in known and one.stats.messages for one in defined):
             for number in recording.logs:
                 with suppress(ChangedError):  # it is noted as lost, and who asks for chunks hears

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 Span = tuple[int, int]
 """`[begin, end)` in nanoseconds."""
 
-_NO_ROWS = np.empty((0, 3), np.int64)
 _ROWS_PER_BATCH = 10_000  # intervals whose columns become Python numbers together
 
 
@@ -241,7 +240,7 @@ class Intervals:
 
     def of_recording(self, recording: str) -> NDArray[np.int64]:
         """Covered time of one recording: int64[n, 2], begin and end, disjoint, in order."""
-        return joined(self._rows.get(recording, _NO_ROWS))[:, :2]
+        return joined(self._rows.get(recording, np.empty((0, 3), np.int64)))[:, :2]
 
     def to_pandas(self) -> pd.DataFrame:
         """A frame: `recording`, `begin`, `end` (UTC, ns), `duration`, `messages`."""
@@ -268,7 +267,7 @@ class Intervals:
     def _all(self) -> tuple[NDArray[np.intp], Rows]:
         """All intervals in order, and the place of the recording of each in `recordings`."""
         if self._columns is None:
-            rows = np.concatenate([_NO_ROWS, *self._rows.values()])
+            rows = np.concatenate([np.empty((0, 3), np.int64), *self._rows.values()])
             codes = np.repeat(np.arange(len(self._rows)), [*map(len, self._rows.values())])
             order = np.lexsort((rows[:, 1], codes, rows[:, 0]))
             self._columns = codes[order], rows[order]
@@ -324,7 +323,7 @@ def holding(
     not count as messages.
     """
     if not len(time):
-        return _NO_ROWS
+        return np.empty((0, 3), np.int64)
     count = holds.astype(np.int64)
     count[:before] = 0
     first = run_starts(time)
@@ -344,7 +343,7 @@ def changing(time: NDArray[np.int64], pause: int) -> NDArray[np.int64]:
     after the one before.
     """
     if not len(time):
-        return _NO_ROWS
+        return np.empty((0, 3), np.int64)
     time = placed(time)
     first = np.append(0, np.flatnonzero(np.diff(time) > pause) + 1)
     steps = np.diff(first, append=len(time))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
@@ -23,7 +23,7 @@ from hybridlog_storage.cells import Cells, drop, put
 from hybridlog_storage.errors import SegmentError, StoreError
 from hybridlog_storage.manifest import LOST, File, Manifest
 from hybridlog_storage.manifests import RECORDINGS
-from hybridlog_storage.messages import EXPIRED_IDS, Channel, schema_hash
+from hybridlog_storage.messages import EXPIRED_IDS, Channel, Schema, schema_hash
 from hybridlog_storage.segments.chunk_table import ChunkTable
 from hybridlog_storage.segments.segment_file import listed_parts, sealed_name
 from hybridlog_storage.segments.segment_reader import GoneLog, open_log
@@ -49,7 +49,8 @@ _INDEX: Final = "index"
 _DECODED: Final = "decoded"
 """Kinds of the cells of a recording, whose key is its id; `_DECODED` has one a segment."""
 _TOPICS: Final = "topics"
-"""Kind of the cells of sets of topics, by hash; nothing removes them."""
+_SCHEMA: Final = "schema"
+"""Kinds of the cells of sets of topics and of schemas, by hash; nothing removes them."""
 _MAX_TABLES: Final = 64 << 20  # bytes of chunk tables in memory
 _T = TypeVar("_T")
 _COUNTS: Final = (
@@ -292,6 +293,16 @@ class Catalog:
         rounded = {n: replace(one, skew_sum=float(one.skew_sum)) for n, one in decoded.items()}
         self._cells.write([put(_DECODED, recording, encode((number, digest, rounded)), number)])
 
+    def put_schemas(self, schemas: Iterable[Schema]) -> None:
+        """Store schemas."""
+        heads = ((one, _body([one.name, one.encoding])) for one in schemas)
+        self._cells.write(
+            [
+                put(_SCHEMA, schema_hash(one), b"%b\n%b" % (head, bytes(one.data)))
+                for one, head in heads
+            ]
+        )
+
     def remove(self, recording: str) -> None:
         """Remove a recording."""
         self._tables.drop("table", recording)
@@ -347,6 +358,16 @@ class Catalog:
         bodies = self._cells.of(_DECODED, recording) if digests else ()
         rows = (row for body in bodies if (row := _read(_DECODED_OF, body)) is not None)
         return {number: found for number, digest, found in rows if digests.get(number) == digest}
+
+    def schemas(self, hashes: Iterable[str]) -> dict[str, Schema]:
+        """Schemas by hash, without missing or damaged ones."""
+        found: dict[str, Schema] = {}
+        for digest in hashes:
+            head, _, text = (self._cells.read(_SCHEMA, digest) or b"").partition(b"\n")
+            names = _read(_NAMES_OF, head)
+            if names is not None and schema_hash(schema := Schema(*names, text)) == digest:
+                found[digest] = schema
+        return found
 
     # Chunks.
 
@@ -410,6 +431,7 @@ _TOPICS_OF: Final = Decoder(tuple[TopicType, ...])
 _Indexed = tuple[str, str, list[tuple[Int, Int, str]]]
 """An index that is complete for a recording, its look then, and its unreadable chunks."""
 _INDEX_OF: Final = Decoder(_Indexed)
+_NAMES_OF: Final = Decoder(tuple[str, str])
 _DECODED_OF: Final = Decoder(tuple[Int, str, dict[int, ChannelStats]])
 
 
