@@ -21,21 +21,18 @@ from tests.view.conftest import opened, served
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
-LOOKS = [
-    (1440, "light"),
-    (1440, "dark"),
-    (760, "light"),
-    (760, "dark"),
-    (390, "light"),
-    (390, "dark"),
-]
+LOOKS = [(1440, "light"), (760, "dark"), (390, "light")]
+OTHERS = [(1440, "dark"), (760, "light"), (390, "dark")]
 LENGTH = 6 * SECOND
 """Of the recording `odd`."""
 PICTURES = os.environ.get("HYBRIDLOG_PICTURES")
 """A folder for pictures of what the tests see, for people."""
 
 
-@pytest.fixture(params=LOOKS, ids=lambda one: f"{one[0]}-{one[1]}")
+@pytest.fixture(
+    params=[*LOOKS, *(pytest.param(one, marks=pytest.mark.exhaustive) for one in OTHERS)],
+    ids=lambda one: f"{one[0]}-{one[1]}",
+)
 def look(request: pytest.FixtureRequest, browser: Browser) -> Iterator[Page]:
     """An empty page of some width, light or dark; nothing in it is wider than it."""
     width, scheme = request.param
@@ -204,6 +201,7 @@ def test_matches_are_episodes(look: Page, demo_url: str, demo_store: hl.Store) -
 
 
 @pytest.mark.peer("browser")
+@pytest.mark.parametrize("look", LOOKS[:1], indirect=True, ids=str)
 def test_a_link_stays_right_after_a_restart(
     look: Page, demo_store: hl.Store, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -125,6 +125,7 @@ def rebuild_summary(path: Path) -> bool:
     opened = path.with_name(f"{number:06d}{OPEN_SUFFIX}")
     with files.explained(path, "rebuilding"):
         files.rename(path, opened)
+        files.sync_folder(path.parent)  # or a power cut leaves it cut, and sealed by its name
     recover_segment(opened)
     return True
 
