@@ -58,9 +58,7 @@ class Columns:
         seal = int.from_bytes(data[begin - 4 : begin], "little")
         demand(seal == zlib.crc32(footer), "the checksum of a footer")
         file = pq.ParquetFile(pa.BufferReader(data), page_checksum_verification=True)
-        about = json.loads(file.metadata.metadata[b"hybridlog"])
-        demand(about["version"] == 4, "the version of a file")
-        (section,) = about["sections"]
+        (section,) = json.loads(file.metadata.metadata[b"hybridlog"])
         demand(section["id"] == self._recording, "a file of another recording")
         demand(section["rows"] == file.metadata.num_rows, "the rows of a file")
         table = file.read()

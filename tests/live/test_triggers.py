@@ -197,7 +197,7 @@ def test_a_trigger_fires_on_whole_and_exact_messages(
 
 
 def test_a_follower_that_is_killed_misses_nothing(store: hl.Store) -> None:
-    recorded = robot(store, "/scan: id in (1, 3, 5)")
+    recorded = robot(store, "/scan: id in [1, 3, 5]")
     follower = recorded.recorder._follower
     start, pids = time.time_ns(), set()
     for number in range(6):

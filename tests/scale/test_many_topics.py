@@ -74,7 +74,8 @@ def test_statistics_of_many_topics_are_planned_together(
             store.refresh()
             for work in (store.all_topics().stats, store.sql("show tables").rows):
                 opened = Counter(cost_of(store, work).opened)
-                assert not [n for file, n in opened.items() if ".parquet" in file and n > 1]
+                # For what it says of itself, and for its columns.
+                assert not [n for file, n in opened.items() if ".parquet" in file and n > 2]
         assert [(one.topic, one.field) for one in found] == [
             (topic, "data") for topic in sorted(f"/s{n}" for n in range(count))
         ]

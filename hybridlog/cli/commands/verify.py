@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import time
+from fnmatch import fnmatchcase
+from typing import TYPE_CHECKING
 
-from msgspec.structs import asdict
+from msgspec.structs import asdict, replace
 
 from hybridlog.cli import output
 from hybridlog.cli.options import (
@@ -19,6 +21,13 @@ from hybridlog.cli.options import (
 )
 from hybridlog.cli.output import Bar
 from hybridlog.wording import listed
+from hybridlog_storage.errors import TopicError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from hybridlog.store import Store
+    from hybridlog_storage.summary import RecordingSummary
 
 
 class _Given(Choosing, InStore, AsJson, Quiet):
@@ -46,10 +55,8 @@ def verify_command(given: _Given) -> int:
         output.note("The store has a new id now.")
     started = time.monotonic()
     with given.opened(verifies=True) as store:
-        # One that cannot be read has lost its name: it is named by its id.
-        lost = [name for name in given.names if name in store.shared.repairs.unreadable]
-        chosen = () if lost else recordings_of(store, given.choice).summaries
-        ids = None if given.choice.is_everything else [*lost, *(one.id for one in chosen)]
+        chosen, unreadable = _chosen(given, store)
+        ids = None if given.choice.is_everything else [*unreadable, *(one.id for one in chosen)]
         with Bar("verify") as bar:
             result = store.verify(ids, bar.part, repair=given.repair)
     elapsed = time.monotonic() - started
@@ -76,3 +83,17 @@ def verify_command(given: _Given) -> int:
             said = f"Still being recorded, and checked as far as sealed: {listed(running)}."
             output.remarks([said])
     return 1 if result.findings else 0
+
+
+def _chosen(given: _Given, store: Store) -> tuple[Sequence[RecordingSummary], list[str]]:
+    """The chosen recordings, and ids of chosen ones that cannot be read: their names are lost."""
+    choice, known = given.choice, store.shared.repairs.unreadable
+    unreadable = [one for one in known if any(fnmatchcase(one, name) for name in choice.name)]
+    names = tuple(name for name in choice.name if name not in unreadable)
+    try:
+        chosen = recordings_of(store, replace(choice, name=names)).summaries
+    except TopicError:
+        if not unreadable:
+            raise
+        return (), unreadable
+    return chosen if names or not unreadable else (), unreadable
