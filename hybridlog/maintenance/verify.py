@@ -246,7 +246,9 @@ class _Check(Struct):
 
     def _others(self, listing: Listing, manifest: Manifest) -> None:
         """Find files that the manifest does not list: of a crash, or from elsewhere."""
-        found = {*listing.sealed.values(), *listing.open.values(), *listing.rows, *listing.others}
+        for name in listing.open.values():
+            self.found(name, "a crash has left it open, and its messages are not recovered yet")
+        found = {*listing.sealed.values(), *listing.rows, *listing.others}
         for name in sorted(found - manifest.present.keys() - {LOCK}):
             self.found(name, "the manifest does not list it", f"{_REPAIR}, or {_MOVE}")
 
