@@ -298,7 +298,7 @@ class ViewRows(Rows):
         groups = [] if table is None else table.parts
         own = {*_TABLE_OWN.intersection(self._schema.names), *[POINTS] * self._has_points}
         for rows, holds in self._in_table(part, table, self._paths, own):
-            span = np.array([[rows.t[0], rows.t[-1] + 1]])
+            span = np.array([[int(rows.t[0]), int(rows.t[-1]) + 1]])
             self._reading.groups |= {
                 (one.file.path, one.group) for one in groups if touches(span, one.first, one.last)
             }
