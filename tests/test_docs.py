@@ -473,10 +473,7 @@ ASKING = {
     *("--json", "-q"),
 }
 """Options that all commands have which ask about topics."""
-CHOICE = (
-    "| `-r`, `--tag`, `--has`, `--type`, `--during`, `--last`, `--older-than`, `--with` "
-    "| [which recordings]"
-)
+CHOICE = "| choosing options | [which recordings]"
 """The row of a command that chooses recordings by the options that all share."""
 _CHOOSING = {"recording", "tag", "has", "types", "during", "last", "older_than", "conditions"}
 
