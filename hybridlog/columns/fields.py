@@ -1,7 +1,7 @@
 """Conversion of message fields to columns of a table, and back.
 
 An array has two columns: the list, null where it has more than `LIMIT` elements, and its
-summary, null where the list is there. In tables with arrays both are always there, but for
+summary, null where the list is there. In tables with arrays the list is always there, but for
 arrays of bytes. Summaries are `{n, min, max, mean}`, as in the index;
 of strings, bytes and messages `{n}`. A message without fields becomes a boolean, because
 Parquet has no column for it. The columns follow from the types of the fields alone. A column

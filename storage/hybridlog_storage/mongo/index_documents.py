@@ -1,6 +1,6 @@
 """Index documents as bytes around the fields of messages; which recordings a database has.
 
-A document is `_id`, the message's fields, and `_meta` (see `docs/format.md`). The fields
+A document is `_id`, the message's fields, and `_meta` (see `docs/derived.md`). The fields
 are given as BSON elements. Thousands of documents are assembled at once: a template row is
 tiled, and each value that differs is a column.
 """
