@@ -29,7 +29,6 @@ from hybridlog.cli.options import (
 from hybridlog.cli.output import Column, print_fields, print_table
 from hybridlog.query.times import format_duration
 from hybridlog.query.topics import matcher, resolve
-from hybridlog.record.losses import losses_of
 from hybridlog.wording import listed
 from hybridlog_storage.errors import SegmentError, TopicError, UsageError
 
@@ -117,6 +116,7 @@ def _as_dict(store: Store, entry: RecordingEntry) -> dict[str, Any]:
     from hybridlog.entries import summary_of
     from hybridlog.query.answers.completeness import coverage
     from hybridlog.query.intervals import mean_rate
+    from hybridlog.record.losses import losses_of
     from hybridlog.schema.codecs import unindexed
     from hybridlog.schema.states import shown_channels
 
@@ -352,6 +352,8 @@ def _quoted(text: str) -> str:
 
 def _show_losses(store: Store, given: _Given) -> None:
     """Print what is missing of topics, from when to when, and why."""
+    from hybridlog.record.losses import losses_of
+
     if given.topic:
         resolve(given.topic, store.topics())  # refuses a name that fits no topic
     fits = matcher(given.topic) if given.topic else None

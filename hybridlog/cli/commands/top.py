@@ -14,7 +14,6 @@ from hybridlog.cli import output
 from hybridlog.cli.options import Place, argument, command, option
 from hybridlog.cli.output import Column, table_lines
 from hybridlog.cli.signals import Stopped
-from hybridlog.record.losses import Cause
 from hybridlog_storage.stopping import at_safe_points
 
 if TYPE_CHECKING:
@@ -94,6 +93,8 @@ _COLUMNS: Final = [
 
 def summary(state: RecorderState) -> str:
     """One line for the whole recorder."""
+    from hybridlog.record.losses import Cause
+
     reason = state.index_failure.partition("\n")[0].partition(". ")[0].rstrip(".")
     why = f": {output.cut(output.printable(reason), _SHORT)}" if reason else ""
     parts = [
