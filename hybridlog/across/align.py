@@ -137,6 +137,11 @@ class TopicReader:
         return self._session.field_types(self.question.topics, self.question.recordings)
 
     @lazy
+    def _recordings(self) -> set[str]:
+        """Ids of the recordings that the question is about."""
+        return {one.id for one in self._session.summaries_of(self.question)}
+
+    @lazy
     def empty(self) -> pa.Table:
         """No rows, with the columns of all recordings."""
         question = replace(self.question, limit=0, bounds=None, during=None, predicate=None)
@@ -231,8 +236,7 @@ class TopicReader:
 
     def is_elsewhere(self, recording: str) -> bool:
         """True if no message can be beside a recording's rows: they are of other recordings."""
-        known = (one.id for one in self._session.summaries_of(self.question))
-        return not self.is_apart and recording not in known
+        return not self.is_apart and recording not in self._recordings
 
     def _beside(self, recording: str) -> Question:
         """The question about the messages that may be beside the rows of a recording."""
@@ -605,7 +609,7 @@ def resampled(
 
 
 def _checked(how: str, tolerance: DurationLike | None) -> dict[str, Any]:
-    """One of the ways to match, and its tolerance, ns."""
+    """The way to match, which must be one of `HOWS`, and the tolerance in ns."""
     if how not in HOWS:
         raise UsageError(f"Unknown way {how!r}; choose {', '.join(HOWS)}.")
     return {"how": how, "tolerance": None if tolerance is None else parse_duration(tolerance)}
