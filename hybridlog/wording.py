@@ -6,7 +6,6 @@ import difflib
 import re
 from collections import defaultdict
 from collections.abc import Iterable
-from html import escape
 from typing import Any, TypeVar
 
 from msgspec import Struct
@@ -114,6 +113,8 @@ def table_html(title: str, rows: Iterable[Iterable[object]]) -> str:
 
 
 def _escaped(value: object) -> str:
+    from html import escape
+
     text = str(value)[: _MAX_TEXT + 1]
     return escape(text if len(text) <= _MAX_TEXT else f"{text[:_MAX_TEXT]}…")
 
