@@ -154,7 +154,7 @@ class Session:
         return found
 
     def some(self, recordings: Collection[str] | None) -> list[RecordingSummary]:
-        """Recordings by id, None for all, in short, oldest first; refuses those that are gone."""
+        """Recordings by id (None: all), oldest first; a `TopicError` if one was removed."""
         snapshot = self.look(recordings)
         if recordings is None:
             return snapshot.summaries
@@ -197,7 +197,7 @@ class Session:
         return [self.entry_of(one) for one in self.named(names)]
 
     def named(self, names: Iterable[str | RecordingEntry]) -> list[RecordingSummary]:
-        """Recordings in short, each once, in the order of the names."""
+        """Summaries of the named recordings, each once, in the order of the names."""
         chosen: dict[str, RecordingSummary] = {}
         for given in names:
             name = given if isinstance(given, str) else given.id
@@ -234,7 +234,7 @@ class Session:
         return self.about(self.resolve_in(names, recordings), recordings)
 
     def about(self, topics: Sequence[str], recordings: Collection[str] | None = None) -> Question:
-        """The question about topics in the recordings, of some by their ids or all, that have any.
+        """The question about topics, in the recordings (ids; None: all) that have any of them.
 
         A `TopicError` if none has.
         """

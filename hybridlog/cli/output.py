@@ -284,7 +284,7 @@ _Fitting = list[tuple[Column, int]]
 
 
 def _fitting(columns: Sequence[Column], block: Sequence[Any], width: int | None) -> _Fitting | None:
-    """The most columns that fit a screen of that width (None: any); None without.
+    """As many columns as fit on a screen `width` characters wide (None: all), or None.
 
     They are as wide as their cells, or narrower where these may be cut, the last column first.
     """

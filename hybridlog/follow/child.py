@@ -45,8 +45,6 @@ LOOK_S: Final = 0.5  # between two looks at the recording of a log
 SHORT_S: Final = 2.0
 """Seconds; a shorter recording gets no process of its own, which takes half a second to start."""
 _OF_SERVICE: Final = {"NOTIFY_SOCKET", "WATCHDOG_PID", "WATCHDOG_USEC"}
-ENDED: Final = "ended"
-"""Tells it that the recording is sealed."""
 
 
 class Task(NamedTuple):
@@ -215,7 +213,7 @@ class FollowerProcess:
         is_told = False
         while not self._over.is_set():
             if self._is_ended and not is_told:
-                control.send(ENDED)
+                control.send("sealed")
                 is_told = True
             if not control.poll(_POLL_S):
                 continue

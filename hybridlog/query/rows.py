@@ -230,7 +230,7 @@ class Rows:
                 (part,) = self._renewed([part], before)
 
     def _renewed(self, parts: Sequence[Part], before: Counters) -> list[Part]:
-        """The same parts of their recordings as these are now; counts what is read again anew."""
+        """The parts with their recordings as they are now; counters go back to `before`."""
         self.counters.unreadable = before.unreadable
         self.counters.without_arrays = before.without_arrays
         found = []

@@ -161,7 +161,7 @@ class Cells:
 
 
 def _cleared(path: Path) -> str:
-    """The address of the file, which is there, without what SQLite would read or write, too."""
+    """Make sure of an ordinary file without journals beside it; returns its URI for SQLite."""
     for suffix in ("", "-journal", "-wal", "-shm"):
         place = path.with_name(path.name + suffix)
         with suppress(FileNotFoundError):

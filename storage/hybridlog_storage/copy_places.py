@@ -73,7 +73,7 @@ class Sending(Struct, frozen=True):
         return [there, 0] if 0 < there <= self.size else [0]
 
     def again(self, at: int = 0) -> Iterator[bytes]:
-        """Its bytes from one on.
+        """Its bytes from byte `at` on; may be called again.
 
         `RefusedError` if it cannot be read, has another size, or, once all were read, another
         digest.

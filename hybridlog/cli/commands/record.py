@@ -235,7 +235,7 @@ class _LogRecorder:
         output.tell(row, lines, at_once=True)
 
     def end(self) -> int:
-        """Say of a search what became of its logs; gives the exit code."""
+        """Tell, after a search, how many logs were recorded; returns the exit code."""
         counts = self._counts
         if self._is_search:
             many = output.counted(counts["recorded"], "log")
@@ -245,7 +245,7 @@ class _LogRecorder:
 
 
 def _between(source: Source, log: LogSet, given: tuple[str, str] | None) -> tuple[int, int] | None:
-    """The range, in which the log has some time."""
+    """The range asked for, ns; refused if no time of the log lies in it."""
     from hybridlog.query.times import format_time, parse_range
 
     if given is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import nullcontext, suppress
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING
 
@@ -90,10 +91,7 @@ def _chosen(given: _Given, store: Store) -> tuple[Sequence[RecordingSummary], li
     choice, known = given.choice, store.shared.repairs.unreadable
     unreadable = [one for one in known if any(fnmatchcase(one, name) for name in choice.name)]
     names = tuple(name for name in choice.name if name not in unreadable)
-    try:
-        chosen = recordings_of(store, replace(choice, name=names)).summaries
-    except TopicError:
-        if not unreadable:
-            raise
-        return (), unreadable
-    return chosen if names or not unreadable else (), unreadable
+    if names or not unreadable:
+        with suppress(TopicError) if unreadable else nullcontext():
+            return recordings_of(store, replace(choice, name=names)).summaries, unreadable
+    return (), unreadable

@@ -36,8 +36,6 @@ if TYPE_CHECKING:
 
 Document = dict[str, Any]
 """A decoded document with values of the `bson` package."""
-Sort = Sequence[tuple[str, int]]
-"""Field paths with 1 (ascending) or -1 (descending)."""
 _T = TypeVar("_T")
 
 BATCH_DOCUMENTS = 5000
