@@ -26,7 +26,7 @@ from tests.odd_messages import write_odd
 from tests.view.chromium import Chromium, chromium
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, ConsoleMessage, Page
+    from playwright.sync_api import Browser, ConsoleMessage, FloatRect, Page
 
 TOKEN, PORT = "a-token", 4242
 ROBOT = RobotConfig(image_size=(64, 48), scan_beams=180, cloud_columns=60)
@@ -181,6 +181,17 @@ def page(browser: Browser) -> Iterator[Page]:
     yield opened
     context.close()
     assert not problems
+
+
+def lane_of(page: Page, topic: str) -> tuple[FloatRect, FloatRect]:
+    """Where a lane's name and the picture lie; asked again while the lanes are made anew."""
+    row = page.locator(".timeline .name").filter(has_text=topic).first
+    row.scroll_into_view_if_needed()
+    for _ in range(60):
+        if (lane := row.bounding_box()) and (box := page.locator(".density").bounding_box()):
+            return lane, box
+        page.wait_for_timeout(50)
+    raise AssertionError(f"no lane of {topic}")
 
 
 def opened(

@@ -16,15 +16,14 @@ from hybridlog.view.server import ViewServer
 from hybridlog_storage.errors import UsageError
 from tests.odd_messages import LOGS, START, log_time
 from tests.test_keep import BEGIN, COUNT, SECOND, record
-from tests.view.conftest import opened, served
+from tests.view.conftest import lane_of, opened, served
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
 LOOKS = [(1440, "light"), (760, "dark"), (390, "light")]
 OTHERS = [(1440, "dark"), (760, "light"), (390, "dark")]
-LENGTH = 6 * SECOND
-"""Of the recording `odd`."""
+LENGTH = 6 * SECOND  # of the recording `odd`
 PICTURES = os.environ.get("HYBRIDLOG_PICTURES")
 """A folder for pictures of what the tests see, for people."""
 
@@ -53,10 +52,7 @@ def look(request: pytest.FixtureRequest, browser: Browser) -> Iterator[Page]:
 
 def tip_at(page: Page, topic: str, share: float) -> str:
     """What the timeline says of a lane at a share of its width."""
-    row = page.locator(".timeline .name").filter(has_text=topic).first
-    lane, box = row.bounding_box(), page.locator(".density").bounding_box()
-    assert lane is not None
-    assert box is not None
+    lane, box = lane_of(page, topic)
     page.mouse.move(box["x"] + box["width"] * share, lane["y"] + lane["height"] / 2)
     return page.locator(".tip").inner_text()
 
@@ -72,10 +68,7 @@ def said(page: Page, topic: str, share: float, text: str) -> None:
 
 def colours(page: Page, topic: str, begin: float, end: float) -> set[tuple[int, ...]]:
     """The colours of a lane between two shares of its width."""
-    row = page.locator(".timeline .name").filter(has_text=topic).first
-    lane, box = row.bounding_box(), page.locator(".density").bounding_box()
-    assert lane is not None
-    assert box is not None
+    lane, box = lane_of(page, topic)
     top, bottom = lane["y"] - box["y"] + 2, lane["y"] - box["y"] + lane["height"] - 4
     found: list[list[int]] = page.locator(".density").evaluate(
         """(canvas, [begin, end, top, bottom]) => {

@@ -17,7 +17,7 @@ from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
 from tests.damage import flip
-from tests.view.conftest import Asking, served, unpacked
+from tests.view.conftest import Asking, lane_of, served, unpacked
 from tests.waiting import wait_for
 
 if TYPE_CHECKING:
@@ -230,8 +230,8 @@ def test_what_is_lost_is_said(page: Page, demo_store: hl.Store, tmp_path: Path) 
     skipped = shutil.ignore_patterns("mongod*")
     shutil.copytree(demo_store.directory.path, tmp_path / "store", ignore=skipped)
     (entry,) = demo_store.recordings()
-    table = demo_store.session.chunk_table(entry, 0)
-    chunk = table.chunks[len(table.chunks) // 2]
+    chunks = demo_store.session.chunk_table(entry, 0).chunks
+    chunk = chunks[len(chunks) // 2]
     path = places.segment(tmp_path / "store", "robot")
     flip(path, int(chunk["offset"]) + int(chunk["length"]) // 2, bits=0xFF)
     with hl.open(tmp_path / "store") as store:
@@ -243,11 +243,7 @@ def test_what_is_lost_is_said(page: Page, demo_store: hl.Store, tmp_path: Path) 
             page.goto(
                 f"{url}#recording=robot&panels=[]&begin={middle - SECOND}&end={middle + SECOND}"
             )
-            row = page.locator(".timeline .name").filter(has_text=loss["topic"])
-            row.scroll_into_view_if_needed()
-            lane, box = row.bounding_box(), page.locator(".density").bounding_box()
-            assert lane is not None
-            assert box is not None
+            lane, box = lane_of(page, loss["topic"])
             page.mouse.move(box["x"] + box["width"] / 2, lane["y"] + lane["height"] / 2)
             tip = page.locator(".tip")
             tip.filter(has_text=f"{loss['count']} lost ({loss['cause']}").wait_for()
