@@ -26,8 +26,12 @@ from hybridlog_storage.catalog import (
     ChannelStats,
     Damage,
     RecordingEntry,
+    RecordingSummary,
+    TopicType,
     file_of,
+    hash_of,
     is_of,
+    topics_to_json,
 )
 from hybridlog_storage.errors import (
     ManifestError,
@@ -50,7 +54,6 @@ from hybridlog_storage.messages import (
 from hybridlog_storage.segments.segment_file import Sealed, is_rows
 from hybridlog_storage.segments.segment_format import group_of
 from hybridlog_storage.segments.segment_reader import GoneLog, SegmentSummary, open_log
-from hybridlog_storage.summary import RecordingSummary, TopicType, hash_of, topics_to_json
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -11,8 +11,7 @@ from hybridlog_storage.errors import TopicError
 
 if TYPE_CHECKING:
     from hybridlog.session import Asked
-    from hybridlog_storage.catalog import RecordingEntry
-    from hybridlog_storage.summary import RecordingSummary
+    from hybridlog_storage.catalog import RecordingEntry, RecordingSummary
 
 
 class Recordings(Sequence["RecordingEntry"]):

@@ -43,12 +43,11 @@ if TYPE_CHECKING:
     from hybridlog.query.predicate.tree import Predicate
     from hybridlog.shared import Shared
     from hybridlog.snapshot import Snapshot
-    from hybridlog_storage.catalog import RecordingEntry
+    from hybridlog_storage.catalog import RecordingEntry, RecordingSummary
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.segments.chunk import StoredChunk
     from hybridlog_storage.segments.chunk_table import ChunkPlace, ChunkTable
     from hybridlog_storage.segments.segment_reader import SegmentReader
-    from hybridlog_storage.summary import RecordingSummary
 
 _ROW_BYTES = 44  # of a message's columns in a chunk
 

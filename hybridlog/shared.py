@@ -1,4 +1,7 @@
-"""What moments of an open store share: the catalog, open files, caches."""
+"""What moments of an open store share: the catalog, open files, caches.
+
+Beside them are the rows of logs whose payloads are gone.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,6 @@ from collections.abc import Callable
 from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any, Final
 
-from hybridlog.columns.recording_logs import RecordingRows
 from hybridlog.maintenance.opening import StoreFiles
 from hybridlog.maintenance.report import RepairReport
 from hybridlog.record.marks import MARK_SCHEMA, with_marks
@@ -16,19 +18,74 @@ from hybridlog.snapshot import UNFINISHED
 from hybridlog_storage.cache import Cache, lazy
 from hybridlog_storage.catalog import Catalog, file_of
 from hybridlog_storage.disk import files
-from hybridlog_storage.errors import UsageError
+from hybridlog_storage.errors import SegmentError, StoreError, UsageError
+from hybridlog_storage.manifests import manifests_at
 from hybridlog_storage.messages import schema_hash
 from hybridlog_storage.segments.segment_reader import open_log
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from hybridlog.columns.rows_file import RowsFile
     from hybridlog.columns.tables import Tables
     from hybridlog.query.question import RecordedChannel
     from hybridlog.record.running import RunningRecording
     from hybridlog.snapshot import Snapshot
-    from hybridlog_storage.catalog import RecordingEntry
+    from hybridlog_storage.catalog import RecordingEntry, RecordingSummary
     from hybridlog_storage.disk.directory import StoreDirectory
+    from hybridlog_storage.manifest import File
+    from hybridlog_storage.messages import Batch
     from hybridlog_storage.segments.segment_reader import SegmentReader
-    from hybridlog_storage.summary import RecordingSummary
+
+_RESTORE: Final = " Restore it from a copy; `hybridlog verify` shows what is affected."
+
+
+class RecordingRows:
+    """The files of rows of one recording; nothing is read before it is needed. Thread safe."""
+
+    def __init__(self, recording: Path, cache: Cache | None = None) -> None:
+        self._recording = recording
+        self._cache = cache or Cache()
+        self._files: dict[int, tuple[list[RowsFile], str]] = {}  # by log, and what is wrong
+
+    @lazy
+    def _listed(self) -> Mapping[int, Sequence[File]]:
+        """The files that its manifest lists, by number of their log."""
+        manifest = manifests_at(self._recording).find(self._recording.name)
+        return {} if manifest is None else manifest.rows
+
+    def left(self, log: int, chunk: int) -> tuple[Batch, NDArray[np.int64]]:
+        """The rows that remain of a chunk, and the arrival numbers of its messages."""
+        from hybridlog.columns.rows import messages_left
+
+        if log not in self._files:
+            self._files[log] = self._open(log)
+        files, problems = self._files[log]
+        try:
+            found = [part for file in files for part in file.of_chunk(chunk)]
+        except StoreError as error:
+            raise SegmentError(f"{error}{_RESTORE}") from error
+        if not found:
+            problems = problems or f"Rows are in no file of {self._recording}."
+            raise SegmentError(f"{problems}{_RESTORE}")
+        return messages_left(found)
+
+    def _open(self, log: int) -> tuple[list[RowsFile], str]:
+        from hybridlog.columns.rows_file import RowsFile
+
+        files: list[RowsFile] = []
+        problems: list[str] = []
+        for listed in self._listed.get(log, ()):
+            try:
+                files.append(RowsFile(self._recording, listed, self._cache))
+            except StoreError as error:
+                problems.append(str(error))
+        return files, " ".join(problems)
+
 
 _MAX_OPEN_SEGMENTS: Final = 256
 

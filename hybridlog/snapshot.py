@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from hybridlog_storage.cache import lazy
 
 if TYPE_CHECKING:
-    from hybridlog_storage.summary import RecordingSummary, TopicType
+    from hybridlog_storage.catalog import RecordingSummary, TopicType
 
 UNFINISHED = frozenset({"open", "unfinished"})
 """Statuses of recordings that may have ended, or grown, since the snapshot."""

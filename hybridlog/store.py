@@ -56,7 +56,7 @@ if TYPE_CHECKING:
     from hybridlog.sql.engine import SqlAnswer, SqlEngine
     from hybridlog.tf.tree import FrameTree
     from hybridlog.training.lerobot import LerobotOptions, LerobotReport
-    from hybridlog_storage.summary import RecordingSummary
+    from hybridlog_storage.catalog import RecordingSummary
 
 DEFAULT_STORE = "hybridlog-store"
 Names: TypeAlias = "Iterable[str | RecordingEntry]"
@@ -467,7 +467,7 @@ class Store:
             PayloadError: No picture can be shown.
             MissingDependencyError: PyAV is not installed.
         """
-        from hybridlog.training.feature_map import FeatureMap
+        from hybridlog.training.episodes import FeatureMap
         from hybridlog.training.lerobot import LerobotOptions, write_lerobot
 
         given = FeatureMap.given(features)

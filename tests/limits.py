@@ -47,7 +47,7 @@ PLACES = {
     "export_piece_bytes": "hybridlog.view.routes.ask.PIECE",
     "catalog_busy_s": "hybridlog_storage.cells._WAIT_S",
     "matches": "hybridlog.drawing.times.MAX_MATCHES",
-    "copy_wait_s": "hybridlog_storage.copy_places.LOCK_WAIT_S",
+    "copy_wait_s": "hybridlog_storage.copy.LOCK_WAIT_S",
     "server_copy_wait_s": "hybridlog_storage.server.LOCK_WAIT_S",
     "manifest_bytes": "hybridlog_storage.manifest.MAX_BYTES",
     "manifest_wait_s": "hybridlog_storage.manifests.WAIT_S",

@@ -40,7 +40,7 @@ ALLOWED = {
     "duckdb": ("hybridlog.sql.views",),
     "google": ("hybridlog.schema.protobuf_codec",),
     "isal": ("hybridlog.drawing.images", "hybridlog_storage.checksum"),
-    "lz4": ("hybridlog.formats.rosbag1.reader", "hybridlog_storage.segments.compression"),
+    "lz4": ("hybridlog.formats.rosbag1.reader", "hybridlog_storage.mcap.mcap_content"),
     "matplotlib": ("hybridlog.drawing.figure",),
     "mcap": ("hybridlog.formats", "hybridlog_storage.mcap", "hybridlog_storage.segments"),
     "mcap_protobuf": ("hybridlog.schema.protobuf_codec",),
@@ -75,12 +75,12 @@ ALLOWED = {
     "yaml": (
         "hybridlog.formats.rosbag2.writer",
         "hybridlog.formats.yaml_values",
-        "hybridlog.training.feature_map",
+        "hybridlog.training.episodes",
     ),
     "zstandard": (
         "hybridlog.formats.log_set",
         "hybridlog.formats.spool",
-        "hybridlog_storage.segments.compression",
+        "hybridlog_storage.mcap.mcap_content",
     ),
 }
 

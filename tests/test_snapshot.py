@@ -15,13 +15,13 @@ from hypothesis import strategies as st
 import hybridlog as hl
 from hybridlog.maintenance.opening import StoreFiles
 from hybridlog.snapshot import Snapshot, differing
+from hybridlog_storage.catalog import RecordingSummary, TopicType, hash_of, topics_to_json
 from hybridlog_storage.cells import CATALOG, Cells
 from hybridlog_storage.errors import TopicError
 from hybridlog_storage.manifest import replace
 from hybridlog_storage.manifests import DiskManifests
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segments.segment_reader import SegmentReader
-from hybridlog_storage.summary import RecordingSummary, TopicType, hash_of, topics_to_json
 from tests import places
 from tests.calls import Calls
 from tests.limits import Limit

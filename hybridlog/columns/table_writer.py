@@ -24,7 +24,7 @@ from msgspec import Struct, field
 from msgspec.structs import replace
 
 from hybridlog.columns.column_file import ColumnFile, ColumnFileWriter
-from hybridlog.columns.fields import copied, joined, side_by_side
+from hybridlog.columns.fields import PointColumns, copied, is_cloud, joined, side_by_side
 from hybridlog.columns.layout import (
     SHARED,
     SUFFIX,
@@ -34,7 +34,6 @@ from hybridlog.columns.layout import (
     shape_folder,
     type_prefix,
 )
-from hybridlog.columns.points import PointColumns, is_cloud
 from hybridlog.columns.rows import LeftFields, columns_from, rows_of
 from hybridlog.columns.tables import shared_for, shared_name, shared_times, type_folders
 from hybridlog.schema.arrow_columns import structs

@@ -13,7 +13,7 @@ from msgspec import Struct
 from hybridlog.across.match import match
 from hybridlog.arrays.message_arrays import plain_type
 from hybridlog.query.answers.completeness import completeness_of
-from hybridlog.query.answers.marks import marks_in
+from hybridlog.query.answers.interval_queries import marks_in
 from hybridlog.query.planner import log_times
 from hybridlog.query.query import Query
 from hybridlog.query.times import format_duration
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from hybridlog.contract import Contract, TopicRules
     from hybridlog.query.answers.statistics import TopicCheck
     from hybridlog.session import Session
-    from hybridlog_storage.summary import RecordingSummary
+    from hybridlog_storage.catalog import RecordingSummary
 
 
 class Result(Struct, frozen=True):

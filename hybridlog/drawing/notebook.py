@@ -13,7 +13,7 @@ from hybridlog.query.times import format_duration, format_time
 from hybridlog.wording import MAX_ROWS, listed, table_html
 
 if TYPE_CHECKING:
-    from hybridlog_storage.summary import RecordingSummary
+    from hybridlog_storage.catalog import RecordingSummary
 
 
 def recordings_html(title: str, recordings: Sequence[RecordingSummary]) -> str:

@@ -20,7 +20,7 @@ from hybridlog.opened import OpenStore
 from hybridlog.snapshot import UNFINISHED
 from hybridlog.wording import counted
 from hybridlog_storage import copy
-from hybridlog_storage.copy_places import Directory, RefusedError
+from hybridlog_storage.copy import Directory, RefusedError
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import StoreDirectory, gone
 from hybridlog_storage.errors import (
@@ -37,9 +37,9 @@ from hybridlog_storage.remote import address_of
 
 if TYPE_CHECKING:
     from hybridlog.maintenance.report import Progress
-    from hybridlog_storage.copy_places import Place, Source
+    from hybridlog_storage.catalog import RecordingSummary
+    from hybridlog_storage.copy import Place, Source
     from hybridlog_storage.manifest import File, Manifest
-    from hybridlog_storage.summary import RecordingSummary
 
 _ELSEWHERE: Final = re.compile(r"[^/:]+:(.*)")
 """A URL, or a place on a server as scp has it."""

@@ -37,11 +37,10 @@ if TYPE_CHECKING:
     from hybridlog.maintenance.report import Progress, RepairReport
     from hybridlog.shared import Shared
     from hybridlog.snapshot import Snapshot
-    from hybridlog_storage.catalog import Catalog, RecordingEntry
+    from hybridlog_storage.catalog import Catalog, RecordingEntry, RecordingSummary
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.mongo.database import Database
     from hybridlog_storage.remote.store import RemoteDirectory
-    from hybridlog_storage.summary import RecordingSummary
 
 
 class StoreIndex(Struct, frozen=True):
@@ -180,7 +179,7 @@ def bring_tables(source: Shared, target: RemoteDirectory, recordings: Collection
 
     No file of them has another recording.
     """
-    from hybridlog_storage.copy_places import read
+    from hybridlog_storage.copy import read
 
     for recording in recordings:
         entry, names = source.now().find(recording), list[str]()

@@ -33,11 +33,10 @@ from hybridlog_storage.manifest import Loss, Manifest, replace
 if TYPE_CHECKING:
     from hybridlog.columns.tables import Tables
     from hybridlog.maintenance.report import RepairReport
-    from hybridlog_storage.catalog import RecordingEntry
+    from hybridlog_storage.catalog import RecordingEntry, RecordingSummary
     from hybridlog_storage.disk.directory import Listing, StoreDirectory
     from hybridlog_storage.segments.recovery import Recovered
     from hybridlog_storage.segments.segment_file import Sealed
-    from hybridlog_storage.summary import RecordingSummary
 
 
 class StoreFiles(Struct):

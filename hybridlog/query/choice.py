@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from hybridlog.query.question import Question
     from hybridlog.query.times import DurationLike, TimeLike
     from hybridlog.session import Session
-    from hybridlog_storage.summary import RecordingSummary
+    from hybridlog_storage.catalog import RecordingSummary
 
 Texts: TypeAlias = "str | Sequence[str] | None"
 """One text or several."""

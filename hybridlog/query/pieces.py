@@ -52,7 +52,7 @@ def _marks(query: Query) -> Iterator[tuple[str, int, int, str]]:
 
     A mark of a moment lasts until the next one of a moment, or to the end of the recording.
     """
-    from hybridlog.query.answers.marks import marks_in
+    from hybridlog.query.answers.interval_queries import marks_in
 
     ends = {one.id: one.extent[1] for one in query.source.now().summaries_of(query.question)}
     found = sorted(marks_in(query.source.now(), query.recordings))

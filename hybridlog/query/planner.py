@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from hybridlog.query.question import Clock, Question, RecordedChannel, Span
     from hybridlog.schema.states import State
     from hybridlog.session import Session
-    from hybridlog_storage.summary import RecordingSummary
+    from hybridlog_storage.catalog import RecordingSummary
 
 _GROUP_GROWTH = 64  # so many times more recordings are planned after each group
 _MAX_GROUP = 4096  # recordings planned at once, if they do not overlap

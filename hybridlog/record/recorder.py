@@ -19,7 +19,7 @@ from msgspec import Struct, field
 from hybridlog.entries import text
 from hybridlog.query.latching import LatchedFront
 from hybridlog.record.capture import Capture
-from hybridlog.schema.completion import TRIED_MESSAGES, completed
+from hybridlog.schema.ros_codec import TRIED_MESSAGES, completed
 from hybridlog.wording import listed
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.errors import (

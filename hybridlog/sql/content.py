@@ -16,7 +16,7 @@ import pyarrow as pa
 from msgspec.structs import replace
 
 from hybridlog.columns.layout import column_names
-from hybridlog.query.answers.marks import marks_in
+from hybridlog.query.answers.interval_queries import marks_in
 from hybridlog.query.planner import resolved
 from hybridlog.query.question import windows_in
 from hybridlog.sql.views import TopicView
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from hybridlog.query.question import Question
     from hybridlog.session import Session
     from hybridlog.sql.views import Names
-    from hybridlog_storage.summary import RecordingSummary
+    from hybridlog_storage.catalog import RecordingSummary
 
 TABLES: Final = ("recordings", "topics", "losses", "marks")
 """Tables about the store itself; their names are reserved."""

@@ -14,9 +14,8 @@ import pyarrow.dataset as ds
 from msgspec import Struct, field
 from msgspec.structs import replace
 
-from hybridlog.columns.fields import without
+from hybridlog.columns.fields import NEEDED, PointColumns, is_cloud, without
 from hybridlog.columns.layout import POINTS
-from hybridlog.columns.points import NEEDED, PointColumns, is_cloud
 from hybridlog.columns.rows import LeftFields, rows_of
 from hybridlog.frames.answer import FIXED
 from hybridlog.query.planner import Planner

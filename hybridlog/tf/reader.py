@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.session import Session
-    from hybridlog_storage.summary import RecordingSummary
+    from hybridlog_storage.catalog import RecordingSummary
 
     Times = NDArray[np.int64]
     Stamps = tuple[Times, Times]  # log times of a topic's messages, ascending, and their stamps

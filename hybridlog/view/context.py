@@ -43,8 +43,7 @@ if TYPE_CHECKING:
     from hybridlog.message import Message
     from hybridlog.query.query import Query
     from hybridlog.store import Store
-    from hybridlog_storage.catalog import RecordingEntry
-    from hybridlog_storage.summary import RecordingSummary
+    from hybridlog_storage.catalog import RecordingEntry, RecordingSummary
 
 
 MAX_WORKING: Final = 4

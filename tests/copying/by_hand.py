@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from blake3 import blake3
 
-from hybridlog_storage.copy_places import Directory, Place, Source
+from hybridlog_storage.copy import Directory, Place, Source
 from hybridlog_storage.manifest import (
     Channel,
     File,

@@ -10,8 +10,7 @@ from typing import Any, NoReturn
 
 import pytest
 
-from hybridlog_storage.copy import Copied, How, copy
-from hybridlog_storage.copy_places import Directory, Place, RefusedError
+from hybridlog_storage.copy import Copied, Directory, How, Place, RefusedError, copy
 from hybridlog_storage.errors import HybridlogError, StoreError
 from hybridlog_storage.manifest import Channel, Manifest, Mark, Note, Pin, replace, with_rows
 from hybridlog_storage.remote.bucket import Bucket

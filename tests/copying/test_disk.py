@@ -14,8 +14,7 @@ from pathlib import Path
 import pytest
 from blake3 import blake3
 
-from hybridlog_storage.copy import How, copy
-from hybridlog_storage.copy_places import Directory, RefusedError
+from hybridlog_storage.copy import Directory, How, RefusedError, copy
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import (
     DiskFullError,

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from hybridlog_storage.copy import copy
-from hybridlog_storage.copy_places import Directory
+from hybridlog_storage.copy import Directory, copy
 from hybridlog_storage.errors import HeldError, StoreError, UsageError
 from hybridlog_storage.manifest import Manifest, Note, new_id, replace
 from hybridlog_storage.server import Server

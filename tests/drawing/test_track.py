@@ -15,7 +15,7 @@ from rosbags.highlevel import AnyReader
 
 import hybridlog as hl
 from benchmarks.simulator.write import write_bag
-from hybridlog.drawing.track import Grid, position_of, track
+from hybridlog.drawing.series import Grid, position_of, track
 from hybridlog.query.query import field_types
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.messages import Channel, Schema

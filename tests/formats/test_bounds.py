@@ -20,7 +20,7 @@ import zstandard
 
 from hybridlog.formats.yaml_values import YamlError, parse_yaml
 from hybridlog_storage.errors import SegmentError
-from hybridlog_storage.segments.compression import Compressor, decompress
+from hybridlog_storage.mcap.mcap_content import Compressor, decompress
 from tests.formats import test_rosbag1 as bags
 from tests.formats.test_rosbag2 import make
 

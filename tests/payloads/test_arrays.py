@@ -21,8 +21,7 @@ from rosbags.typesys import Stores, get_typestore
 
 import hybridlog as hl
 from hybridlog.arrays.message_arrays import to_numpy
-from hybridlog.columns.fields import as_columns
-from hybridlog.columns.points import PointColumns
+from hybridlog.columns.fields import PointColumns, as_columns
 from hybridlog.query.planner import Planner
 from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.errors import PayloadError, StoreError, TopicError, UsageError

@@ -15,12 +15,12 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 import hybridlog as hl
-from hybridlog.columns.recording_logs import RecordingRows
 from hybridlog.columns.rows import reduced
 from hybridlog.columns.rows_file import RowsFile
 from hybridlog.entries import put_entry
 from hybridlog.maintenance.keep import expire, write_rows
 from hybridlog.schema.codecs import codec_for
+from hybridlog.shared import RecordingRows
 from hybridlog_storage import manifest as truth
 from hybridlog_storage.errors import PayloadError, SegmentError, StoreError
 from hybridlog_storage.manifest import File

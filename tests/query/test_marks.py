@@ -17,7 +17,7 @@ from msgspec import structs
 from starlette.testclient import TestClient
 
 import hybridlog as hl
-from hybridlog.query.answers.marks import marks_in
+from hybridlog.query.answers.interval_queries import marks_in
 from hybridlog.record.marks import MARKS_SEGMENT, mark_channel, mark_payload, with_marks
 from hybridlog.view.guard import Admission
 from hybridlog.view.server import make_app

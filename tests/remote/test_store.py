@@ -21,8 +21,7 @@ from hybridlog_storage.errors import (
     UsageError,
 )
 from hybridlog_storage.remote import address_of
-from hybridlog_storage.remote.blocks import BLOCK, BlockCache
-from hybridlog_storage.remote.bucket import Bucket
+from hybridlog_storage.remote.bucket import BLOCK, BlockCache, Bucket
 from hybridlog_storage.remote.store import RemoteDirectory
 from tests.cli.within import answer
 from tests.copies import bring

@@ -9,10 +9,10 @@ import pytest
 from msgspec.structs import replace
 from rosbags.typesys import Stores, get_typestore
 
-from hybridlog.schema import completion
+from hybridlog.schema import ros_codec
 from hybridlog.schema.codecs import codec_for
-from hybridlog.schema.completion import completed
 from hybridlog.schema.definition import parse_definition, typestore
+from hybridlog.schema.ros_codec import completed
 from hybridlog_storage.errors import DefinitionError
 from hybridlog_storage.messages import REPLACED, SUPPLIED, Channel, Schema
 from tests.calls import Calls
@@ -162,7 +162,7 @@ def test_an_empty_definition_and_its_md5_sum(metadata: dict[str, str]) -> None:
 
 def test_work_on_large_messages_is_bounded(calls: Calls) -> None:
     seen: list[int] = []
-    calls(completion, "_fit", lambda _, __, payloads: seen.append(sum(map(len, payloads))))
+    calls(ros_codec, "_fit", lambda _, __, payloads: seen.append(sum(map(len, payloads))))
     large = (3 << 20).to_bytes(4, "little") + bytes(3 << 20)
     bare = Channel("/t", "ros1", Schema("std_msgs/String", "", b""))
     assert completed(bare, [large] * 10) is not bare

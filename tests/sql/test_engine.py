@@ -17,7 +17,7 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.query.choice import Choice
-from hybridlog.sql import duck
+from hybridlog.sql import engine
 from hybridlog.sql.engine import SqlConnection
 from hybridlog_storage.errors import (
     HybridlogError,
@@ -196,7 +196,7 @@ def test_without_duckdb(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         return importlib.import_module(name)
 
     with hl.open(root, mongo="mongodb://127.0.0.1:1/") as opened:
-        monkeypatch.setattr(duck, "import_module", missing)
+        monkeypatch.setattr(engine, "import_module", missing)
         with pytest.raises(MissingDependencyError, match=r"pip install 'hybridlog\[sql\]'"):
             opened.sql("select 1")
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from hybridlog.sql.duck import OWN_MEMORY, limited_memory, private_bytes
+from hybridlog.sql.engine import OWN_MEMORY, limited_memory, private_bytes
 from hybridlog_storage.mongo.mongod import EmbeddedMongod
 from tests.cli.running import COMMAND, environment
 

@@ -9,13 +9,13 @@ import pytest
 from numpy.typing import NDArray
 
 from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.mcap.mcap_content import checked_frame
 from hybridlog_storage.messages import Batch
 from hybridlog_storage.segments.chunk_table import (
     ChunkTable,
     TableBuilder,
     parts_of,
 )
-from hybridlog_storage.segments.compression import checked_frame
 from hybridlog_storage.segments.segment_format import index_order
 
 

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hybridlog_storage.errors import SegmentError
-from hybridlog_storage.segments.compression import Compressor, decompress
+from hybridlog_storage.mcap.mcap_content import Compressor, decompress
 from tests.calls import Calls
 
 TEXT = b"".join(b"%d: the robot is at %d\n" % (i, i * 7919) for i in range(40_000))

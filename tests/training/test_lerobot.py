@@ -25,7 +25,7 @@ from benchmarks.simulator.topics import RobotConfig
 from benchmarks.simulator.write import write_bag
 from hybridlog.drawing.images import shown_pixels
 from hybridlog.training import lerobot
-from hybridlog.training.feature_map import FeatureMap
+from hybridlog.training.episodes import FeatureMap
 from hybridlog.training.lerobot import LerobotReport
 from hybridlog_storage.errors import PayloadError, TopicError, UsageError
 from hybridlog_storage.messages import Channel, Schema

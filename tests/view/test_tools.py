@@ -226,7 +226,7 @@ def test_no_byte_is_written_and_losses_are_told(demo_store: hl.Store, tmp_path: 
 
 
 def test_an_endless_answer_is_given_up(demo_store: hl.Store) -> None:
-    with asking(make_server(demo_store, seconds=2)) as ask:
+    with asking(make_server(demo_store, seconds=6)) as ask:
         endless = "select count(*) from range(100000000000) where sin(range) > 2"
         assert re.search("stopped after|longer than", ask("sql", query=endless).error)
         assert ask("sql", query="select 1 as n").values["rows"] == [{"n": 1}]

@@ -252,7 +252,7 @@ def _pieces(query: Query, how: str, target: Path) -> list[tuple[Path, Query]]:
 def _export_set(store: Store, query: Query, target: Path, given: _Given) -> None:
     """Write a training set, or propose a map for one."""
     if given.propose_map:
-        from hybridlog.training.feature_map import proposed
+        from hybridlog.training.episodes import proposed
 
         check_room(target, force=given.force)
         write_bytes(target, proposed(query).to_yaml().encode())

@@ -270,7 +270,7 @@ def _show_topics(store: Store, query: Query, given: _Given) -> None:
 
 
 def _topic_dict(store: Store, recorded: RecordedChannel) -> dict[str, Any]:
-    from hybridlog.query.answers.infer_fields import infer_fields
+    from hybridlog.query.answers.statistics import infer_fields
 
     channel, codec, fields = recorded.channel, recorded.codec, recorded.codec.paths()
     schema, text = channel.schema, None

@@ -130,7 +130,7 @@ def _pin(store: Store, given: _Given) -> list[str]:
 def _spans(store: Store, given: _Given) -> Iterator[tuple[str, int | None, int | None]]:
     """Id of a recording, begin and end of what is to be pinned of it; None for all."""
     from hybridlog.maintenance.edit import may_hold
-    from hybridlog.query.answers.marks import mark_topics
+    from hybridlog.query.answers.interval_queries import mark_topics
 
     before, after = given.before, given.after
     for entry in () if given.when else given.recordings_in(store):

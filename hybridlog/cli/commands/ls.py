@@ -9,7 +9,7 @@ from hybridlog.cli.options import AsJson, Choosing, InStore, command
 from hybridlog.cli.output import Column
 
 if TYPE_CHECKING:
-    from hybridlog_storage.summary import RecordingSummary
+    from hybridlog_storage.catalog import RecordingSummary
 
 
 class _Given(Choosing, InStore, AsJson):

@@ -24,8 +24,8 @@ from hybridlog.wording import listed
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
+    from hybridlog_storage.catalog import RecordingSummary
     from hybridlog_storage.manifest import Pin
-    from hybridlog_storage.summary import RecordingSummary
 
 
 class _Given(Choosing, InStore, Quiet):

@@ -29,7 +29,7 @@ def sql_command(given: _Given) -> None:
     and views and marks only the time of --between or --last. Needs no MongoDB.
     """
     from hybridlog.query.question import Question
-    from hybridlog.sql.duck import limited_memory
+    from hybridlog.sql.engine import limited_memory
 
     text = sys.stdin.read() if given.query is None else given.query
     with given.opened(snapshot=True) as store:

@@ -26,8 +26,8 @@ from hybridlog.formats.reading import (
 )
 from hybridlog.wording import listed
 from hybridlog_storage.errors import SourceError
+from hybridlog_storage.mcap.mcap_content import is_implausible
 from hybridlog_storage.messages import MAX_PAYLOAD, Batch, Channel, Schema
-from hybridlog_storage.segments.compression import is_implausible
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterator

@@ -28,8 +28,7 @@ from hybridlog_storage.times import BEGIN, END, span_of, touches
 if TYPE_CHECKING:
     from hybridlog.query.question import Counters, Question, Span
     from hybridlog.session import Session
-    from hybridlog_storage.catalog import RecordingEntry
-    from hybridlog_storage.summary import RecordingSummary
+    from hybridlog_storage.catalog import RecordingEntry, RecordingSummary
 
     Row = Mapping[str, Any]
     """A row of a ledger."""

@@ -53,9 +53,8 @@ if TYPE_CHECKING:
     from hybridlog.message import Message, PictureOf
     from hybridlog.query.question import RecordedChannel, Span
     from hybridlog.session import Session
-    from hybridlog_storage.catalog import RecordingEntry
+    from hybridlog_storage.catalog import RecordingEntry, RecordingSummary
     from hybridlog_storage.messages import Batch
-    from hybridlog_storage.summary import RecordingSummary
 
 
 _MAX_OPEN = 4

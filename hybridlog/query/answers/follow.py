@@ -32,8 +32,7 @@ if TYPE_CHECKING:
     from hybridlog.query.planner import Resolved
     from hybridlog.query.question import Counters, Part, Question, Span
     from hybridlog.session import Asked, Session
-    from hybridlog_storage.catalog import RecordingEntry
-    from hybridlog_storage.summary import RecordingSummary
+    from hybridlog_storage.catalog import RecordingEntry, RecordingSummary
 
 _EVERY_S: Final = 0.25
 

@@ -1,21 +1,25 @@
-"""Intervals from messages: states, changes, windows around events, times near other topics."""
+"""Intervals from messages: states, changes, windows around events, times near other topics.
+
+Marks are such messages, too: what happened, at a moment or for a while.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import partial, reduce
 from itertools import groupby
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 from msgspec.structs import replace
 
+from hybridlog.arrays.message_arrays import plain_type
 from hybridlog.columns.fields import joined
+from hybridlog.message import messages_in
 from hybridlog.query.answers.completeness import lost_times
-from hybridlog.query.answers.marks import mark_topics, marks
 from hybridlog.query.intervals import Intervals, changing, clipped, holding
 from hybridlog.query.planner import Planner, log_spans
 from hybridlog.query.predicate.tree import (
@@ -29,13 +33,97 @@ from hybridlog.query.predicate.tree import (
     check,
     nodes,
 )
-from hybridlog.query.question import Counters, windows_in
-from hybridlog.query.times import TIME_LIMIT, DurationLike, parse_duration
+from hybridlog.query.question import Counters, Question, windows_in
+from hybridlog.query.times import TIME_LIMIT, DurationLike, decoded_time, parse_duration
+from hybridlog.record.marks import MARK
 from hybridlog.schema.arrow_types import is_list, lengths_of
 from hybridlog.schema.column import ranges
 from hybridlog.wording import listed
-from hybridlog_storage.errors import UsageError, WhereError
+from hybridlog_storage.errors import HybridlogError, UsageError, WhereError
 from hybridlog_storage.times import END, earlier, inside, placed
+
+if TYPE_CHECKING:
+    from hybridlog.message import Message
+    from hybridlog.query.question import Counters
+    from hybridlog.session import Session
+
+EVENT: Final = "foxglove.Event"
+_NAMES: Final = ("text", "name", "title", "event", "type")
+"""Keys of the metadata of an event that may say what it is, the best first."""
+
+
+class Mark(NamedTuple):
+    """A mark, or an event of Foxglove.
+
+    Attributes:
+        recording: Id of its recording.
+        begin: ns since the epoch.
+        end: The same; None for a moment.
+        text: What happened.
+        tags: Further values by name.
+    """
+
+    recording: str
+    begin: int
+    end: int | None
+    text: str
+    tags: Mapping[str, str]
+
+
+def mark_topics(session: Session, recordings: Collection[str] | None = None) -> tuple[str, ...]:
+    """Full names of the topics with marks in some recordings (ids), or in all."""
+    known = session.look(recordings).kinds
+    return tuple(sorted({one.topic for one in known if plain_type(one.type) in {MARK, EVENT}}))
+
+
+def marks(session: Session, question: Question, counters: Counters | None = None) -> Iterator[Mark]:
+    """The marks among the messages of a question, in their order.
+
+    Unreadable ones are left out; `counters.unreadable` counts them.
+    """
+    planner = Planner(session, question, counters)
+    for run in planner.runs():
+        for message in messages_in(run):
+            if plain_type(message.type) not in {MARK, EVENT}:
+                continue
+            try:
+                yield _mark_of(message)
+            except HybridlogError:
+                planner.counters.unreadable += 1
+
+
+def marks_in(session: Session, recordings: Collection[str]) -> Iterator[Mark]:
+    """All marks of some recordings, in order of log time."""
+    topics = mark_topics(session, recordings)
+    having = {one.id for one in session.snapshot().having(topics)}
+    chosen = tuple(one for one in recordings if one in having)
+    if chosen:
+        yield from marks(session, Question(topics, chosen))
+
+
+def _mark_of(message: Message) -> Mark:
+    fields: dict[str, Any] = message.fields
+    begin: int | None
+    if plain_type(message.type) == MARK:
+        begin, end = message.log_time_ns, fields.get("end")
+        text, tags = fields.get("text"), fields.get("tags")
+    else:
+        begin, end = (decoded_time(fields.get(f"{edge}_time")) for edge in ("start", "end"))
+        found = fields.get("metadata")
+        pairs = [one for one in found if isinstance(one, dict)] if isinstance(found, list) else []
+        tags = {str(one.get("key")): str(one.get("value")) for one in pairs}
+        known = next((tags[name] for name in _NAMES if name in tags), None)
+        text = known or ", ".join(f"{key}={value}" for key, value in tags.items())
+    begin = message.log_time_ns if begin is None else begin
+    lasts = isinstance(end, int) and end > begin
+    return Mark(
+        message.recording,
+        begin,
+        end if lasts else None,
+        str(text or ""),
+        tags if isinstance(tags, dict) else {},
+    )
+
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -1,14 +1,18 @@
 """Statistics of numeric fields, and gaps and regularity of topics.
 
 The times of a topic in a recording are in memory at once, 8 bytes a message.
+
+Fields of a topic without a definition are inferred from its first messages.
 """
 
 from __future__ import annotations
 
 import math
+import re
 from collections import defaultdict
-from collections.abc import Mapping
-from itertools import groupby
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
+from itertools import groupby, islice
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
@@ -19,9 +23,13 @@ from hybridlog.query.intervals import GAP_PERIODS, Intervals, mean_rate, usual_p
 from hybridlog.query.planner import Planner, log_spans, resolved
 from hybridlog.query.question import windows_in
 from hybridlog.query.times import DurationLike, parse_duration
+from hybridlog.schema.definition import FieldPath
 from hybridlog.schema.definition_text import NUMBERS
 from hybridlog.wording import listed
-from hybridlog_storage.errors import UsageError
+from hybridlog_storage.errors import PayloadError, UsageError
+
+if TYPE_CHECKING:
+    from hybridlog.message import Message
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -29,7 +37,7 @@ if TYPE_CHECKING:
 
     from hybridlog.query.question import Counters, Question, Span
     from hybridlog.session import Session
-    from hybridlog_storage.summary import RecordingSummary
+    from hybridlog_storage.catalog import RecordingSummary
 
     Times = NDArray[np.int64]
 
@@ -318,3 +326,43 @@ def _measured(times: Times, summary: RecordingSummary, span: Span) -> dict[str, 
         found["jitter_ns"] = float(np.std(steps)) if len(steps) > 1 else None
         found["gap_ns"], found["gap_begin_ns"] = int(steps[longest]), int(times[longest])
     return found
+
+
+SAMPLE = 100
+"""Messages that are read."""
+_MAX_FIELDS = 1000
+_WORDS = {"int64": "integer", "uint64": "integer", "double": "number"}
+_PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+
+
+def infer_fields(messages: Iterable[Message]) -> list[FieldPath]:
+    """Fields that the first messages have, which are in JSON, with the types of their columns.
+
+    What cannot be read is skipped. Names that no path can have are in backticks.
+    """
+    from hybridlog.schema.arrow_columns import objects_array  # loads pyarrow
+
+    values: list[Any] = []
+    for message in islice(messages, SAMPLE):
+        with suppress(PayloadError):
+            values.append(message.decode())
+    records = objects_array([one for one in values if isinstance(one, dict)], None)
+    return [*islice(_fields(records.type, "", within_array=False), _MAX_FIELDS)]
+
+
+def _fields(kind: Any, prefix: str, *, within_array: bool) -> Iterator[FieldPath]:
+    import pyarrow as pa
+
+    from hybridlog.schema.arrow_types import is_list
+
+    for field in kind:
+        path = prefix + (field.name if _PLAIN.fullmatch(field.name) else f"`{field.name}`")
+        inner, brackets = field.type, ""
+        while is_list(inner):
+            inner, brackets = inner.value_type, f"{brackets}[]"
+        is_object = pa.types.is_struct(inner)
+        word = "any" if inner == pa.json_() else _WORDS.get(str(inner), str(inner))
+        is_array = within_array or bool(brackets)
+        yield FieldPath(path, ("object" if is_object else word) + brackets, is_array)
+        if is_object:
+            yield from _fields(inner, f"{path}{brackets}.", within_array=is_array)

@@ -13,10 +13,9 @@ from starlette.responses import Response
 
 from hybridlog.drawing.images import picture
 from hybridlog.drawing.points import MAX_POINTS, bounds, points
-from hybridlog.drawing.series import fields_of, known_fields
+from hybridlog.drawing.series import fields_of, known_fields, track
 from hybridlog.drawing.series import series as read_series
 from hybridlog.drawing.times import aligned, lane_of
-from hybridlog.drawing.track import track
 from hybridlog.drawing.tree import MAX_SHOWN, tree
 from hybridlog.query.times import format_time
 from hybridlog.schema.states import CAUSES

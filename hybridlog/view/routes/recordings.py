@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeAlias
 
 from msgspec import Meta
 
-from hybridlog.query.answers.marks import marks_in
+from hybridlog.query.answers.interval_queries import marks_in
 from hybridlog.query.choice import Choice
 from hybridlog.record.losses import losses_of
 from hybridlog.schema.states import encoding_of, shown_channels
@@ -18,9 +18,8 @@ from hybridlog_storage.catalog import ChannelStats
 from hybridlog_storage.manifest import MAX_MARKS
 
 if TYPE_CHECKING:
-    from hybridlog_storage.catalog import RecordingEntry
+    from hybridlog_storage.catalog import RecordingEntry, RecordingSummary
     from hybridlog_storage.manifest import Manifest
-    from hybridlog_storage.summary import RecordingSummary
 
 _MAX_ROWS: Final = 200
 

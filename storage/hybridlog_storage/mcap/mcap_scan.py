@@ -20,6 +20,7 @@ from hybridlog_storage.mcap.mcap_content import (
     LAST_KNOWN,
     MAGIC,
     MAX_CHUNK_HEAD,
+    MAX_UNCOMPRESSED,
     MIN_RECORDS,
     RECORD_HEAD,
     TAIL,
@@ -27,14 +28,15 @@ from hybridlog_storage.mcap.mcap_content import (
     ChunkHead,
     Damage,
     RecordFile,
+    beginning,
     chunk_head_of,
+    decompress,
     footer_of,
     parse_content,
     parse_summary,
     read_record,
 )
 from hybridlog_storage.messages import MAX_PAYLOAD
-from hybridlog_storage.segments.compression import MAX_UNCOMPRESSED, beginning, decompress
 from hybridlog_storage.segments.segment_format import (
     MAX_HEAD,
     Attachment,

@@ -27,7 +27,7 @@ from typing import ClassVar, Final, cast
 from msgspec.structs import replace
 
 from hybridlog_storage.cells import Cells, cells_of_user, drop, put
-from hybridlog_storage.copy_places import RefusedError, Sending, Source
+from hybridlog_storage.copy import RefusedError, Sending, Source
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import (
     Listing,
@@ -48,8 +48,7 @@ from hybridlog_storage.manifest import (
     encode,
 )
 from hybridlog_storage.manifests import MANIFESTS, RECORDINGS, Manifests, decoded, ids_of
-from hybridlog_storage.remote.blocks import BlockCache, inode_of
-from hybridlog_storage.remote.bucket import Bucket, Object
+from hybridlog_storage.remote.bucket import BlockCache, Bucket, Object, inode_of
 from hybridlog_storage.settings import MAX_SETTINGS, NONE, StoreSettings, settings_of, settings_text
 from hybridlog_storage.settings import NAME as SETTINGS
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from hybridlog_storage.segments.compression import Compressor
+    from hybridlog_storage.mcap.mcap_content import Compressor
 
 
 _HEAD = MESSAGE_HEAD.itemsize

@@ -15,8 +15,8 @@ from msgspec.structs import replace
 
 from hybridlog_storage.cache import RowType
 from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.mcap.mcap_content import checked_frame, decompress
 from hybridlog_storage.messages import EXPIRED_IDS, run_starts
-from hybridlog_storage.segments.compression import checked_frame, decompress
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -36,12 +36,13 @@ from hybridlog_storage.mcap.mcap_content import (
     MESSAGE_HEAD,
     RECORD_HEAD,
     batch_of,
+    checked_frame,
+    decompress,
     heads_at,
     read_record,
 )
 from hybridlog_storage.messages import Batch, Buffer, Channel, Schema, run_starts
 from hybridlog_storage.segments.chunk_table import PART
-from hybridlog_storage.segments.compression import checked_frame, decompress
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -30,13 +30,13 @@ from hybridlog_storage.mcap.mcap_content import (
     TAIL,
     ChunkHead,
     chunk_head_of,
+    decompress,
     footer_of,
     parse_summary,
 )
 from hybridlog_storage.messages import EXPIRED_IDS, Buffer, Channel, distinct, with_expired
 from hybridlog_storage.segments.chunk import StoredChunk
 from hybridlog_storage.segments.chunk_table import ChunkPlace, ChunkTable, places_of
-from hybridlog_storage.segments.compression import decompress
 from hybridlog_storage.segments.segment_format import (
     CHUNK_TABLE_OPCODE,
     FORMAT_VERSION,

@@ -23,10 +23,9 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from hybridlog_storage.errors import DiskFullError, StoreError, UsageError
-from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD
+from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD, Compressor
 from hybridlog_storage.messages import MAX_CHANNELS, Batch, Channel, LooseBatch, Schema
 from hybridlog_storage.segments.chunk import OpenChunk, PackedChunk, pack
-from hybridlog_storage.segments.compression import Compressor
 from hybridlog_storage.segments.segment_file import Sealed, SegmentFile
 from hybridlog_storage.segments.segment_format import Attachment
 from hybridlog_storage.stopping import safe_point
