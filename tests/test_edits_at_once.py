@@ -147,7 +147,7 @@ def keep(
 
 
 @pytest.mark.parametrize(
-    "rounds", [6, pytest.param(60, marks=[pytest.mark.exhaustive, pytest.mark.timeout(1800)])]
+    "rounds", [3, pytest.param(60, marks=[pytest.mark.exhaustive, pytest.mark.timeout(1800)])]
 )
 @pytest.mark.parametrize("protect", ["pin", "tag"])
 def test_what_was_protected_first_outlasts_retention(

@@ -32,12 +32,12 @@ def mongod(path: Path) -> psutil.Process:
 
 
 def test_a_server_stays_while_a_client_is_connected(path: Path, limit: Limit) -> None:
-    limit(clients_wait_s=5.0)
+    limit(clients_wait_s=1.0)
     with hl.open(path) as store:
         address = store.index.address()
     server = mongod(path)
     with MongoClient[dict[str, object]](address.uri) as client:
-        time.sleep(7)
+        time.sleep(2)
         assert server.is_running()
         assert client[address.database]["number"].count_documents({"n": {"$gte": 5}}) == 15
     server.wait(30)

@@ -136,12 +136,3 @@ def test_as_a_command(tmp_path: Path, log: Path) -> None:
     assert run("info", "log", store=place).out.count("not indexed: recorded with --no-index") == 2
     (told,) = run("index", "rebuild", "--json", store=place).json
     assert told == {"recording": "log", "messages": 80, "documents": 40}
-    replayed = run(
-        *("record", "--replay", log, "--speed", 1000, "--name", "live"),
-        *("--no-index", "**", "--quiet"),
-        store=place,
-    )
-    assert replayed.out == ""
-    channels = run("info", "live", "--json", store=place).json[0]["channels"]
-    assert len(channels) == 4
-    assert all(channel["not_indexed"] for channel in channels)

@@ -167,25 +167,3 @@ def test_a_power_cut_while_recording(
     assert seen >= ({"nothing"} if sync == "never" else {"nothing", "recovered"})
     told = {"nothing", "recovered", "complete", "damaged", "unproven"}
     assert seen <= (told | {"unreadable"} if sync == "never" else told)
-
-
-def test_the_model_loses_what_is_not_synced(tmp_path: Path) -> None:
-    root = tmp_path / "root"
-    root.mkdir()
-    power = PowerCut(root)
-    with files.folder(root) as fd:
-        one = power.open("one", 0o102, dir_fd=fd)
-        power.writev(one, [memoryview(b"x" * 1000)])
-        power.sync(one)
-        power.writev(one, [memoryview(b"y" * 1000)])
-        power.rename("one", "two", src_dir_fd=fd, dst_dir_fd=fd)
-    contents, names = set(), set()
-    for seed in range(40):
-        target = tmp_path / str(seed)
-        power.after_cut(target, random.Random(seed))
-        (found,) = target.iterdir()
-        names.add(found.name)
-        assert found.read_bytes()[:1000] == b"x" * 1000
-        contents.add(len(found.read_bytes()))
-    assert names == {"one", "two"}
-    assert {1000, 1512, 2000} <= contents

@@ -14,13 +14,13 @@ from hybridlog.maintenance.verify import RESTORE
 from hybridlog_storage.errors import SegmentError, TopicError
 from hybridlog_storage.manifest import replace
 from hybridlog_storage.manifests import MANIFEST_OLD
-from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
 from tests.cli.within import answer
 from tests.damage import flip
 from tests.running.running import NO_MONGODB as NOWHERE
 from tests.running.test_faults import record_starts
+from tests.some import in_turn
 from tests.test_identity import COUNT, make_log, payload
 
 
@@ -163,8 +163,9 @@ def test_without_a_repair_no_file_is_changed(store: Path) -> None:
             _ = [one.raw for one in opened.topic("/n").in_recording("one")]
 
 
-@pytest.mark.parametrize("has_old", [True, False])
-@pytest.mark.parametrize("harm", ["gone", "flipped", "cut", "empty"])
+@pytest.mark.parametrize(
+    ("harm", "has_old"), in_turn(["gone", "flipped", "cut", "empty"], [True, False])
+)
 def test_a_manifest_is_made_again_when_it_is_asked_for(
     store: Path, harm: str, has_old: bool
 ) -> None:
@@ -198,18 +199,6 @@ def test_a_manifest_is_made_again_when_it_is_asked_for(
     assert (status, messages + lost) == ("damaged", COUNT)
 
 
-def test_a_manifest_that_is_made_again_takes_no_name_of_another(store: Path) -> None:
-    folder = places.folder(store, "one")
-    with closing(hl.open(store, mongo="none")) as opened:
-        opened.edit("one", name="first")
-        with opened.start("one") as recording:
-            recording.write(Channel("/m", "json", None), b"{}", log_time=1)
-    places.manifest_of(folder).unlink()
-    (folder / MANIFEST_OLD).unlink()
-    answer("verify", "--repair", "--mongo", "none", store=store, code=None)
-    assert places.name_of(folder) == "one-2"
-
-
 @pytest.mark.mongo("embedded")
 def test_a_segment_that_was_restored_is_answered_from_again(store: Path) -> None:
     whole = file(store, 1).read_bytes()
@@ -229,26 +218,6 @@ def test_a_segment_that_was_restored_is_answered_from_again(store: Path) -> None
         assert opened.entry("one").status == "complete"
         assert opened.topic("/n").where("n >= 0").count() == 2 * COUNT
         assert not opened.verify().findings
-
-
-def test_a_mark_beside_a_lost_segment_takes_nothing_of_it(store: Path) -> None:
-    """The segment comes back from a copy: its number and its arrival numbers are still its own."""
-    last = max(places.folder(store, "one").glob("*.mcap"))
-    whole = last.read_bytes()
-    last.unlink()
-    with closing(hl.open(store, mongo=NOWHERE)) as opened:
-        opened.mark("one", "+1s", "slip")
-    assert not last.exists()
-    last.write_bytes(whole)
-    with closing(hl.open(store, mongo=NOWHERE)) as opened:
-        entry = opened.entry("one")
-        assert (entry.status, entry.messages, len(entry.manifest.marks)) == (
-            "complete",
-            COUNT + 1,
-            1,
-        )
-        seqs = [m.seq for m in opened.all_topics().in_recording("one")]
-        assert len(set(seqs)) == len(seqs) == COUNT + 1
 
 
 @pytest.mark.parametrize("chosen", ["its id", "*"])

@@ -316,9 +316,7 @@ def test_a_quota_says_how_large_segments_are(quota: str | None, size: float) -> 
     "values",
     [
         {"quota": "much"},
-        {"quota": [1]},
         {"max-age": "old"},
-        {"max-age": True},
         {"min_free": "1GB"},
         {"topic": ["/camera"]},
         {"topic": {"/camera": "x"}},
@@ -327,12 +325,9 @@ def test_a_quota_says_how_large_segments_are(quota: str | None, size: float) -> 
         {"never-tag": 5},
         {"fields-age": "-1d"},
         {"quota": 200},
-        {"quota": "200"},
         {"min-free": "1.5"},
         {"max-age": 30},
-        {"max-age": "30"},
         {"max-age": "30M"},
-        {"max-age": "1d12"},
         {"topic": {"/camera": 7}},
     ],
 )

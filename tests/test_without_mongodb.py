@@ -34,13 +34,13 @@ from tests.running.running import NO_MONGODB
 pytestmark = pytest.mark.mongo("embedded")
 
 TOPICS = ("/imu/data", "/base/scan", "/tf")
-SMALL = SegmentSettings(chunk_size=8192, segment_size=200_000)
+SMALL = SegmentSettings(chunk_size=8192, segment_size=80_000)
 
 
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("bags") / "robot.bag"
-    write_bag(path, duration_s=5.0, topics=[*TOPICS])
+    write_bag(path, duration_s=2.0, topics=[*TOPICS])
     return path
 
 

@@ -61,7 +61,7 @@ def log_of(store: Path, messages: list[tuple[int, bytes, int, int]]) -> tuple[Pa
 
 
 @given(messages=MESSAGES, kind=st.sampled_from(["expired", "elsewhere"]), rows=st.integers(2, 50))
-@settings(max_examples=20)
+@settings(max_examples=10)
 def test_a_log_and_its_rows_say_the_same(
     messages: list[tuple[int, bytes, int, int]], kind: str, rows: int
 ) -> None:
@@ -128,11 +128,11 @@ def test_a_damaged_file_of_rows_is_told(tmp_path: Path) -> None:
     list_rows(folder, line, [made])
     path = folder / made.name
     whole = path.read_bytes()
-    for at in range(0, len(whole), 7):
+    for at in range(0, len(whole), 41):
         path.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
         with pytest.raises(StoreError):
             check_all(folder, made)
-    for size in range(0, len(whole), 50):
+    for size in range(0, len(whole), 300):
         path.write_bytes(whole[:size])
         with pytest.raises(StoreError):
             check_all(folder, made)

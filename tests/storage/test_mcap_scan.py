@@ -254,17 +254,6 @@ def parts_of(data: bytes | bytearray) -> tuple[list[int], int]:
 ALL = payloads(items_of(written()))
 
 
-def private(data: bytes) -> bytes:
-    return struct.pack("<BQ", 0x90, len(data)) + data
-
-
-def test_private_and_reserved_records_are_skipped() -> None:
-    reserved = struct.pack("<BQ", 0x42, 3) + b"abc"
-    body = content_of(Header("p", "l")) + private(b"mine") + reserved + private(b"")
-    data = MAGIC + body + content_of(DataEnd(0), Footer(0, 0, 0)) + MAGIC
-    assert [type(item) for _, item in items_of(data)] == [Header]
-
-
 @pytest.mark.parametrize("summary", [True, False])
 @pytest.mark.parametrize("compression", list(CompressionType))
 @pytest.mark.parametrize("claim", [0, 5, 1 << 20, (1 << 63) - 1, (1 << 64) - 1])
