@@ -610,17 +610,11 @@ class Store:
         follow = FollowerProcess.of_short(shared, "Starting a recording", interval_s)
         return LiveRecording(shared, follow, name, chosen)
 
-    @again_if_lost
     def sizes(self, recordings: Names | None = None) -> Sizes:
-        """Bytes of recordings and topics in segments, tables and MongoDB.
-
-        The share of MongoDB is None if that is unavailable; TopicError if one does not exist.
-        """
+        """Bytes of recordings and topics in segments and tables; TopicError if one is not there."""
         from hybridlog.maintenance.sizes import sizes_of
 
-        return sizes_of(
-            self.directory, self.session.select(recordings), self.shared.index.reached()
-        )
+        return sizes_of(self.directory, self.session.select(recordings))
 
     @again_if_lost
     def verify(

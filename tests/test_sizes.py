@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,16 +10,11 @@ from typing import Any
 import pytest
 
 import hybridlog as hl
-from hybridlog.query.topics import matcher
 from hybridlog_storage.messages import Channel, Schema
-from hybridlog_storage.mongo.database import Database
 from tests import places
-from tests.calls import Calls
 from tests.cli.running import run
 from tests.independent import write_mcap
 from tests.many_topics import BASE, FLOAT
-
-pytestmark = pytest.mark.mongo("embedded")
 
 LARGE = 20_000
 """Bytes of a payload of `/large`, which has chunks of its own."""
@@ -41,12 +35,10 @@ def write(path: Path, small: int, large: int) -> Path:
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("sizes")
-    with hl.open(folder / "store", create=True, require_database=True) as store:
+    with hl.open(folder / "store", create=True) as store:
         store.record(write(folder / "one.mcap", 400, 30))
         store.record(write(folder / "two.mcap", 1200, 0))
-        store.record(write(folder / "mute.mcap", 10, 0), no_index=matcher(["/a", "/b"]))
-        # Until then MongoDB has no size of new collections.
-        store.shared.index.connect()._client.admin.command("fsync")
+        store.record(write(folder / "mute.mcap", 10, 0))
     return folder / "store"
 
 
@@ -103,26 +95,6 @@ def test_shares_of_chunks_and_tables(store: hl.Store) -> None:
     assert (
         abs(rows["one", "/a"].table_bytes - share * rows["one", "/a"].messages) < 1.5
     )  # both are rounded
-
-
-def test_the_cost_does_not_depend_on_the_number_of_messages(store: hl.Store, calls: Calls) -> None:
-    made: Counter[str] = Counter()
-    for method in ("size", "find", "each"):
-        calls(Database, method, lambda *_, name=method, **__: made.update([name]))
-    calls.fail(hl.Query, "__iter__", AssertionError)
-    store.shared.index.connect()
-    found = []
-    for recording in ("one", "two"):
-        made.clear()
-        store.sizes([recording])
-        found.append(dict(made))
-    assert found == [{"size": 3}, {"size": 2}]
-
-
-def test_bytes_of_mongodb(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Database, "size", lambda _, name: {"a": 5, "b": 6, "large": 70}[name])
-    store.shared.index.connect()
-    assert (store.sizes().index_bytes, store.sizes(["two"]).index_bytes) == (81, 11)
 
 
 def test_as_commands(place: Path) -> None:

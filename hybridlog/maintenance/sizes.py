@@ -1,8 +1,7 @@
 """Bytes that recordings and topics take on the disk, by tier.
 
-Manifests, the sizes of files and one command for each collection of MongoDB suffice: the cost
-does not depend on the number of messages. Files that topics share are divided by payload and
-by number of messages.
+Manifests and the sizes of files suffice: the cost does not depend on the number of messages. Files
+that topics share are divided by payload and by number of messages.
 """
 
 from __future__ import annotations
@@ -18,14 +17,12 @@ from msgspec import Struct
 
 from hybridlog.columns.layout import type_prefix
 from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD
-from hybridlog_storage.mongo.index_documents import collection_of
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
-    from hybridlog_storage.mongo.database import Database
 
 
 _Key = TypeVar("_Key")
@@ -63,11 +60,9 @@ class Sizes(Struct, frozen=True):
 
     Attributes:
         rows: Each topic of each recording, largest first.
-        index_bytes: Bytes in MongoDB of the topics in all recordings; None if it is unavailable.
     """
 
     rows: list[Size]
-    index_bytes: int | None
 
     @property
     def total(self) -> Size:
@@ -89,13 +84,9 @@ class Sizes(Struct, frozen=True):
         return _largest_first(_sum(*names, rows) for names, rows in groups.items())
 
 
-def sizes_of(
-    directory: StoreDirectory,
-    entries: Sequence[RecordingEntry],
-    database: Database | None,
-) -> Sizes:
+def sizes_of(directory: StoreDirectory, entries: Sequence[RecordingEntry]) -> Sizes:
     """Sizes of some recordings."""
-    rows, topics = list[Size](), set[str]()
+    rows = list[Size]()
     tables = table_bytes(directory.path, entries)
     for entry in entries:
         name, segments, messages = entry.name, _segment_bytes(entry), entry.messages_by_topic()
@@ -106,9 +97,7 @@ def sizes_of(
             Size(name, one, messages[one], payload[one], segments[one], tables[entry.id, one])
             for one in {"", *messages}
         )
-        topics.update(+messages)
-    index = None if database is None else sum(database.size(collection_of(one)) for one in topics)
-    return Sizes(_largest_first(rows), index)
+    return Sizes(_largest_first(rows))
 
 
 def disk_bytes(root: Path, but: Collection[str] = ()) -> int:

@@ -397,14 +397,12 @@ def _show_sizes(store: Store, by: str, given: _Given) -> None:
         for one in (sizes.total, *found)
     )
     if given.as_json:
-        output.print_json({"rows": rows, "total": total, "index_bytes": sizes.index_bytes})
+        output.print_json({"rows": rows, "total": total})
         return
     names = [Column("recording"), Column("topic", lambda row: row.get("topic", "(no topic)"))]
     names = [one for one in names if by in {one.name, "both"}]
     last = total | {"recording": "", "topic": "", names[0].name: "total"}
     given.show([*rows, last] if rows else [], [*names, *_SIZES], store.session.when_empty)
-    if sizes.index_bytes:
-        output.remarks([f"MongoDB: {output.size(sizes.index_bytes)} for these topics."])
 
 
 _SIZES = [

@@ -317,11 +317,6 @@ class Database:
         ]
         return sorted(keys for keys in found if [field for field, _ in keys] != ["_id"])
 
-    def size(self, collection: str) -> int:
-        """Bytes of a collection on the disk, with its indexes."""
-        found = self.run(lambda db: db.command("collStats", collection))
-        return int(found.get("totalSize", 0))
-
 
 def _options(parsed: Mapping[str, Any], timeout_s: float) -> dict[str, object]:
     """The options of a connection, beside those in its parsed URI."""
