@@ -411,7 +411,7 @@ def _losses_of_chunks(
     ]
 
 
-def listed(*segments: Sealed) -> Callable[[Manifest], Manifest]:
+def with_segments(*segments: Sealed) -> Callable[[Manifest], Manifest]:
     """The change that lists segments, in the place of those of their numbers."""
     files = tuple(sealed.file for sealed in segments)
     numbers = {file.number for file in files}
@@ -485,7 +485,7 @@ def _listing_of(
     def how(now: Manifest) -> Manifest:
         for sealed, log, rows in found:
             if sealed.file.number not in now.logs:
-                now = listed(sealed)(now)
+                now = with_segments(sealed)(now)
             line = log or truth.replace(now.logs[sealed.file.number], gone=UNSET, copy="")
             now = truth.with_rows(now, line, rows)
         return now

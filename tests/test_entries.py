@@ -17,13 +17,13 @@ from msgspec.structs import replace
 import hybridlog as hl
 from hybridlog.entries import (
     ended,
-    listed,
     lost_in_crash,
     made_again,
     put_entry,
     read_summary,
     see,
     unlisted,
+    with_segments,
 )
 from hybridlog.maintenance.opening import StoreFiles
 from hybridlog.maintenance.report import RepairReport
@@ -107,7 +107,7 @@ class Made:
         assert len(self.segments) == segments
 
     def _announce(self, group: Any) -> None:
-        self.change(listed(*group))
+        self.change(with_segments(*group))
         if self.has_ended:
             self.change(ended("complete"))
 
@@ -318,7 +318,7 @@ def test_what_a_crash_took_of_a_listed_segment(made: Made) -> None:
     other = changed(there, bytes=9, digest=f"{5:064x}", parts=parts)
     made.change(lambda now: with_rows(now, other, ()))
     losses = tuple(lost_in_crash(made.manifest(), sealed))
-    made.change(lambda now: changed(listed(sealed)(now), losses=losses, status="damaged"))
+    made.change(lambda now: changed(with_segments(sealed)(now), losses=losses, status="damaged"))
     entry = made.entry()
     assert entry.status == "damaged"
     assert kept(entry) == by_topic(0, 1, 2, 3)

@@ -105,7 +105,6 @@ class _Beside:
         for thread in threads:
             thread.start()
         self._watch(self._task.seen)
-        self.tell("seen")
         for thread in threads:
             while thread.is_alive():
                 thread.join(_EVERY_S)

@@ -90,11 +90,9 @@ class FollowerProcess:
         self.said: list[str] = []
         self.judged: Collection[int] | None = () if triggers else None
         self.wait_s = math.inf
-        self._is_finishing = False
         self._shared = shared
         self._triggers = triggers
         self._task = task
-        self._has_seen = not triggers
         self._why = "their process ends again and again"
         self._purpose = purpose
         self._hit = hit
@@ -135,15 +133,13 @@ class FollowerProcess:
         """Wait until it has done everything, but no longer than wanted."""
         if self._purpose and time.monotonic() - self._begun < SHORT_S:
             return self._finish_here(entry)
-        self._is_finishing = True
         self._is_ended = True
         begun = time.monotonic()
         while self._thread.is_alive() and time.monotonic() - begun < self.wait_s:
             self._thread.join(_POLL_S)
         if self._thread.is_alive():
-            if not self._has_seen:
-                self._say("triggers have not seen the last messages: that takes too long")
-            self._say("tables and index are not complete: the next command makes the rest")
+            what = "triggers may not have seen the last messages; " if self._triggers else ""
+            self._say(f"{what}tables and index are not complete: the next command makes the rest")
         self.abandon()
         return put_entry(self._shared.directory, self._shared.catalog, entry.id)
 
@@ -165,8 +161,8 @@ class FollowerProcess:
 
     def leave(self) -> bool:
         """Let `finish` wait no longer; False if it does not wait."""
-        was_waiting = self._is_finishing and self.wait_s > 0
-        self.wait_s = 0.0 if self._is_finishing else self.wait_s
+        was_waiting = self._is_ended and self.wait_s > 0
+        self.wait_s = 0.0 if self._is_ended else self.wait_s
         return was_waiting
 
     def abandon(self) -> None:
@@ -224,8 +220,6 @@ class FollowerProcess:
                 case ("read", seen):
                     self.judged = seen[1]
                     self._task = self._task._replace(seen=seen)
-                case ("seen",):
-                    self._has_seen = True
                 case ("state", state):
                     self.state = state
                 case ("say", text):

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any, Final
 from msgspec import Struct, field
 
 from hybridlog.entries import put_entry
-from hybridlog.index.indexing import ChunkIndexer, IndexTarget, Sender
+from hybridlog.index.indexing import ChunkIndexer, Sender
 from hybridlog.maintenance.keep import make_rows
 from hybridlog.maintenance.opening import missing
-from hybridlog.maintenance.report import Followed, reporter
+from hybridlog.maintenance.report import Followed, IndexTarget, reporter
 from hybridlog.maintenance.retention import Rules
 from hybridlog.shared import RecordingRows
 from hybridlog_storage.catalog import WHOLE, ChannelStats, file_of

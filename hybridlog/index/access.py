@@ -11,6 +11,7 @@ from contextlib import suppress
 from functools import wraps
 from typing import TYPE_CHECKING, NamedTuple, ParamSpec, TypeVar
 
+from hybridlog.maintenance.report import IndexTarget
 from hybridlog_storage.errors import (
     ConnectionLostError,
     DatabaseError,
@@ -29,7 +30,6 @@ from hybridlog_storage.settings import (
 )
 
 if TYPE_CHECKING:
-    from hybridlog.index.indexing import IndexTarget
     from hybridlog.maintenance.report import Progress
     from hybridlog.shared import Shared
     from hybridlog_storage.mongo.database import Database
@@ -143,8 +143,6 @@ class IndexAccess:
 
     def index_to_record(self, purpose: str, *, brings: bool = True) -> IndexTarget:
         """The index, for a new recording; it may be unavailable, or without `brings` be behind."""
-        from hybridlog.index.indexing import IndexTarget
-
         try:
             database = self.database_for(purpose, writes=True, brings=brings)
         except DatabaseError as error:

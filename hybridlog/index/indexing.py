@@ -10,7 +10,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from msgspec import Struct
 
 from hybridlog.schema.codec import stamps_of
 from hybridlog.schema.codecs import bodies_in, codec_for
@@ -25,11 +24,9 @@ from hybridlog_storage.segments.chunk import Placed, StoredChunk
 if TYPE_CHECKING:
     from collections.abc import Hashable
 
-    import numpy as np
     from numpy.typing import NDArray
 
     from hybridlog.schema.codec import Codec, Decoded
-    from hybridlog_storage.errors import DatabaseError
     from hybridlog_storage.mongo.database import Database
 
 
@@ -159,28 +156,6 @@ def stamp_stats(log_time: NDArray[np.int64], stamps: NDArray[np.int64]) -> Chann
 
 
 _SEND_BYTES: Final = 8 << 20  # documents that are sent together, at most
-
-
-class IndexTarget(Struct, frozen=True):
-    """The database for the index documents of a recording.
-
-    Attributes:
-        database: The index; None if it is unavailable now, or the recording gets none.
-        failure: Why it is unavailable now; None if it is not, or the recording gets none.
-    """
-
-    database: Database | None = None
-    failure: DatabaseError | None = None
-
-    @property
-    def is_wanted(self) -> bool:
-        """True if the recording gets documents, now or later."""
-        return self.database is not None or self.failure is not None
-
-    @property
-    def without(self) -> str:
-        """The end of a sentence about a MongoDB that is unavailable."""
-        return "so the index is made later" if self.is_wanted else "so there is no index"
 
 
 class Sender:

@@ -255,7 +255,7 @@ class Recorder:
                 store.directory,
                 partial(remove_if, store.shared, clears=False),
                 self._target.id,
-                sealed=lambda: self._target.capture.writer.totals.segments,
+                sealed=lambda: self._target.capture.writer.sealed,
                 reserve=options.reserve_bytes,
                 say=self.say,
                 ring_s=options.ring_s,

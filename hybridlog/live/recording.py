@@ -20,9 +20,8 @@ from typing import TYPE_CHECKING, Any, Final, Self
 import numpy as np
 from msgspec import Struct, field
 
-from hybridlog.record.capture import Capture
 from hybridlog.record.losses import Cause, Ledger
-from hybridlog.record.recorder import RecordReport
+from hybridlog.record.recorder import Capture, RecordReport
 from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.errors import DatabaseError, DiskFullError, UsageError
 from hybridlog_storage.manifest import Loss
@@ -290,8 +289,7 @@ class LiveRecording:
     @property
     def stored(self) -> tuple[int, int]:
         """Messages in chunks, and the bytes of their payloads."""
-        totals = self.capture.writer.totals
-        return totals.messages, totals.payload_bytes
+        return self.capture.writer.messages, self.capture.writer.payload_bytes
 
     @property
     def lag(self) -> int:

@@ -73,7 +73,12 @@ class StoreIndex(Struct, frozen=True):
         if is_other:
             behind, known = snapshot.summaries, state.of()
             if removes:
-                self._remove_orphans(known, report)
+                # The directories are listed after the index: those that have begun are there, too.
+                there = (*directory.ids(), *directory.manifests.without())
+                gone = {*known} - {one[-16:] for one in there}
+                if gone:
+                    state.forget(gone)
+                    report.removed += sorted(gone)
         changed, current = set(), []
         for summary in behind:
             entry = entry_of(summary)
@@ -96,18 +101,6 @@ class StoreIndex(Struct, frozen=True):
     def _bring(self, entry: RecordingEntry, **options: Any) -> Follower | None:
         directory, catalog, database = self.directory, self.catalog, self.database
         return bring(directory, catalog, entry, database, progress=self.progress, **options)
-
-    def _remove_orphans(self, known: Iterable[str], report: RepairReport) -> None:
-        """Remove recordings without a directory from the index.
-
-        The directories are listed after the index, so they include recordings that have begun
-        meanwhile.
-        """
-        directory, state = self.directory, IndexState(self.database)
-        gone = {*known} - {one[-16:] for one in (*directory.ids(), *directory.manifests.without())}
-        if gone:
-            state.forget(gone)
-            report.removed += sorted(gone)
 
     def rebuild(self, entries: Iterable[RecordingEntry]) -> dict[str, HybridlogError]:
         """Rebuild the index of recordings from their segments; returns why some are unchanged.

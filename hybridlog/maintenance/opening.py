@@ -17,12 +17,12 @@ from hybridlog.entries import (
     NO_MANIFEST,
     Seen,
     ended,
-    listed,
     lost_in_crash,
     recording_metadata,
     see,
     summary_by,
     unlisted,
+    with_segments,
 )
 from hybridlog.snapshot import UNFINISHED, Snapshot
 from hybridlog_storage.catalog import Catalog, Damage
@@ -35,8 +35,8 @@ if TYPE_CHECKING:
     from hybridlog.maintenance.report import RepairReport
     from hybridlog_storage.catalog import RecordingEntry, RecordingSummary
     from hybridlog_storage.disk.directory import Listing, StoreDirectory
-    from hybridlog_storage.segments.recovery import Recovered
     from hybridlog_storage.segments.segment_file import Sealed
+    from hybridlog_storage.segments.walk import Recovered
 
 
 class StoreFiles(Struct):
@@ -166,7 +166,7 @@ def recover_segments(
     directory: StoreDirectory, recording: str, listing: Listing, manifest: Manifest | None
 ) -> list[Recovered]:
     """Seal what a killed recorder has left; the manifest, if there is one, lists it first."""
-    from hybridlog_storage.segments.recovery import recover_segment
+    from hybridlog_storage.segments.walk import recover_segment
 
     path = directory.recording(recording)
     said = None if manifest is None else recording_metadata(manifest)
@@ -180,7 +180,7 @@ def recover_segments(
             lost += [Loss("damaged segment", reason=one) for one in found.damage]
 
             def change(now: Manifest) -> Manifest:
-                return replace(listed(sealed)(now), losses=(*now.losses, *lost))
+                return replace(with_segments(sealed)(now), losses=(*now.losses, *lost))
 
             directory.manifests.change(recording, change)
 

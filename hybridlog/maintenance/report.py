@@ -9,7 +9,8 @@ from msgspec import Struct, field
 
 if TYPE_CHECKING:
     from hybridlog_storage.errors import DatabaseError
-    from hybridlog_storage.segments.recovery import Recovered
+    from hybridlog_storage.mongo.database import Database
+    from hybridlog_storage.segments.walk import Recovered
 
 Progress = Callable[[str, int, int], None]
 """Called with the recording's name, bytes done and bytes in all."""
@@ -81,3 +82,25 @@ class Followed(NamedTuple):
     indexed: int = 0
     missed: int = 0
     failure: DatabaseError | None = None
+
+
+class IndexTarget(Struct, frozen=True):
+    """The database for the index documents of a recording.
+
+    Attributes:
+        database: The index; None if it is unavailable now, or the recording gets none.
+        failure: Why it is unavailable now; None if it is not, or the recording gets none.
+    """
+
+    database: Database | None = None
+    failure: DatabaseError | None = None
+
+    @property
+    def is_wanted(self) -> bool:
+        """True if the recording gets documents, now or later."""
+        return self.database is not None or self.failure is not None
+
+    @property
+    def without(self) -> str:
+        """The end of a sentence about a MongoDB that is unavailable."""
+        return "so the index is made later" if self.is_wanted else "so there is no index"

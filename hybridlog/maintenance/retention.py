@@ -23,7 +23,7 @@ from hybridlog_storage.errors import HybridlogError, TimeError, UsageError
 
 if TYPE_CHECKING:
     from hybridlog.query.topics import TopicMatcher
-    from hybridlog_storage.manifest import File, Manifest, Part, Pin
+    from hybridlog_storage.manifest import File, Manifest, Part
 
 MIN_SEGMENT: Final = 4 << 20
 MAX_SEGMENT: Final = 1 << 30
@@ -209,19 +209,13 @@ def _parts_of(log: File, manifest: Manifest) -> list[tuple[str, Part]]:
 
 def is_pinned(log: File, manifest: Manifest) -> bool:
     """True if a pin keeps messages of a log."""
-    return any(
-        _touches(pin, topic, part)
-        for topic, part in _parts_of(log, manifest)
-        for pin in manifest.pins
-    )
-
-
-def _touches(pin: Pin, topic: str, part: Part) -> bool:
     # A part without times may have messages at any.
-    return (
+    return any(
         (pin.topics is None or topic in pin.topics)
         and (pin.first is None or part.last is None or pin.first <= part.last)
         and (pin.last is None or part.first is None or part.first <= pin.last)
+        for topic, part in _parts_of(log, manifest)
+        for pin in manifest.pins
     )
 
 

@@ -13,7 +13,7 @@ from hybridlog.columns.layout import topics_of
 from hybridlog.columns.rows_file import RowsFile
 from hybridlog.entries import free_name_in, made_again, put_entry
 from hybridlog.follow.follower import bring, make_tables
-from hybridlog.maintenance.opening import recover, recover_segments
+from hybridlog.maintenance.opening import missing, recover, recover_segments
 from hybridlog.maintenance.report import Repaired, reporter
 from hybridlog_storage.catalog import WHOLE
 from hybridlog_storage.disk.directory import LOCK, LOCK_WAIT_S
@@ -28,8 +28,8 @@ from hybridlog_storage.errors import (
 )
 from hybridlog_storage.manifest import encode, replace
 from hybridlog_storage.manifests import DiskManifests
-from hybridlog_storage.segments.recovery import damage_of, rebuild_summary
 from hybridlog_storage.segments.segment_reader import SegmentReader
+from hybridlog_storage.segments.walk import damage_of, rebuild_summary
 from hybridlog_storage.settings import EMBEDDED, is_uri, read_settings, write_settings
 
 if TYPE_CHECKING:
@@ -128,14 +128,10 @@ class TableChecker:
         self.tables = Tables(directory.path)
         self._checked: dict[int, str] = {}
 
-    def lacking(self, entry: RecordingEntry) -> set[str]:
-        """Topics whose tables lack rows, or have others than the recording."""
-        self.tables.look_again()
-        return self.tables.lacking(entry, topics_of(entry))
-
     def damage(self, entry: RecordingEntry) -> dict[str, str]:
         """Problems of the existing tables, by topic. Reads every byte of them."""
         found: dict[str, str] = {}
+        self.tables.look_again()
         for topic in sorted(topics_of(entry)):
             table = self.tables.of(entry, topic)
             if table is not None:
@@ -292,12 +288,12 @@ def _make_tables(
 ) -> list[Finding]:
     """Make missing and damaged tables again, which are then `done`; returns why not, if not."""
     damaged = tables.damage(entry)
-    wanted = sorted(tables.lacking(entry).union(damaged))
+    wanted = sorted(missing(directory, entry).union(damaged))
     problem = make_tables(directory, catalog, entry, topics=damaged) if wanted else ""
     if problem:
         why = f"it cannot be made again: {problem}"
         return [Finding(entry.name, f"table of {topic}", why, AGAIN) for topic in wanted]
-    left = tables.lacking(entry) if wanted else ()
+    left = missing(directory, entry) if wanted else ()
     made = [topic for topic in wanted if topic not in left]
     done += (Repaired(entry.name, f"table of {topic}", "made again") for topic in made)
     return []

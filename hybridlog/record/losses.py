@@ -83,12 +83,14 @@ class Ledger:
             everything: True to include rows that are written less often.
         """
         with self._lock:
-            ready = [key for key, row in self._open.items() if everything or _is_due(row)]
+            ready = [
+                key
+                for key, row in self._open.items()
+                if everything
+                or row.cause != Cause.THROTTLE
+                or (row.last or 0) - (row.first or 0) >= _SLOW_NS
+            ]
             return [self._open.pop(key) for key in ready]
-
-
-def _is_due(row: Loss) -> bool:
-    return row.cause != Cause.THROTTLE or (row.last or 0) - (row.first or 0) >= _SLOW_NS
 
 
 def joined(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:

@@ -53,9 +53,8 @@ MARK_SCHEMA: Final = Schema(
 )
 
 
-def mark_channel() -> Channel:
-    """The channel of marks."""
-    return Channel(MARKS, "json", MARK_SCHEMA, {})
+MARK_CHANNEL: Final = Channel(MARKS, "json", MARK_SCHEMA)
+"""The channel of marks."""
 
 
 def mark_payload(text: str, tags: Mapping[str, str], end: int | None = None) -> bytes:
@@ -115,7 +114,7 @@ def with_marks(entry: RecordingEntry) -> RecordingEntry:
     if not entry.manifest.marks:
         return entry
     flushed = _MarksLog(entry.manifest.marks).flushed
-    channel = channel_entry(MARKS_CHANNEL, replace(mark_channel(), is_indexed=False))
+    channel = channel_entry(MARKS_CHANNEL, replace(MARK_CHANNEL, is_indexed=False))
     channel.stats = channel_totals(flushed.table)[MARKS_CHANNEL]
     span = int(flushed.table.parts["first"].min()), int(flushed.table.parts["last"].max())
     return replace(

@@ -1,36 +1,50 @@
-"""Recording a log into the store: source to segments to index.
+"""A recording in progress, and a log that becomes one: source to segments to index.
 
-The recorder gets its parts as arguments. A complete recording has everything that could
-be read, and a loss ledger of everything that could not. A failed recording leaves nothing
-behind.
+Messages of log files and of running robots both go through a `Capture`. It starts the recording,
+provides its writer, and completes or removes the recording. A complete recording has everything
+that could be read, and a loss ledger of everything that could not. A failed one leaves nothing.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from msgspec import Struct, field
+from msgspec import Struct, convert, field
+from msgspec.structs import replace
 
-from hybridlog.entries import text
-from hybridlog.query.latching import LatchedFront
-from hybridlog.record.capture import Capture
+from hybridlog.entries import (
+    ended,
+    free_name_in,
+    put_entry,
+    recording_metadata,
+    text,
+    with_segments,
+)
+from hybridlog.maintenance.retention import Rules
+from hybridlog.query.latching import LatchedFront, depth_of
 from hybridlog.schema.ros_codec import TRIED_MESSAGES, completed
 from hybridlog.wording import listed
 from hybridlog_storage.catalog import RecordingEntry
+from hybridlog_storage.disk.directory import LOCK_WAIT_S
 from hybridlog_storage.errors import (
     AlreadyRecordedError,
     DatabaseError,
+    DiskFullError,
+    HybridlogError,
     SourceError,
     TopicError,
 )
-from hybridlog_storage.manifest import Loss
+from hybridlog_storage.manifest import Loss, Manifest, new_id
+from hybridlog_storage.manifest import Source as Origin
+from hybridlog_storage.manifest import replace as replaced
 from hybridlog_storage.messages import Batch, Channel, distinct
-from hybridlog_storage.segments.segment_format import OUR_NAMES, Attachment
+from hybridlog_storage.segments.segment_format import OUR_NAMES, Attachment, losses_record
 from hybridlog_storage.segments.segment_writer import RecordingWriter, SegmentSettings
 from hybridlog_storage.stopping import at_safe_points, safe_point
 from hybridlog_storage.times import placed
@@ -44,6 +58,178 @@ if TYPE_CHECKING:
     from hybridlog.snapshot import Snapshot
     from hybridlog_storage.catalog import Catalog
     from hybridlog_storage.disk.directory import StoreDirectory
+    from hybridlog_storage.segments.segment_file import Sealed
+
+
+class Capture:
+    """Records the messages of one new recording.
+
+    `follow` starts its follower; `known` returns all recordings of the store as they are now.
+    `on_written` and `make_room` are as of `RecordingWriter`. `no_index` tells whether the messages
+    of a topic get no documents in MongoDB. Files of a ring go while it is recorded, so latched
+    messages have files of their own. `check` is called with all recordings before anything is
+    written, while no other process can start one; it raises to refuse.
+
+    Attributes:
+        entry: The recording's catalog entry.
+        writer: Writer of its segments.
+        follower: Makes what is derived of it.
+    """
+
+    def __init__(
+        self,
+        directory: StoreDirectory,
+        catalog: Catalog,
+        follow: Callable[[RecordingEntry], FollowerProcess],
+        known: Callable[[], Snapshot],
+        *,
+        name: str,
+        tags: Mapping[str, str],
+        source: Mapping[str, Any],
+        settings: SegmentSettings,
+        on_written: Callable[[], None] | None = None,
+        no_index: Callable[[str], bool] | None = None,
+        is_ring: bool = False,
+        check: Callable[[Snapshot], None] = lambda _: None,
+        make_room: Callable[[], bool] = lambda: False,
+    ) -> None:
+        self.catalog = catalog
+        self._directory = directory
+        self._make_room = make_room
+        rules = Rules.of(directory.settings.retention)
+        largest = int(min(settings.segment_size, rules.segment_size))
+        settings = replace(settings, segment_size=largest)
+        self._end: Callable[[Manifest], Manifest] | None = None
+        self._held = ExitStack()
+        recording = new_id(name)
+        with self._held:
+            try:
+                with directory.manifests.creating() as create:
+                    # Of two processes that record the same content now, one is refused.
+                    recorded = known()
+                    check(recorded)
+                    manifest = Manifest(
+                        recording,
+                        free_name_in(recorded.summaries, name),
+                        time.time_ns(),
+                        source=convert(dict(source), Origin),
+                        tags={text(key): text(value) for key, value in tags.items()},
+                    )
+                    # First the recording's folder, locked, then its manifest.
+                    lock = directory.writing(
+                        recording, wait_s=LOCK_WAIT_S, records=True, makes=True
+                    )
+                    self._held.enter_context(lock)
+                    create(manifest)
+                    self.entry = put_entry(directory, catalog, recording)
+            except BaseException:
+                with suppress(HybridlogError):
+                    directory.manifests.remove(recording)
+                raise
+            self._held = self._held.pop_all()
+        folder = directory.recording(recording)
+        self.follower = follow(self.entry)
+        self.writer = RecordingWriter(
+            folder,
+            recording_metadata(self.entry.manifest),
+            settings,
+            no_index=no_index or (lambda _: False),
+            is_named=lambda topic: rules.topic_rule(topic) is not None,
+            is_latched=lambda channel: depth_of(channel) > 0,
+            latched_apart=is_ring,
+            on_sealing=self._announce,
+            make_room=make_room,
+            on_written=on_written,
+        )
+
+    @property
+    def indexed(self) -> int:
+        """Number of messages in the index, after the end."""
+        return max(0, self.follower.state.indexed - (self.entry.messages - self.entry.documents))
+
+    @property
+    def lag(self) -> int:
+        """Messages that are to be in the index, and are not yet."""
+        state = self.follower.state
+        return max(self.writer.messages - state.indexed, 0) if state.is_wanted else 0
+
+    def close(self, losses: Sequence[Loss] = ()) -> DatabaseError | None:
+        """Complete the recording, which is damaged if its source had `losses`.
+
+        `entry` is then complete, too.
+
+        Returns:
+            Why the index is not complete, None when it is.
+        """
+        # From here on only the last group is sealed, which announces the end.
+        self.writer.flush()
+        self._end = ended("damaged" if losses else "complete", losses)
+        self.writer.close()
+        return self._finish()
+
+    def close_truncated(self, lost: Sequence[Loss]) -> DatabaseError | None:
+        """Complete the recording on a full disk.
+
+        Returns:
+            Why the index is not complete, None when it is.
+
+        Raises:
+            DiskFullError: No room for that either. Without any message, the recording is gone.
+        """
+        self._end = ended("complete")  # the segment holds the last losses
+        try:
+            self.writer.close_truncated([losses_record(lost)])
+        except DiskFullError:
+            if not self.writer.written.total():
+                self.rollback()
+                raise
+            if not self.writer.has_extras:  # or else the next look reads them in the segment
+                with suppress(DiskFullError):
+                    self._change(lambda now: replaced(now, losses=(*now.losses, *lost)))
+            raise
+        return self._finish()
+
+    def _announce(self, group: Sequence[Sealed]) -> None:
+        """List the segments of a group in the manifest before they get their final names."""
+        end, change = self._end, with_segments(*group)
+        self._change(change if end is None else lambda now: end(change(now)))
+
+    def _change(self, how: Callable[[Manifest], Manifest]) -> None:
+        while True:
+            try:
+                self._directory.manifests.change(self.entry.id, how)
+                return
+            except DiskFullError:
+                from hybridlog.maintenance.keep import use_spare
+
+                if not (self._make_room() or use_spare(self._directory)):
+                    raise
+
+    def _finish(self) -> DatabaseError | None:
+        self.entry = put_entry(self._directory, self.catalog, self.entry.id)
+        self.entry = self.follower.finish(self.entry)
+        self._held.close()
+        return self.follower.state.failure
+
+    def abort(self) -> None:
+        """Stop at once; flushed messages stay, and are sealed by the next change of the store."""
+        self.writer.abort()
+        self.follower.abandon()
+        self._held.close()
+
+    def rollback(self) -> None:
+        """Remove the whole recording; what fails is finished by the next change of the store."""
+        entry, manifests = self.entry, self._directory.manifests
+        with suppress(HybridlogError):  # or else the files go first
+            manifests.change(entry.id, lambda now: replaced(now, status="removed"))
+        self.writer.abort()
+        self.follower.abandon()
+        with suppress(HybridlogError):
+            manifests.remove(entry.id)
+        with suppress(HybridlogError):
+            self.catalog.remove(entry.id)
+        self._held.close()
+
 
 _MAX_PARTS = 1000  # of a log, whose fingerprints the recording has
 
@@ -151,7 +337,18 @@ def record(
         copy = _Copy(source, capture.writer, options)
         copy.run(progress)
         _check_result(source, capture.writer, options)
-        failure = capture.close(_losses_of(source))
+        losses = [
+            Loss(
+                "source damaged",
+                count=damage.messages_lost,
+                reason=damage.reason,
+                file=text(damage.file.name),
+                offset=damage.offset,
+                length=damage.length,
+            )
+            for damage in source.damage
+        ]
+        failure = capture.close(losses)
     except BaseException:
         # Remove a partial recording: the source still exists, the command can be repeated.
         capture.rollback()
@@ -191,7 +388,8 @@ class _Copy:
         self._between = options.between
         self._matcher = options.matcher
         self._wanted: list[bool] = []  # of the channels
-        self._completed = _Completed(source)
+        self._channels: list[Channel] = []  # completed by their first messages
+        self._open: set[int] = set()  # numbers of those that are not yet
 
     def run(self, progress: Callable[[int, int], None] | None) -> None:
         """Copy the source from its beginning to its end."""
@@ -202,16 +400,16 @@ class _Copy:
             self._copy_extras()
             read += len(batch)
             chosen = self._chosen(batch)
-            writer.append(chosen, self._completed.of(chosen))
+            writer.append(chosen, self._completed(chosen))
             if progress is not None:
-                progress(source.bytes_read, writer.totals.messages)
+                progress(source.bytes_read, writer.messages)
         for batch in self.front.batches() if self.front is not None else ():
-            writer.append(batch, self._completed.of(batch))
+            writer.append(batch, self._completed(batch))
         self._copy_extras()
-        for channel in self._completed.all():
+        for channel in self._all_channels():
             if self._matcher is None or self._matcher(channel.topic):
                 writer.declare(channel)
-        self.skipped = read - writer.totals.messages
+        self.skipped = read - writer.messages
 
     def _chosen(self, batch: Batch) -> Batch:
         """The wanted messages of a batch."""
@@ -240,16 +438,7 @@ class _Copy:
             self._writer.add_extra(extra)
         self._source.extras.clear()
 
-
-class _Completed:
-    """The channels of a source, completed with standard definitions by their first messages."""
-
-    def __init__(self, source: Source) -> None:
-        self._source = source
-        self._channels: list[Channel] = []
-        self._open: set[int] = set()
-
-    def of(self, batch: Batch) -> list[Channel]:
+    def _completed(self, batch: Batch) -> list[Channel]:
         """The channels of a batch, by their numbers in the source."""
         self._learn()
         if self._open and len(batch):
@@ -261,7 +450,7 @@ class _Completed:
                 self._open.discard(number)
         return self._channels
 
-    def all(self) -> list[Channel]:
+    def _all_channels(self) -> list[Channel]:
         """All channels of the source; those without messages are completed by proof only."""
         self._learn()
         for number in self._open:
@@ -280,28 +469,14 @@ def _where(batch: Batch, mask: NDArray[np.bool_]) -> Batch:
 
 
 def _check_result(source: Source, writer: RecordingWriter, options: RecordOptions) -> None:
-    if not writer.totals.messages and source.damage:
+    if not writer.messages and source.damage:
         first = source.damage[0]
         raise SourceError(f"{source.path}: no message could be read: {first.reason}")
-    if options.matcher is not None and not writer.totals.messages:
+    if options.matcher is not None and not writer.messages:
         topics = listed(sorted({c.topic for c in source.channels}), 20)
         raise TopicError(
             f"{source.path}: no message is on the topics asked for; the log has: {topics}"
         )
-
-
-def _losses_of(source: Source) -> list[Loss]:
-    return [
-        Loss(
-            "source damaged",
-            count=damage.messages_lost,
-            reason=damage.reason,
-            file=text(damage.file.name),
-            offset=damage.offset,
-            length=damage.length,
-        )
-        for damage in source.damage
-    ]
 
 
 def _identity(fingerprint: Fingerprint) -> dict[str, object]:

@@ -18,7 +18,7 @@ from starlette.testclient import TestClient
 
 import hybridlog as hl
 from hybridlog.query.answers.interval_queries import marks_in
-from hybridlog.record.marks import MARKS_SEGMENT, mark_channel, mark_payload, with_marks
+from hybridlog.record.marks import MARK_CHANNEL, MARKS_SEGMENT, mark_payload, with_marks
 from hybridlog.view.guard import Admission
 from hybridlog.view.server import make_app
 from hybridlog_storage.errors import SegmentError, StoreError, TimeError, UsageError
@@ -137,7 +137,7 @@ def test_marks_answer_as_messages_do(tmp_path: Path) -> None:
                     recording.write(NUMBERS, b'{"n": %d}' % number, log_time=time)
                 for begin, text, tags, end in [] if are_set else said:
                     payload = mark_payload(text, tags, None if end is None else end * S)
-                    recording.write(mark_channel(), payload, log_time=begin * S)
+                    recording.write(MARK_CHANNEL, payload, log_time=begin * S)
             for begin, text, tags, end in said if are_set else []:
                 until = None if end is None else f"+{end - BEGIN}s"
                 store.mark("drive", f"+{begin - BEGIN}s", text, tags, until=until)

@@ -16,7 +16,7 @@ from rosbags.rosbag2 import Reader
 
 import hybridlog as hl
 from hybridlog.contract import contract_of
-from hybridlog.record.marks import MARKS, mark_channel, mark_payload
+from hybridlog.record.marks import MARK_CHANNEL, MARKS, mark_payload
 from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segments.segment_writer import SegmentSettings
@@ -113,7 +113,7 @@ def write(recording: Any) -> None:
             recording.write(video, data, log_time=time_ns + 3 * MS)
         if n in {10, 25}:
             mark = mark_payload(f"turn {n}", {"kind": "turn"}, time_ns + 300 * MS)
-            recording.write(mark_channel(), mark, log_time=time_ns + 4 * MS)
+            recording.write(MARK_CHANNEL, mark, log_time=time_ns + 4 * MS)
         content = json.dumps({"n": n, "text": NOISE.decode()}).encode()
         recording.write(noise, content, log_time=time_ns + 5 * MS)
 

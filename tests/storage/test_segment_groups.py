@@ -20,7 +20,6 @@ from hybridlog_storage.errors import DiskFullError
 from hybridlog_storage.manifest import Loss
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.chunk import StoredChunk
-from hybridlog_storage.segments.recovery import recover_segment
 from hybridlog_storage.segments.segment_file import Sealed, SegmentFile
 from hybridlog_storage.segments.segment_format import (
     LOSSES_METADATA,
@@ -29,6 +28,7 @@ from hybridlog_storage.segments.segment_format import (
 )
 from hybridlog_storage.segments.segment_reader import SegmentReader
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from hybridlog_storage.segments.walk import recover_segment
 from tests.storage.noting import NotingWriter
 from tests.storage.test_segments import RECORDING, Row, batch_of, problems
 

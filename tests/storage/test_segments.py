@@ -27,7 +27,6 @@ from hybridlog_storage.manifest import Loss, replace
 from hybridlog_storage.messages import Batch, Channel, LooseBatch, Schema
 from hybridlog_storage.segments.chunk import StoredChunk
 from hybridlog_storage.segments.chunk_table import ChunkPlace
-from hybridlog_storage.segments.recovery import Recovered, damage_of, recover_segment
 from hybridlog_storage.segments.segment_file import Sealed, SegmentFile
 from hybridlog_storage.segments.segment_format import (
     RECORDING_METADATA,
@@ -37,6 +36,7 @@ from hybridlog_storage.segments.segment_format import (
 )
 from hybridlog_storage.segments.segment_reader import SegmentReader, SegmentSummary
 from hybridlog_storage.segments.segment_writer import AT_WORK, RecordingWriter, SegmentSettings
+from hybridlog_storage.segments.walk import Recovered, damage_of, recover_segment
 from tests.calls import Calls
 from tests.limits import Limit
 from tests.some import each

@@ -47,8 +47,6 @@ from hybridlog_storage.segments.chunk_table import PART
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog_storage.messages import Buffer
-
 
 PROFILE: Final = "hybridlog"
 LIBRARY: Final = "hybridlog"
@@ -220,11 +218,6 @@ def chunk_head(
             struct.pack("<Q", compressed_size),
         )
     )
-
-
-def damaged_head(size: int) -> bytes:
-    """The head of a record of `size` damaged bytes, including itself."""
-    return RECORD_HEAD.pack(DAMAGED_OPCODE, size - RECORD_HEAD.size)
 
 
 def index_order(channel: NDArray[np.int32], log_time: NDArray[np.int64]) -> NDArray[np.intp]:

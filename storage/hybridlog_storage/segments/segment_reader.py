@@ -58,15 +58,11 @@ from hybridlog_storage.segments.segment_format import (
 from hybridlog_storage.stopping import check_wanted
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-    from pathlib import Path
-
     from mcap.summary import Summary
     from numpy.typing import NDArray
 
     from hybridlog_storage.manifest import File
-    from hybridlog_storage.messages import Batch, Buffer
-    from hybridlog_storage.segments.chunk_table import ChunkPlace
+    from hybridlog_storage.messages import Batch
 
 
 _MAX_SUMMARY = 1 << 30

@@ -35,8 +35,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     _Done = TypeVar("_Done")
-    from hybridlog_storage.segments.chunk import PackedChunk
-    from hybridlog_storage.segments.segment_file import Sealed, SegmentFile
 
 
 FIRST: Final = 1
@@ -161,15 +159,6 @@ class SegmentSettings(Struct, frozen=True):
                 raise UsageError(f"{words}; give another value.")
 
 
-class RecordingTotals(Struct):
-    """Progress of a recording's writer."""
-
-    messages: int = 0
-    payload_bytes: int = 0
-    segments: int = 0
-    chunks: int = 0
-
-
 class RecordingWriter:
     """Writes the batches of one recording into segments.
 
@@ -204,7 +193,8 @@ class RecordingWriter:
         make_room: Callable[[], bool] = lambda: False,
     ) -> None:
         self.settings = settings or SegmentSettings()
-        self.totals = RecordingTotals()
+        self.messages = self.payload_bytes = self.sealed = 0
+        """Messages that were appended, bytes of their payloads, and segments that are sealed."""
         self.channels: dict[int, Channel] = {}
         self.written: Counter[int] = Counter()
         """Number of messages in the files, by channel id."""
@@ -271,8 +261,8 @@ class RecordingWriter:
             for key in clusters:
                 rows = np.flatnonzero(cluster_of == key)
                 self._fill(key, own.take(rows), seq[rows])
-        self.totals.messages += len(batch)
-        self.totals.payload_bytes += batch.payload_bytes
+        self.messages += len(batch)
+        self.payload_bytes += batch.payload_bytes
         self._limit_queue(limit=4)
 
     def declare(self, channel: Channel) -> None:
@@ -502,7 +492,6 @@ class RecordingWriter:
 
     def _publish(self, chunk: PackedChunk) -> None:
         """Report that a chunk is in its segment."""
-        self.totals.chunks += 1
         rows = chunk.parts[["channel", "messages", "last"]].tolist()
         for channel_id, messages, last in rows:
             self.written[channel_id] += messages
@@ -545,7 +534,7 @@ class RecordingWriter:
         segments = [*self._segments.values()]
         self._on_sealing(self._with_room(partial(self._prepared, segments)))
         self._closed += [segment.publish(sync=segment is segments[-1]) for segment in segments]
-        self.totals.segments += len(segments)
+        self.sealed += len(segments)
         self._division.begin()
         self._segments.clear()
 
