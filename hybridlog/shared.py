@@ -189,7 +189,7 @@ class Shared:
 
     def _open(self, recording: str, number: int, name: str, changes: int) -> SegmentReader:
         path = self.directory.recording(recording)
-        return open_log(path / name, number, self._rows(path, changes))
+        return open_log(path / name, number, self._rows(path, changes).left)
 
     def _drop_files(self) -> None:
         self._opened.cache_clear()

@@ -200,7 +200,7 @@ class Follower:
         self, number: int, name: str, digest: str, report: Callable[[int], None] = lambda _: None
     ) -> int:
         """Read what is left of a sealed segment; returns its bytes."""
-        with open_log(self._path / name, number, RecordingRows(self._path)) as reader:
+        with open_log(self._path / name, number, RecordingRows(self._path).left) as reader:
             summary = reader.summary()
             segment = self._segment(number)
             places = summary.chunks

@@ -85,10 +85,10 @@ def list_rows(folder: Path, line: File, made: Sequence[File]) -> None:
 
 def compare(folder: Path, line: File, made: tuple[File, ...], added: int) -> None:
     list_rows(folder, line, made)
-    rows = RecordingRows(folder)
+    left = RecordingRows(folder).left
     with (
         SegmentReader(folder / line.name, line.number) as log,
-        open_log(folder / made[0].name, line.number, rows) as gone,
+        open_log(folder / made[0].name, line.number, left) as gone,
     ):
         here, there = log.summary(), gone.summary()
         assert isinstance(gone, GoneLog)
@@ -139,7 +139,7 @@ def test_a_damaged_file_of_rows_is_told(tmp_path: Path) -> None:
 
 
 def check_all(folder: Path, made: File) -> None:
-    with open_log(folder / made.name, made.number, RecordingRows(folder)) as gone:
+    with open_log(folder / made.name, made.number, RecordingRows(folder).left) as gone:
         for place in gone.summary().chunks:
             gone.read_chunk(place)
     RowsFile(folder, made).check()

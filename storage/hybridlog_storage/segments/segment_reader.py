@@ -12,7 +12,7 @@ import struct
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -63,6 +63,8 @@ if TYPE_CHECKING:
 
     from hybridlog_storage.manifest import File
     from hybridlog_storage.messages import Batch
+
+    Left = Callable[[int, int], tuple[Batch, NDArray[np.int64]]]
 
 
 _MAX_SUMMARY = 1 << 30
@@ -338,13 +340,6 @@ _MAX_FRONT = 1 << 30
 _ADDED = {"expired": EXPIRED_IDS, "elsewhere": 2 * EXPIRED_IDS}
 
 
-class Rows(Protocol):
-    """Finds what is left of chunks. The caller checks it."""
-
-    def left(self, log: int, chunk: int) -> tuple[Batch, NDArray[np.int64]]:
-        """The rows that remain of a chunk of a log, and the arrival numbers of its messages."""
-
-
 def front(reader: SegmentReader, summary: SegmentSummary, log: File) -> bytes:
     """Make what stands before the columns of the first file of rows of a log, behind its magic.
 
@@ -364,12 +359,13 @@ def front(reader: SegmentReader, summary: SegmentSummary, log: File) -> bytes:
 class GoneLog(SegmentReader):
     """A log that is gone, by its first file of rows; `log` is its line of the manifest.
 
-    Without `rows` it has a summary only.
+    `left` gives, unchecked, the rows that remain of a chunk (numbers of log and chunk), and the
+    arrival numbers of its messages; without it there is a summary only.
     """
 
-    def __init__(self, path: Path, number: int, rows: Rows | None = None) -> None:
+    def __init__(self, path: Path, number: int, left: Left | None = None) -> None:
         super().__init__(path, number)
-        self._rows = rows
+        self._left = left
         self._stretches: list[tuple[int, memoryview]] = []
         try:
             self.log = self._front()
@@ -423,9 +419,9 @@ class GoneLog(SegmentReader):
         """The rows that are left of a chunk."""
         check_wanted()
         try:
-            if self._rows is None:
+            if self._left is None:
                 raise SegmentError("its rows are not at hand")
-            batch, seq = self._rows.left(self.number, place.number)
+            batch, seq = self._left(self.number, place.number)
             channels = {channel % EXPIRED_IDS for channel in place.channels}
             times = (place.first, place.last)
             is_all = (
@@ -443,6 +439,6 @@ class GoneLog(SegmentReader):
         return StoredChunk(self.number, place, batch, seq)
 
 
-def open_log(path: Path, number: int, rows: Rows | None = None) -> SegmentReader:
-    """Open a sealed log, or what is left of it, by its first file of rows."""
-    return GoneLog(path, number, rows) if path.suffix == ".parquet" else SegmentReader(path, number)
+def open_log(path: Path, number: int, left: Left | None = None) -> SegmentReader:
+    """Open a sealed log, or what is left of it, by its first file of rows; `left` of `GoneLog`."""
+    return GoneLog(path, number, left) if path.suffix == ".parquet" else SegmentReader(path, number)
