@@ -22,6 +22,7 @@ from hybridlog.schema.states import State, expired_messages
 from hybridlog_storage import manifest as truth
 from hybridlog_storage.catalog import (
     WHOLE,
+    Catalog,
     ChannelEntry,
     ChannelStats,
     Damage,
@@ -49,6 +50,7 @@ from hybridlog_storage.messages import (
     NOT_COPIED,
     ORIGINAL_ENCODING,
     REDUCED,
+    Schema,
     schema_hash,
 )
 from hybridlog_storage.segments.segment_file import Sealed, is_rows
@@ -58,9 +60,7 @@ from hybridlog_storage.segments.segment_reader import GoneLog, SegmentSummary, o
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from hybridlog_storage.catalog import Catalog
     from hybridlog_storage.disk.directory import Listing, StoreDirectory
-    from hybridlog_storage.messages import Schema
 
 
 NO_MANIFEST: Final = (

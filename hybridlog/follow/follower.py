@@ -17,10 +17,10 @@ from hybridlog.entries import put_entry
 from hybridlog.index.indexing import ChunkIndexer, Sender
 from hybridlog.maintenance.keep import make_rows
 from hybridlog.maintenance.opening import missing
-from hybridlog.maintenance.report import Followed, IndexTarget, reporter
+from hybridlog.maintenance.report import Followed, IndexTarget, Progress, reporter
 from hybridlog.maintenance.retention import Rules
 from hybridlog.shared import RecordingRows
-from hybridlog_storage.catalog import WHOLE, ChannelStats, file_of
+from hybridlog_storage.catalog import WHOLE, Catalog, ChannelStats, RecordingEntry, file_of
 from hybridlog_storage.errors import (
     DatabaseError,
     HybridlogError,
@@ -29,20 +29,16 @@ from hybridlog_storage.errors import (
     TopicError,
 )
 from hybridlog_storage.mongo.index_documents import IndexState
-from hybridlog_storage.segments.chunk_table import places_of
-from hybridlog_storage.segments.segment_reader import open_log
+from hybridlog_storage.segments.chunk_table import ChunkPlace, places_of
+from hybridlog_storage.segments.segment_reader import SegmentReader, open_log
 from hybridlog_storage.segments.walk import Walk
 from hybridlog_storage.settings import read_settings
 
 if TYPE_CHECKING:
-    from hybridlog.maintenance.report import Progress
-    from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.messages import Channel
     from hybridlog_storage.mongo.database import Database
     from hybridlog_storage.segments.chunk import StoredChunk
-    from hybridlog_storage.segments.chunk_table import ChunkPlace
-    from hybridlog_storage.segments.segment_reader import SegmentReader
 
 _GROUP_BYTES: Final = 8 << 20  # content of chunks that are decoded together
 _GROUP_ROWS: Final = 1 << 17  # messages that are decoded together

@@ -11,7 +11,7 @@ from contextlib import suppress
 from functools import wraps
 from typing import TYPE_CHECKING, NamedTuple, ParamSpec, TypeVar
 
-from hybridlog.maintenance.report import IndexTarget
+from hybridlog.maintenance.report import IndexTarget, Progress
 from hybridlog_storage.errors import (
     ConnectionLostError,
     DatabaseError,
@@ -19,7 +19,7 @@ from hybridlog_storage.errors import (
     StoreError,
     WithoutMongoError,
 )
-from hybridlog_storage.mongo.index_documents import IndexState, other_store
+from hybridlog_storage.mongo.index_documents import IndexState, Owner, other_store
 from hybridlog_storage.settings import (
     EMBEDDED,
     NAME,
@@ -30,10 +30,8 @@ from hybridlog_storage.settings import (
 )
 
 if TYPE_CHECKING:
-    from hybridlog.maintenance.report import Progress
     from hybridlog.shared import Shared
     from hybridlog_storage.mongo.database import Database
-    from hybridlog_storage.mongo.index_documents import Owner
     from hybridlog_storage.mongo.mongod import EmbeddedMongod
 
 _P = ParamSpec("_P")

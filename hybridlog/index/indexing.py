@@ -6,12 +6,12 @@ All that is derived of them needs only chunks and their channels, so it is dispo
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from hybridlog.schema.codec import stamps_of
+from hybridlog.schema.codec import Codec, Decoded, stamps_of
 from hybridlog.schema.codecs import bodies_in, codec_for
 from hybridlog.schema.column import STAMP, Records, header_stamps
 from hybridlog.schema.states import encoding_of
@@ -22,11 +22,8 @@ from hybridlog_storage.mongo.index_documents import DocumentAssembler, IndexStat
 from hybridlog_storage.segments.chunk import Placed, StoredChunk
 
 if TYPE_CHECKING:
-    from collections.abc import Hashable
-
     from numpy.typing import NDArray
 
-    from hybridlog.schema.codec import Codec, Decoded
     from hybridlog_storage.mongo.database import Database
 
 

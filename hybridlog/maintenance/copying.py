@@ -20,7 +20,7 @@ from hybridlog.opened import OpenStore
 from hybridlog.snapshot import UNFINISHED
 from hybridlog.wording import counted
 from hybridlog_storage import copy
-from hybridlog_storage.copy import Directory, RefusedError
+from hybridlog_storage.copy import Directory, Place, RefusedError, Source
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import StoreDirectory, gone
 from hybridlog_storage.errors import (
@@ -31,15 +31,13 @@ from hybridlog_storage.errors import (
     StoreError,
     UsageError,
 )
-from hybridlog_storage.manifest import free_name
+from hybridlog_storage.manifest import File, Manifest, free_name
 from hybridlog_storage.manifests import MANIFESTS, RECORDINGS
 from hybridlog_storage.remote import address_of
 
 if TYPE_CHECKING:
     from hybridlog.maintenance.report import Progress
     from hybridlog_storage.catalog import RecordingSummary
-    from hybridlog_storage.copy import Place, Source
-    from hybridlog_storage.manifest import File, Manifest
 
 _ELSEWHERE: Final = re.compile(r"[^/:]+:(.*)")
 """A URL, or a place on a server as scp has it."""

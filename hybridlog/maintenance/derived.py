@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import tempfile
 from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,10 +14,10 @@ from msgspec import Struct
 
 from hybridlog.columns.layout import SHARED, SUFFIX, TABLES, topics_of, type_prefix
 from hybridlog.follow.follower import Follower, bring, make_tables
-from hybridlog.maintenance.report import ArraysOfTopic
-from hybridlog.snapshot import UNFINISHED
+from hybridlog.maintenance.report import ArraysOfTopic, Progress, RepairReport
+from hybridlog.snapshot import UNFINISHED, Snapshot
 from hybridlog_storage.disk import files
-from hybridlog_storage.disk.directory import LOCK_WAIT_S
+from hybridlog_storage.disk.directory import LOCK_WAIT_S, StoreDirectory
 from hybridlog_storage.errors import (
     HeldError,
     HybridlogError,
@@ -31,14 +31,9 @@ from hybridlog_storage.mongo.index_documents import IndexState
 from hybridlog_storage.settings import read_settings
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
-
     from hybridlog.columns.tables import Tables
-    from hybridlog.maintenance.report import Progress, RepairReport
     from hybridlog.shared import Shared
-    from hybridlog.snapshot import Snapshot
     from hybridlog_storage.catalog import Catalog, RecordingEntry, RecordingSummary
-    from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.mongo.database import Database
     from hybridlog_storage.remote.store import RemoteDirectory
 

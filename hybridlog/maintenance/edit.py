@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from hybridlog.entries import free_name_in, text
 from hybridlog.maintenance.opening import remove_tables
 from hybridlog.query.times import TimeLike, format_time, parse_range, parse_time
-from hybridlog_storage.disk.directory import LOCK_WAIT_S, gone
+from hybridlog_storage.disk.directory import LOCK_WAIT_S, StoreDirectory, gone
 from hybridlog_storage.errors import (
     DatabaseError,
     RecordingGoneError,
@@ -33,7 +33,6 @@ from hybridlog_storage.mongo.index_documents import IndexState
 if TYPE_CHECKING:
     from hybridlog.opened import OpenStore
     from hybridlog_storage.catalog import RecordingEntry
-    from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.mongo.database import Database
 
 

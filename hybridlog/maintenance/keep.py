@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Final
 
 from msgspec import Struct, field, structs
 
-from hybridlog.columns.layout import TABLES
+from hybridlog.columns.layout import TABLES, type_prefix
 from hybridlog.maintenance.retention import (
     Held,
     Plan,
@@ -42,7 +42,7 @@ from hybridlog.maintenance.retention import (
 from hybridlog.maintenance.sizes import disk_bytes
 from hybridlog.record.losses import Cause
 from hybridlog_storage.disk import files
-from hybridlog_storage.disk.directory import LOCK_WAIT_S
+from hybridlog_storage.disk.directory import LOCK_WAIT_S, StoreDirectory
 from hybridlog_storage.errors import (
     ChangedError,
     DiskFullError,
@@ -53,6 +53,7 @@ from hybridlog_storage.errors import (
     TopicError,
 )
 from hybridlog_storage.manifest import (
+    File,
     LetGo,
     Loss,
     Manifest,
@@ -67,9 +68,6 @@ from hybridlog_storage.settings import read_settings
 
 if TYPE_CHECKING:
     from pathlib import Path
-
-    from hybridlog_storage.disk.directory import StoreDirectory
-    from hybridlog_storage.manifest import File
 
     Check = Callable[[Manifest], None]
     Remove = Callable[[str, Check], None]
@@ -515,7 +513,6 @@ def without_payloads(
 
 def _remove_arrays(directory: StoreDirectory, manifest: Manifest, going: Collection[File]) -> None:
     """Remove tables with arrays that expire; they are made again without these."""
-    from hybridlog.columns.layout import type_prefix
     from hybridlog.columns.table_writer import TableFolders
 
     channels = (manifest.channels[number] for log in going for number in log.parts)

@@ -25,7 +25,7 @@ from hybridlog.entries import (
     with_segments,
 )
 from hybridlog.snapshot import UNFINISHED, Snapshot
-from hybridlog_storage.catalog import Catalog, Damage
+from hybridlog_storage.catalog import Catalog, Damage, RecordingEntry, RecordingSummary
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import DiskFullError, RecordingGoneError, StoreError, TopicError
 from hybridlog_storage.manifest import Loss, Manifest, replace
@@ -33,7 +33,6 @@ from hybridlog_storage.manifest import Loss, Manifest, replace
 if TYPE_CHECKING:
     from hybridlog.columns.tables import Tables
     from hybridlog.maintenance.report import RepairReport
-    from hybridlog_storage.catalog import RecordingEntry, RecordingSummary
     from hybridlog_storage.disk.directory import Listing, StoreDirectory
     from hybridlog_storage.segments.segment_file import Sealed
     from hybridlog_storage.segments.walk import Recovered

@@ -17,12 +17,11 @@ from msgspec.structs import replace
 from hybridlog.query.choice import Choice
 from hybridlog.query.latching import depth_of, publisher_of
 from hybridlog.query.times import parse_duration
-from hybridlog.query.topics import matcher
+from hybridlog.query.topics import TopicMatcher, matcher
 from hybridlog.wording import listed, parse_size, size
 from hybridlog_storage.errors import HybridlogError, TimeError, UsageError
 
 if TYPE_CHECKING:
-    from hybridlog.query.topics import TopicMatcher
     from hybridlog_storage.manifest import File, Manifest, Part
 
 MIN_SEGMENT: Final = 4 << 20

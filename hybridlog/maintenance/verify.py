@@ -14,9 +14,9 @@ from hybridlog.columns.rows_file import RowsFile
 from hybridlog.entries import free_name_in, made_again, put_entry
 from hybridlog.follow.follower import bring, make_tables
 from hybridlog.maintenance.opening import missing, recover, recover_segments
-from hybridlog.maintenance.report import Repaired, reporter
-from hybridlog_storage.catalog import WHOLE
-from hybridlog_storage.disk.directory import LOCK, LOCK_WAIT_S
+from hybridlog.maintenance.report import Progress, Repaired, RepairReport, reporter
+from hybridlog_storage.catalog import WHOLE, Catalog, RecordingEntry
+from hybridlog_storage.disk.directory import LOCK, LOCK_WAIT_S, Listing, StoreDirectory
 from hybridlog_storage.errors import (
     HeldError,
     ManifestError,
@@ -26,7 +26,7 @@ from hybridlog_storage.errors import (
     TopicError,
     UsageError,
 )
-from hybridlog_storage.manifest import encode, replace
+from hybridlog_storage.manifest import File, Manifest, encode, replace
 from hybridlog_storage.manifests import DiskManifests
 from hybridlog_storage.segments.segment_reader import SegmentReader
 from hybridlog_storage.segments.walk import damage_of, rebuild_summary
@@ -36,11 +36,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from hybridlog.columns.column_file import ColumnFile
-    from hybridlog.maintenance.report import Progress, RepairReport
     from hybridlog.opened import OpenStore
-    from hybridlog_storage.catalog import Catalog, RecordingEntry
-    from hybridlog_storage.disk.directory import Listing, StoreDirectory
-    from hybridlog_storage.manifest import File, Manifest
 
 _REPAIR = "run `hybridlog verify --repair`"
 AGAIN = f"{_REPAIR} again"

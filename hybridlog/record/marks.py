@@ -7,31 +7,26 @@ memory beside the files; tables and the index, which are derived from files, nev
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from msgspec.structs import replace
 
-from hybridlog_storage.catalog import channel_entry, channel_totals
+from hybridlog_storage.catalog import RecordingEntry, channel_entry, channel_totals
 from hybridlog_storage.errors import SegmentError
-from hybridlog_storage.manifest import hasher
+from hybridlog_storage.manifest import Mark, hasher
 from hybridlog_storage.messages import MARKS_CHANNEL, Batch, Channel, Schema
 from hybridlog_storage.segments.chunk import StoredChunk
-from hybridlog_storage.segments.chunk_table import CHUNK, PART, ChunkTable, parts_of
+from hybridlog_storage.segments.chunk_table import CHUNK, PART, ChunkPlace, ChunkTable, parts_of
 from hybridlog_storage.segments.segment_format import index_order
 from hybridlog_storage.segments.segment_reader import SegmentReader
 from hybridlog_storage.segments.walk import Flushed
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from numpy.typing import NDArray
 
-    from hybridlog_storage.catalog import RecordingEntry
-    from hybridlog_storage.manifest import Mark
-    from hybridlog_storage.segments.chunk_table import ChunkPlace
 
 MARKS: Final = "/hybridlog/marks"
 """Topic of marks."""

@@ -30,8 +30,8 @@ from hybridlog.maintenance.retention import Rules
 from hybridlog.query.latching import LatchedFront, depth_of
 from hybridlog.schema.ros_codec import TRIED_MESSAGES, completed
 from hybridlog.wording import listed
-from hybridlog_storage.catalog import RecordingEntry
-from hybridlog_storage.disk.directory import LOCK_WAIT_S
+from hybridlog_storage.catalog import Catalog, RecordingEntry
+from hybridlog_storage.disk.directory import LOCK_WAIT_S, StoreDirectory
 from hybridlog_storage.errors import (
     AlreadyRecordedError,
     DatabaseError,
@@ -56,8 +56,6 @@ if TYPE_CHECKING:
     from hybridlog.formats.reading import Damage, Fingerprint, Source
     from hybridlog.query.topics import TopicMatcher
     from hybridlog.snapshot import Snapshot
-    from hybridlog_storage.catalog import Catalog
-    from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.segments.segment_file import Sealed
 
 

@@ -14,16 +14,14 @@ from msgspec.structs import replace
 from hybridlog.entries import loss_values
 from hybridlog.record.losses import Cause, joined
 from hybridlog.snapshot import UNFINISHED
-from hybridlog_storage.catalog import channel_entry, channel_totals
-from hybridlog_storage.disk.directory import is_stable
+from hybridlog_storage.catalog import RecordingEntry, channel_entry, channel_totals
+from hybridlog_storage.disk.directory import StoreDirectory, is_stable
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.manifest import Loss
 from hybridlog_storage.segments.segment_file import OPEN_SUFFIX
 from hybridlog_storage.segments.walk import Walk
 
 if TYPE_CHECKING:
-    from hybridlog_storage.catalog import RecordingEntry
-    from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.messages import Schema
 
 

@@ -32,14 +32,13 @@ from msgspec import Struct
 
 from hybridlog_storage.cache import RowType
 from hybridlog_storage.errors import SegmentError
-from hybridlog_storage.messages import Batch
+from hybridlog_storage.messages import Batch, Buffer
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
 
     from numpy.typing import NDArray
 
-    from hybridlog_storage.messages import Buffer
 
 MAGIC = b"\x89MCAP0\r\n"
 """First and last eight bytes of an MCAP file."""

@@ -36,7 +36,7 @@ from hybridlog_storage.mcap.mcap_content import (
     parse_summary,
     read_record,
 )
-from hybridlog_storage.messages import MAX_PAYLOAD
+from hybridlog_storage.messages import MAX_PAYLOAD, Buffer
 from hybridlog_storage.segments.segment_format import (
     MAX_HEAD,
     Attachment,
@@ -49,7 +49,6 @@ if TYPE_CHECKING:
 
     from mcap.summary import Summary
 
-    from hybridlog_storage.messages import Buffer
 
 _CODECS: Final = frozenset({"", "zstd", "lz4"})
 _DATA_END: Final = RECORD_HEAD.pack(Opcode.DATA_END, 4)

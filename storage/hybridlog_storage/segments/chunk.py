@@ -10,7 +10,7 @@ from mcap.opcode import Opcode
 from msgspec import Struct
 
 from hybridlog_storage.checksum import crc32
-from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD
+from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD, Compressor
 from hybridlog_storage.messages import Batch, Buffer, LooseBatch, joined
 from hybridlog_storage.segments.chunk_table import ChunkPlace, parts_of
 from hybridlog_storage.segments.segment_format import (
@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
-
-    from hybridlog_storage.mcap.mcap_content import Compressor
 
 
 _HEAD = MESSAGE_HEAD.itemsize

@@ -16,12 +16,11 @@ from msgspec.structs import replace
 from hybridlog_storage.cache import RowType
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.mcap.mcap_content import checked_frame, decompress
-from hybridlog_storage.messages import EXPIRED_IDS, run_starts
+from hybridlog_storage.messages import EXPIRED_IDS, Batch, Buffer, run_starts
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog_storage.messages import Batch, Buffer
 
 CHUNK: Final = RowType(
     ("offset", "<u8"),

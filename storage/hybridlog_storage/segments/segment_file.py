@@ -30,7 +30,7 @@ from hybridlog_storage.errors import HybridlogError, StoreError
 from hybridlog_storage.manifest import Channel as ListedChannel
 from hybridlog_storage.manifest import File, Loss, Part
 from hybridlog_storage.mcap.mcap_content import MAGIC, RECORD_HEAD, ChunkHead, chunk_head_of
-from hybridlog_storage.messages import EXPIRED_IDS, schema_hash
+from hybridlog_storage.messages import EXPIRED_IDS, Buffer, Channel, Schema, schema_hash
 from hybridlog_storage.segments.chunk import PackedChunk
 from hybridlog_storage.segments.chunk_table import ChunkTable, TableBuilder
 from hybridlog_storage.segments.segment_format import (
@@ -55,7 +55,6 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from hybridlog_storage.messages import Buffer, Channel, Schema
 
 OPEN_SUFFIX = ".mcap.open"
 SEALED_SUFFIX = ".mcap"

@@ -22,7 +22,7 @@ from msgspec import Struct
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import SegmentError, exhausted
-from hybridlog_storage.manifest import Loss, decode_file, encode_file, hasher
+from hybridlog_storage.manifest import File, Loss, decode_file, encode_file, hasher
 from hybridlog_storage.mcap.mcap_content import (
     MAGIC,
     MAX_CHUNK_HEAD,
@@ -34,7 +34,7 @@ from hybridlog_storage.mcap.mcap_content import (
     footer_of,
     parse_summary,
 )
-from hybridlog_storage.messages import EXPIRED_IDS, Buffer, Channel, distinct, with_expired
+from hybridlog_storage.messages import EXPIRED_IDS, Batch, Buffer, Channel, distinct, with_expired
 from hybridlog_storage.segments.chunk import StoredChunk
 from hybridlog_storage.segments.chunk_table import ChunkPlace, ChunkTable, places_of
 from hybridlog_storage.segments.segment_format import (
@@ -60,9 +60,6 @@ from hybridlog_storage.stopping import check_wanted
 if TYPE_CHECKING:
     from mcap.summary import Summary
     from numpy.typing import NDArray
-
-    from hybridlog_storage.manifest import File
-    from hybridlog_storage.messages import Batch
 
     Left = Callable[[int, int], tuple[Batch, NDArray[np.int64]]]
 
