@@ -80,10 +80,6 @@ SPARE: Final = "spare"
 _SPARE_BYTES: Final = 8 << 20
 _SPARE_SHARE: Final = 64  # of the quota, at most
 _LEAST_SPARE: Final = 1 << 16
-NO_ROOM: Final = "deleted without its fields: the disk was full"
-"""Reason in the loss ledger."""
-TOO_LATE: Final = "deleted without its fields: they were not written in time"
-"""Another one, of a recording in progress."""
 _WAIT_S: Final = 5.0  # for rows that a follower writes
 _POLL_S: Final = 0.1
 _LATE_S: Final = 1.0  # a signal may come so long after what it is about
@@ -322,7 +318,7 @@ def expire(
                 if use_spare(directory):
                     continue
                 going_alone = Step("", recording, (log.number,), 0, "").going
-                let_go(directory, recording, going_alone, check, NO_ROOM)
+                let_go(directory, recording, going_alone, check, "the disk was full")
             except SegmentError as error:
                 damaged[log.number] = str(error)
                 freed -= log.bytes
@@ -342,7 +338,7 @@ def _have_rows(
     until = time.monotonic() + _WAIT_S
     while lacking(directory.manifests.read(recording)):
         if time.monotonic() >= until:
-            let_go(directory, recording, lacking, check, TOO_LATE)
+            let_go(directory, recording, lacking, check, "they were not written in time")
             return
         use_spare(directory)
         time.sleep(_POLL_S)
@@ -435,8 +431,8 @@ def let_go(
     """Delete files of a recording with all that is left; returns the manifest without them.
 
     This process has locked the recording, or records it. `choose` returns the logs of a manifest
-    that go, with their rows; `check` raises if they must stay. `lost` is the reason of a row of the
-    loss ledger, empty if they are counted as let go.
+    that go, with their rows; `check` raises if they must stay. `lost` tells the loss
+    ledger why they go without their fields; empty if they are counted as let go.
     """
 
     def how(now: Manifest) -> Manifest:
@@ -448,8 +444,9 @@ def let_go(
         parts = [(n, part) for f in gone if f.kind == "log" for n, part in f.parts.items()]
         before = now.let_go or LetGo(0, 0)
         count = 0 if lost else sum(part.messages for _, part in parts)
+        why = f"deleted without its fields: {lost}"
         rows = [
-            Loss(Cause.SEGMENT, now.channels[n].topic, part.messages, part.first, part.last, lost)
+            Loss(Cause.SEGMENT, now.channels[n].topic, part.messages, part.first, part.last, why)
             for n, part in (parts if lost else ())
         ]
         return with_totals(

@@ -41,8 +41,6 @@ if TYPE_CHECKING:
 _REPAIR = "run `hybridlog verify --repair`"
 AGAIN = f"{_REPAIR} again"
 RESTORE = "`hybridlog copy --check` from a store that has it brings it back"
-_RESTORE_LOST = f"{RESTORE}; `hybridlog info --losses` lists the lost messages"
-_MOVE = "move it out of the store"
 
 
 class Finding(Struct, frozen=True):
@@ -220,7 +218,8 @@ class _Check(Struct):
         """Place, problem and cure of what is damaged in a file."""
         path = self.directory.recording(self.recording)
         if file.name not in listing.sizes:
-            yield file.name, "it is missing", RESTORE if file.kind == "rows" else _RESTORE_LOST
+            lost = "; `hybridlog info --losses` lists the lost messages"
+            yield file.name, "it is missing", RESTORE + (lost if file.kind == "log" else "")
             return
         try:
             if file.kind == "rows":
@@ -242,7 +241,9 @@ class _Check(Struct):
             self.found(name, "a crash has left it open, and its messages are not recovered yet")
         found = {*listing.sealed.values(), *listing.rows, *listing.others}
         for name in sorted(found - manifest.present.keys() - {LOCK}):
-            self.found(name, "the manifest does not list it", f"{_REPAIR}, or {_MOVE}")
+            self.found(
+                name, "the manifest does not list it", f"{_REPAIR}, or move it out of the store"
+            )
 
 
 def _repair(
