@@ -218,7 +218,6 @@ def row_of(report: RecordReport, path: object) -> dict[str, Any]:
         "messages_skipped": report.skipped,
         "messages_latched": report.latched,
         "attachments": entry.attachments,
-        "attachments_left_out": report.attachments_left_out,
         "metadata_records": entry.metadata_records,
         # A live source has no size of its own.
         "bytes_in": entry.manifest.source.bytes or sum(one.payload_bytes for one in stats),

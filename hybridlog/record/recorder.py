@@ -271,7 +271,6 @@ class RecordReport(Struct):
         elapsed_s: Wall time, seconds.
         latched: Latched messages from before the time range.
         latched_left_out: Those that were in force and did not fit in memory.
-        attachments_left_out: Attachments from behind the time range.
         remarks: What is odd about the source, where nothing is damaged or lost.
         not_indexed: Why the index has no fields of some channels, by id.
     """
@@ -285,7 +284,6 @@ class RecordReport(Struct):
     elapsed_s: float
     latched: int = 0
     latched_left_out: int = 0
-    attachments_left_out: int = 0
     remarks: list[str] = field(default_factory=list)
     not_indexed: dict[int, str] = field(default_factory=dict)
 
@@ -361,7 +359,6 @@ def record(
         time.monotonic() - started,
         latched=copy.front.messages if copy.front is not None else 0,
         latched_left_out=copy.front.left_out if copy.front is not None else 0,
-        attachments_left_out=copy.attachments_left_out,
         remarks=[*source.remarks, *capture.follower.said],
     )
 
@@ -372,7 +369,6 @@ class _Copy:
     Attributes:
         front: The latched messages in front of a slice; None for none.
         skipped: Messages left out.
-        attachments_left_out: Attachments left out.
     """
 
     def __init__(self, source: Source, writer: RecordingWriter, options: RecordOptions) -> None:
@@ -380,7 +376,6 @@ class _Copy:
         if options.between is not None and options.latched:
             self.front = LatchedFront(options.between[0], original_times=options.original_times)
         self.skipped = 0
-        self.attachments_left_out = 0
         self._source = source
         self._writer = writer
         self._between = options.between
@@ -428,12 +423,11 @@ class _Copy:
         """Store attachments and metadata records; a slice holds the attachments up to its end."""
         for extra in self._source.extras:
             if isinstance(extra, Attachment):
-                if self._between is not None and extra.log_time >= self._between[1]:
-                    self.attachments_left_out += 1
-                    continue
-            elif extra.name.startswith(OUR_NAMES):
-                continue
-            self._writer.add_extra(extra)
+                is_wanted = self._between is None or extra.log_time < self._between[1]
+            else:
+                is_wanted = not extra.name.startswith(OUR_NAMES)
+            if is_wanted:
+                self._writer.add_extra(extra)
         self._source.extras.clear()
 
     def _completed(self, batch: Batch) -> list[Channel]:
