@@ -86,7 +86,7 @@ def start(script: str, *args: object) -> subprocess.Popen[str]:
 
 @pytest.mark.parametrize(
     ("editors", "edits"),
-    [(4, 5), pytest.param(10, 50, marks=[pytest.mark.exhaustive, pytest.mark.timeout(1800)])],
+    [(3, 4), pytest.param(10, 50, marks=[pytest.mark.exhaustive, pytest.mark.timeout(1800)])],
 )
 def test_what_was_acknowledged_while_it_was_recorded_is_there(
     tmp_path: Path, editors: int, edits: int

@@ -16,14 +16,14 @@ from hybridlog.record.losses import losses_of
 from hybridlog_storage.errors import PayloadError
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
-from tests.copying.by_hand import make, pair, sshd
+from tests.copying.by_hand import directories, make, pair, sshd
 from tests.payloads.logs import robot, write_log
 from tests.remote.conftest import address, moto, proxy, running_proxy
 
 SETTINGS = SegmentSettings(chunk_size=8 << 10, segment_size=14 << 10)
 STATES = ("recorded", "damaged", "calm", "driven", "expired", "noted")
 
-__all__ = ["address", "make", "moto", "pair", "proxy", "running_proxy", "sshd"]
+__all__ = ["address", "directories", "make", "moto", "pair", "proxy", "running_proxy", "sshd"]
 
 
 @pytest.fixture(scope="session")

@@ -44,14 +44,13 @@ async def run(process):
 
 
 async def main():
-    options = {"process_factory": run, "encoding": None} if sys.argv[2] == "shell" else {}
     server = await asyncssh.listen(
         "127.0.0.1",
         0,
         server_host_keys=[asyncssh.generate_private_key("ssh-ed25519")],
         authorized_client_keys=sys.argv[1],
-        sftp_factory=True,
-        **options,
+        process_factory=run,
+        encoding=None,
     )
     print(server.sockets[0].getsockname()[1], flush=True)
     await asyncio.Event().wait()
@@ -62,22 +61,14 @@ asyncio.run(main())
 
 
 class Sshd(Proxy):
-    """A server on this machine.
+    """A server on this machine, whose key lies in a folder; `ssh` reaches it, with options."""
 
-    Args:
-        folder: Where its key is to lie.
-        kind: "shell", or "sftp" for one that runs no commands.
-
-    Attributes:
-        ssh: The program that reaches it, with options.
-    """
-
-    def __init__(self, folder: Path, kind: str) -> None:
+    def __init__(self, folder: Path) -> None:
         key = folder / "key"
         make = ["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", str(key)]
         subprocess.run(make, check=True)
         self._process = subprocess.Popen(
-            [sys.executable, "-c", _SERVES, f"{key}.pub", kind],
+            [sys.executable, "-c", _SERVES, f"{key}.pub"],
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
         )

@@ -57,38 +57,10 @@ def test_copies_to_a_directory(
     assert run("copy", "nosuch", tmp_path / "x", "--store", robots, code=2).err
 
 
-@pytest.mark.parametrize(
-    ("label", "state", "why"),
-    [
-        ("noted", State.NOT_COPIED, "not copied yet (`hybridlog copy"),
-        ("expired", State.EXPIRED, "deleted to make room"),
-    ],
-)
-def test_payloads_that_were_not_copied_yet_were_not_deleted(
-    robots: Path, tmp_path: Path, label: str, state: State, why: str
-) -> None:
-    lab, told = tmp_path / "lab", f"no payload, which was {why}"
-    run("copy", "-r", label, lab, "--store", robots, "--only-fields")
-    assert told in answer("fetch", "cloud", "-o", tmp_path / "cut.mcap", store=lab).err
-    assert told in " ".join(answer("info", label, store=lab).out.split())
-    assert told in answer("info", label, "--json", store=lab).json[0]["coverage"]
-    words = why.partition(" (")[0].partition(" to ")[0]
-    assert f"payloads {words}" in answer("ls", store=lab).out
-    (listed,) = answer("ls", "--json", store=lab).json
-    assert bool(listed["not_copied"]) == (state is State.NOT_COPIED)
-    verified = answer("verify", store=lab)
-    assert "to make room" not in verified.out + verified.err
-    with hl.open(lab, mongo="none") as store:
-        query = store.topic("/cloud")
-        (first,) = query.limit(1)
-        assert first.state is state
-        with pytest.raises(PayloadError, match=f"its payload was {re.escape(why)}"):
-            _ = first.raw
-        assert told in str(query.completeness())
-        found = store.sql("select distinct state from cloud where state <> 'whole'")
-        assert found.to_arrow()["state"].to_pylist() == [state]
-    arrays = answer("sql", "select sum(len(data)) from cloud", store=lab)
-    assert why in " ".join(arrays.err.split())
+WHY = {
+    State.NOT_COPIED: "not copied yet (`hybridlog copy",
+    State.EXPIRED: "deleted to make room",
+}
 
 
 def test_some_were_deleted_before_and_others_not_copied_yet(robots: Path, tmp_path: Path) -> None:
@@ -128,8 +100,16 @@ def _told(path: Path) -> Counter[State]:
         assert lane.counts(aligned(span, 8)).sum() == found.total()
         (listed,) = answer("ls", "--json", store=path).json
         assert (listed["expired"], listed["not_copied"]) == (one.expired, one.not_copied)
+        for message in query:
+            if message.state in WHY:
+                with pytest.raises(PayloadError, match=re.escape(WHY[message.state])):
+                    _ = message.raw
     raw = answer("fetch", "cloud", "-o", path.with_suffix(".mcap"), "--force", store=path).err
+    arrays = answer("sql", "select sum(len(data)) from cloud", store=path).err
+    verified = answer("verify", store=path)
+    assert "to make room" not in verified.out + verified.err
     for state, number in ((State.EXPIRED, one.expired), (State.NOT_COPIED, one.not_copied)):
+        assert (WHY[state] in " ".join(arrays.split())) == bool(number)
         text = answer("info", "--json", store=path).json[0]["coverage"]
         assert (CAUSES[state] in text) == bool(number)
         assert not number or f"{number} " in text
@@ -140,8 +120,8 @@ def _told(path: Path) -> Counter[State]:
     return found
 
 
-def test_copies_over_ssh(robots: Path, tmp_path: Path, sshd: dict[str, Sshd]) -> None:
-    server, there = sshd["shell"], tmp_path / "lab store"
+def test_copies_over_ssh(robots: Path, tmp_path: Path, sshd: Sshd) -> None:
+    server, there = sshd, tmp_path / "lab store"
     url = server.url(there).replace(" ", "%20")
     words = ("copy", "driven", url, "--store", robots, "--ssh")
     server.left = 20_000
@@ -171,9 +151,9 @@ def test_follows_a_store(robots: Path, tmp_path: Path) -> None:
 
 
 def test_a_watch_goes_on_after_a_cut(
-    robots: Path, tmp_path: Path, sshd: dict[str, Sshd], monkeypatch: pytest.MonkeyPatch
+    robots: Path, tmp_path: Path, sshd: Sshd, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pauses, server = [], sshd["shell"]
+    pauses, server = [], sshd
 
     def pause(seconds: float) -> None:
         server.reset()  # the connection is there again

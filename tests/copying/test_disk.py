@@ -28,6 +28,7 @@ from tests.calls import Calls
 from tests.copying.by_hand import RECORDING, Makes, Store, recording, without_payloads
 from tests.copying.test_any_place import as_of, edited
 from tests.power import dies, each_cut
+from tests.some import each, in_turn
 
 SMALL = recording(3)
 PART = f".{SMALL.files[0].digest[:32]}.part"
@@ -54,8 +55,7 @@ def check(source: Store, folder: Path) -> None:
     target.place.manifests.change(RECORDING, edited)
 
 
-@pytest.mark.parametrize("after", [False, True])
-@pytest.mark.parametrize("has_some", [False, True])
+@pytest.mark.parametrize(("has_some", "after"), in_turn([False, True], [False, True]))
 def test_killed_at_each_system_call(
     stores: tuple[Store, Store], tmp_path: Path, has_some: bool, after: bool
 ) -> None:
@@ -78,7 +78,7 @@ def test_killed_at_each_system_call(
     assert at > 15
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *each(1, 2)])
 def test_power_cut_at_each_system_call(
     stores: tuple[Store, Store], tmp_path: Path, seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -112,7 +112,7 @@ class Full(files.System):
         return done
 
 
-@pytest.mark.parametrize("room", [0, 10, 1000, 5000, 100_000, 540_000, 553_500])
+@pytest.mark.parametrize("room", [0, 10, 5000, 553_500])
 def test_a_full_disk_keeps_what_has_arrived(
     stores: tuple[Store, Store], room: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -205,18 +205,12 @@ def test_hostile_manifests(make: Makes, kind: str) -> None:
             copy(source.source, target.place, recording_id)
 
 
-@pytest.mark.parametrize("kind", ["directory", "shell", "bucket"])
+@pytest.mark.parametrize("kind", ["directory", "shell"])
 def test_a_manifest_without_end_is_not_read_to_its_end(make: Makes, kind: str) -> None:
-    source, target = make("directory"), make(kind)
-    source.begin(SMALL)
-    name = f"manifests/{RECORDING}.json"
-    if target.folder is not None:
-        (target.folder / "manifests").mkdir(parents=True, exist_ok=True)
+    target, name = make(kind), f"manifests/{RECORDING}.json"
+    assert target.folder is not None
     target.write(name, b"")
-    if target.folder is None:
-        target.write(name, bytes(70 << 20))
-    else:
-        os.truncate(target.folder / name, 70 << 20)
+    os.truncate(target.folder / name, 70 << 20)
     with pytest.raises(ManifestError):
         target.place.manifests.read(RECORDING)
 
@@ -232,10 +226,8 @@ def test_what_is_left_of_a_file_that_no_longer_comes_goes(make: Makes, kind: str
     target.check(SMALL)
 
 
-@pytest.mark.parametrize("kind", ["directory", "shell"])
-def test_a_disk_that_cannot_be_read(make: Makes, kind: str, calls: Calls) -> None:
-    source, target = make("directory"), make(kind)
-    source.begin(SMALL)
+def test_a_disk_that_cannot_be_read(stores: tuple[Store, Store], calls: Calls) -> None:
+    source, target = stores
 
     def fail(*_: object) -> None:
         raise OSError(errno.EIO, "Input/output error")

@@ -18,7 +18,7 @@ from tests.limits import Limit
 from tests.places import begin
 
 
-def test_urls(sshd: dict[str, Sshd], tmp_path: Path) -> None:
+def test_urls(sshd: Sshd, tmp_path: Path) -> None:
     for wrong in (
         "ssh://server",
         "ssh://server/",
@@ -34,19 +34,19 @@ def test_urls(sshd: dict[str, Sshd], tmp_path: Path) -> None:
             Server(wrong)
     with (
         pytest.raises(StoreError, match="flock and sha256sum"),
-        Server(sshd["sftp"].url(tmp_path), sshd["sftp"].ssh),
+        Server("ssh://server/x", "sh -c 'exit 3'"),  # as of a login without a shell
     ):
         pass
-    server = sshd["shell"]
-    with pytest.raises(StoreError, match="not reached"), Server("ssh://127.0.0.1:1/x", server.ssh):
+
+    with pytest.raises(StoreError, match="not reached"), Server("ssh://127.0.0.1:1/x", sshd.ssh):
         pass
     with (
         pytest.raises(StoreError, match="no-such"),
-        Server(server.url(tmp_path), "no-such"),
+        Server(sshd.url(tmp_path), "no-such"),
     ):
         pass
-    missing = server.url(tmp_path / "missing" / "store")
-    with pytest.raises(StoreError, match="missing/store"), Server(missing, server.ssh):
+    missing = sshd.url(tmp_path / "missing" / "store")
+    with pytest.raises(StoreError, match="missing/store"), Server(missing, sshd.ssh):
         pass
 
 
@@ -74,7 +74,7 @@ def test_no_edit_is_lost_while_it_is_copied_again_and_again(make: Makes, kind: s
 
     def note() -> None:
         manifests = target.manifests()
-        for at in range(30):
+        for at in range(15):
             manifests.change(RECORDING, lambda now, at=at: noted(now, at))
 
     thread = threading.Thread(target=note)
@@ -87,7 +87,7 @@ def test_no_edit_is_lost_while_it_is_copied_again_and_again(make: Makes, kind: s
         copy(source.source, target.place, RECORDING)
     thread.join()
     found = target.check()
-    assert [note.at for note in found.notes] == [*range(30)]
+    assert [note.at for note in found.notes] == [*range(15)]
     assert found.files == recording().files
 
 

@@ -7,7 +7,6 @@ import fcntl
 import os
 import random
 import shutil
-import signal
 import subprocess
 import sys
 import time
@@ -21,7 +20,6 @@ from hybridlog_storage.disk import files
 from hybridlog_storage.errors import (
     DiskFullError,
     HeldError,
-    HybridlogError,
     StoreError,
 )
 from hybridlog_storage.manifest import Manifest, encode, new_id, replace
@@ -30,6 +28,7 @@ from tests.calls import Calls
 from tests.limits import Limit
 from tests.places import begin
 from tests.power import dies, each_cut
+from tests.some import each, in_turn
 
 ONE = Manifest(new_id("run"), "run", 1)
 
@@ -62,39 +61,20 @@ from hybridlog_storage.errors import RecordingGoneError
 from hybridlog_storage.manifest import Note, replace
 from hybridlog_storage.manifests import DiskManifests
 manifests, recording = DiskManifests(Path(sys.argv[1])), sys.argv[2]
-for at in range(int(sys.argv[3]), int(sys.argv[3]) + 40):
+for at in range(int(sys.argv[3]), int(sys.argv[3]) + 100):
     try:
         manifests.change(recording, lambda now: replace(now, notes=(*now.notes, Note(at, ""))))
     except RecordingGoneError:
         sys.exit(9)
-    print(at, flush=True)
 """
 
 
-def adding(store: Path) -> list[subprocess.Popen[str]]:
-    """Ten processes that add 40 notes each, and print the number of each that is there."""
+def adding(store: Path) -> list[subprocess.Popen[bytes]]:
+    """Processes that add many notes each."""
     return [
-        subprocess.Popen(
-            [sys.executable, "-c", _ADDS, str(store), ONE.id, str(first)],
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        for first in range(0, 1000, 100)
+        subprocess.Popen([sys.executable, "-c", _ADDS, str(store), ONE.id, str(first)])
+        for first in range(0, 400, 100)
     ]
-
-
-def test_of_400_edits_by_ten_processes_none_is_lost(store: Path) -> None:
-    manifests = DiskManifests(store)
-    processes = adding(store)
-    last = 0
-    while any(process.poll() is None for process in processes):
-        now = manifests.read(ONE.id)  # never missing, never damaged, never older
-        assert now.changes >= last
-        last = now.changes
-    done = [int(line) for process in processes for line in process.communicate()[0].split()]
-    assert [process.returncode for process in processes] == [0] * 10
-    assert sorted(note.at for note in manifests.read(ONE.id).notes) == sorted(done)
-    assert len(done) == 400
 
 
 def test_nothing_comes_back_after_a_removal(store: Path) -> None:
@@ -104,9 +84,7 @@ def test_nothing_comes_back_after_a_removal(store: Path) -> None:
         time.sleep(0.001)
     manifests.remove(ONE.id)
     assert manifests.ids() == []
-    for process in processes:
-        process.communicate()
-    assert {process.returncode for process in processes} <= {0, 9}
+    assert {process.wait() for process in processes} <= {0, 9}
     assert names(store) == ["hybridlog.toml", "manifests/.lock"]
     assert list((store / "recordings").iterdir()) == []
 
@@ -139,8 +117,7 @@ def check(place: Path, what: str) -> None:
     assert set(hidden) <= {"manifests/.lock"}
 
 
-@pytest.mark.parametrize("after", [False, True])
-@pytest.mark.parametrize("what", WORKS)
+@pytest.mark.parametrize(("what", "after"), in_turn([*WORKS], [False, True]))
 def test_killed_at_each_system_call(store: Path, tmp_path: Path, what: str, after: bool) -> None:
     at, went_on = 0, True
     while went_on:
@@ -152,7 +129,7 @@ def test_killed_at_each_system_call(store: Path, tmp_path: Path, what: str, afte
     assert at > 6
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *each(1, 2)])
 @pytest.mark.parametrize("what", WORKS)
 def test_power_cut_at_each_system_call(
     store: Path, tmp_path: Path, what: str, seed: int, monkeypatch: pytest.MonkeyPatch
@@ -241,24 +218,10 @@ def test_folders_without_a_manifest_are_told_unless_they_hold_nothing(store: Pat
 
 def test_who_stands_still_is_not_waited_for_without_end(store: Path, limit: Limit) -> None:
     limit(manifest_wait_s=0.2)
-    holds = (
-        "import fcntl, sys, time\n"
-        "file = open(sys.argv[1], 'r+')\n"
-        "fcntl.flock(file, fcntl.LOCK_EX)\n"
-        "print(flush=True)\n"
-        "time.sleep(60)\n"
-    )
-    lock = store / "recordings" / ONE.id / "manifest.lock"
-    holder = subprocess.Popen([sys.executable, "-c", holds, lock], stdout=subprocess.PIPE)
-    try:
-        assert holder.stdout is not None
-        holder.stdout.readline()
-        holder.send_signal(signal.SIGSTOP)
+    with (store / "recordings" / ONE.id / "manifest.lock").open("r+") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
         with pytest.raises(HeldError, match="Another process has held"):
             DiskManifests(store).change(ONE.id, tagged)
-    finally:
-        holder.kill()
-        holder.communicate()
     assert DiskManifests(store).change(ONE.id, tagged).tags == {"a": "b"}
 
 
@@ -285,35 +248,6 @@ def test_an_empty_folder_that_a_copy_left_out_is_made(store: Path) -> None:
     shutil.rmtree(store / "recordings")
     (store / "recordings").mkdir()
     assert DiskManifests(store).change(ONE.id, tagged).tags == {"a": "b"}
-
-
-@pytest.mark.parametrize("what", ["manifest", "manifests", "folder", "lock"])
-def test_links_are_not_followed(store: Path, tmp_path: Path, what: str) -> None:
-    place = {
-        "manifest": store / "manifests" / f"{ONE.id}.json",
-        "manifests": store / "manifests",
-        "folder": store / "recordings" / ONE.id,
-        "lock": store / "recordings" / ONE.id / "manifest.lock",
-    }[what]
-    outside = tmp_path / "outside"
-    place.rename(outside)
-    place.symlink_to(outside)
-    before = [outside.read_bytes()] if outside.is_file() else sorted(outside.iterdir())
-    with pytest.raises((HybridlogError, OSError)):
-        DiskManifests(store).change(ONE.id, tagged)
-    assert before == ([outside.read_bytes()] if outside.is_file() else sorted(outside.iterdir()))
-
-
-def test_a_store_that_only_others_may_write_is_read(store: Path, calls: Calls) -> None:
-    def refuse(name: str, flags: int, *_: object, **__: object) -> None:
-        if flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT):
-            raise PermissionError(errno.EACCES, "Permission denied")
-
-    calls(files.system, "open", refuse)
-    manifests = DiskManifests(store)
-    assert manifests.read(ONE.id).name == "first"
-    with pytest.raises(StoreError, match="Not allowed to write"):
-        manifests.change(ONE.id, tagged)
 
 
 def test_no_two_manifests_look_alike(store: Path) -> None:

@@ -51,23 +51,16 @@ class Proxy:
 
     Attributes:
         requests: Method, object and range of each request so far.
-        received: Bytes of their answers.
-        sent: Bytes of their bodies.
         spoil: Called with the number of each request, from 1; says what becomes of it: "reset"
             before it reaches the server, "lost" after that, "503", "403", "cut" in the middle of
             the answer, "slow", "flip" for one bit of it and of the answer, or "" for nothing.
-        delay: Seconds that each request takes longer.
-        old_lists: Answers to requests for lists, once they are kept; None to pass them on.
         without_conditions: Drop the conditions of writers, as some servers do.
     """
 
     def __init__(self, port: int) -> None:
         self.requests: list[tuple[str, str, str]] = []
-        self.received = self.sent = 0
         self.spoil: Callable[[int], str] = lambda _: ""
-        self.delay = 0.0
         self.without_conditions = False
-        self.old_lists: dict[str, bytes] | None = None
         self._writing = Lock()
         outer = self
 
@@ -91,11 +84,8 @@ class Proxy:
     def reset(self) -> None:
         """Forget the requests, and spoil none."""
         self.requests.clear()
-        self.received = self.sent = 0
         self.spoil = lambda _: ""
-        self.delay = 0.0
         self.without_conditions = False
-        self.old_lists = None
 
     def close(self) -> None:
         self._server.shutdown()
@@ -107,10 +97,8 @@ class Proxy:
         self.requests.append((client.command, client.path, headers.get("range", "")))
         what = self.spoil(len(self.requests))
         body = client.rfile.read(int(headers.get("content-length", 0)))
-        self.sent += len(body)
         if what == "flip":
             body = _flipped(body)
-        time.sleep(self.delay)
         if what == "reset":
             _break(client)
             return
@@ -129,9 +117,6 @@ class Proxy:
             content = answer.read()
         if what == "flip":
             content = _flipped(content)
-        self.received += len(content)
-        if self.old_lists is not None and "list-type" in client.path:
-            content = self.old_lists.setdefault(client.path, content)
         if what == "lost":
             _break(client)
             return

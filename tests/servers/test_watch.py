@@ -14,7 +14,6 @@ import pytest
 from pymongo import MongoClient
 
 import hybridlog as hl
-from hybridlog.session import Session
 from hybridlog_storage.mongo.index_documents import IndexState
 from tests import logs, places
 from tests.cli.running import COMMAND, environment
@@ -36,12 +35,10 @@ def arrive(robot: Path, lab: Path, label: str) -> None:
     coming.rename(places.manifest_of(there))
 
 
-def test_what_comes_into_a_store_is_indexed_once_by_several_that_watch(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_comes_into_a_store_is_indexed_once_by_several_that_watch(tmp_path: Path) -> None:
     robot, lab = tmp_path / "robot", tmp_path / "lab"
     with hl.open(robot, create=True, mongo="none") as store:
-        for n in range(5):
+        for n in range(4):
             log = logs.write(tmp_path / f"{n}.mcap", logs.content(n, 20 + n))
             store.record(log, name=f"drive-{n}", settings=logs.SETTINGS)
         expected = store.all_topics().count()
@@ -54,23 +51,6 @@ def test_what_comes_into_a_store_is_indexed_once_by_several_that_watch(
         with hl.open(lab, create=True, mongo=uri) as store:
             arrive(robot, lab, "drive-0")
             store.shared.index.connect()
-            with hl.open(lab, mongo=uri) as other:
-                arrive(robot, lab, "drive-4")
-                read = Session.entry_of
-
-                def overtaken(session: Session, summary: Any) -> Any:
-                    entry = read(session, summary)
-                    is_ours = session.shared is store.shared
-                    if is_ours and summary.name == "drive-4" and not other.shared.repairs.indexed:
-                        other.refresh()
-                        other.shared.index.connect()
-                    return entry
-
-                monkeypatch.setattr(Session, "entry_of", overtaken)
-                store.refresh()
-                store.shared.index.connect()
-                assert "drive-4" in other.shared.repairs.indexed
-                assert "drive-4" not in store.shared.repairs.indexed
 
         def is_indexed(label: str) -> Any:
             with hl.open(robot, mongo="none") as source, hl.open(lab, mongo=uri) as store:

@@ -1,61 +1,65 @@
-"""Index documents, read back by pymongo's BSON and compared value by value."""
+"""No two topics meet in one collection, and errors stand in the documents that they are of."""
 
 from __future__ import annotations
 
-import struct
-from typing import Any
-
 import bson
 import numpy as np
-from numpy.typing import NDArray
+from hypothesis import given
+from hypothesis import strategies as st
 
 from hybridlog_storage.messages import Batch, Channel
-from hybridlog_storage.mongo.index_documents import DocumentAssembler
+from hybridlog_storage.mongo.index_documents import (
+    CATALOG_PREFIX,
+    DocumentAssembler,
+    collection_of,
+)
 from hybridlog_storage.segments.chunk import Placed, StoredChunk
 from hybridlog_storage.segments.chunk_table import ChunkPlace
+from tests.format_reader import collection_name
 
-KEY = "fedcba9876543210"
-CHANNEL = Channel("/a topic/ä", "x", None)
+# Few letters, so that names meet if they can.
+NASTY = st.text(alphabet="/_a~.$ \0A0é", max_size=12)
+ROS = st.lists(st.from_regex(r"[a-z0-9]{1,3}(_[a-z0-9]{1,2})?", fullmatch=True), min_size=1).map(
+    lambda parts: "/" + "/".join(parts)
+)
 
 
-def chunk_of(count: int) -> StoredChunk:
-    """A chunk of messages of three bytes."""
-    numbers = np.arange(count)
-    none = np.zeros(count, np.int32)
-    batch = Batch(b"", numbers * 34, np.full(count, 3), none, numbers, numbers, none)
+@given(NASTY | ROS | st.text(max_size=300))
+def test_names_are_as_the_page_says(topic: str) -> None:
+    assert collection_of(topic) == collection_name(topic)
+
+
+@given(st.sets(NASTY | ROS | st.text(max_size=300), min_size=2, max_size=60))
+def test_one_to_one(topics: set[str]) -> None:
+    assert len({collection_of(topic) for topic in topics}) == len(topics)
+
+
+@given(st.text(max_size=400) | NASTY | st.binary(max_size=20).map(lambda b: b.decode("latin-1")))
+def test_mongodb_takes_every_name(topic: str) -> None:
+    name = collection_of(topic)
+    assert 0 < len(name.encode()) <= 160
+    assert name.isascii()
+    assert not set(name) & set("\0$. /")
+    assert not name.startswith((CATALOG_PREFIX, "system."))
+
+
+def test_halves_of_surrogate_pairs() -> None:
+    assert collection_of("/\udc80") != collection_of("/\udc81")
+
+
+def test_errors_stand_in_the_documents_that_they_are_of() -> None:
+    """None is too long, or stays in a document without."""
+    assembler, rows = DocumentAssembler("fedcba9876543210", Channel("/ä", "x", None)), np.arange(3)
+    none = np.zeros(3, np.int32)
     place = ChunkPlace(
         number=5, offset=2**41, length=100, trailer=50, first=0, last=0, channels=(1,)
     )
-    return StoredChunk(7, place, batch, numbers)
-
-
-def documents(data: NDArray[np.uint8]) -> list[dict[str, Any]]:
-    assert data.dtype == np.uint8
-    raw = [row.tobytes() for row in data]
-    for row in raw:
-        assert struct.unpack_from("<i", row)[0] == len(row)
-    return [bson.decode(row) for row in raw]
-
-
-def test_errors_replace_the_fields() -> None:
-    assembler = DocumentAssembler(KEY, CHANNEL)
-    chunk = chunk_of(3)
-    none = np.empty((3, 0), np.uint8)
-    for error in ("short", "ü" * 3000, "\udc80 half", "short"):
-        for document in documents(
-            assembler.assemble(Placed.of([chunk]), np.arange(3), none, error)
-        ):
-            assert list(document) == ["_id", "_meta"]
-            said = document["_meta"]["error"]
-            assert said[:5] == error.encode("utf-8", "replace").decode()[:5]
-            assert len(said) <= 1000
-    # Many different errors do not mix, nor does one stay in documents without.
-    for number in range(600):
-        (made, *_) = documents(
-            assembler.assemble(Placed.of([chunk]), np.arange(3), none, f"e{number}")
-        )
-        assert made["_meta"]["error"] == f"e{number}"
-    assert (
-        "error"
-        not in documents(assembler.assemble(Placed.of([chunk]), np.arange(3), none))[0]["_meta"]
-    )
+    batch = Batch(b"", rows * 34, np.full(3, 3), none, rows, rows, none)
+    placed = Placed.of([StoredChunk(7, place, batch, rows)])
+    for error in ("short", "ü" * 3000, "\udc80 half", None, *map(str, range(600)), "short", None):
+        for row in assembler.assemble(placed, rows, np.empty((3, 0), np.uint8), error):
+            document = bson.decode(row.tobytes())
+            assert [*document] == ["_id", "_meta"]
+            said = document["_meta"].get("error")
+            wanted = None if error is None else error.encode("utf-8", "replace")[:1000].decode()
+            assert said == wanted
