@@ -27,12 +27,12 @@ from hybridlog_storage.catalog import (
     Catalog,
     ChannelStats,
     RecordingEntry,
+    RecordingSummary,
     channel_entry,
 )
 from hybridlog_storage.cells import CATALOG, Cells, put
 from hybridlog_storage.manifest import Manifest, Mark, Note, Source
 from hybridlog_storage.messages import Channel, Schema, schema_hash
-from hybridlog_storage.summary import RecordingSummary
 from tests.limits import Limit
 
 STORE = "5" * 32
