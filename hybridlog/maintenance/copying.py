@@ -137,14 +137,10 @@ class Copying:
                 server.begin()
                 yield server, lambda name: free_name(name, server.names())
         elif (address := address_of(self.to)) is not None:
-            from hybridlog.maintenance.derived import bring_tables
             from hybridlog_storage.remote.store import RemoteDirectory
 
             target = RemoteDirectory.create_in(address)
-            try:
-                yield target.source, _naming(lambda: target.manifests.each(target.ids()))
-            finally:
-                bring_tables(self.shared, target, self._arrived)
+            yield target.source, _naming(lambda: target.manifests.each(target.ids()))
         else:
             from hybridlog.follow.follower import make_tables
 

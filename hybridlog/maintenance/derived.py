@@ -1,41 +1,36 @@
-"""Brings what is derived of recordings up to date: the index, tables with arrays, in buckets."""
+"""Brings what is derived of recordings up to date: the index, and tables with arrays."""
 
 from __future__ import annotations
 
-import os
-import tempfile
-from collections import defaultdict
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from msgspec import Struct
 
-from hybridlog.columns.layout import SHARED, SUFFIX, TABLES, topics_of, type_prefix
+from hybridlog.columns.layout import topics_of, type_prefix
 from hybridlog.follow.follower import Follower, bring, make_tables
 from hybridlog.maintenance.report import ArraysOfTopic, Progress, RepairReport
-from hybridlog.snapshot import UNFINISHED, Snapshot
-from hybridlog_storage.disk import files
+from hybridlog.snapshot import Snapshot
 from hybridlog_storage.disk.directory import LOCK_WAIT_S, StoreDirectory
 from hybridlog_storage.errors import (
     HeldError,
     HybridlogError,
     SegmentError,
-    StoreError,
     TopicError,
-    unreadable,
 )
 from hybridlog_storage.messages import EXPIRED_IDS
 from hybridlog_storage.mongo.index_documents import IndexState
 from hybridlog_storage.settings import read_settings
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from hybridlog.columns.tables import Tables
-    from hybridlog.shared import Shared
+    from hybridlog.maintenance.report import Progress, RepairReport
+    from hybridlog.snapshot import Snapshot
     from hybridlog_storage.catalog import Catalog, RecordingEntry, RecordingSummary
     from hybridlog_storage.mongo.database import Database
-    from hybridlog_storage.remote.store import RemoteDirectory
 
 
 class StoreIndex(Struct, frozen=True):
@@ -160,49 +155,3 @@ def _differs(known: Tables, entry: RecordingEntry, topic: str, *, off: bool) -> 
     arrays = [section.arrays for section in found if section.topic == topic]
     is_expired = any(one.id >= EXPIRED_IDS for one in entry.channels if one.topic == topic)
     return (not arrays or off in arrays) and (off or not is_expired)
-
-
-def bring_tables(source: Shared, target: RemoteDirectory, recordings: Collection[str]) -> None:
-    """Bring the tables of recordings that were copied into a bucket; messages answer without.
-
-    No file of them has another recording.
-    """
-    from hybridlog_storage.copy import read
-
-    for recording in recordings:
-        entry, names = source.now().find(recording), list[str]()
-        if entry is None or entry.status in UNFINISHED:
-            continue
-        with tempfile.TemporaryDirectory(prefix="hybridlog-") as place:
-            for number, path in enumerate(_tables(source, entry, Path(place))):
-                names.append(f"{TABLES}/{path.parent.name}/{entry.id}-{number}{SUFFIX}")
-                try:
-                    fd = files.open_file(path, os.O_RDONLY)
-                except OSError as error:
-                    raise unreadable(error, path) from error
-                try:
-                    size = os.fstat(fd).st_size
-                    target.bucket.put(names[-1], size, read(fd, 0, size))
-                finally:
-                    os.close(fd)
-        target.source.keep_tables(entry.id, names)
-
-
-def _tables(source: Shared, entry: RecordingEntry, root: Path) -> list[Path]:
-    """Files with the fields of a recording; of shared ones its rows alone, below `root`."""
-    from hybridlog.columns.table_writer import Addition, TableFolders
-    from hybridlog.columns.tables import files_of
-
-    found = []
-    shared = defaultdict[str, Addition](Addition)
-    for file, begin, section in source.tables.sections_of(entry):
-        if not section.segments.items() <= entry.digests.items():
-            continue  # they are of what it was before
-        if not file.path.name.startswith(SHARED):
-            found.append(file.path)
-            continue
-        with suppress(StoreError):  # what is damaged is left out: messages answer, too
-            rows = file.table().slice(begin, section.rows)
-            shared[file.path.parent.name].pieces.append((section, rows))
-    TableFolders(root, entry.id, entry.created).add(shared)
-    return found + [reader.path for reader in files_of(root)]

@@ -210,9 +210,8 @@ def changed_names(
     First comes its inode and the time of its last change, ns, which is `before` of the next call;
     the entries are None if they are as before.
     """
-    if (found := _mounted(path)) is not None:
-        number, entries = found[0].names(found[1])
-        return (number, 0), None if (number, 0) == before else entries
+    if _mounted(path) is not None:
+        raise FileNotFoundError(errno.ENOENT, "a bucket has no tables", str(path))
     with folder(path) as fd:
         about = os.fstat(fd)
         now = about.st_ino, about.st_mtime_ns

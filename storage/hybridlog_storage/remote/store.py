@@ -1,10 +1,8 @@
 """A store in a bucket, as a directory that others read.
 
 Its objects have the names of the files of a directory. A recording is its manifest, as this
-process has seen it last, and the files that it lists; nobody asks which others there are. Tables
-are derived and may be missing; no file of them has two recordings:
-
-    tables/<type>~<shape>/<id>-<number>.parquet
+process has seen it last, and the files that it lists; nobody asks which others there are. It has no
+tables: messages answer, which are fetched once, and rows.
 
 The catalog lies in the user's cache, and has manifests with their versions: an opening reads those
 that have changed since the last one.
@@ -13,9 +11,7 @@ that have changed since the last one.
 from __future__ import annotations
 
 import errno
-import os
 import secrets
-import stat
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -48,19 +44,16 @@ from hybridlog_storage.manifest import (
     encode,
 )
 from hybridlog_storage.manifests import MANIFESTS, RECORDINGS, Manifests, decoded, ids_of
-from hybridlog_storage.remote.bucket import BlockCache, Bucket, Object, inode_of
+from hybridlog_storage.remote.bucket import BlockCache, Bucket, Object
 from hybridlog_storage.settings import MAX_SETTINGS, NONE, StoreSettings, settings_of, settings_text
 from hybridlog_storage.settings import NAME as SETTINGS
 
 LOOK_EVERY_S: Final = 5.0
 """Seconds between two looks for changes of others, for each thousand recordings."""
-TABLES: Final = "tables"
 _MANIFEST: Final = "manifest"
 """Kind of the cells, by recording, of its manifest with its version."""
 _PARALLEL: Final = 16
 _FETCHED: Final = 8 << 20  # bytes that a copy asks for at once
-_FOLDER: Final = stat.S_IFDIR | 0o555
-_FILE: Final = stat.S_IFREG | 0o444
 
 
 class BucketManifests(Manifests):
@@ -169,7 +162,6 @@ class BucketManifests(Manifests):
     def _delete_files(self, recording: str) -> None:
         names = [one.name for one in self._bucket.objects(f"{RECORDINGS}/{recording}/")]
         self._bucket.delete(names)
-        self._bucket.delete([one.name for one in tables_of(self._bucket, recording)])
 
     def _forget(self, recording: str, *, says_so: bool) -> None:
         # Servers have no condition for deletions: between these two it could be created anew.
@@ -198,50 +190,18 @@ class BucketStore(Source):
         self.cells = cells_of_user(self.address, self.address)
         self.manifests = BucketManifests(bucket, self.cells)
         self._found: dict[str, Object] = {}
-        self._tables: tuple[int, dict[str, dict[str, Object]]] = -1, {}
 
     def open(self, inner: tuple[str, ...]) -> int:
-        """A handle for reading a file that a manifest or the catalog lists."""
+        """A handle for reading a file that a manifest lists."""
         about = None
         if len(inner) == 3 and inner[0] == RECORDINGS:
             with suppress(RecordingGoneError):
                 listed = objects_of(self.manifests.read(inner[1]))
                 about = next((one for one in listed if one.name == "/".join(inner)), None)
-        elif len(inner) == 3 and inner[0] == TABLES:
-            about = self.tables().get(inner[1], {}).get(inner[2])
         if about is None:
             place = "/".join([self.address, *inner])
             raise FileNotFoundError(errno.ENOENT, "there is no such object", place)
         return self.cache.open(self.bucket, about)
-
-    def names(self, inner: tuple[str, ...]) -> tuple[int, dict[str, os.stat_result]]:
-        """The entries of a folder of tables, and a number that changes with them."""
-        found, number = self.tables(), self.manifests.number
-        if inner == (TABLES,):
-            return number, dict.fromkeys(found, _stat(_FOLDER, 0, 0))
-        if len(inner) != 2 or inner[0] != TABLES or inner[1] not in found:
-            raise FileNotFoundError(errno.ENOENT, "there is no such folder", inner[-1])
-        entries = found[inner[1]].items()
-        return self.manifests.number, {
-            name: _stat(_FILE, inode_of(o), o.size) for name, o in entries
-        }
-
-    def tables(self) -> dict[str, dict[str, Object]]:
-        """The objects of tables by folder and name."""
-        number = self.manifests.number
-        if self._tables[0] != number:
-            found: dict[str, dict[str, Object]] = {}
-            for one in tables_of(self.bucket):
-                _, folder, name = one.name.split("/")
-                found.setdefault(folder, {})[name] = one
-            self._tables = number, found
-        return self._tables[1]
-
-    def keep_tables(self, recording: str, names: Collection[str]) -> None:
-        """Delete the tables of a recording but some."""
-        there = (one.name for one in tables_of(self.bucket, recording))
-        self.bucket.delete(sorted({*there}.difference(names)))
-        self._tables = -1, {}
 
     def sizes(self, folder: str) -> dict[str, int]:
         """As of `Place`; 1,000 a request."""
@@ -384,21 +344,9 @@ class RemoteDirectory(StoreDirectory):
         yield
 
 
-def tables_of(bucket: Bucket, recording: str = "") -> Iterator[Object]:
-    """The objects of tables, of a recording or of all."""
-    for one in bucket.objects(f"{TABLES}/"):
-        name = one.name.rpartition("/")[2]
-        if one.name.count("/") == 2 and (not recording or name.startswith(f"{recording}-")):
-            yield one
-
-
 def _version(about: Object | None) -> str:
     return "" if about is None else about.version
 
 
 def _name_of(recording: str) -> str:
     return f"{MANIFESTS}/{recording}.json"
-
-
-def _stat(mode: int, inode: int, size: int) -> os.stat_result:
-    return os.stat_result((mode, inode, 0, 1, os.getuid(), os.getgid(), size, 0, 0, 0))
