@@ -188,7 +188,7 @@ class _Beside:
             with suppress(StoreError):  # the next look or the end sees it
                 follower.follow()
             is_lost = follower.failure is not None and index.connected is None
-            if is_lost and index.reached(brings=False, writes=True) is not None:
+            if is_lost and index.reached(brings=False) is not None:
                 follower.discard()
                 follower = self._begin(is_again=True)
         directory, catalog = self._store.directory, self._store.shared.catalog

@@ -80,9 +80,8 @@ class IndexAccess:
 
     Attributes:
         wanted: The URI that was asked for; None for the one in the store's settings.
-        may_write: False if the user of MongoDB may only read.
         id: Id of the index; an index that replaces it has another one. Empty without a
-            connection, and for an index without an id that this user may only read.
+            connection.
         unavailable: The reason why MongoDB is unavailable; None while that is unknown.
     """
 
@@ -93,7 +92,6 @@ class IndexAccess:
         progress: Progress | None,
     ) -> None:
         self.wanted = mongo
-        self.may_write = True
         self.id = ""
         self.unavailable: HybridlogError | None = None
         self._shared = shared
@@ -115,34 +113,28 @@ class IndexAccess:
         """The index, if it is connected already."""
         return None if self._database is None or self._database.is_lost else self._database
 
-    def reached(self, *, brings: bool = True, writes: bool = False) -> Database | None:
+    def reached(self, *, brings: bool = True) -> Database | None:
         """The index, connected when it is needed; without `brings`, it may lack recordings.
 
-        None if it is unavailable, or if it is for who `writes`, and its user may only read. A
-        failure is remembered for some seconds.
+        None if it is unavailable. A failure is remembered for some seconds.
         """
         is_ready = self._is_complete or not brings
         if (self.connected is None or not is_ready) and time.monotonic() >= self._rests_until:
             with suppress(HybridlogError):
                 self.connect(brings=brings)
-        return self.connected if self.may_write or not writes else None
+        return self.connected
 
-    def database_for(self, purpose: str, *, writes: bool = False, brings: bool = True) -> Database:
+    def database_for(self, purpose: str, *, brings: bool = True) -> Database:
         """The index, for a purpose that errors name; without `brings`, it may lack recordings."""
         database = self.reached(brings=brings)
         if database is None:
             raise DatabaseError(f"{purpose} needs MongoDB. {self.unavailable or ''}".strip())
-        if writes and not self.may_write:
-            raise DatabaseError(
-                f"{purpose} needs a MongoDB user who may write. This one may only read: grant "
-                f"the role readWrite on the database {database.name!r}."
-            )
         return database
 
     def index_to_record(self, purpose: str, *, brings: bool = True) -> IndexTarget:
         """The index, for a new recording; it may be unavailable, or without `brings` be behind."""
         try:
-            database = self.database_for(purpose, writes=True, brings=brings)
+            database = self.database_for(purpose, brings=brings)
         except DatabaseError as error:
             why = self.unavailable if isinstance(self.unavailable, DatabaseError) else error
             # It does without MongoDB if none is wanted, or ours does not start.
@@ -259,7 +251,7 @@ class IndexAccess:
             self._is_complete = False
         changed: set[str] = set()
         database = self._open()
-        if brings and self.may_write:
+        if brings:
             shared.recover()
             store = StoreIndex(shared.directory, shared.catalog, database, self._progress)
             session = shared.now()
@@ -285,7 +277,6 @@ class IndexAccess:
             self._database.close()
         database = self._database = self._another()
         state, store_id = IndexState(database), self._directory.settings.store_id
-        self.may_write = database.may_write()
         owner = state.owner()
         if owner is not None and owner.store != store_id:
             if self._named != EMBEDDED:
@@ -293,8 +284,7 @@ class IndexAccess:
             # The store is a copy that has an id of its own now.
             database.run(lambda db: db.client.drop_database(db.name))
             owner = None
-        if owner is None and self.may_write:
+        if owner is None:
             owner = self.claim(database)
-        self.id = "" if owner is None else owner.made
-        self._owns = owner is not None and owner.place == self._own_place
+        self.id, self._owns = owner.made, owner.place == self._own_place
         return database

@@ -73,7 +73,7 @@ class Index:
         from hybridlog.maintenance.derived import StoreIndex
 
         shared = self._shared
-        database = shared.index.database_for("Rebuilding the index", writes=True)
+        database = shared.index.database_for("Rebuilding the index")
         shared.invalidate()
         chosen = shared.now().select(recordings)
         index = StoreIndex(shared.directory, shared.catalog, database, progress)
@@ -105,7 +105,7 @@ class Index:
             DatabaseError: MongoDB refuses, for example because two fields are arrays.
         """
         query = self._about(topic)
-        database = self._shared.index.database_for("An index", writes=True)
+        database = self._shared.index.database_for("An index")
         query.fields(*(name for name in fields if name not in _OWN_FIELDS))
         keys = _keys(fields)
         names = [*map(collection_of, query.topics)]
@@ -122,7 +122,7 @@ class Index:
             TopicError: A topic does not exist.
         """
         query = self._about(topic)
-        database = self._shared.index.database_for("An index", writes=True)
+        database = self._shared.index.database_for("An index")
         keys = _keys(fields)
         names = [*map(collection_of, query.topics)]
         names = [name for name in names if tuple(keys) in database.indexes(name)]

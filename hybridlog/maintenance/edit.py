@@ -263,7 +263,7 @@ def remove_if(
     directory = shared.directory
     try:
         entry = shared.now().entry(recording)
-        database = shared.index.reached(writes=True) if clears else None
+        database = shared.index.reached() if clears else None
         with directory.writing(entry.id, entry.name, wait_s=LOCK_WAIT_S):
             try:
                 directory.manifests.remove(entry.id, check)

@@ -252,7 +252,7 @@ def _repair(
     """Repair files, manifests, the catalog, tables and index; returns what was not repaired."""
     directory, catalog, report = shared.directory, shared.catalog, shared.repairs
     directory.check_writable()
-    database, left, tables = shared.index.reached(writes=True), [], TableChecker(directory)
+    database, left, tables = shared.index.reached(), [], TableChecker(directory)
     for recording, name in names.items():
         try:
             with directory.writing(recording, name, wait_s=LOCK_WAIT_S):

@@ -50,7 +50,8 @@ _REPLICATION_S = 60.0  # seconds for a majority of its members to take over a wr
 _DUPLICATE_KEY = 11000
 _NAMESPACE_EXISTS = 48
 _DISK_FULL = 14031
-_NOT_ALLOWED = frozenset({13, 18})  # unauthorized, or no login
+_NO_ROLE = 13
+_NOT_ALLOWED = frozenset({_NO_ROLE, 18})  # unauthorized, or no login
 _RESERVED_NAMES = frozenset({"admin", "local", "config"})
 
 
@@ -146,23 +147,6 @@ class Database:
         except ConnectionLostError:
             self.is_lost = True
             raise
-
-    def may_write(self) -> bool:
-        """False if the user of this connection may not change the database."""
-        from pymongo import WriteConcern
-
-        def delete(database: PymongoDatabase[Document]) -> None:
-            # Without a majority of a replica set, there is nothing to wait for.
-            of = database.get_collection("hybridlog.store", write_concern=WriteConcern(1))
-            of.delete_one({"_id": ""})  # which is never there
-
-        try:
-            self.run(delete)
-        except ConnectionLostError:
-            raise
-        except DatabaseError:
-            return False
-        return True
 
     def ensure_collection(self, name: str) -> None:
         """Create a clustered collection (`_id` is its only key) unless it exists."""
@@ -388,6 +372,8 @@ def _refused(address: str, code: int, text: str) -> HybridlogError:
         return DiskFullError(f"MongoDB at {address} has no space left: {text}")
     text = text.partition(" to execute command")[0]  # which may be long
     cure = f". {LOGIN_CURE}" if "uthentication" in text else ""
+    if code == _NO_ROLE:  # who may only read asks an index that is complete
+        cure = ". Grant its user the role readWrite on this database"
     return DatabaseError(f"MongoDB at {address} refuses (error {code}): {text}{cure}")
 
 
