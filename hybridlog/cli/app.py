@@ -16,7 +16,7 @@ import click
 from hybridlog import __version__
 from hybridlog.cli import signals
 from hybridlog.cli.output import Bar, counted, notes, printable
-from hybridlog_storage.disk.unfinished import undo_unfinished
+from hybridlog_storage.disk.files import undo_unfinished
 from hybridlog_storage.errors import NO_SPACE, DiskFullError, HybridlogError, WithoutMongoError
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from typing import Final, NoReturn
 
 from hybridlog.cli import output
 from hybridlog_storage import stopping
-from hybridlog_storage.disk.unfinished import undo_unfinished
+from hybridlog_storage.disk.files import undo_unfinished
 from hybridlog_storage.errors import (
     BucketError,
     DatabaseError,

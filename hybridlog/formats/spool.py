@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, BinaryIO
 import zstandard
 
 from hybridlog.formats.reading import cannot_open
-from hybridlog_storage.disk.unfinished import undone
+from hybridlog_storage.disk.files import undone
 from hybridlog_storage.errors import NO_SPACE, SourceError
 
 if TYPE_CHECKING:

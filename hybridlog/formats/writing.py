@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Self, TypeAlias
 
 from msgspec import Struct, field
 
-from hybridlog_storage.disk.unfinished import Unfinished, beside
+from hybridlog_storage.disk.files import Unfinished, beside
 from hybridlog_storage.errors import (
     NO_SPACE,
     DiskFullError,

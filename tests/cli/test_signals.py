@@ -9,7 +9,7 @@ from typing import NoReturn
 import pytest
 
 from hybridlog.cli import signals
-from hybridlog_storage.disk.unfinished import beside
+from hybridlog_storage.disk.files import beside
 from hybridlog_storage.stopping import at_safe_points
 
 

@@ -20,8 +20,8 @@ from msgspec.structs import replace
 import hybridlog.formats
 from hybridlog.formats import OUTPUTS, formats_of
 from hybridlog.formats.writing import Answer, Sink
-from hybridlog_storage.disk import unfinished
-from hybridlog_storage.disk.unfinished import (
+from hybridlog_storage.disk import files
+from hybridlog_storage.disk.files import (
     beside,
     undo_unfinished,
     undone,
@@ -148,7 +148,7 @@ class Interruption:
         at: Number of the step, from 1; 0 for none.
     """
 
-    OURS = (str(Path(hybridlog.formats.__file__).parent), unfinished.__file__)
+    OURS = (str(Path(hybridlog.formats.__file__).parent), files.__file__)
 
     def __init__(self, at: int) -> None:
         self.at = at

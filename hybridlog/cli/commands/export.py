@@ -22,7 +22,7 @@ from hybridlog.cli.answers import (
 from hybridlog.cli.options import Forced, Latched, Options, Topics, argument, command, option
 from hybridlog.cli.output import Bar
 from hybridlog.formats import OUTPUTS, formats_of, suffixes_of
-from hybridlog_storage.disk.unfinished import undone
+from hybridlog_storage.disk.files import undone
 from hybridlog_storage.errors import (
     DefinitionError,
     HybridlogError,

@@ -15,7 +15,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from hybridlog.formats.mcap.writer import source_metadata
 from hybridlog.formats.writing import Answer, LogWriter, Target, destination, failures, path_of
-from hybridlog_storage.disk.unfinished import beside
+from hybridlog_storage.disk.files import beside
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:

@@ -20,12 +20,14 @@ import os
 import random
 import resource
 import secrets
+import shutil
 import stat
 import time
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, cast
+from weakref import WeakSet, finalize
 
 from hybridlog_storage.errors import NO_SPACE, DiskFullError, HybridlogError, StoreError, exhausted
 from hybridlog_storage.stopping import pause
@@ -391,3 +393,82 @@ def remove(folder: Path, names: Collection[str]) -> None:
                 unlink(folder / name)
         if names:
             sync_folder(folder)
+
+
+# Names until what is written is complete.
+
+_unfinished: WeakSet[Unfinished] = WeakSet()
+_undo: list[tuple[int, Callable[[], object]]] = []
+
+
+class Unfinished:
+    """A temporary name, unused so far, where the owner creates a file or a directory.
+
+    An interruption may come at any moment, so it exists before the file does. The file goes with
+    its owner, by `undo_unfinished`, or when the process ends; a child process removes none.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._process = os.getpid()
+        self._at_the_end = finalize(self, _remove_own, path, self._process)
+        _unfinished.add(self)
+
+    def publish(self, final: Path) -> None:
+        """Rename it atomically to its final name in its directory, and sync that.
+
+        It replaces a file, or as a directory an empty directory.
+        """
+        publish(self.path, final)
+        self._at_the_end.detach()
+
+    def remove(self) -> None:
+        """Remove the file or directory; does nothing after `publish`."""
+        if self._at_the_end.alive:
+            _remove_own(self.path, self._process)
+            self._at_the_end.detach()
+
+
+def beside(final: Path) -> Unfinished:
+    """An unused name in the same directory."""
+    return Unfinished(final.with_name(f".{final.name[:100]}.{secrets.token_hex(6)}.partial"))
+
+
+@contextmanager
+def undone(undo: Callable[[], object]) -> Iterator[None]:
+    """Take something back if the block fails, or if the process is stopped in it.
+
+    `undo` may be called before it was done.
+    """
+    registered = os.getpid(), undo
+    _undo.append(registered)
+    try:
+        yield
+    except BaseException:
+        undo()
+        raise
+    finally:
+        _undo.remove(registered)
+
+
+def undo_unfinished() -> None:
+    """Remove all unfinished files of this process, and take back what is registered.
+
+    For a process that is stopping and may have lost its reference to the writer.
+    """
+    for one in [*_unfinished]:
+        one.remove()
+    for process, undo in reversed(_undo):
+        if process == os.getpid():
+            with suppress(OSError):
+                undo()
+
+
+def _remove_own(path: Path, process: int) -> None:
+    if process != os.getpid():
+        return
+    with suppress(OSError):
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
