@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import json
 import os
-import random
-import shutil
 import subprocess
 import sys
-import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -19,9 +15,6 @@ import hybridlog as hl
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
-from tests.test_keep import recorded
-
-__all__ = ["recorded"]
 
 CHANNEL = Channel("/n", "json", None, {})
 BEGIN = 1_700_000_000 * 10**9
@@ -135,51 +128,3 @@ def test_what_was_acknowledged_while_it_was_recorded_is_there(
         manifest = places.manifest(path, recording.id)
         assert manifest.changes >= 4 * editors * edits
         assert not store.verify().findings
-
-
-def keep(
-    path: Path, rules: dict[str, object], begun: threading.Event, passed: threading.Event
-) -> None:
-    with hl.open(path, mongo="none") as store:
-        begun.set()
-        store.keep(rules)
-        passed.set()
-
-
-@pytest.mark.parametrize(
-    "rounds", [3, pytest.param(60, marks=[pytest.mark.exhaustive, pytest.mark.timeout(1800)])]
-)
-@pytest.mark.parametrize("protect", ["pin", "tag"])
-def test_what_was_protected_first_outlasts_retention(
-    recorded: Path, tmp_path: Path, protect: str, rounds: int
-) -> None:
-    """Whenever it is protected, nothing goes from there on."""
-    chance = random.Random(rounds)
-    rules: dict[str, object] = {"topic": {"/camera": "0s"}, "never-tag": ["hold"]}
-    edits: dict[str, Callable[[hl.Store], object]] = {
-        "pin": lambda store: store.pin("run", reason="wanted"),
-        "tag": lambda store: store.edit("run", tag={"hold": "yes"}),
-    }
-    path, lasted = tmp_path / "store", 1.0
-    for number in range(rounds):
-        shutil.rmtree(path, ignore_errors=True)
-        shutil.copytree(recorded, path)
-        begun, passed = threading.Event(), threading.Event()
-        keeper = threading.Thread(target=keep, args=(path, rules, begun, passed))
-        with hl.open(path, mongo="none") as store:
-            at = time.monotonic()
-            keeper.start()
-            begun.wait()
-            time.sleep(lasted * (0, 0.2, 0.5)[number % 3] * chance.random())
-            edits[protect](store)
-            whole = {n for n, file in places.manifest(path, "run").logs.items() if file.is_here}
-            keeper.join()
-            lasted = min(lasted, time.monotonic() - at)
-            assert passed.is_set()
-            logs = places.manifest(path, "run").logs
-            assert {n for n, file in logs.items() if file.is_here} == whole
-            # Nor in the next pass.
-            store.keep(rules)
-            logs = places.manifest(path, "run").logs
-            assert {n for n, file in logs.items() if file.is_here} == whole
-            assert not store.verify().findings

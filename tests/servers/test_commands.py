@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
-from hybridlog.query.choice import Choice
 from tests import logs
 from tests.servers.commands import Sent, commands
 
@@ -22,22 +21,6 @@ GAP = 1000  # messages that would lie between two recordings
 ABSOLUTE = f"{logs.BEGIN_NS + 3 * logs.STEP_NS}ns", f"{logs.BEGIN_NS + 9_005 * logs.STEP_NS}ns"
 RELATIVE = "+0s", "+0.055s"
 RAW = {"n": {"$gt": 1}}
-BY_COLUMNS: dict[str, Callable[[hl.Store], object]] = {
-    "count": lambda s: s.topic("/number").where("x > 1").count(),
-    "count of relative times": lambda s: (
-        s.topic("/number").where("n > 1").between(*RELATIVE).count()
-    ),
-    "count by stamps": lambda s: (
-        s.topic("/stamped").where("n > 1").clock("header").between(*ABSOLUTE).count()
-    ),
-    "count of elements": lambda s: s.topic("/text").where("s ~ '^x.$'").count(),
-    "fetch": lambda s: [m.raw for m in s.topic("/number").where("x > 1")],
-    "table": lambda s: s.topic("/number").where("x > 1").to_pandas()["n"].tolist(),
-    "intervals": lambda s: [*s.topic("/number").where("n > 3").intervals()],
-    "windows": lambda s: [*s.topic("/number").where("n > 3").windows(0, "1ms")],
-    "single message": lambda s: s.topic("/number").where("n > 1").at(ABSOLUTE[1]).raw,
-    "recordings": lambda s: s.choose(Choice(where=("/number: n > 3",))).ids,
-}
 BY_MONGODB: dict[str, Callable[[hl.Store], object]] = {
     "count": lambda s: s.topic("/number").where(RAW).count(),
     "count of times": lambda s: s.topic("/number").where(RAW).between(*ABSOLUTE).count(),
@@ -100,14 +83,3 @@ def test_no_question_asks_once_a_recording(tmp_path: Path) -> None:
     }
     assert all(few.values())
     assert "create" not in {one.name for one in few["record"]}, "once a topic, though it exists"
-
-
-def test_what_columns_answer_asks_mongodb_nothing(tmp_path: Path) -> None:
-    path = tmp_path / "store"
-    add(path, range(4))
-    with hl.open(path, mongo="none") as alone:
-        wanted = {name: ask(alone) for name, ask in BY_COLUMNS.items()}
-    with hl.open(path, require_database=True) as store, commands() as sent:
-        for name, ask in BY_COLUMNS.items():
-            assert ask(store) == wanted[name]
-            assert not sent, name
