@@ -22,7 +22,6 @@ import hybridlog as hl
 from hybridlog_storage.errors import TopicError
 from hybridlog_storage.messages import Channel, Schema
 from tests.every_output import parquet, written
-from tests.limits import Limit
 
 CASES = Path(__file__).parent / "cases"
 LOGS = [
@@ -166,25 +165,6 @@ def test_odd_values_stay_apart(tmp_path: Path) -> None:
             ",,,,",
             '1.5,"x","[null]",true,1',
         ]
-
-
-def test_a_late_key_and_a_late_type(tmp_path: Path, limit: Limit) -> None:
-
-    limit(output_held_bytes=1, frame_block_rows=1)
-    with hl.open(tmp_path / "store", create=True) as store:
-        with store.start("x") as recorder:
-            for n in range(600):
-                value: Any = n if n < 590 else {"k": n}
-                message = {"v": value} | ({"late": 1} if n > 595 else {})
-                text = json.dumps(message).encode()
-                recorder.write(Channel("/o", "json", None), text, log_time=1 + n)
-        query = store.topic("/o")
-        for form, read in (("parquet", parquet), ("csv", csv_rows)):
-            found = read(query)
-            assert (found.num_rows if form == "parquet" else len(found)) == 600
-        values = [json.loads(text) for text in parquet(query)["v"].to_pylist()]
-        assert values[0] == 0
-        assert values[-1] == {"k": 599}
 
 
 # --- ROS --------------------------------------------------------------------------------

@@ -267,8 +267,6 @@ class Asked:
     bounds: tuple[int, int] | None
     number: int | None
     """`where number >= …`."""
-    limit: int | None
-    every: int
     reverse: bool
 
 
@@ -280,8 +278,6 @@ questions = st.builds(
     topics=st.just(()),
     bounds=st.none() | bounds,
     number=st.none() | st.integers(-3, 4),
-    limit=st.none() | st.integers(0, 5),
-    every=st.sampled_from([1, 1, 2, 3]),
     reverse=st.booleans(),
 )
 
@@ -444,7 +440,7 @@ class Machine(RuleBasedStateMachine):
         self.store = hl.open(self.path, require_database=True)
         topics = tuple(sorted({t for k in self.model.values() for t in k.topics}))
         if topics:
-            check(self.store, self.model, Asked(topics, None, None, None, 1, reverse=False))
+            check(self.store, self.model, Asked(topics, None, None, reverse=False))
         assert not self.store.shared.repairs.removed
         assert {f.place for f in self.store.verify().findings} == self.places()
         self.open_again()  # what only decoding tells is found out now, if a question missed it
@@ -684,9 +680,9 @@ class Machine(RuleBasedStateMachine):
         self.store.shared.index.connect()
         assert misindexed(self.store) == {}
         if topics:
-            check(self.store, self.model, Asked(topics, None, None, None, 1, reverse=False))
+            check(self.store, self.model, Asked(topics, None, None, reverse=False))
         for topic in topics:
-            check(self.store, self.model, Asked((topic,), None, None, None, 1, reverse=True))
+            check(self.store, self.model, Asked((topic,), None, None, reverse=True))
 
     def chosen(self, which: int, fits: Callable[[Recording], bool] = lambda _: True) -> str:
         able = [name for name, known in self.model.items() if fits(known)]
@@ -779,14 +775,7 @@ def expected(model: dict[str, Recording], asked: Asked) -> list[Said] | type[Exc
     if asked.number is not None:
         everything = [m for m in everything if _number(m) >= asked.number]
     everything.sort(key=lambda m: m.order, reverse=asked.reverse)
-    seen: Counter[str] = Counter()
-    thinned = []
-    for m in everything:
-        if seen[m.topic] % asked.every == 0:
-            thinned.append(m)
-        seen[m.topic] += 1
-    everything = thinned
-    return everything if asked.limit is None else everything[: asked.limit]
+    return everything
 
 
 def _number(message: Said) -> float:
@@ -796,13 +785,11 @@ def _number(message: Said) -> float:
 
 
 def query_of(store: hl.Store, asked: Asked) -> Query:
-    query = store.query(asked.topics).every(asked.every)
+    query = store.query(asked.topics)
     if asked.bounds is not None:
         query = query.between(*asked.bounds)
     if asked.number is not None:
         query = query.where(f"number >= {asked.number}")
-    if asked.limit is not None:
-        query = query.limit(asked.limit)
     return query.reverse() if asked.reverse else query
 
 

@@ -1,4 +1,4 @@
-"""A store with MongoDB, and a recording of many chunks in it."""
+"""A store, and a recording of many chunks in it."""
 
 from __future__ import annotations
 
@@ -9,14 +9,13 @@ import pytest
 import hybridlog as hl
 from tests.query.test_intervals import recorded
 
-AWAY = "mongodb://127.0.0.1:9/?serverSelectionTimeoutMS=300&connectTimeoutMS=300"
 PADDING = "a" * 60  # about ten messages fill a chunk
 
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
     place = tmp_path_factory.mktemp("query") / "store"
-    with hl.open(place, create=True, require_database=True) as opened:
+    with hl.open(place, create=True, mongo="none") as opened:
         yield opened
 
 

@@ -45,10 +45,13 @@ bool b
 string s
 float64[] a
 uint64[] k
+bool[] flags
+string[] names
 demo/Part[] m
 ================================================================================
 MSG: demo/Part
 int32 v
+int32 n
 float32[] q
 """
 FULL_DEFINITION = (
@@ -78,7 +81,7 @@ class Sent:
     raw: bytes
 
 
-def _ros_message(types: Any, rng: random.Random, stamp: int) -> Any:
+def ros_message(types: Any, rng: random.Random, stamp: int) -> Any:
     numbers = [0.0, -0.0, 1.0, 1.5, -2.25, math.nan, math.inf, 2.0**53 + 2]
     unsigned = [0, 1, 2**53 + 1, 2**63 - 1, 2**63, 2**63 + 1, 2**64 - 1]
     make = types.types
@@ -96,26 +99,32 @@ def _ros_message(types: Any, rng: random.Random, stamp: int) -> Any:
         s=rng.choice(["", "a", "slip 1", "SLIP", "é\n"]),
         a=np.array([rng.choice(numbers) for _ in range(length)], np.float64),
         k=np.array([rng.choice(unsigned) for _ in range(length)], np.uint64),
+        flags=np.array([rng.random() < 0.5 for _ in range(rng.choice([0, 1, 3]))], np.bool_),
+        names=[rng.choice(["", "a", "b"]) for _ in range(rng.choice([0, 1, 3]))],
         m=[
-            part(v=rng.randrange(3), q=np.array([rng.choice(numbers[:5])], np.float32))
+            part(
+                v=rng.randrange(3),
+                n=rng.randrange(3),
+                q=np.array(rng.choices(numbers[:7], k=rng.choice([0, 1, 5])), np.float32),
+            )
             for _ in range(rng.choice([0, 1, 3]))
         ],
     )
 
 
-def _as_dict(value: Any) -> Any:
+def as_dict(value: Any) -> Any:
     """A message of rosbags as plain values; times as nanoseconds."""
     if hasattr(value, "sec") and hasattr(value, "nanosec"):
         return value.sec * SECOND + value.nanosec
     if hasattr(value, "__dataclass_fields__"):
         names = [n for n in value.__dataclass_fields__ if not n.startswith("__")]
-        return {name: _as_dict(getattr(value, name)) for name in names}
+        return {name: as_dict(getattr(value, name)) for name in names}
     if isinstance(value, np.ndarray):
         return value.tolist()
-    return [_as_dict(each) for each in value] if isinstance(value, list) else value
+    return [as_dict(each) for each in value] if isinstance(value, list) else value
 
 
-def _json_message(rng: random.Random) -> dict[str, Any]:
+def json_message(rng: random.Random) -> dict[str, Any]:
     numbers = [0, -0.0, 1, 1.5, 2**53 + 1, -(2**53) - 1, 2**63, 2**64 - 1, 2**64, 2**70, True]
     found: dict[str, Any] = {}
     for name, make in (
@@ -149,11 +158,11 @@ def _write(path: Path, seed: int, count: int) -> list[Sent]:
         publish, stamp = log_time - rng.randrange(SECOND), log_time - rng.randrange(9) * SECOND
         kind = rng.randrange(3)
         if kind < 2:
-            message = _ros_message(types, rng, stamp)
+            message = ros_message(types, rng, stamp)
             raw = bytes(types.serialize_cdr(message, "demo/msg/Thing"))
-            fields = _as_dict(message)
+            fields = as_dict(message)
         else:
-            fields = _json_message(rng)
+            fields = json_message(rng)
             raw = json.dumps(fields).encode()
         own = stamp if kind < 2 else None
         topic = [*channels][kind]
@@ -222,14 +231,16 @@ number = st.sampled_from(
 order = st.sampled_from(["==", "!=", "<", "<=", ">", ">="])
 ros_numbers = st.sampled_from(
     [
-        *("x", "i", "u", "a", "k", "m[].v", "m[0].q", "a.min", "a.n", "k.max"),
-        *("a[1:3]", "a[30:].min", "k[:2].max", "m[:1].q[1:]"),
+        *("x", "i", "u", "a", "k", "m[].v", "m[0].q", "a.min", "a.n", "k.max", "k[1]", "k.mean"),
+        *("a[1:3]", "a[30:].min", "k[:2].max", "m[:1].q[1:]", "m[1:].n", "m.n", "m[1].q.n"),
+        *("m.q.max", "m[0].q.mean", "flags.mean", "flags[1:].n", "names.n", "i", "abs(x)"),
     ]
 )
 json_numbers = st.sampled_from(
     [
         *("x", "n", "a", "l", "a.n", "a.min", "l[0]", "o.v", "a[1]", "a[1:3]", "l[1:].n"),
-        *("g", "g[0]", "g[1:]", "g.n", "g[1].n", "h", "h.v", "h[0].v", "h[0][0].v"),
+        *("g", "g[0]", "g[1:]", "g.n", "g[1].n", "h", "h.v", "h[0].v", "h[0][0].v", "x.n"),
+        *("a.max", "a[4:].mean", "g[0][1:3]", "l.n", "o.n", "h[1:].v", "h.n", "o[0:2].v"),
     ]
 )
 pattern = st.sampled_from(["'^slip'", "'(?i)slip'", "'[0-9]$'", "'^$'", "'l.p 1'"])
@@ -242,7 +253,8 @@ def _conditions(numbers: st.SearchStrategy[str], extra: list[str]) -> st.SearchS
         st.builds("{} in [{}, {}]".format, numbers, number, number),
         st.builds("s ~ {}".format, pattern),
         st.builds("s !~ {}".format, pattern),
-        st.sampled_from(["s == 'a'", "s != ''", "_meta.seq < 200", *extra]),
+        st.builds("{} {}".format, numbers, st.sampled_from(["exists", "missing"])),
+        st.sampled_from(["s == 'a'", "s != ''", "s in ['a', '']", "_meta.seq < 200", *extra]),
     )
     return st.one_of(
         one,

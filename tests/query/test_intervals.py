@@ -26,8 +26,6 @@ from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.independent import write_mcap
 
-pytestmark = pytest.mark.mongo
-
 SECOND = 10**9
 BASE = 1_748_937_600 * SECOND
 Rows = list[tuple[int, int, int]]
@@ -251,7 +249,7 @@ def seconds(found: Intervals) -> set[tuple[str, int]]:
     }
 
 
-several = settings(max_examples=25)
+several = settings(max_examples=15)
 
 
 @several

@@ -180,7 +180,7 @@ def written(query: Query, front: Front | None = None) -> list[tuple[int, int, st
     ]
 
 
-@pytest.mark.parametrize("at", [0.5, 3, 10, 41, 45.5, 58, 80])
+@pytest.mark.parametrize("at", [0.5, 10, 45.5, 80])
 def test_a_slice_begins_with_what_a_late_subscriber_receives(store: hl.Store, at: float) -> None:
     begin, end = BEGIN + round(at * SECOND), BEGIN + round((at + 2) * SECOND)
     query = store.query(store.topics(), [store.entry("log").id]).between(begin, end)

@@ -1,8 +1,7 @@
-"""The message at a time, against a loop, and what looking around in a log reads."""
+"""The message at a time, against a loop; what looking around in a log, and counting, reads."""
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -10,16 +9,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import hybridlog as hl
-from hybridlog.query.query import Query, at_time
+from hybridlog.query.query import at_time
 from hybridlog.record.recorder import RecordOptions
 from hybridlog_storage.errors import SegmentError, TopicError
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
-from tests.query.conftest import AWAY, PADDING
+from tests.query.conftest import PADDING
 from tests.query.test_intervals import BASE, SECOND, Model, recorded, several
-
-pytestmark = pytest.mark.mongo
-
 
 rows = st.lists(
     st.tuples(
@@ -47,13 +43,11 @@ def looked_for(
 @given(
     logs=st.fixed_dictionaries({"a": rows, "b": rows}),
     moments=st.lists(st.integers(-2, 210), min_size=1, max_size=8),
-    is_away=st.booleans(),
 )
 def test_the_message_at_a_time_is_what_a_loop_finds(
     store: hl.Store,
     logs: dict[str, list[tuple[int, str, int]]],
     moments: list[int],
-    is_away: bool,
 ) -> None:
     model = recorded(
         store,
@@ -64,26 +58,22 @@ def test_the_message_at_a_time_is_what_a_loop_finds(
             for name, log in logs.items()
         },
     )
-    with hl.open(store.directory.path, mongo=AWAY) if is_away else nullcontext(store) as asked:
-        keys = {entry.id: entry.key for entry in asked.recordings()}
-        for topics in ({"/state"}, {"/other"}, {"/state", "/other"}):
-            if not topics <= set(asked.topics()):
-                continue
-            questions: dict[tuple[int, ...], Query] = {(0, 1, 2, 3): asked.topic(*topics)}
-            if not is_away:
-                questions[0, 2] = asked.topic(*topics).where("s == 0 or s == 2")
-            for states, query in questions.items():
-                for moment in moments:
-                    now = BASE + moment * SECOND + 1
-                    want = looked_for(model, keys, topics, now, set(states))
-                    if want is None:
-                        with pytest.raises(TopicError, match="at or before"):
-                            query.at(f"{now}ns")
-                        continue
-                    found = query.at(f"{now}ns")
+    keys = {entry.id: entry.key for entry in store.recordings()}
+    for topics in ({"/state"}, {"/other"}, {"/state", "/other"}):
+        if not topics <= set(store.topics()):
+            continue
+        query = store.topic(*topics)
+        for states, asked in ((range(4), query), ((0, 2), query.where("s == 0 or s == 2"))):
+            for moment in moments:
+                now = BASE + moment * SECOND + 1
+                want = looked_for(model, keys, topics, now, {*states})
+                if want is None:
+                    with pytest.raises(TopicError, match="at or before"):
+                        asked.at(f"{now}ns")
+                    continue
+                (same,) = at_time(asked, f"{now}ns")
+                for found in (asked.at(f"{now}ns"), same):
                     assert (found.recording, found.fields["n"]) == want
-                    (same,) = at_time(query, f"{now}ns")
-                    assert (same.recording, same.fields["n"]) == want
 
 
 def test_a_chunk_is_read_once_for_who_looks_around_in_it(many: hl.Store) -> None:
@@ -98,20 +88,50 @@ def test_a_chunk_is_read_once_for_who_looks_around_in_it(many: hl.Store) -> None
     assert sum(count for count, _ in read) == many.recordings()[0].chunks
 
 
-def test_a_damaged_chunk_is_named(many: hl.Store) -> None:
-    entry = many.recordings()[0]
-    path = places.segment(many.directory.path, entry.name)
+def test_a_count_by_time_reads_indexes_at_its_ends_only(many: hl.Store) -> None:
+    query = many.topic("/state").between("+5s", "+165s")
+    assert query.count() == 160
+    assert query.counters.documents_read == query.counters.chunks_read == 0
+    assert 0 < query.counters.bytes_read < 1000
+
+
+@pytest.mark.parametrize("damage", ["chunk", "time", "place", "length", "opcode", "arrivals"])
+def test_a_damaged_message_index_is_not_believed(many: hl.Store, damage: str) -> None:
+    """Whether or not what it says could be: its chunk is damaged with it, and that is said."""
+    path = places.segment(many.directory.path, "a")
     whole = path.read_bytes()
-    last = many.session.chunks(entry, [entry.channels[0].id], None, "log")[-1]
-    place = last.place.offset + last.place.length - 1
-    path.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
+    (entry,) = many.recordings()
+    chunk = many.session.chunks(entry, [entry.channels[0].id], None, "log")[0]
+    index = chunk.place.offset + chunk.place.length
+    second = 9 + 6 + 16  # entry: record head, channel, length, the first one
+    at = {
+        "chunk": -1,
+        "opcode": 0,
+        "length": 2,
+        "time": second,
+        "place": second + 8,
+        "arrivals": chunk.place.trailer - 1,
+    }[damage]
+    damaged = bytearray(whole)
+    damaged[index + at] ^= 1
+    path.write_bytes(damaged)
     try:
-        with pytest.raises(SegmentError, match=f"{last.place.offset} of .*{path.name}"):
-            many.topic("/state").at("end")
-        assert many.topic("/state").at("+3s").fields["n"] == 3
+        with hl.open(many.directory.path) as alone:
+            query = alone.topic("/state").between("+5s", "+165s")
+            said = pytest.raises(SegmentError, match=f"{chunk.place.offset} of .*{path.name}")
+            if damage in {"arrivals", "chunk"}:
+                assert query.count() == 160  # the index has a checksum of its own
+            else:
+                with said:
+                    query.count()
+            for ask in (lambda: list(query), lambda: alone.topic("/state").at("+3s")):
+                with said:
+                    ask()
+            assert alone.topic("/state").at("end").fields["n"] == 199
+            # Within one range the chunk is not looked at.
+            assert alone.topic("/state").between("+20s", "+165s").count() == 145
     finally:
         path.write_bytes(whole)
-    assert many.topic("/state").at("end").fields["n"] == 199
 
 
 @pytest.mark.parametrize("compression", ["none", "zstd"])

@@ -102,7 +102,7 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def store(path: Path) -> Iterator[hl.Store]:
     with hl.open(path) as opened:
         yield opened
@@ -347,18 +347,20 @@ def test_what_the_index_lacks_is_said(tmp_path: Path) -> None:
 
 
 def test_messages_without_fields_are_told(tmp_path: Path) -> None:
+    """One is broken, and one too large for a document."""
     with hl.open(tmp_path / "store", create=True, require_database=True) as store:
         with store.start("one") as recording:
-            for n in range(3):
-                recording.write(THING, thing(n) if n else b"short", log_time=n * SECOND)
-        topic = store.topic("/t")
-        query = topic.where({"x": {"$ne": 1}})
+            for n, text in enumerate(("{", '{"n": 1}', '{"n": 2}', "large")):
+                large = json.dumps({"n": 3, "text": "x" * 9_000_000})
+                raw = (large if text == "large" else text).encode()
+                recording.write(JSON, raw, log_time=n * SECOND)
+        query = store.topic("/j").where({"n": {"$ne": 1}})
         assert query.count() == 1
-        assert query.counters.unreadable == 1
+        assert query.counters.unreadable == 2
         assert "could not be tested: no fields in the index" in query.completeness().sentences[0]
-        both = topic.where({"x": {"$ne": 1}}).where("x < 5")
-        assert (both.count(), both.counters.unreadable) == (1, 1)
-        assert topic.where({"_meta.error": {"$exists": True}}).count() == 1
+        both = query.where("n < 5")
+        assert (both.count(), both.counters.unreadable) == (1, 2)
+        assert store.topic("/j").where({"_meta.error": {"$exists": True}}).count() == 2
 
 
 @pytest.mark.parametrize(

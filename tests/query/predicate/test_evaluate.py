@@ -16,6 +16,7 @@ from hybridlog.query.predicate.evaluate import on_columns
 from hybridlog.query.predicate.mongo_filter import mongo_filter
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.tree import Condition, Field
+from hybridlog.schema.arrow_columns import objects_array
 
 ORDERS = {
     "==": operator.eq,
@@ -155,3 +156,8 @@ def test_two_fields_are_compared_by_value(order: str) -> None:
         found = on_columns(predicate, {}, records)
         assert found.holds.tolist() == want
         assert not found.open.any()
+
+
+def test_strings_that_are_no_unicode() -> None:
+    for where in ("s ~ '^.$'", "s == '\N{REPLACEMENT CHARACTER}'"):
+        assert on_columns(parse(where), None, objects_array([{"s": "\ud800"}], None)).holds.all()
