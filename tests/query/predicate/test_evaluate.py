@@ -102,6 +102,12 @@ def test_a_literal_beyond_float32_is_no_infinity() -> None:
     assert on_columns(parse("v == 1e300"), {"v": "float32"}, records).fails.all()
 
 
+def test_an_order_is_of_finite_elements() -> None:
+    table = pa.record_batch({"a": [[np.inf], [np.inf, 2.0], [-np.inf, np.nan]]})
+    assert mask_of("a > 1", table, {"a": "float64[]"}) == [False, True, False]
+    assert mask_of("a == inf", table, {"a": "float64[]"}) == [True, True, False]
+
+
 def test_times_are_nanoseconds() -> None:
     table = pa.record_batch(
         {
