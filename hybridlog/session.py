@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Protocol, TypeVar
 import numpy as np
 
 from hybridlog.entries import put_entry, schemas_in, summary_of, topic_types
-from hybridlog.query.chunk_columns import PARTS, ChunkColumns, log_bounds
+from hybridlog.query.chunk_columns import PARTS, ChunkColumns
 from hybridlog.query.question import Question, RecordedChannel, field_types
 from hybridlog.query.topics import resolve
 from hybridlog.record.marks import MARKS
@@ -335,18 +335,12 @@ class Session:
         self,
         recording: RecordingEntry,
         channels: Sequence[int],
-        bounds: tuple[int, int] | None,
-        clock: str,
+        span: tuple[int, int] | None = None,
     ) -> list[Chunk]:
-        """Chunks that may hold messages of some channels in a time range."""
+        """Chunks that may hold messages of some channels in a range of log time, ns; None: any."""
         found: list[Chunk] = []
-        timed = [c.id for c in recording.channels if c.has_publish_time]
-        if clock == "header" and bounds is not None and recording.is_decoded:
-            stats = [c.stats for c in recording.channels if c.id in channels]
-            bounds, clock = log_bounds(bounds, stats), "log"
-        near = bounds if clock == "log" else None
-        for columns in self._chunk_columns(recording, channels, near):
-            found += columns.chunks(columns.within(bounds, clock, timed=timed))
+        for columns in self._chunk_columns(recording, channels, span):
+            found += columns.chunks(columns.within(span))
         return found
 
     def _chunk_columns(

@@ -15,7 +15,6 @@ from hybridlog_storage.times import BEGIN, END, placed
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog_storage.catalog import ChannelStats
     from hybridlog_storage.segments.chunk_table import ChunkPlace, ChunkTable
 
 
@@ -88,48 +87,8 @@ class ChunkColumns:
     def _bounds(self) -> NDArray[np.int64]:
         return self._table.part_bounds()
 
-    def within(
-        self,
-        bounds: tuple[int, int] | None,
-        clock: str = "log",
-        *,
-        timed: Collection[int] = (),
-    ) -> NDArray[np.bool_]:
-        """True for chunks that may have messages in `[begin, end)`, ns, of a clock.
-
-        No bounds are all times. Header stamps are unknown here, so every chunk may hold any;
-        channels in `timed` have publish times.
-        """
-        if bounds is None or clock == "header" or not len(self.number):
-            return np.ones(len(self.number), np.bool_)
-        begin, end = (max(min(bound, END), BEGIN) for bound in bounds)
-        own = self._table.parts[self._rows]
-        suffix = "_publish" if clock == "publish" else ""
-        inside = (placed(own[f"first{suffix}"]) < end) & (own[f"last{suffix}"] >= begin)
-        if clock == "publish":
-            inside &= np.isin(own["channel"], np.fromiter(timed, np.int64, len(timed)))
-        return np.logical_or.reduceat(inside, self._starts)
-
-
-def log_bounds(bounds: tuple[int, int], stats: Collection[ChannelStats]) -> tuple[int, int] | None:
-    """The range of log time, ns, in which messages with header stamps in a range lie; None for all.
-
-    `stats` are decoded statistics of the channels.
-    """
-    begin, end = bounds
-    known = [one for one in stats if one.skew_min is not None]
-    if not all(map(_is_exact, known)):
-        return None
-    least = min((one.skew_min or 0 for one in known), default=0)
-    most = max((one.skew_max or 0 for one in known), default=0)
-    return (
-        begin if begin <= BEGIN else begin + least,
-        end if end >= END else end + most,
-    )
-
-
-def _is_exact(stats: ChannelStats) -> bool:
-    """True if the difference of no log time and header stamp runs over 64 bits."""
-    return (stats.last or 0) - (stats.first_stamp or 0) <= END and (stats.first or 0) - (
-        stats.last_stamp or 0
-    ) >= BEGIN
+    def within(self, span: tuple[int, int] | None) -> NDArray[np.bool_]:
+        """True for chunks that may have messages in `[begin, end)` of log time, ns; None: any."""
+        begin, end = (BEGIN, END) if span is None else span
+        found: NDArray[np.bool_] = (self.first < end) & (self.last >= begin)
+        return found

@@ -24,13 +24,13 @@ from hybridlog.query.question import Counters
 from hybridlog_storage.errors import StoreError
 from hybridlog_storage.messages import distinct, interleave, order_of
 from hybridlog_storage.stopping import check_wanted
-from hybridlog_storage.times import inside, placed, touches
+from hybridlog_storage.times import inside, touches
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.query.chunk_columns import Chunk
-    from hybridlog.query.question import Clock, Part, RecordedChannel, Span
+    from hybridlog.query.question import Part, RecordedChannel
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.messages import Batch
@@ -48,15 +48,13 @@ ChunkKey = tuple[str, int, int]
 class RecordingScan(Struct, frozen=True):
     """The chunks of a recording to read for some channels: their ids and places in the scan.
 
-    `windows` are of log time: int64[n, 2], apart and in order; `bounds` are of the scan's clock,
-    where that is another one. None is all times, ns.
+    `windows` are of log time, ns: int64[n, 2], apart and in order; None is all times.
     """
 
     recording: RecordingEntry
     channels: Mapping[int, int]
     chunks: Sequence[Chunk]
     windows: NDArray[np.int64] | None = None
-    bounds: Span | None = None
 
 
 class _Task(Struct, frozen=True):
@@ -124,7 +122,6 @@ class ChunkScan(Struct):
     channels: Sequence[RecordedChannel]
     scans: Sequence[RecordingScan]
     counters: Counters
-    clock: Clock = "log"
     filters: Mapping[int, Part] = field(default_factory=dict)
     offsets: Mapping[ChunkKey, NDArray[np.int64]] = field(default_factory=dict)
     is_chosen: bool = False
@@ -241,8 +238,6 @@ class ChunkScan(Struct):
         if self.is_chosen:
             offsets = self.offsets.get(task.key, np.empty(0, np.int64))
             mask &= np.isin(channel, filtering) | np.isin(batch.places[0], offsets)
-        if scan.bounds is not None:
-            mask &= self._inside(batch, channel, mask, scan.bounds)
         if scan.windows is not None:
             mask &= inside(batch.log_time, scan.windows)
         if mask.all() and not self.keeps:
@@ -270,26 +265,6 @@ class ChunkScan(Struct):
         elif not holds.all():
             run = run.take(holds)
         return run, unreadable, expired
-
-    def _inside(
-        self,
-        batch: Batch,
-        channel: NDArray[np.int32],
-        mask: NDArray[np.bool_],
-        bounds: Span,
-    ) -> NDArray[np.bool_]:
-        begin, end = bounds
-        times, is_timed = batch.publish_time, mask
-        if self.clock == "header":
-            from hybridlog.schema.codec import stamps_of
-
-            times, is_timed = np.zeros(len(batch), np.int64), np.zeros(len(batch), np.bool_)
-            for index in distinct(channel[mask]).tolist():
-                rows = np.flatnonzero(mask & (channel == index))
-                stamped, stamps = stamps_of(self.channels[index].codec, batch.take(rows))
-                times[rows[stamped]], is_timed[rows[stamped]] = stamps, True
-        times = placed(times)
-        return is_timed & (times >= begin) & (times < end)
 
     def _split(
         self, waiting: list[MessageRun], following: Chunk | None

@@ -16,7 +16,6 @@ from hybridlog.query.predicate.mongo_filter import misjudged
 from hybridlog.query.predicate.tree import And, Condition, Field, MongoFilter, Predicate
 from hybridlog.query.question import field_types
 from hybridlog.record.marks import MARKS
-from hybridlog.schema.column import STAMP
 from hybridlog_storage.errors import StoreError, TopicError, WhereError
 from hybridlog_storage.mongo.index_documents import KEY_BYTES, IndexState, between, collection_of
 from hybridlog_storage.stopping import check_wanted
@@ -57,7 +56,8 @@ def decided(
     everything: Filter = {"$and": [*own, _READABLE] if asks_fields else own}
     numbers = _numbers(database, parts, everything, counters)
     found = [
-        replace(part, predicate=_decided(predicate, numbers[part.recording.key])) for part in parts
+        replace(part, predicate=_decided(_predicate(part), numbers[part.recording.key]))
+        for part in parts
     ]
     if asks_fields:
         lacking = [part for part in parts if _lacks_fields(part)]
@@ -160,11 +160,6 @@ def _queries(parts: Sequence[Part], own: Filter) -> list[Query]:
     found: list[Query] = []
     for part in parts:
         condition: Filter = {"_meta.rec": part.recording.key}
-        if part.bounds is not None:
-            begin, end = part.bounds
-            name = STAMP if part.clock == "header" else "_meta.pub"
-            unset = {"$ne": 0} if part.clock == "header" else {}
-            condition[name] = {"$gte": begin, "$lte" if end == END else "$lt": end, **unset}
         # Of an open recording, more may have come.
         span = (0, END) if part.recording.status == "open" else part.span
         for low, high in np.clip(part.log_windows, *span).tolist():

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from msgspec.structs import replace
 
+from hybridlog.query.predicate.tree import And, Condition, Field, Predicate
 from hybridlog.query.question import Counters, Part, windows_in
 from hybridlog.query.rows import RowBatch, Rows
 from hybridlog.query.times import format_time, is_early, is_relative, parse_range, parse_time
@@ -74,16 +75,19 @@ class Planner(Rows):
         windows: NDArray[np.int64] | None = None,
         bounds: Span | None = None,
     ) -> Iterator[Part]:
-        """The parts of the question in one recording; ranges are as of `Part`."""
+        """The parts of the question in one recording; ranges are as of `Resolved`."""
         recording, question = self.session.entry_of(summary), self.question
+        predicate = question.predicate
+        if bounds is not None:
+            within = _within(question.clock, bounds)
+            predicate = within if predicate is None else within & predicate
         by_topic: dict[str, list[RecordedChannel]] = defaultdict(list)
         for channel in self.session.channels_of(recording, {*question.topics}):
             self._check_clock(channel)
             by_topic[channel.channel.topic].append(channel)
-        range_ = windows, bounds, question.clock
         for topic, channels in by_topic.items():
             if any(c.stats.messages for c in channels):  # else nothing was sent on the topic
-                yield Part(recording, topic, tuple(channels), question.predicate, *range_)
+                yield Part(recording, topic, tuple(channels), predicate, windows)
 
     def channels(self) -> list[RecordedChannel]:
         """Every channel of the question."""
@@ -169,8 +173,9 @@ class Planner(Rows):
             for state in GONE:
                 gone = tuple(one for one in part.channels if one.state is state)
                 if gone:
-                    own = replace(part, channels=gone, predicate=None)
-                    found[state] += self.count_of([own])
+                    own = [replace(part, channels=gone)]  # of which a table does not tell
+                    count = self.count_of if part.predicate is None else self.count_in_chunks
+                    found[state] += count(own)
         return found
 
     def not_indexed(self) -> tuple[tuple[str, int], ...]:
@@ -190,6 +195,15 @@ class Planner(Rows):
             raise TopicError(
                 f"{topic} came without publish times (ROS 1 bags have none): use --clock log."
             )
+
+
+def _within(clock: Clock, bounds: Span) -> Predicate:
+    """A range of another clock than the log's as a predicate; a stamp of zero was not set."""
+    time = Field(tuple(STAMP.split(".")) if clock == "header" else ("_meta", "pub"))
+    edges = [Condition(time, ">=", bounds[:1])]
+    edges += [Condition(time, "<", bounds[1:])] if bounds[1] < END else []
+    edges += [Condition(time, "!=", (0,))] if clock == "header" else []
+    return Predicate(And(tuple(edges)))
 
 
 def recordings_with_any(session: Session, question: Question) -> set[str]:
@@ -244,7 +258,11 @@ def _decimated(runs: Iterator[MessageRun], question: Question) -> Iterator[Messa
 
 
 class Resolved(NamedTuple):
-    """A recording that a question asks, with `windows` and `bounds` as of `Part`."""
+    """A recording that a question asks, and where.
+
+    `windows` are as of `Part`; `bounds` are `[begin, end)` of the question's clock, where that is
+    not the log's, ns; None for all times.
+    """
 
     summary: RecordingSummary
     windows: NDArray[np.int64] | None
@@ -356,7 +374,7 @@ def _ends(session: Session, channel: RecordedChannel, clock: Clock) -> Iterator[
     elif clock == "header" and recording.is_decoded:
         yield from (time for time in (stats.first_stamp, stats.last_stamp) if time is not None)
     elif clock == "header":
-        for chunk in session.chunks(recording, [number], None, "log"):
+        for chunk in session.chunks(recording, [number]):
             batch = session.read_chunk(recording, chunk.segment, chunk.place).batch
             own = batch.take(np.flatnonzero(batch.channel == number))
             yield from stamps_of(channel.codec, own)[1].tolist()

@@ -123,8 +123,8 @@ class Part(Struct, frozen=True, eq=False, dict=True):
     """The part of a question for one topic of one recording.
 
     Attributes:
+        predicate: What messages satisfy, a range of another clock than the log's among it.
         windows: int64[n, 2], `[begin, end)` of log time, disjoint, in order; None for all times.
-        bounds: `[begin, end)` of the `clock`, where that is not the log's, ns; None for all times.
     """
 
     recording: RecordingEntry
@@ -132,13 +132,6 @@ class Part(Struct, frozen=True, eq=False, dict=True):
     channels: tuple[RecordedChannel, ...]
     predicate: Predicate | None
     windows: NDArray[np.int64] | None = None
-    bounds: Span | None = None
-    clock: Clock = "log"
-
-    @property
-    def is_unbounded(self) -> bool:
-        """True if the part covers all times of the recording."""
-        return self.bounds is None and self.windows is None
 
     @property
     def messages(self) -> int:
@@ -162,7 +155,7 @@ class Part(Struct, frozen=True, eq=False, dict=True):
 
     @property
     def log_windows(self) -> NDArray[np.int64]:
-        """int64[n, 2]: the log time of the part; bounds of another clock do not restrict it."""
+        """int64[n, 2]: the log time of the part."""
         return windows_in(None) if self.windows is None else self.windows
 
     @property

@@ -92,10 +92,8 @@ class Rows:
         asks_publish = predicate is not None and "_meta.pub" in predicate.fields()
         # A table does not say which messages have a publish time, and may be older than the
         # package that reads the messages.
-        if (
-            part.bounds is not None
-            or (asks_fields and not part.has_fields)
-            or (asks_publish and len({c.channel.has_publish_time for c in part.channels}) > 1)
+        if (asks_fields and not part.has_fields) or (
+            asks_publish and len({c.channel.has_publish_time for c in part.channels}) > 1
         ):
             return None
         table = self.session.table(part.recording, part.topic)
@@ -141,20 +139,20 @@ class Rows:
 
         Of whole parts that lie in one file, the predicate is evaluated once for all rows.
         """
-        by_file: dict[int, list[tuple[Part, TopicTable]]] = defaultdict(list)
+        by_file: dict[tuple[int, int], list[tuple[Part, TopicTable]]] = defaultdict(list)
         for part in parts:
             # What is meta is known of the part, not of a row.
             if (
                 part.predicate is None
                 or part in self._counts
-                or not part.is_unbounded
+                or part.windows is not None
                 or part.needs_index
                 or any(map(is_meta, part.predicate.fields()))
             ):
                 continue
             table = self.tabled(part)
             if table is not None and len(table.files) == 1:
-                by_file[table.files[0].number].append((part, table))
+                by_file[table.files[0].number, id(part.predicate)].append((part, table))
         for group in by_file.values():
             if len(group) > 1:
                 with suppress(StoreError):  # then part by part
@@ -248,8 +246,8 @@ class Rows:
         total = 0
         left: list[Part] = []
         for part in parts:
-            if part.predicate is None and part.bounds is None:
-                total += part.messages if part.is_unbounded else self._count_by_time(part)
+            if part.predicate is None:
+                total += part.messages if part.windows is None else self._count_by_time(part)
             elif part in self._counts:
                 matched, unreadable = self._counts[part]
                 total += matched
@@ -271,7 +269,7 @@ class Rows:
             yield RowBatch(rows.t, rows.seq, holds)
         if table is not None:
             return
-        if part.predicate is None and part.bounds is None:
+        if part.predicate is None:
             with suppress(SegmentError):
                 time = self._times(part, self._held(part))
                 yield RowBatch(time, np.zeros_like(time), np.ones(len(time), np.bool_))
@@ -359,7 +357,7 @@ class Rows:
         own: Collection[str] = (),
     ) -> Iterator[tuple[TableRows, NDArray[np.bool_]]]:
         """Rows of a part's time in a table, with the outcome for each."""
-        spans = None if part.is_unbounded else [(a, b) for a, b in part.log_windows.tolist()]
+        spans = None if part.windows is None else [(a, b) for a, b in part.log_windows.tolist()]
         columns = {*own}
         if part.predicate is not None:
             columns |= {"pub"} if "_meta.pub" in part.predicate.fields() else set()
@@ -399,7 +397,6 @@ class Rows:
             channels,
             [self._scan(part, indexes) for part, indexes in of_recording.values()],
             self.counters,
-            parts[0].clock if parts else "log",
             filters,
             {key: np.concatenate(own) for key, own in offsets.items()},
             not how.get("marks") and any(part.predicate is not None for part in parts),
@@ -425,11 +422,9 @@ class Rows:
     def _scan(self, part: Part, indexes: dict[int, int]) -> RecordingScan:
         """The chunks of a recording that may hold wanted messages."""
         session, ids = self.session, [*indexes]
-        bounds = part.bounds or (None if part.windows is None else part.log_span)
-        clock = "log" if part.bounds is None else part.clock
-        chunks = session.chunks(part.recording, ids, bounds, clock)
+        chunks = session.chunks(part.recording, ids, part.log_span)
         session.hold(part.recording, {chunk.segment for chunk in chunks})
-        return RecordingScan(part.recording, indexes, chunks, part.windows, part.bounds)
+        return RecordingScan(part.recording, indexes, chunks, part.windows)
 
     # Times alone.
 

@@ -101,7 +101,7 @@ def test_a_damaged_message_index_is_not_believed(many: hl.Store, damage: str) ->
     path = places.segment(many.directory.path, "a")
     whole = path.read_bytes()
     (entry,) = many.recordings()
-    chunk = many.session.chunks(entry, [entry.channels[0].id], None, "log")[0]
+    chunk = many.session.chunks(entry, [entry.channels[0].id])[0]
     index = chunk.place.offset + chunk.place.length
     second = 9 + 6 + 16  # entry: record head, channel, length, the first one
     at = {

@@ -239,7 +239,7 @@ def test_a_choice_of_recordings_and_a_time(store: hl.Store) -> None:
 def test_a_damaged_chunk_is_an_error(own: hl.Store) -> None:
     entry = own.entry("first")
     channels = [c.id for c in entry.channels if c.topic == "/base/scan"]
-    chunk = own.session.chunks(entry, channels, None, "log")[3]
+    chunk = own.session.chunks(entry, channels)[3]
     path = places.segment(own.directory.path, "first")
     with path.open("r+b") as file:
         file.seek(chunk.place.offset + 100)

@@ -555,7 +555,7 @@ def test_a_damaged_recording(demo: Path, tmp_path: Path) -> None:
     with hl.open(demo, mongo="none") as store:
         (entry,) = store.recordings()
         ids = [one.channel_id for one in store.session.channels_of(entry, [FRONT])]
-        chunk = store.session.chunks(entry, ids, None, "log")[-2]
+        chunk = store.session.chunks(entry, ids)[-2]
         data[chunk.place.offset + chunk.place.length // 2] ^= 0xFF
     (tmp_path / "damaged.mcap").write_bytes(data)
     features = {"images": {"front": FRONT}}

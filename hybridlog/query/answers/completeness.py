@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from msgspec import Struct
+from msgspec.structs import replace
 
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.planner import Planner, bounds_in, resolved
@@ -306,7 +307,7 @@ def _gone(session: Session, question: Question) -> Counter[State]:
     summaries = session.snapshot().summaries
     if any(one.expired or one.not_copied or one.status in UNFINISHED for one in summaries):
         with suppress(TimeError, TopicError):  # nothing is in the range, or has this clock
-            return +Planner(session, question).count_expired()
+            return +Planner(session, replace(question, predicate=None)).count_expired()
     return Counter()
 
 
@@ -324,6 +325,8 @@ def _left_out(
     if counters is None:
         return
     predicate, unreadable = question.predicate, counters.unreadable - counters.without_arrays
+    if question.clock == "header" and question.bounds is not None:
+        unreadable = 0  # `_unstamped` tells it
     if unreadable > 0 and (predicate is None or not predicate.asks_fields):
         how = "--format raw, mcap or bag gives payloads"
         yield f"{unfit(unreadable)}: not in this answer; {how}.", False

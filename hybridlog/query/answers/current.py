@@ -308,7 +308,7 @@ def _last_messages(
         publishers[publisher_of(channel.channel, channel.channel)][channel.channel_id] = index
     found: list[MessageRun] = []
     for indexes in publishers.values():
-        chunks = session.chunks(recording, [*indexes], (BEGIN, begin), "log")
+        chunks = session.chunks(recording, [*indexes], (BEGIN, begin))
         one = RecordingScan(recording, indexes, chunks, windows_in(None, (BEGIN, begin)))
         scan = ChunkScan(session, channels, [one], counters, reverse=True, ahead=False)
         found += _of_publisher([channels[index] for index in indexes.values()], scan)

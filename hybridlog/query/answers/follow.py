@@ -71,9 +71,9 @@ class Arrivals(Planner):
                 # The beginning that a time may be relative to is known now.
                 self._bounds[one.id] = bounds_in(session, self.question, one)
             bounds = self._bounds.get(one.id)
-            self._chunks[one.id] = chunks = [*self._arrivals(entry, bounds)]
-            is_log = self.question.is_by_log_time
-            ranges = (windows_in(None, bounds), None) if is_log and bounds else (None, bounds)
+            span = bounds if self.question.is_by_log_time else None
+            self._chunks[one.id] = chunks = [*self._arrivals(entry, span)]
+            ranges = (None, bounds) if span is None else (windows_in(None, span), None)
             parts += self.parts_in(one, *ranges) if chunks else ()
         return self.scan(parts).runs(), any(map(self._goes_on, summaries))
 
@@ -89,7 +89,7 @@ class Arrivals(Planner):
         """Reads only the chunks that have just come."""
         new = self._chunks[part.recording.id]
         chunks = [chunk for chunk in new if not indexes.keys().isdisjoint(chunk.place.channels)]
-        return RecordingScan(part.recording, indexes, chunks, part.windows, part.bounds)
+        return RecordingScan(part.recording, indexes, chunks, part.windows)
 
     def _goes_on(self, one: RecordingSummary) -> bool:
         """True if more messages of the question may come."""
@@ -99,18 +99,16 @@ class Arrivals(Planner):
             is_past = one.span[1] - flush_interval_ns(one) >= bounds[1]
         return one.status == "open" and not is_past
 
-    def _arrivals(self, entry: RecordingEntry, bounds: Span | None) -> Iterator[Chunk]:
-        """The chunks that have come since the last call, and may have messages in bounds."""
-        clock = self.question.clock
+    def _arrivals(self, entry: RecordingEntry, span: Span | None) -> Iterator[Chunk]:
+        """The chunks that have come since the last call, and may have messages in a log time."""
         read, sealed = self.read[entry.id], self.sealed[entry.id]
         sealed &= _sealed(entry)
-        timed = [c.id for c in entry.channels if c.has_publish_time]
         for segment in sorted((_sealed(entry) | entry.flushed.keys()) - {*sealed, MARKS_SEGMENT}):
             flushed = entry.flushed.get(segment)
             table = flushed.table if flushed else self.session.chunk_table(entry, segment)
             columns = ChunkColumns(segment, table)
             is_new = columns.number >= read[segment]
-            yield from columns.chunks(is_new & columns.within(bounds, clock, timed=timed))
+            yield from columns.chunks(is_new & columns.within(span))
             read[segment] = len(table.chunks)
             if flushed is None:
                 sealed.add(segment)
@@ -120,7 +118,7 @@ class Arrivals(Planner):
             self.session.show(entry)
             self._marks.update(mark.id for mark in entry.manifest.marks)
             columns = ChunkColumns(MARKS_SEGMENT, entry.flushed[MARKS_SEGMENT].table)
-            yield from columns.chunks(columns.within(bounds, clock, timed=timed))
+            yield from columns.chunks(columns.within(span))
 
 
 class Following(Arrivals, Iterator["Message"]):

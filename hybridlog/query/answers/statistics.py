@@ -122,7 +122,7 @@ def statistics(session: Session, question: Question, counters: Counters) -> list
     planner = Planner(session, question, counters)
     found: dict[str, dict[str, _Running]] = {topic: {} for topic in question.topics}
     for part in planner.parts():
-        if part.predicate is None and not part.has_fields:
+        if not (part.has_fields or (part.predicate and part.predicate.asks_fields)):
             continue
         fields = _numbers(part.field_types) if question.fields is None else question.fields
         if fields == []:
