@@ -100,7 +100,7 @@ def test_representations_are_short(store: hl.Store) -> None:
     assert repr(entry.channels[1]) == "<Channel /many ; 1 messages>"
     query = store.topic("/many").between("+0s", "end").where("f1 > 0").limit(3)
     assert repr(query) == (
-        f"<Query /many; recording {entry.name}; between +0s and end; where f1 > 0; at most 3>"
+        f"<Query /many; recording {entry.name}; between +0s and end; where f1 > 0>"
     )
     wide = store.all_topics().where(" or ".join(f"f{n} > {n}" for n in range(40)))
     assert len(repr(wide)) < 450

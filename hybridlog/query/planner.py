@@ -49,14 +49,11 @@ class Planner(Rows):
     ) -> None:
         super().__init__(session, Counters() if counters is None else counters)
         self.question = question
-        self._resolved: list[Resolved] | None = None
 
-    @property
+    @lazy
     def resolved(self) -> list[Resolved]:
         """The recordings to ask, oldest first, each with its range."""
-        if self._resolved is None:
-            self._resolved = resolved(self.session, self.question)
-        return self._resolved
+        return resolved(self.session, self.question)
 
     def parts(self) -> list[Part]:
         """The question, split by recording and topic, where it may have an answer.

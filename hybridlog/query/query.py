@@ -105,25 +105,17 @@ class Query:
 
     def __repr__(self) -> str:
         question = self.question
-        begin, end = question.bounds or (None, None)
         try:
             known = self.source.now().summaries_of(question)
             those = f"recording {known[0].name}" if len(known) == 1 else f"{len(known)} recordings"
         except HybridlogError as error:
             those = str(error)
-        predicate = "" if question.predicate is None else question.predicate.text
-        clock = "" if question.clock == "log" else f" by {question.clock} time"
-        words = (
-            listed(self.topics, 3),
-            those,
-            question.bounds is not None and f"between {begin} and {end}{clock}",
-            question.during is not None and f"during {len(question.during)} intervals",
-            predicate and f"where {predicate[:200]}{'…' * (len(predicate) > 200)}",
-            question.every > 1 and f"every {question.every}th",
-            question.limit is not None and f"at most {question.limit}",
-            question.reverse and "latest first",
-        )
-        return f"<Query {'; '.join(one for one in words if isinstance(one, str) and one)}>"
+        words = [listed(self.topics, 3), those]
+        if question.bounds is not None:
+            words.append("between {} and {}".format(*question.bounds))
+        if question.predicate is not None:
+            words.append(f"where {question.predicate.text[:200]}")
+        return f"<Query {'; '.join(words)}>"
 
     # Steps.
 

@@ -21,7 +21,6 @@ from hybridlog.contract import Contract
 from hybridlog.follow.child import Trigger
 from hybridlog.query.choice import Choice
 from hybridlog.query.index_reader import keys_of
-from hybridlog.query.predicate.mongo_filter import MAX_DEPTH
 from hybridlog.query.query import Query
 from hybridlog_storage.errors import (
     DatabaseError,
@@ -115,7 +114,7 @@ def seqs(query: Query) -> list[tuple[str, int]]:
 def nested(operator: str) -> dict[str, object]:
     """A filter that is nowhere deeper than it may be."""
     found: dict[str, object] = {"x": 1}
-    for _ in range(MAX_DEPTH // 2):
+    for _ in range(25):
         found = {operator: [found, {"x": 2}]}
     return found
 
@@ -129,7 +128,7 @@ def nested(operator: str) -> dict[str, object]:
         {"$and": [{"x": {"$gte": 3}}, {"$or": [{"s": "odd 5"}, {"two.1": {"$lt": 6}}]}]},
         {"$nor": [{"x": {"$lt": 18}}, {"s": "even"}]},
         {"s": {"$regex": "ODD 1.?$", "$options": "i"}},
-        {"s": re.compile("^e")},
+        {"s": re.compile("^e(?=v)")},
         {"s": {"$not": re.compile("^e")}},
         {"u": {"$gt": 2.0**63}},
         {"ranges.min": {"$lt": 2}},
@@ -244,7 +243,6 @@ def test_short_arrays_are_whole(tmp_path: Path) -> None:
         ({"$where": "sleep(1000)"}, r"\$where"),
         ({"y": 1}, "there is no field y"),
         ({"two.2": 1}, "two has 2 elements"),
-        ({"s": re.compile("(?=a)")}, "RE2"),
     ],
 )
 def test_what_is_refused(store: hl.Store, own: dict[str, object], says: str) -> None:

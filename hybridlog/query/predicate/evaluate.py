@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -91,49 +91,7 @@ def on_columns(
 
     Arrays may be structs of `n`, `min`, `max` and `mean`, or of `n`, if they are `left`.
     """
-    columns = _Columns(FieldTypes.of(types), records, left=left)
-    return _verdict(root_of(node), columns.outcome, len(records))
-
-
-def on_left(
-    node: Predicate | Node,
-    types: Types,
-    records: pa.StructArray,
-    summaries: pa.StructArray,
-    lacks: Callable[[Sequence[str]], Mask],
-) -> Verdict:
-    """The same of messages whose payloads are gone.
-
-    Of the arrays of some fields that a message `lacks`, the summaries are asked.
-    """
-    known = FieldTypes.of(types)
-    whole, left = _Columns(known, records), _Columns(known, summaries, left=True)
-
-    def outcome(condition: Condition) -> Verdict:
-        fields = [one.names for one in (condition.field, condition.other) if one is not None]
-        found, gone = whole.outcome(condition), lacks(fields)
-        if not gone.any():
-            return found
-        both = zip(left.outcome(condition), found, strict=True)
-        return Verdict(*(np.where(gone, *masks) for masks in both))
-
-    return _verdict(root_of(node), outcome, len(records))
-
-
-def _verdict(node: Node, outcome: Callable[[Condition], Verdict], rows: int) -> Verdict:
-    none = np.zeros(rows, np.bool_)
-    match node:
-        case And(items):
-            inner = [_verdict(item, outcome, rows) for item in items]
-            holds = np.logical_and.reduce([~none, *(one.holds for one in inner)])
-            return Verdict(holds, np.logical_or.reduce([none, *(one.fails for one in inner)]))
-        case Or(items):
-            return _verdict(Not(And(tuple(map(Not, items)))), outcome, rows)
-        case Not(item):
-            return Verdict(*reversed(_verdict(item, outcome, rows)))
-        case Condition():
-            return outcome(node)
-    return Verdict(none, none)
+    return _Columns(FieldTypes.of(types), records, left=left).verdict(root_of(node))
 
 
 class _Values(NamedTuple):
@@ -177,6 +135,22 @@ class _Columns:
         self._types = types
         self._records = records
         self._left = left
+
+    def verdict(self, node: Node) -> Verdict:
+        """The messages for which a predicate holds, and fails."""
+        none = np.zeros(len(self._records), np.bool_)
+        match node:
+            case And(items):
+                inner = [self.verdict(item) for item in items]
+                holds = np.logical_and.reduce([~none, *(one.holds for one in inner)])
+                return Verdict(holds, np.logical_or.reduce([none, *(one.fails for one in inner)]))
+            case Or(items):
+                return self.verdict(Not(And(tuple(map(Not, items)))))
+            case Not(item):
+                return Verdict(*reversed(self.verdict(item)))
+            case Condition():
+                return self.outcome(node)
+        return Verdict(none, none)
 
     def outcome(self, node: Condition) -> Verdict:
         """The messages for which a condition holds, and fails."""
@@ -504,9 +478,13 @@ def matches(
     decoded = channel.codec.columns_of(batch, fields)
     rows, records = decoded.rows, decoded.records
     times = batch.log_time[rows], seq[rows], batch.publish_time[rows]
-    if isinstance(records, LeftFields):
-        whole, left = (_with_meta(part, channel, one, *times) for one in records.both())
-        found = on_left(predicate, part.field_types, whole, left, records.lacks)
+    if isinstance(records, LeftFields):  # where an array is gone, its summary is asked
+        whole, left = records.both()
+        of_whole = verdict_of(part, channel, whole, *times)
+        of_left = verdict_of(part, channel, left, *times, left=True)
+        gone = records.lacks([one.field.names for one in predicate.conditions()])
+        pairs = zip(of_left, of_whole, strict=True)
+        found = Verdict(*(np.where(gone, *masks) for masks in pairs))
     else:
         found = verdict_of(part, channel, decoded.arrow(), *times)
     holds[rows] = found.holds

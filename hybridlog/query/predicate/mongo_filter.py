@@ -1,7 +1,7 @@
 """Checks MongoDB filters that a user wrote, before they are handed to MongoDB as they are.
 
 Only operators that compare values are allowed, on fields that exist; values are data, and never
-run. Patterns have RE2's syntax. What is written wrongly otherwise MongoDB says itself.
+run. Patterns are MongoDB's, and what is written wrongly otherwise it says itself.
 """
 
 from __future__ import annotations
@@ -14,9 +14,7 @@ from typing import Any
 import bson
 from bson.codec_options import CodecOptions, TypeRegistry
 from bson.errors import BSONError
-from bson.regex import Regex
 
-from hybridlog.query.predicate.parser import RegexError, compile_regex
 from hybridlog.query.predicate.tree import (
     ALWAYS,
     STATS,
@@ -32,20 +30,17 @@ from hybridlog.query.predicate.tree import (
 from hybridlog.schema.definition_text import width_of
 from hybridlog_storage.errors import WhereError
 
-MAX_DEPTH = 50
-"""A nesting that each MongoDB takes."""
 MAX_BYTES = 1_000_000
 """Maximum size, as text and as BSON."""
 WHOLE = 32
 """Longer arrays are summaries in index documents."""
 
 _LOGICAL = {"$and", "$or", "$nor"}
-_OF_VALUES = {"$eq", "$ne", "$gt", "$gte", "$lt", "$lte", "$in", "$nin", "$all", "$not"}
-_PLAIN = {
-    *("$exists", "$type", "$size", "$mod"),
+_OPERATORS = {
+    *("$eq", "$ne", "$gt", "$gte", "$lt", "$lte", "$in", "$nin", "$all", "$not", "$elemMatch"),
+    *("$exists", "$type", "$size", "$mod", "$regex", "$options"),
     *("$bitsAllSet", "$bitsAllClear", "$bitsAnySet", "$bitsAnyClear"),
 }
-_FLAGS = re.IGNORECASE | re.MULTILINE | re.DOTALL | re.UNICODE
 _PLACE = re.compile(r"0|[1-9][0-9]{0,8}")
 
 Filter = dict[str, object]
@@ -68,7 +63,7 @@ def mongo_filter(
             raise WhereError(f"a filter is a mapping, not {type(query).__name__}")
         content = bson.encode(query, codec_options=_CODEC)
         found = bson.decode(content)
-        _check_query(found, paths, ())
+        _check(found, paths)
     except RecursionError:
         raise _refused((), "it is nested too deeply") from None
     except (BSONError, OverflowError, TypeError, ValueError) as error:
@@ -146,51 +141,30 @@ def _plain(value: Any) -> object:
 _CODEC: CodecOptions[Filter] = CodecOptions(type_registry=TypeRegistry(fallback_encoder=_plain))
 
 
-def _check_query(query: object, paths: _Paths, place: tuple[str, ...], above: str = "") -> None:
-    """Check a filter, or several; `above` is the array that it is inside of, and a dot."""
+def _check(
+    query: object, paths: _Paths, place: tuple[str, ...] = (), name: str = "", above: str = ""
+) -> None:
+    """Check a filter, or several; with a `name`, what a field is compared with.
+
+    `above` is the array that the filter is inside of, and a dot.
+    """
     for one in query if isinstance(query, list) else [query]:
-        for key, value in one.items() if isinstance(one, dict) else ():
-            if key in _LOGICAL:
-                _check_query(value, paths, (*place, key), above)
-            elif key.startswith("$"):
-                raise _refused((*place, key), "the operator is not allowed here")
+        if not isinstance(one, dict) or (name and not _has_operators(one)):
+            continue  # a value
+        for key, value in one.items():
+            at = (*place, key)
+            are_operators = _has_operators(value) and _LOGICAL.isdisjoint(value)
+            if name and key == "$elemMatch" and not are_operators:
+                _check(value, paths, at, above=f"{name}.")
+            elif key in (_OPERATORS if name else _LOGICAL):
+                _check(value, paths, at, name, above)
+            elif name or key.startswith("$"):
+                raise _refused(at, "the operator is not allowed here")
             else:
-                _check_condition(above + key, value, paths, (*place, key))
-
-
-def _check_condition(name: str, value: object, paths: _Paths, place: tuple[str, ...]) -> None:
-    """Check what a field is compared with: a value, a pattern, or operators."""
-    operators = value if _has_operators(value) else {}
-    assert isinstance(operators, dict)
-    paths[name] = paths.get(name, False) or [*operators] != ["$exists"]
-    if isinstance(value, Regex):
-        _check_pattern(value, "", place)
-    for key, item in operators.items():
-        at = (*place, key)
-        if key == "$regex":
-            _check_pattern(item, operators.get("$options", ""), at)
-        elif key == "$elemMatch" and _has_operators(item) and _LOGICAL.isdisjoint(item):
-            _check_condition(name, item, paths, at)
-        elif key == "$elemMatch":
-            _check_query(item, paths, at, f"{name}.")
-        elif key in _OF_VALUES:
-            is_list = key in {"$in", "$nin", "$all"} and isinstance(item, list)
-            for each in item if is_list else [item]:
-                _check_condition(name, each, paths, at)
-        elif key not in _PLAIN and (key != "$options" or "$regex" not in operators):
-            raise _refused(at, "the operator is not allowed here")
-
-
-def _check_pattern(value: object, options: object, place: tuple[str, ...]) -> None:
-    flags, pattern = 0, value
-    if isinstance(value, Regex):
-        flags, pattern = value.flags, value.pattern
-    if flags & ~_FLAGS or not {*str(options)} <= {*"ims"}:
-        raise _refused(place, "may have the options i, m and s only")
-    try:
-        compile_regex(str(pattern))
-    except RegexError as error:
-        raise _refused(place, f"the pattern is refused: {error}") from None
+                path = above + key
+                is_of_value = not isinstance(value, dict) or [*value] != ["$exists"]
+                paths[path] = paths.get(path, False) or is_of_value
+                _check(value, paths, at, path)
 
 
 def _has_operators(value: object) -> bool:

@@ -294,11 +294,6 @@ def parse(text: str) -> Predicate:
         raise WhereError(f"a predicate is text, not {type(text).__name__}")
     if is_filter(text):
         raise WhereError("MongoDB filters are not possible here: write a predicate, such as x > 1")
-    return _parsed(text)
-
-
-@lru_cache(maxsize=128)  # for a small topic, parsing takes as long as the answer
-def _parsed(text: str) -> Predicate:
     return _Parser(text).parse()
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from bson import Regex
 
-from hybridlog.query.predicate.mongo_filter import MAX_DEPTH, mongo_filter
+from hybridlog.query.predicate.mongo_filter import mongo_filter
 from hybridlog_storage.errors import WhereError
 
 Document = dict[str, object]
@@ -25,13 +25,6 @@ Document = dict[str, object]
         ({"a": {"$not": {"$where": "1"}}}, r"\$where"),
         ({"a": {"$eq": {"$where": "1"}}}, r"\$where"),
         ({"a": {"$gt": 1, "b": 2}}, "a → b: .* not allowed"),
-        ({"a": {"$regex": "(?=a)"}}, "RE2"),
-        ({"a": {"$elemMatch": {"b": {"$regex": "(?=a)"}}}}, "RE2"),
-        ({"a": {"$in": [re.compile("(?=a)")]}}, "RE2"),
-        ({"a": {"$regex": "a", "$options": "x"}}, "options"),
-        ({"a": {"$options": "i"}}, r"\$options"),
-        ({"a": re.compile("(?=a)")}, "RE2"),
-        ({"a": re.compile("a", re.VERBOSE)}, "options i, m and s"),
         ({"a": {"$mod": [2**63, 0]}}, "64 bits"),
         ({"a": [1, {"b": -(2**63) - 1}]}, "64 bits"),
         ({"a": object()}, "object"),
@@ -56,7 +49,7 @@ def test_deep_filters() -> None:
         mongo_filter({"x": deep}, None)
     for operator in ("$and", "$or", "$nor"):
         deepest: Document = {"a": 1}
-        for _ in range(MAX_DEPTH // 2):
+        for _ in range(25):
             deepest = {operator: [deepest, {"b": 2}]}
         assert mongo_filter(deepest, None).filters  # MongoDB takes it: see `test_mongo_filters.py`
     clause: Document = {"a": 1}
