@@ -14,7 +14,7 @@ import hybridlog as hl
 from hybridlog_storage.messages import Channel, Schema
 from tests.formats.test_rosbag2 import MESSAGES, TOPICS, database
 from tests.independent import write_mcap
-from tests.schema.wire_oracle import DUMMY
+from tests.schema.test_definition import DUMMY
 
 CASES = Path(__file__).parents[1] / "cases"
 RULE = "=" * 80 + "\n"

@@ -128,11 +128,11 @@ def test_a_damaged_file_of_rows_is_told(tmp_path: Path) -> None:
     list_rows(folder, line, [made])
     path = folder / made.name
     whole = path.read_bytes()
-    for at in range(0, len(whole), 41):
+    for at in range(0, len(whole), 31):
         path.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
         with pytest.raises(StoreError):
             check_all(folder, made)
-    for size in range(0, len(whole), 300):
+    for size in range(0, len(whole), 500):
         path.write_bytes(whole[:size])
         with pytest.raises(StoreError):
             check_all(folder, made)

@@ -1,8 +1,9 @@
-"""Bodies of index documents against `bson.encode` of the dictionary a row stands for."""
+"""Bodies of index documents against `bson.encode` of the dictionary of a row; summaries."""
 
 from __future__ import annotations
 
 import math
+from fractions import Fraction
 from typing import Any
 
 import bson
@@ -12,7 +13,16 @@ from bson.int64 import Int64
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybridlog.schema.column import Arrays, Column, Records, Scalars, Strings, take
+from hybridlog.schema.column import (
+    Arrays,
+    Column,
+    Records,
+    Scalars,
+    Strings,
+    Summary,
+    summarise,
+    take,
+)
 from hybridlog.schema.document import bodies
 from tests.limits import Limit
 
@@ -245,3 +255,67 @@ def test_columns_may_be_parts_of_larger_ones() -> None:
         {"s": "one", "v": 0.0},
         {"s": "two", "v": 5.0},
     ]
+
+
+# --- summaries of arrays against exact arithmetic, and against themselves one at a time
+
+
+@st.composite
+def ragged(draw: st.DrawFn) -> tuple[str, list[list[Any]]]:
+    dtype = draw(st.sampled_from(DTYPES))
+    rows = draw(st.lists(st.lists(value_of(("number", dtype)), max_size=12), max_size=8))
+    # Long rows, too, whose sums numpy makes in blocks.
+    times = draw(
+        st.lists(st.sampled_from([1, 1, 30, 1500]), min_size=len(rows), max_size=len(rows))
+    )
+    return dtype, [row * n for row, n in zip(rows, times, strict=True)]
+
+
+def of(dtype: str, rows: list[list[Any]]) -> Summary:
+    offset = np.cumsum([0] + [len(row) for row in rows])
+    return summarise(Scalars(np.array([v for row in rows for v in row], dtype)), offset)
+
+
+def bits(summary: Summary) -> list[bytes]:
+    columns = (summary.n, summary.min, summary.max, summary.mean, summary.has)
+    return [b"".join(c[i].tobytes() for c in columns) for i in range(len(summary.n))]
+
+
+@given(ragged())
+def test_against_exact_arithmetic(case: tuple[str, list[list[Any]]]) -> None:
+    dtype, rows = case
+    found = of(dtype, rows)
+    assert found.n.tolist() == [len(row) for row in rows]
+    for i, row in enumerate(rows):
+        finite = [np.dtype(dtype).type(v).item() for v in row if math.isfinite(v)]
+        assert found.has[i] == bool(finite)
+        if not finite:
+            continue
+        assert found.min[i] == min(finite)
+        assert found.max[i] == max(finite)
+        mean = sum(map(Fraction, finite)) / len(finite)
+        size = max(abs(Fraction(v)) for v in finite)
+        assert math.isfinite(found.mean[i])
+        # Rounding of a sum is relative to its largest parts, not to the sum; below the
+        # least of all doubles there is nothing to round to.
+        bound = size * Fraction(1, 10**9) + Fraction(math.ulp(0.0))
+        assert abs(Fraction(found.mean[i].item()) - mean) <= bound
+
+
+@given(ragged())
+def test_a_row_does_not_depend_on_the_others(case: tuple[str, list[list[Any]]]) -> None:
+    dtype, rows = case
+    alone = [bits(of(dtype, [row]))[0] for row in rows]
+    assert bits(of(dtype, rows)) == alone
+    assert bits(of(dtype, rows[::-1] + rows)) == alone[::-1] + alone
+
+
+def test_zero_has_one_sign() -> None:
+    for row in ([0.0, -0.0], [-0.0, 0.0], [-0.0] * 40):
+        found = of("f8", [row])
+        assert not np.signbit([found.min[0], found.max[0], found.mean[0]]).any()
+
+
+def test_a_sum_past_the_largest_double_has_a_mean() -> None:
+    assert of("f8", [[1e308] * 40]).mean[0] == pytest.approx(1e308)
+    assert of("f8", [[1e308, -1e308] * 40, [1.0]]).mean.tolist() == [0.0, 1.0]

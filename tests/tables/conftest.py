@@ -17,7 +17,14 @@ SMALL_CHUNKS = SegmentSettings(chunk_size=4096)
 
 
 @pytest.fixture
-def store(tmp_path: Path, mongo: str) -> Iterator[hl.Store]:
+def store(tmp_path: Path) -> Iterator[hl.Store]:
+    with hl.open(tmp_path / "store", create=True, mongo=NONE) as opened:
+        yield opened
+
+
+@pytest.fixture
+def indexed(tmp_path: Path, mongo: str) -> Iterator[hl.Store]:
+    """A store with an index in MongoDB."""
     with hl.open(tmp_path / "store", create=True, mongo=mongo, require_database=True) as opened:
         yield opened
 
@@ -32,6 +39,13 @@ def recorded_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with hl.open(place / "store", create=True, mongo=NONE) as store:
         store.record(log, name="log", settings=SegmentSettings(chunk_size=32 << 10))
     return place / "store"
+
+
+@pytest.fixture(scope="session")
+def kept(recorded_once: Path) -> Iterator[hl.Store]:
+    """The store with that recording, for tests that change nothing."""
+    with hl.open(recorded_once, mongo=NONE, read_only=True) as store:
+        yield store
 
 
 @pytest.fixture

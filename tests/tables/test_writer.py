@@ -10,6 +10,7 @@ import pyarrow as pa
 import pytest
 
 import hybridlog as hl
+from hybridlog.columns.column_file import ColumnFileWriter
 from hybridlog.columns.layout import OWN_COLUMNS, TABLES
 from hybridlog.columns.table_writer import TableFolders, TableWriter
 from hybridlog.columns.tables import TableRows, Tables
@@ -22,6 +23,7 @@ from tests import places
 from tests.calls import Calls
 from tests.indexed import documents_of
 from tests.limits import Limit
+from tests.some import in_turn
 from tests.tables.conftest import SMALL_CHUNKS
 from tests.tables.logs import (
     BASE,
@@ -35,23 +37,19 @@ from tests.tables.logs import (
 )
 
 
-def tables_of(store: hl.Store) -> Path:
-    return store.directory.path / TABLES
-
-
 def files_of(store: hl.Store) -> list[Path]:
-    return sorted(tables_of(store).glob("*~*/*.parquet"))
+    return sorted((store.directory.path / TABLES).glob("*~*/*.parquet"))
 
 
 def topics_of(entry: RecordingEntry) -> list[str]:
     return sorted({c.topic for c in entry.channels if c.stats.messages})
 
 
-def compare(store: hl.Store, recording: str | None = None) -> int:
+def compare(store: hl.Store) -> int:
     """Every row of every table with the message itself; returns how many rows there are."""
     tables = Tables(store.directory.path)
     compared = 0
-    for entry in store.recordings() if recording is None else [store.entry(recording)]:
+    for entry in store.recordings():
         for topic in topics_of(entry):
             table = tables.of(entry, topic)
             assert table is not None, topic
@@ -114,26 +112,25 @@ def test_tables_are_what_the_messages_say(
 
 def test_a_long_topic_has_a_file_of_its_own(store: hl.Store, tmp_path: Path, limit: Limit) -> None:
     """One, of however many segments; a short one shares a file."""
-    limit(long_table_rows=1000)
-    said = [(BASE + n, "/slow" if n % 20 == 0 else "/fast", varied(n)) for n in range(12_000)]
+    limit(long_table_rows=500)
+    said = [(BASE + n, "/slow" if n % 20 == 0 else "/fast", varied(n)) for n in range(2000)]
     write_log(tmp_path / "log.mcap", said)
-    settings = SegmentSettings(chunk_size=4096, segment_size=1 << 18)
+    settings = SegmentSettings(chunk_size=4096, segment_size=1 << 15)
     store.record(tmp_path / "log.mcap", name="log", settings=settings)
     (entry,) = store.recordings()
     assert entry.segments >= 4
     names = [path.name for path in files_of(store)]
     assert names == [f"{entry.id}-0.parquet", "shared-00000000000000000000.parquet"]
-    assert compare(store) == 12_000
+    assert compare(store) == 2000
 
 
-@pytest.mark.parametrize("count", [40, 1200])
-def test_unreadable_messages_say_why(store: hl.Store, tmp_path: Path, count: int) -> None:
-    said = [(BASE + n, "/a", varied(n)[:-1] if n % 3 == 1 else varied(n)) for n in range(count)]
+def test_unreadable_messages_say_why(indexed: hl.Store, tmp_path: Path) -> None:
+    said = [(BASE + n, "/a", varied(n)[:-1] if n % 3 == 1 else varied(n)) for n in range(40)]
     write_log(tmp_path / "log.mcap", said)
-    store.record(tmp_path / "log.mcap", name="log")
-    assert compare(store) == count
-    table = table_of(store)
-    want = [d["_meta"].get("error") for d in documents_of(store, "/a")]
+    indexed.record(tmp_path / "log.mcap", name="log")
+    assert compare(indexed) == 40
+    table = table_of(indexed)
+    want = [d["_meta"].get("error") for d in documents_of(indexed, "/a")]
     have = [e for block in table.scan(own=["error"]) for e in block.own["error"].to_pylist()]
     assert have == want
     assert table.unreadable == sum(error is not None for error in want) > 0
@@ -168,12 +165,12 @@ def waiting(writer: TableWriter) -> int:
 def test_memory_does_not_grow_with_the_recording(
     store: hl.Store, tmp_path: Path, limit: Limit
 ) -> None:
-    limit(table_pending_bytes=200_000, table_left_bytes=50_000)
     most = []
-    for count in (2000, 8000):
+    for count in (1000, 4000):
         said = [(BASE + n, f"/{n % 3}", payload(n)) for n in range(count)]
         path = write_log(tmp_path / f"{count}.mcap", said)
         entry = store.record(path, name=str(count), settings=SMALL_CHUNKS).entry
+        limit(table_pending_bytes=100_000, table_left_bytes=25_000)
         writer = TableWriter(store.directory.path, entry, topics_of(entry))
         held, indexer = [], ChunkIndexer(entry.id)
         for chunk, channels in chunks_of(store, entry):
@@ -182,9 +179,9 @@ def test_memory_does_not_grow_with_the_recording(
         writer.close(entry)
         most.append(max(held))
         assert waiting(writer) == 0
-    assert most[0] < 1000
+        limit(table_pending_bytes=1 << 24, table_left_bytes=1 << 22)
+    assert most[0] < 500
     assert most[1] <= most[0] + 50
-    assert compare(store) == 10_000
 
 
 def test_the_last_room_is_the_segments_alone(store: hl.Store, tmp_path: Path, limit: Limit) -> None:
@@ -196,10 +193,15 @@ def test_the_last_room_is_the_segments_alone(store: hl.Store, tmp_path: Path, li
 
 
 ERRORS = [MemoryError(), ValueError("odd"), OSError(errno.EIO, "no"), OSError(errno.ENOSPC, "full")]
+PLACES = {
+    "add": (TableWriter, "_spill"),
+    "write": (ColumnFileWriter, "write"),
+    "close": (ColumnFileWriter, "close"),
+    "publish": (TableFolders, "_change"),
+}
 
 
-@pytest.mark.parametrize("error", ERRORS, ids=lambda e: f"{type(e).__name__} {e}")
-@pytest.mark.parametrize("place", ["add", "write", "close", "publish"])
+@pytest.mark.parametrize(("place", "error"), in_turn([*PLACES], ERRORS))
 def test_whatever_fails_the_recording_goes_on(
     store: hl.Store,
     tmp_path: Path,
@@ -208,14 +210,7 @@ def test_whatever_fails_the_recording_goes_on(
     place: str,
     error: Exception,
 ) -> None:
-    if place == "add":
-        calls.fail(TableWriter, "_spill", error)
-    elif place == "publish":
-        calls.fail(TableFolders, "_change", error)
-    else:
-        from hybridlog.columns.column_file import ColumnFileWriter
-
-        calls.fail(ColumnFileWriter, place, error)
+    calls.fail(*PLACES[place], error)
     said = [(BASE + n, "/large" if n % 50 else "/small", varied(n)) for n in range(1500)]
     write_log(tmp_path / "log.mcap", said)
     assert store.record(tmp_path / "log.mcap", name="log").entry.status == "complete"
