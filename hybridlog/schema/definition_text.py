@@ -20,7 +20,7 @@ from msgspec.structs import replace
 from hybridlog_storage.errors import DefinitionError
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Collection, Iterator
 
 # Names of the primitive types of fields. A new type of number is added here: its bytes on the wire
 # follow from its numpy type, its column from `pa.from_numpy_dtype`.
@@ -239,6 +239,7 @@ def has_parts(text: str) -> bool:
 # retried at the next character, in quadratic time.
 _TOKEN = re.compile(
     r"""(?P<skip>\s+|//[^\n]*|/\*(?s:.*?)(?:\*/|\Z)|\#[^\n]*)
+      |(?P<note>@\s*[A-Za-z_:][A-Za-z0-9_:]*)
       |(?P<name>(?:::)?[A-Za-z_][A-Za-z0-9_]*(?:::[A-Za-z_][A-Za-z0-9_]*)*)
       |(?P<number>[0-9][0-9A-Za-z_.]*)
       |(?P<text>"(?s:[^"\\]|\\.)*\\?(?:"|\Z)|'(?s:[^'\\]|\\.)*\\?(?:'|\Z))
@@ -313,142 +314,109 @@ def _candidates(scope: str, name: str) -> list[str]:
     return ["/".join([*parts[:depth], path]) for depth in range(len(parts), -1, -1)]
 
 
+# A declaration of one type, its words with a space in between.
+_TYPE = r"[A-Za-z_:][\w:]*(?: (?:long|short|double))*(?: < [^<>]* >)?"
+_DECLARATION = re.compile(
+    rf"(?:sequence < (?P<element>{_TYPE})(?P<most> , [^<>]*)? >|(?P<type>{_TYPE})) (?P<names>.+)",
+    re.DOTALL,
+)
+
+
 class _Parser:
     """Scopes are the names of the modules around a place, each with a slash behind it."""
 
-    def __init__(self, owner: str, text: str, types: IdlTypes) -> None:
+    def __init__(self, owner: str, types: IdlTypes) -> None:
         self._owner = owner
         self._types = types
-        tokens = [match.group() for match in _TOKEN.finditer(text) if match.lastgroup != "skip"]
-        self._tokens = tokens[::-1]  # the next one is the last
 
-    def parse(self) -> None:
+    def parse(self, text: str) -> None:
         scopes = [""]
-        while self._tokens:
-            annotations, word = self._annotations(), self._next()
+        fields: list[RawField] | None = None  # of the struct that is open
+        for words, end in self._statements(text):
+            kind, *rest = words or [""]
+            scope, name = scopes[-1], "".join(rest[:1])
             if len(scopes) > _MAX_DEPTH:
                 raise self._fail("modules are nested too deep")
-            if word == "module":
-                scopes.append(f"{scopes[-1]}{self._name()}/")
-                self._expect("{")
-            elif word == "}" and len(scopes) > 1:
+            if end == "}" and not words and scopes[1:]:
                 scopes.pop()
-            elif word == "struct":
-                self._struct(scopes[-1])
-            elif word == "typedef":
-                for raw in self._declared(scopes[-1]):
-                    self._types.typedefs[scopes[-1] + raw.name] = raw
-            elif word == "const":
-                self._constant(scopes[-1])
-            elif word == "enum" and "bit_bound" not in annotations:
-                self._types.typedefs[scopes[-1] + self._name()] = RawField("", _ENUM)
-                self._up_to("}")
-            elif word != ";":
-                raise self._fail(f"not indexed: IDL {word[:40]!r} has no ROS wire form")
+                fields = None
+            elif fields is not None and end == ";":
+                fields += self._declared(scope, words) if words else []
+            elif kind == "module" and end == "{" and len(rest) == 1:
+                scopes.append(f"{scope}{name}/")
+            elif kind == "struct" and end == "{" and fields is None:
+                fields = self._struct(scope + name, rest)
+                scopes.append(scope)
+            elif kind == "enum" and end == "}":
+                self._types.typedefs[scope + name] = RawField("", _ENUM)
+            elif kind == "typedef" and end == ";":
+                self._types.typedefs |= {
+                    scope + raw.name: raw for raw in self._declared(scope, rest)
+                }
+            elif kind == "const" and end == ";":
+                self._constant(scope, " ".join(rest))
+            elif (words or end != ";") and (kind, end) != (
+                "struct",
+                ";",
+            ):  # which is declared later
+                raise self._fail(f"not indexed: IDL {kind[:40]!r} has no ROS wire form")
         if scopes[1:]:
-            self._next()
+            raise self._fail("the IDL text ends too early")
+
+    def _statements(self, text: str) -> Iterator[tuple[list[str], str]]:
+        """The words of each statement, and the sign behind it; an enum is one.
+
+        Annotations are left out, unless they change the wire form.
+        """
+        words, depth = list[str](), 0
+        for found in _TOKEN.finditer(text):
+            word = found.group()
+            depth += {"(": 1, ")": -1}.get(word, 0)
+            if found.lastgroup == "note" and word[1:].strip() in {"optional", "bit_bound"}:
+                raise self._fail(f"not indexed: IDL {word} has no ROS wire form")
+            if depth or word == ")" or found.lastgroup in {"skip", "note"}:
+                continue
+            if word in ";}" or (word == "{" and words[:1] != ["enum"]):
+                yield words, word
+                words = []
+            else:
+                words.append(word)
+        if words or depth:
+            raise self._fail("the IDL text ends too early")
 
     def _fail(self, what: str) -> DefinitionError:
         return DefinitionError(f"{self._owner}: {what}")
 
-    def _peek(self) -> str:
-        return self._tokens[-1] if self._tokens else ""
-
-    def _next(self) -> str:
-        if not self._tokens:
-            raise self._fail("the IDL text ends too early")
-        return self._tokens.pop()
-
-    def _up_to(self, sign: str) -> str:
-        """The text in front of a sign, which is skipped, too."""
-        found: list[str] = []
-        while (token := self._next()) != sign:
-            found.append(token)
-        return " ".join(found)
-
-    def _take(self, sign: str) -> bool:
-        """Skip a sign if it is next."""
-        found = self._peek() == sign
-        if found:
-            self._tokens.pop()
-        return found
-
-    def _expect(self, sign: str) -> None:
-        if not self._take(sign):
-            raise self._fail(f"expected {sign!r}, found {self._next()[:40]!r}")
-
-    def _name(self) -> str:
-        token = self._next()
-        if not (token[0].isalpha() or token[0] == "_") or ":" in token:
-            raise self._fail(f"expected a name, found {token[:40]!r}")
-        return token
-
-    def _annotations(self) -> set[str]:
-        """Skip annotations; return their names."""
-        found = set()
-        while self._take("@"):
-            found.add(self._next())
-            depth = int(self._take("("))
-            while depth:
-                depth += {"(": 1, ")": -1}.get(self._next(), 0)
-        return found
-
-    def _struct(self, scope: str) -> None:
-        name = scope + self._name()
-        if self._take(";"):
-            return  # declared here, defined elsewhere
-        if self._peek() == ":":
-            raise self._fail("not indexed: a struct that inherits")
-        self._expect("{")
-        fields: list[RawField] = []
-        while not self._take("}"):
-            if "optional" in self._annotations():
-                raise self._fail("not indexed: optional members")
-            fields += self._declared(scope)
+    def _struct(self, name: str, words: list[str]) -> list[RawField]:
+        if len(words) != 1:
+            raise self._fail(f"{canonical(name)} inherits from another struct: not indexed")
         if name in self._types.structs:
             raise self._fail(f"{canonical(name)} is defined twice")
-        self._types.structs[name] = fields
+        return self._types.structs.setdefault(name, [])
 
-    def _declared(self, scope: str) -> list[RawField]:
-        """Parse a type and its declarators, up to the semicolon."""
-        kind = self._type(scope)
-        fields: list[RawField] = []
-        while not fields or self._take(","):
-            raw = replace(kind, name=self._name())
-            if self._take("["):
-                width = self._size(scope, "]")
-                if raw.array or self._peek() == "[":
-                    raise self._fail(f"field {raw.name[:80]} is an array of arrays: not indexed")
-                raw = replace(raw, array=True, width=width)
-            fields.append(raw)
-        self._expect(";")
+    def _declared(self, scope: str, words: list[str]) -> list[RawField]:
+        """The fields of one type that a statement declares."""
+        text = " ".join(words)
+        found = _DECLARATION.fullmatch(text)
+        kind, _, size = (found["element"] or found["type"]).partition(" < ") if found else ("",) * 3
+        kind = _WORDS.get(kind, kind)
+        if found is None or " " in kind or (size and "string" not in kind):
+            raise self._fail(f"not indexed: {text[:80]!r} has no ROS wire form")
+        most, is_list = found["most"], found["element"] is not None
+        bound = None if most is None else self._size(scope, most[3:])
+        raw = RawField(
+            "", kind, is_list, None, bound, self._size(scope, size[:-2]) if size else None
+        )
+        fields = []
+        for one in found["names"].split(" , "):
+            name, sign, width = one.partition(" [ ")
+            if sign and (is_list or "[" in width):
+                raise self._fail(f"field {name[:80]} is an array of arrays: not indexed")
+            size = self._size(scope, width.rstrip("] ")) if sign else None
+            fields.append(replace(raw, name=name, array=is_list or bool(sign), width=size))
         return fields
 
-    def _type(self, scope: str) -> RawField:
-        word = self._next()
-        if word == "sequence":
-            self._expect("<")
-            if self._peek() == "sequence":
-                raise self._fail("a sequence of sequences: not indexed")
-            element = self._type(scope)
-            bound = self._size(scope, ">") if self._take(",") else None
-            if bound is None:
-                self._expect(">")
-            return replace(element, array=True, bound=bound)
-        if word in {"unsigned", "long"}:
-            while self._peek() in {"long", "short", "double"}:
-                word += " " + self._next()
-        if word in {"string", "wstring"} and self._take("<"):
-            return RawField("", word, text_bound=self._size(scope, ">"))
-        if word in _WORDS:
-            return RawField("", _WORDS[word])
-        if not (word[0].isalpha() or word[0] in "_:") or " " in word:
-            raise self._fail(f"expected a type, found {word[:40]!r}")
-        return RawField("", word)
-
-    def _size(self, scope: str, end: str) -> int:
-        """An array size and the sign behind it."""
-        text = self._up_to(end)
+    def _size(self, scope: str, text: str) -> int:
         if (number := self._value(scope, text)) is None:
             raise self._fail(f"an array size must be a number or a constant, found {text[:40]!r}")
         return number
@@ -458,12 +426,10 @@ class _Parser:
         known = map(self._types.constants.get, _candidates(scope, text))
         return next((n for n in (_integer(text), *known) if n is not None), None)
 
-    def _constant(self, scope: str) -> None:
-        self._type(scope)
-        name = self._name()
-        self._expect("=")
-        if (number := self._value(scope, self._up_to(";"))) is not None:
-            self._types.constants[scope + name] = number
+    def _constant(self, scope: str, text: str) -> None:
+        declared, _, value = text.partition(" = ")
+        if (number := self._value(scope, value)) is not None:
+            self._types.constants[scope + declared.rpartition(" ")[2]] = number
 
 
 def _integer(token: str) -> int | None:
@@ -478,4 +444,4 @@ def _integer(token: str) -> int | None:
 
 def parse_idl(owner: str, text: str, types: IdlTypes) -> None:
     """Add the declarations of one IDL file to `types`; later files see its constants."""
-    _Parser(owner, text, types).parse()
+    _Parser(owner, types).parse(text)
