@@ -17,7 +17,7 @@ from bson.int64 import Int64
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybridlog.schema.codec import Codec
+from hybridlog.schema.codec import Codec, no_messages
 from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.errors import DefinitionError, PayloadError
 from hybridlog_storage.messages import Channel, Schema
@@ -260,16 +260,17 @@ def protobuf_channel() -> Channel:
     from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Field
     from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
 
-    file = FileDescriptorProto(name="t.proto", package="t", syntax="proto3")
+    file = FileDescriptorProto(name="t.proto", package="t", syntax="proto2")
     file.dependency.extend([timestamp_pb2.DESCRIPTOR.name, duration_pb2.DESCRIPTOR.name])
     kind = file.enum_type.add(name="Kind")
     kind.value.add(name="NONE", number=0)
     kind.value.add(name="SOME", number=5)
     message = file.message_type.add(name="All")
-    entry = message.nested_type.add(name="MapEntry")
-    entry.options.map_entry = True
-    entry.field.add(name="key", number=1, type=Field.TYPE_STRING, label=1)
-    entry.field.add(name="value", number=2, type=Field.TYPE_INT32, label=1)
+    for name, key in (("Map", Field.TYPE_STRING), ("Flags", Field.TYPE_BOOL)):
+        entry = message.nested_type.add(name=f"{name}Entry")
+        entry.options.map_entry = True
+        entry.field.add(name="key", number=1, type=key, label=1)
+        entry.field.add(name="value", number=2, type=Field.TYPE_INT32, label=1)
     simple = "double float int32 int64 uint32 uint64 bool string bytes sint64 fixed32 sfixed32"
     number = 0
     for name in simple.split():
@@ -288,6 +289,7 @@ def protobuf_channel() -> Channel:
         ("child", ".t.All", 1),
         ("children", ".t.All", 3),
         ("map", ".t.All.MapEntry", 3),
+        ("flags", ".t.All.FlagsEntry", 3),
     ):
         number += 1
         message.field.add(
@@ -388,6 +390,7 @@ def test_protobuf_rules() -> None:
     message.children.add().int64_3.extend([1, 2])
     message.map["b"] = 1
     message.map["a"] = 2
+    message.flags[True] = 5
     payload = message.SerializeToString()
     found = index_fields(codec, payload)
     assert found["stamp"] == 1_700_000_000_000_000_005
@@ -407,6 +410,7 @@ def test_protobuf_rules() -> None:
     assert found["string_3"] == {"n": 33}
     assert found["map"] == {"a": 2, "b": 1}
     assert list(found["map"]) == ["a", "b"]  # type: ignore[call-overload]
+    assert found["flags"] == {"true": 5}
     assert found["kind"] == 5
     assert found["_id_"] == 9
     assert math.copysign(1, found["double_1"]) == -1  # type: ignore[call-overload]
@@ -428,6 +432,14 @@ def test_protobuf_rules() -> None:
     stamps = records.field("stamp").view("int64").to_pylist()
     assert stamps == [1_700_000_000_000_000_005, None]
     assert [len(row) for row in records.field("double_3").to_pylist()] == [33, 0]
+    kinds = codec.columns_of(no_messages(), {"uint64_1", "child.string_1"}).arrow().type
+    assert kinds.field("uint64_1").type == pa.uint64()
+    first, second = codec.columns_of(batch_of(payload, b"")).arrow().to_pylist()
+    assert (first["uint64_1"], first["string_1"], first["_id_"]) == ((1 << 64) - 1, "ü", 9)
+    assert (first["flags"], second["flags"]) == ({"true": 5}, {"true": None})
+    assert (first["child"]["int32_1"], first["child"]["string_1"]) == (8, None)
+    assert first["children"][0]["int64_3"] == [1, 2]
+    assert [second[name] for name in ("string_1", "child", "children")] == [None, None, []]
 
 
 def test_protobuf_without_its_package(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -530,42 +542,3 @@ def test_chosen_fields() -> None:
         {"a": None, "c": None, "_id_": None},
     ]
     assert arrow_of(JSON, rows, {"a"}).field("a").to_pylist() == [{"x": 1, "y": 2}, None]
-
-
-def test_protobuf_presence_maps_and_extremes() -> None:
-    from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Field
-    from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
-
-    file = FileDescriptorProto(name="t.proto", package="t", syntax="proto2")
-    kind = file.message_type.add(name="M")
-    entry = kind.nested_type.add(name="EEntry")
-    entry.options.map_entry = True
-    entry.field.add(name="key", number=1, type=Field.TYPE_BOOL, label=1)
-    entry.field.add(name="value", number=2, type=Field.TYPE_UINT64, label=1)
-    kind.field.add(name="u", number=1, type=Field.TYPE_UINT64, label=1)
-    kind.field.add(name="s", number=2, type=Field.TYPE_STRING, label=1)
-    kind.field.add(name="e", number=3, type=Field.TYPE_MESSAGE, label=3, type_name=".t.M.EEntry")
-    kind.field.add(name="m", number=4, type=Field.TYPE_MESSAGE, label=1, type_name=".t.M")
-    kind.field.add(name="l", number=5, type=Field.TYPE_MESSAGE, label=3, type_name=".t.M")
-    kind.field.add(name="_id", number=6, type=Field.TYPE_SINT32, label=1)
-    schema = Schema("t.M", "protobuf", FileDescriptorSet(file=[file]).SerializeToString())
-    codec = codec_for(Channel("/t", "protobuf", schema))
-    make: Any = type(codec.decode(b""))
-    rows = [
-        make(u=(1 << 64) - 1, s="", e={True: 5}, m=make(s="in"), _id=-1),
-        make(l=[make(u=1), make(m=make(m=make(u=2)))]),
-    ]
-    records = arrow_of(codec, [row.SerializeToString() for row in rows])
-    first, second = records.to_pylist()
-    assert first["u"] == (1 << 64) - 1
-    assert first["s"] == ""
-    assert second["s"] is None
-    assert first["e"] == {"true": 5}
-    assert second["e"] == {"true": None}
-    assert first["m"]["s"] == "in"
-    assert second["m"] is None
-    assert first["l"] == []
-    assert second["l"][0]["u"] == 1
-    assert second["l"][1]["m"]["m"]["u"] == 2
-    assert first["_id_"] == -1
-    assert arrow_of(codec, [], {"u", "m.s"}).type.field("u").type == pa.uint64()
