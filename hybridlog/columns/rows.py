@@ -45,7 +45,6 @@ from hybridlog.schema.arrow_types import (
 from hybridlog.schema.codec import (
     Decoded,
     no_messages,
-    no_rows,
     payload_alone,
     stamp_array,
     unreadable,
@@ -212,26 +211,20 @@ def decoded_left(
     if reduced and original.indexed:
         batch = with_rows(batch)
     empty = original.columns_of(no_messages(), fields)
-    parts: list[pa.StructArray] = []
-    rows, surplus = [no_rows()], [no_rows()]
-    bad: dict[str, list[int]] = {}
-    for part, own, taken in () if batch.left is None else batch.left.by_part():
-        found = part.take(taken)
-        error = found.field("error")
-        for row, reason in zip(own.tolist(), error.to_pylist(), strict=True):
-            if reason is not None:
-                bad.setdefault(reason, []).append(row)
-        there = error.is_null().to_numpy(zero_copy_only=False)
-        parts.append(_fields_in(found if there.all() else found.filter(there)))
-        rows.append(own[there])
-        has_surplus = found.field("ref").field("surplus").to_numpy(zero_copy_only=False)
-        surplus.append(own[has_surplus])
-    if not parts:
+    found = [] if batch.left is None else [*batch.left.by_part()]
+    if not found:
         return empty
-    columns = joined(parts)
-    order = np.argsort(good := np.concatenate(rows))
-    records = LeftFields(columns.take(order) if len(parts) > 1 else columns, fields, empty)
-    return Decoded(good[order], records, unreadable(bad), np.sort(np.concatenate(surplus)))
+    order = np.argsort(np.concatenate([own for _, own, _ in found]))
+    rows = joined([part.take(taken) for part, _, taken in found]).take(order)
+    reasons, surplus = rows.field("error"), rows.field("ref").field("surplus")
+    bad: dict[str, list[int]] = {}
+    for row, reason in enumerate(reasons.to_pylist()):
+        if reason is not None:
+            bad.setdefault(reason, []).append(row)
+    there = reasons.is_null()
+    records = LeftFields(_fields_in(rows.filter(there)), fields, empty)
+    good, more = (np.flatnonzero(one.to_numpy(zero_copy_only=False)) for one in (there, surplus))
+    return Decoded(good, records, unreadable(bad), more)
 
 
 def _fields_in(rows: pa.StructArray) -> pa.StructArray:

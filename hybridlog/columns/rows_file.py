@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from hybridlog.columns.column_file import ColumnFile, ColumnFileWriter
 from hybridlog.columns.fields import side_by_side
@@ -22,10 +23,9 @@ from hybridlog.index.indexing import ChunkIndexer
 from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.codecs import LeftCodec
 from hybridlog.schema.states import State
-from hybridlog_storage.cache import Cache, lazy
+from hybridlog_storage.cache import Cache
 from hybridlog_storage.errors import StoreError
 from hybridlog_storage.manifest import File, Part, rows_line
-from hybridlog_storage.messages import distinct, run_starts
 from hybridlog_storage.segments.segment_file import rows_name
 
 if TYPE_CHECKING:
@@ -64,24 +64,18 @@ class RowsFile(ColumnFile):
     def _other(self) -> StoreError:
         return StoreError(f"The file of rows {self.path} is not the one that the manifest lists.")
 
-    @lazy
-    def _places(self) -> dict[int, list[tuple[int, int, int]]]:
-        """The row groups of each chunk, its first row and number of rows there."""
-        found: dict[int, list[tuple[int, int, int]]] = {}
-        for group, rows in enumerate(self.groups):
-            chunks = self.read(group, self.numbers("ref.chunk"))["ref"].combine_chunks()
-            numbers = chunks.field("chunk").to_numpy()
-            starts = run_starts(numbers).tolist()
-            for begin, end in zip(starts, [*starts[1:], rows], strict=True):
-                found.setdefault(int(numbers[begin]), []).append((group, begin, end - begin))
-        return found
-
     def of_chunk(self, chunk: int) -> list[pa.StructArray]:
         """The rows of a chunk, by row group; a struct has all columns."""
-        return [
-            self._group(group).slice(begin, rows)
-            for group, begin, rows in self._places.get(chunk, ())
-        ]
+        found = []
+        (leaf,) = self.numbers("ref.chunk")
+        for group in range(len(self.groups)):
+            first, last = self.bounds(group, leaf) or (chunk, chunk)
+            if first <= chunk <= last:
+                rows = self._group(group)
+                numbers = rows.field("ref").field("chunk").to_numpy()
+                begin, end = np.searchsorted(numbers, [chunk, chunk + 1]).tolist()
+                found.append(rows.slice(begin, end - begin))
+        return [one for one in found if len(one)]
 
     def _group(self, group: int) -> pa.StructArray:
         def read() -> pa.StructArray:
@@ -94,14 +88,12 @@ class RowsFile(ColumnFile):
 def line_of(folder: Path, log: File, name: str) -> File:
     """The line of a manifest for a file of rows of a log."""
     file = ColumnFile(folder / name)
-    rows = file.table(file.numbers("t", "channel", "ref.len")).combine_chunks()
-    t, channel = rows["t"].to_numpy(), rows["channel"].to_numpy()
-    size = rows["ref"].combine_chunks().field("len").to_numpy()
-    parts = {}
-    for number in distinct(channel).tolist():
-        own = channel == number
-        times = t[own]
-        parts[number] = Part(len(times), int(size[own].sum()), int(times.min()), int(times.max()))
+    rows = file.table(file.numbers("t", "channel", "ref.len"))
+    rows = rows.append_column("size", pc.struct_field(rows["ref"], "len"))
+    about = [("t", "count"), ("size", "sum"), ("t", "min"), ("t", "max")]
+    found = rows.drop_columns(["ref"]).group_by("channel").aggregate(about).sort_by("channel")
+    keys = [f"{column}_{what}" for column, what in about]
+    parts = {row["channel"]: Part(*(row[key] for key in keys)) for row in found.to_pylist()}
     return rows_line(log, name, file.size_bytes, file.digest(), parts)
 
 

@@ -369,7 +369,6 @@ class Tables:
         self._found: dict[tuple[str, str], TopicTable | None] = {}
         self._all = _Folder(self._place, self._cache)
         self._folders: dict[str, dict[str, _Folder]] = {}  # by the beginning of their names
-        self._looked_at: set[str] = set()  # types whose folders were looked at
         self._lock = threading.RLock()
 
     def of(self, recording: RecordingEntry, topic: str) -> TopicTable | None:
@@ -386,7 +385,6 @@ class Tables:
         """Look for all tables again; files that are as before stay open."""
         with self._lock:
             self._found.clear()
-            self._looked_at.clear()
 
     def reject(self, recording: RecordingEntry, topic: str) -> None:
         """Ignore the table, which was found to be damaged; look again if a file was replaced."""
@@ -448,24 +446,15 @@ class Tables:
         return None
 
     def _rows(self, recording: RecordingEntry, topic: str) -> tuple[list[TopicRows], bool]:
-        """The rows of a topic in files, and whether these are as many as its messages.
-
-        The folders of its types are looked at if it lacks some.
-        """
-        channels, key = _channels(recording, topic), (recording.id, topic)
-        types = {channel.type for channel in channels}
-        messages = sum(channel.stats.messages for channel in channels)
+        """The rows of a topic in files, and whether these are as many as its messages."""
+        channels, found = _channels(recording, topic), list[TopicRows]()
         with self._lock:
-            for is_looked_at in (False, True):
-                found = [rows for own in self._of(channels) for rows in own.rows.get(key, ())]
-                is_whole = sum(one.section.rows for one in found) == messages
-                if is_looked_at or (is_whole and types <= self._looked_at):
-                    break
-                self._look()
-                for folder in self._of(channels):
-                    folder.look(recording)
-                self._looked_at |= types
-        return found, is_whole
+            self._look()
+            for folder in self._of(channels):
+                folder.look(recording)
+                found += folder.rows.get((recording.id, topic), ())
+        rows = sum(one.section.rows for one in found)
+        return found, rows == sum(channel.stats.messages for channel in channels)
 
     def _look(self) -> None:
         """See which folders there are."""
