@@ -140,8 +140,8 @@ class Message:
             DefinitionError: no usable definition exists.
         """
         decoded = self._of.decoded(self._row)
-        has_columns = isinstance(decoded.records, Records)
-        values: Any = decoded.arrow() if has_columns else decoded.plain()
+        records = decoded.records
+        values: Any = decoded.arrow() if isinstance(records, Records) else records.plain()
         return cast("pa.StructScalar | Mapping[str, Any]", values[0])
 
     def to_numpy(self) -> NDArray[Any]:

@@ -24,6 +24,7 @@ from hybridlog.schema.arrow_types import (
     plain_values,
     time_of_day,
 )
+from hybridlog.schema.column import Records
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -64,7 +65,8 @@ def _lines_of(run: MessageRun, decoder: Decoder, fields: Sequence[str] | None) -
         else:  # each message has fields of its own
             own = decoder.own_columns(channel, batch.take(good), seq[good])
             firsts |= {name: array for name, array in own.items() if name not in firsts}
-            made = _of_objects(firsts, decoded.plain())
+            assert not isinstance(decoded.records, Records)
+            made = _of_objects(firsts, decoded.records.plain())
         for row, line in zip(rows[good].tolist(), made, strict=True):
             found[row] = line
     return [line for line in found if line is not None]

@@ -289,8 +289,8 @@ def _example(array: Array) -> Array:
 def converted(array: Array, kind: pa.DataType, *, drops: bool = False) -> Array:
     """The values of an array in another type that represents them, else `pa.ArrowInvalid`.
 
-    Arrays become summaries where the type is that of summaries, and bytes become lists of numbers.
-    With `drops`, fields of structs that the type lacks are left out.
+    Arrays become summaries where the type is that of summaries. With `drops`, fields of structs
+    that the type lacks are left out.
     """
     if array.type == kind:
         return array
@@ -300,8 +300,6 @@ def converted(array: Array, kind: pa.DataType, *, drops: bool = False) -> Array:
         return json_array(plain_values(array))
     if _types.is_struct(kind):
         return _converted_struct(array, kind, drops=drops)
-    if is_list(kind) and _types.is_binary(array.type):
-        array = _numbers_of(array)
     if is_list(kind) and is_list(array.type):
         made = with_values(array, converted(array.flatten(), kind.value_type, drops=drops))
         return made if made.type == kind else made.cast(kind)
@@ -309,15 +307,6 @@ def converted(array: Array, kind: pa.DataType, *, drops: bool = False) -> Array:
     if numeric or any(same(kind) and same(array.type) for same in (is_text, is_bytes)):
         return array.cast(kind)
     raise pa.ArrowInvalid(f"{array.type} is not {kind}")
-
-
-def _numbers_of(array: Array) -> Array:
-    """Bytes as lists of numbers, without a copy."""
-    validity, places, data = array.buffers()
-    data = data if data is not None else pa.py_buffer(b"")
-    values = pa.Array.from_buffers(pa.uint8(), data.size, [None, data])
-    kind, buffers = pa.list_(pa.uint8()), [validity, places]
-    return pa.Array.from_buffers(kind, len(array), buffers, offset=array.offset, children=[values])
 
 
 def _converted_struct(array: Array, kind: pa.DataType, *, drops: bool) -> Array:

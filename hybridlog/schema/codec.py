@@ -91,17 +91,6 @@ class Decoded(Struct):
 
         return records_array(self.records)
 
-    def plain(self) -> list[dict[str, object]]:
-        """The messages as plain values: dict, list, str, bytes, bool, int, float, None.
-
-        A field that a message lacks is not there. Times and durations are integer nanoseconds.
-        """
-        if not isinstance(self.records, Records):
-            return self.records.plain()
-        from hybridlog.schema.arrow_types import plain_values
-
-        return plain_values(self.arrow())
-
 
 class Codec(ABC):
     """Decodes the payloads of a channel. Thread safe."""

@@ -76,7 +76,10 @@ class Objects:
         return False
 
     def plain(self) -> list[dict[str, object]]:
-        """The messages as plain values; see `Decoded.plain`."""
+        """The messages as plain values: dict, list, str, bytes, bool, int, float, None.
+
+        A field that a message lacks is not there. Times and durations are integer nanoseconds.
+        """
         return [cast("dict[str, object]", top(value)) for value in self.values]
 
     def arrow(self) -> pa.StructArray:
