@@ -12,9 +12,7 @@ import os
 import threading
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
-from functools import partial
-from itertools import accumulate, count
-from operator import attrgetter
+from itertools import accumulate, chain, count
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -269,29 +267,18 @@ class ColumnFile:
         table = pa.concat_tables(groups) if groups else self.schema.empty_table()
         return table.replace_schema_metadata(None)
 
-    def columns(self, group: int, chosen: Mapping[str, Sequence[int]]) -> dict[str, Any]:
-        """Columns of a row group, of each some of Parquet's, as arrays; cached.
+    def columns(self, group: int, chosen: Mapping[str, Sequence[int]]) -> Mapping[str, Any]:
+        """Columns of a row group, of each some of Parquet's, as arrays; cached as asked for."""
+        leaves = [*chain.from_iterable(chosen.values())]
 
-        Those that are not at hand are read together.
-        """
-        found: dict[str, Any] = {}
-        fresh: dict[str, Any] = {}
+        def read() -> dict[str, Any]:
+            table = self.read(group, leaves).combine_chunks()
+            return {one: table.column(one).chunk(0) for one in chosen}
 
-        def read(name: str) -> Any:
-            if name not in fresh:
-                left = [one for one in chosen if one not in found]
-                table = self.read(group, [leaf for one in left for leaf in chosen[one]])
-                for one in left:
-                    array = table.column(one).combine_chunks()
-                    is_cut = isinstance(array, pa.ChunkedArray)
-                    fresh[one] = pa.concat_arrays(array.chunks) if is_cut else array
-            return fresh[name]
+        def size_of(found: Mapping[str, Any]) -> int:
+            return sum(one.nbytes for one in found.values())
 
-        for name, leaves in chosen.items():
-            key, make = (self.number, group, *leaves), partial(read, name)
-            size_of = attrgetter("nbytes")
-            found[name] = self._cache.made("column", *key, make=make, size_of=size_of)
-        return found
+        return self._cache.made("column", self.number, group, *leaves, make=read, size_of=size_of)
 
     def read(self, group: int | None, leaves: Sequence[int]) -> pa.Table:
         """Columns, numbered in Parquet's order (depth first), of a row group; None for no rows."""
