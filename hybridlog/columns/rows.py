@@ -11,6 +11,7 @@ rows has those of messages whose payloads are gone.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import suppress
 from hashlib import sha256
 from typing import TYPE_CHECKING, Any, Final
 
@@ -37,10 +38,11 @@ from hybridlog.schema.arrow_types import (
     Array,
     bounds_of,
     converted,
+    is_array,
     is_list,
     is_summary,
-    part_of_summary,
     plain_values,
+    statistic,
 )
 from hybridlog.schema.codec import (
     Decoded,
@@ -167,13 +169,14 @@ class LeftFields(Objects):
 
     def statistics(self, paths: Iterable[str]) -> dict[str, pa.Array[Any]]:
         """`n`, `min`, `max` or `mean` of arrays by path (`ranges.min`), of those that have one."""
-        made = {}
+        made: dict[str, pa.Array[Any]] = {}
         for path in paths:
             *array, what = names_of(path)
-            records = records_of(self.columns, (*array,).__eq__)
-            found = part_of_summary(records, array, what)
-            if found is not None:
-                made[path] = found
+            with suppress(pa.ArrowException):  # of such elements there are no numbers
+                found = pc.struct_field(records_of(self.columns, (*array,).__eq__), array)
+                is_whole = is_array(found.type)  # of a fixed length
+                part = statistic(found, what) if is_whole else pc.struct_field(found, what)
+                made |= {} if part is None else {path: part}
         return made
 
     def both(self) -> tuple[Array, Array]:

@@ -15,7 +15,7 @@ import shutil
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from itertools import chain, count
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -335,20 +335,19 @@ class TableFolders:
         replaced: Collection[str] = (),
         prefixes: Collection[str] = (),
     ) -> None:
-        """Add tables by folder, in place of older ones of the `replaced` topics.
+        """Add tables by folder, once older ones of the `replaced` topics are removed.
 
         `prefixes` are beginnings of the names of folders that may have such tables.
         """
         with suppress(FileExistsError):
             files.make_folder(self._root / TABLES)
         with files.locked_folder(self._root / TABLES):
-            others = [name for name in type_folders(self._root) if name.startswith(tuple(prefixes))]
-            for name in dict.fromkeys([*additions, *others]):
-                if name in additions:
-                    files.make_folders(self._root / TABLES / name)
+            if prefixes:
+                self._remove(prefixes, replaced.__contains__)
+            for name, addition in additions.items():
+                files.make_folders(self._root / TABLES / name)
                 try:
-                    addition = additions.get(name, Addition())
-                    self._change(name, addition, replaced.__contains__ if prefixes else None)
+                    self._add(self._root / TABLES / name, addition)
                 except (OSError, MemoryError):
                     raise
                 except Exception as error:
@@ -357,54 +356,42 @@ class TableFolders:
     def remove(self, prefixes: Collection[str] = ("",)) -> None:
         """Remove all tables of the recording in folders whose names begin with a prefix."""
         with suppress(FileNotFoundError), files.locked_folder(self._root / TABLES):
-            for name in type_folders(self._root):
-                if name.startswith(tuple(prefixes)):
-                    self._change(name, Addition(), lambda _: True)
+            self._remove(prefixes, lambda _: True)
 
-    def _change(self, folder: str, addition: Addition, goes: Callable[[str], bool] | None) -> None:
-        """Remove older rows of topics that go, and add tables; an empty folder is removed."""
-        place = self._root / TABLES / folder
-        names = [n for n in files.names(place) if n.endswith(SUFFIX)]
-        self._share(place, shared_for(shared_times(names), self._created), addition.pieces, goes)
-        old: list[Path] = []
-        own = f"{self._recording}-"
-        if goes is not None:
-            readers = map(_reader, (place / name for name in sorted(names) if name.startswith(own)))
-            known = [reader for reader in readers if reader is not None]
-            old = [one.path for one in known if all(goes(s.topic) for s in one.sections)]
-        numbered = (f"{own}{number}{SUFFIX}" for number in count())
+    def _remove(self, prefixes: Collection[str], goes: Callable[[str], bool]) -> None:
+        """Remove rows of topics that go; an empty folder is removed."""
+        for folder in type_folders(self._root):
+            if not folder.startswith(tuple(prefixes)):
+                continue
+            place = self._root / TABLES / folder
+            own = [n for n in files.names(place) if n.startswith(f"{self._recording}-")]
+            for reader in _readers(place, sorted(own)):
+                if all(goes(one.topic) for one in reader.sections):
+                    files.remove_tree(reader.path)
+            for reader in self._shared(place):
+                if reader.has(self._recording):
+                    self._rewrite(reader, (), goes)
+                    break
+            with suppress(OSError), files.folder(place.parent) as fd:
+                files.system.rmdir(folder, dir_fd=fd)
+
+    def _add(self, place: Path, addition: Addition) -> None:
+        names, pieces = files.names(place), addition.pieces
+        numbered = (f"{self._recording}-{number}{SUFFIX}" for number in count())
         free = (place / name for name in numbered if name not in names)
-        for part, path in zip(addition.files, chain(old, free), strict=False):
+        for part, path in zip(addition.files, free, strict=False):
             files.rename(part, path)
-        for path in old[len(addition.files) :]:
-            files.remove_tree(path)
-        with suppress(OSError), files.folder(place.parent) as fd:
-            files.system.rmdir(folder, dir_fd=fd)
-
-    def _share(
-        self,
-        place: Path,
-        names: Iterable[str],
-        pieces: Sequence[_Piece],
-        goes: Callable[[str], bool] | None,
-    ) -> None:
-        """Add rows to the shared file that has the recording, to the likeliest, or to a new one."""
-        readers = (one for one in (_reader(place / name) for name in names) if one is not None)
-        first = reader = next(readers, None)
-        while goes is not None and reader is not None and not reader.has(self._recording):
-            reader = next(readers, None)
-        if goes is not None and reader is not None:
-            self._rewrite(reader, pieces, goes)
-            return
-        own = shared_name(0 if first is None else max(self._created or 0, 0))
-        if (
-            first is not None
-            and pieces
-            and (first.path.name == own or self._has_room(first, pieces))
-        ):
+        first = next(self._shared(place), None)
+        own = place / shared_name(0 if first is None else max(self._created or 0, 0))
+        is_fit = first is not None and (first.path == own or self._has_room(first, pieces))
+        if pieces and first is not None and is_fit:
             self._rewrite(first, pieces, lambda _: False)
         elif pieces:
-            self._write(place / own, pieces)
+            self._write(own, pieces)
+
+    def _shared(self, place: Path) -> Iterator[ColumnFile]:
+        """The shared files that may have the recording, the likeliest first."""
+        return _readers(place, shared_for(shared_times(files.names(place)), self._created))
 
     def _has_room(self, reader: ColumnFile, pieces: Sequence[_Piece]) -> bool:
         return (
@@ -456,15 +443,15 @@ class TableFolders:
         files.rename(part, path)
 
 
-def _reader(path: Path) -> ColumnFile | None:
-    """A shared file; one that cannot be read is removed, since all of it can be made again."""
-    try:
-        return ColumnFile(path)
-    except FileNotFoundError:
-        return None
-    except StoreError as error:
-        if isinstance(error.__cause__, PermissionError):
-            raise error.__cause__ from error
-        _log.info("%s", error)
-        files.remove_tree(path)
-        return None
+def _readers(place: Path, names: Iterable[str]) -> Iterator[ColumnFile]:
+    """Files of tables; one that cannot be read is removed, since all of it can be made again."""
+    for path in (place / name for name in names if name.endswith(SUFFIX)):
+        try:
+            yield ColumnFile(path)
+        except FileNotFoundError:
+            continue
+        except StoreError as error:
+            if isinstance(error.__cause__, PermissionError):
+                raise error.__cause__ from error
+            _log.info("%s", error)
+            files.remove_tree(path)

@@ -419,15 +419,3 @@ def _summarised(array: Array) -> Summary | None:
         bounds = np.concatenate(([0], np.cumsum(there, dtype=np.int64)))[bounds]
         values = values.drop_null()
     return summarise(Scalars(values.to_numpy(zero_copy_only=False)), bounds)
-
-
-def part_of_summary(records: Array, path: Sequence[str], name: str) -> Array | None:
-    """One number of the summary of an array in records; None if summaries of it lack that.
-
-    The array is a summary there, or of a fixed length.
-    """
-    try:
-        found = pc.struct_field(records, list(path))
-        return statistic(found, name) if is_array(found.type) else pc.struct_field(found, name)
-    except pa.ArrowException:
-        return None

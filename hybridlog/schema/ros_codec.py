@@ -19,10 +19,10 @@ from contextlib import suppress
 from functools import cache, lru_cache, partial
 from itertools import accumulate
 from operator import itemgetter
-from typing import TYPE_CHECKING, Literal, cast
+from typing import TYPE_CHECKING, Literal, TypeAlias, cast
 
 import numpy as np
-from msgspec import Struct, field
+from msgspec import Struct
 from msgspec.structs import replace
 
 from hybridlog.schema.codec import Codec, Decoded, Unreadable, no_rows
@@ -52,22 +52,14 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from rosbags.interfaces.typing import FieldDesc, Typesdict
 
-    from hybridlog.schema.codec import Decoded
-    from hybridlog.schema.definition import MessageType
-    from hybridlog.schema.wire_program import Wire
     from hybridlog_storage.messages import Batch, Buffer, Channel, Schema
 
 _HEADER = 4  # bytes in front of a message in CDR
 _LITTLE = 0x0001
 _ORDERS: dict[int, Literal["<", ">"]] = {_LITTLE: "<", 0x0000: ">"}
 """Byte orders of plain CDR, by the first two bytes."""
-
-
-class _Odd(Struct):
-    """Rows to remark: unreadable ones by reason, and those with bytes left over."""
-
-    bad: dict[str, list[NDArray[np.intp]]] = field(default_factory=dict)
-    surplus: list[NDArray[np.intp]] = field(default_factory=list)
+_Bad: TypeAlias = "dict[str, list[NDArray[np.intp]]]"
+"""Rows that cannot be read, by reason."""
 
 
 class WireReader:
@@ -91,22 +83,22 @@ class WireReader:
         """
         offset = np.asarray(offset, np.int64)
         end = offset + np.asarray(length, np.int64)
-        odd = _Odd()
+        bad: _Bad = {}
         outside = (offset < 0) | (end < offset) | (end > memoryview(buffer).nbytes)
         rows = np.flatnonzero(~outside)
         if len(rows) < len(offset):
-            odd.bad["lies outside of the chunk"] = [np.flatnonzero(outside)]
+            bad["lies outside of the chunk"] = [np.flatnonzero(outside)]
         sources, start = [(Source(buffer, "<"), rows)], offset
         if self._wire == "cdr":
-            sources, start = self._by_order(buffer, rows, offset, end, odd), offset + _HEADER
-        (good, records), *others = (self._read(*one, start, end, odd) for one in sources)
-        for other, more in others:
-            both = np.concatenate([good, other])
-            order = np.argsort(both)
-            good, records = both[order], take(concatenate([records, more]), order)
-        unreadable = [Unreadable(np.sort(np.concatenate(r)), why) for why, r in odd.bad.items()]
-        surplus = np.sort(np.concatenate(odd.surplus)) if odd.surplus else no_rows()
-        return Decoded(good, records, unreadable, surplus)
+            sources, start = self._by_order(buffer, rows, offset, end, bad), offset + _HEADER
+        found = [self._read(*one, start, end, bad) for one in sources]
+        good, records, surplus = found[0]
+        if found[1:]:
+            good, surplus = (np.concatenate([one[at] for one in found]) for at in (0, 2))
+            order = np.argsort(good)
+            good, records = good[order], take(concatenate([one[1] for one in found]), order)
+        unreadable = [Unreadable(np.sort(np.concatenate(r)), why) for why, r in bad.items()]
+        return Decoded(good, records, unreadable, np.sort(surplus))
 
     def message_in(self, payload: Buffer) -> memoryview:
         """A payload without the bytes that are left over behind its message."""
@@ -122,12 +114,12 @@ class WireReader:
         rows: NDArray[np.intp],
         offset: NDArray[np.int64],
         end: NDArray[np.int64],
-        odd: _Odd,
+        bad: _Bad,
     ) -> list[tuple[Source, NDArray[np.intp]]]:
         """The rows of each byte order of CDR, at least of one, and the buffer for these."""
         short = end[rows] - offset[rows] < _HEADER
         if bool(short.any()):
-            odd.bad["is shorter than a CDR header"] = [rows[short]]
+            bad["is shorter than a CDR header"] = [rows[short]]
             rows = rows[~short]
         little, begin = Source(buffer, "<"), offset[rows]
         kind = little.u1(begin, 0).astype(np.int64) << 8
@@ -140,7 +132,7 @@ class WireReader:
             if code in _ORDERS:
                 found.append((Source(buffer, _ORDERS[code]), own))
             else:
-                odd.bad[f"encapsulation 0x{code:04x} is not read"] = [own]
+                bad[f"encapsulation 0x{code:04x} is not read"] = [own]
         return found or [(little, rows[:0])]
 
     def _read(
@@ -149,21 +141,18 @@ class WireReader:
         rows: NDArray[np.intp],
         start: NDArray[np.int64],
         end: NDArray[np.int64],
-        odd: _Odd,
-    ) -> tuple[NDArray[np.intp], Records]:
-        """Read rows of one byte order; those that do not fit go to `odd`."""
+        bad: _Bad,
+    ) -> tuple[NDArray[np.intp], Records, NDArray[np.intp]]:
+        """Read rows of one byte order, and which have bytes left over; `bad` gets the others."""
         walker = Walker(source, self._wire)
         try:
             column, surplus = walker.read(self._program, start[rows], end[rows])
         except MisfitError:
-            rows = self._sort_out(source, rows, start, end, odd)
+            rows = self._sort_out(source, rows, start, end, bad)
             column, surplus = walker.read(self._program, start[rows], end[rows])
-        if surplus is not None:
-            odd.surplus.append(rows[surplus])
-        if column is None:
-            return rows, Records({}, len(rows))
-        assert isinstance(column, Records)
-        return rows, column
+        records = Records({}, len(rows)) if column is None else column
+        assert isinstance(records, Records)
+        return rows, records, no_rows() if surplus is None else rows[surplus]
 
     def _sort_out(
         self,
@@ -171,7 +160,7 @@ class WireReader:
         rows: NDArray[np.intp],
         start: NDArray[np.int64],
         end: NDArray[np.int64],
-        odd: _Odd,
+        bad: _Bad,
     ) -> NDArray[np.intp]:
         """Check each row separately; return the valid ones."""
         scanner = Scanner(source, self._wire)
@@ -182,7 +171,7 @@ class WireReader:
                 scanner.check(self._program, begin, finish)
             except MisfitError as misfit:
                 good[index] = False
-                odd.bad.setdefault(str(misfit), []).append(np.array([row], np.intp))
+                bad.setdefault(str(misfit), []).append(np.array([row], np.intp))
         return rows[good]
 
 
