@@ -21,7 +21,7 @@ from hybridlog.columns.layout import Section
 from hybridlog.columns.rows import columns_from, digest_in, rows_of, with_rows
 from hybridlog.index.indexing import ChunkIndexer
 from hybridlog.schema.arrow_columns import structs
-from hybridlog.schema.codecs import LeftCodec
+from hybridlog.schema.codec import LeftCodec
 from hybridlog.schema.states import State
 from hybridlog_storage.cache import Cache
 from hybridlog_storage.errors import StoreError

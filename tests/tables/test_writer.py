@@ -197,7 +197,7 @@ PLACES = {
     "add": (TableWriter, "_spill"),
     "write": (ColumnFileWriter, "write"),
     "close": (ColumnFileWriter, "close"),
-    "publish": (TableFolders, "_change"),
+    "publish": (TableFolders, "_add"),
 }
 
 
