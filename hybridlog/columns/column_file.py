@@ -23,11 +23,11 @@ import pyarrow.parquet as pq
 from hybridlog.columns.fields import (
     SUMMARY_FIELDS,
     has_summaries,
-    names_of,
     original_name,
 )
 from hybridlog.columns.layout import ABOUT, OWN, OWN_COLUMNS, Section
 from hybridlog.schema.arrow_types import is_bytes, is_list
+from hybridlog.schema.column import names_of
 from hybridlog_storage.cache import Cache, lazy
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import files

@@ -254,11 +254,6 @@ def side_by_side(own: Mapping[str, Array], others: Array) -> Array:
     return structs(columns, len(others), None, [*kinds, *others.type])
 
 
-def names_of(path: str) -> tuple[str, ...]:
-    """Names on a dotted path of a field, without brackets."""
-    return tuple(path.replace("[]", "").split("."))
-
-
 _CLOUDS: Final = frozenset({"sensor_msgs/PointCloud2", "sensor_msgs/msg/PointCloud2"})
 _make = POINT_MAKERS["sensor_msgs/PointCloud2"]
 _NUMBERS = ("height", "width", "point_step", "row_step", "is_bigendian")

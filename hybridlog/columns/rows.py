@@ -26,7 +26,6 @@ from hybridlog.columns.fields import (
     content_of,
     has_summaries,
     joined,
-    names_of,
     original_name,
     records_of,
     side_by_side,
@@ -51,7 +50,7 @@ from hybridlog.schema.codec import (
     stamp_array,
     unreadable,
 )
-from hybridlog.schema.column import Records, offsets
+from hybridlog.schema.column import Records, names_of, offsets
 from hybridlog.schema.document import MAX_BYTES
 from hybridlog.schema.objects import Objects, plain_cells
 from hybridlog.schema.states import State

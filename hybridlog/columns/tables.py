@@ -29,7 +29,7 @@ import pyarrow.compute as pc
 from msgspec import Struct
 
 from hybridlog.columns.column_file import FIRST, ColumnFile, TablePart
-from hybridlog.columns.fields import joined, names_of, records_of
+from hybridlog.columns.fields import joined, records_of
 from hybridlog.columns.layout import (
     OWN_COLUMNS,
     POINTS,
@@ -41,7 +41,7 @@ from hybridlog.columns.layout import (
 )
 from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.arrow_types import converted
-from hybridlog.schema.column import ranges
+from hybridlog.schema.column import names_of, ranges
 from hybridlog.schema.states import State, encoding_of
 from hybridlog_storage.cache import Cache
 from hybridlog_storage.disk import files

@@ -476,7 +476,7 @@ def _decided(part: Part, rows: TableRows) -> NDArray[np.bool_]:
 
 def _holds(table: TopicTable, part: Part, fields: Collection[str] | None) -> bool:
     """True if a table holds some fields, or all, in full: no array that is a summary there."""
-    from hybridlog.columns.fields import names_of
+    from hybridlog.schema.column import names_of
 
     types = part.field_types
     if fields is not None and not fields:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 import numpy as np
 import pyarrow as pa
 
-from hybridlog.schema.column import Column, Records, Scalars, Strings, offsets
+from hybridlog.schema.column import Column, Records, Scalars, Strings, Wanted, below, offsets
 from hybridlog.schema.text import MAX_DEPTH, json_text, repaired_text
 
 if TYPE_CHECKING:
@@ -123,16 +123,12 @@ def _validity(missing: NDArray[np.bool_] | None) -> pa.Buffer | None:
 # Python objects.
 
 
-def objects_array(
-    objects: Sequence[Mapping[str, Any]], wanted: Sequence[Sequence[str]] | None
-) -> pa.StructArray:
+def objects_array(objects: Sequence[Mapping[str, Any]], wanted: Wanted) -> pa.StructArray:
     """Messages, one a row, as a struct array of the wanted paths; None for all."""
     return cast("pa.StructArray", _structs(objects, wanted, 1))
 
 
-def values_array(
-    values: Sequence[Any], wanted: Sequence[Sequence[str]] | None = None, depth: int = 1
-) -> pa.Array[Any]:
+def values_array(values: Sequence[Any], wanted: Wanted = None, depth: int = 1) -> pa.Array[Any]:
     """Values of any kind as one array, None as null; of objects the wanted paths, None for all.
 
     There are `depth` levels above these values.
@@ -201,23 +197,21 @@ def _numbers(values: Sequence[Any], kinds: set[type]) -> pa.Array[Any] | None:
     return None
 
 
-def _lists(
-    values: Sequence[list[Any] | None], wanted: Sequence[Sequence[str]] | None, depth: int
-) -> pa.Array[Any]:
+def _lists(values: Sequence[list[Any] | None], wanted: Wanted, depth: int) -> pa.Array[Any]:
     elements = [element for row in values if row is not None for element in row]
     items = values_array(elements, wanted, depth)
     return lists(items, offsets_of(values), missing_rows(values))
 
 
 def _structs(
-    values: Sequence[Mapping[str, Any] | None], wanted: Sequence[Sequence[str]] | None, depth: int
+    values: Sequence[Mapping[str, Any] | None], wanted: Wanted, depth: int
 ) -> pa.Array[Any] | None:
     columns: dict[str, list[Any]] = {}
     for row, value in enumerate(values):
         for name in value or ():
             column = columns.get(name)
             if column is None:
-                if wanted is not None and not any(path[0] == name for path in wanted):
+                if below(wanted, name) == []:
                     continue
                 column = columns[name] = [None] * len(values)
                 if len(columns) > MAX_NAMES and depth > 1:
@@ -230,11 +224,3 @@ def _structs(
             plain += "_"
         arrays[plain] = values_array(column, below(wanted, name), depth)
     return structs(arrays, len(values), missing_rows(values))
-
-
-def below(wanted: Sequence[Sequence[str]] | None, name: str) -> Sequence[Sequence[str]] | None:
-    """The wanted paths below a wanted field; None for all."""
-    if wanted is None:
-        return None
-    rest = [path[1:] for path in wanted if path[0] == name]
-    return None if [] in [list(path) for path in rest] else rest

@@ -144,6 +144,23 @@ def offsets(counts: NDArray[np.int64]) -> NDArray[np.int64]:
     return result
 
 
+Wanted: TypeAlias = "Sequence[tuple[str, ...]] | None"
+"""Paths of the fields that are wanted, each with all below it, by names; None for all."""
+
+
+def names_of(path: str) -> tuple[str, ...]:
+    """Names on a dotted path of a field, without brackets."""
+    return tuple(path.replace("[]", "").split("."))
+
+
+def below(wanted: Wanted, name: str) -> Wanted:
+    """What is wanted of a field: nothing if it is empty."""
+    if wanted is None:
+        return None
+    rest = [path[1:] for path in wanted if path[0] == name]
+    return None if () in rest else rest
+
+
 STAMP: Final = "header.stamp"
 """Path of the header stamp in messages that have one."""
 

@@ -16,7 +16,7 @@ import numpy as np
 from bson.errors import BSONError
 from bson.int64 import Int64
 
-from hybridlog.schema.column import RESERVED, summary_of, top_level_names
+from hybridlog.schema.column import RESERVED, Wanted, names_of, summary_of, top_level_names
 from hybridlog.schema.document import ARRAY_LIMIT, MAX_BYTES, BodyGroup
 from hybridlog.schema.text import nearest, repaired_text
 from hybridlog_storage.errors import PayloadError
@@ -88,11 +88,9 @@ class Objects:
 
         return objects_array(self.plain(), self.wanted())
 
-    def wanted(self) -> list[list[str]] | None:
+    def wanted(self) -> Wanted:
         """The wanted paths as the names they consist of."""
-        if self.fields is None:
-            return None
-        return [path.replace("[]", "").split(".") for path in self.fields]
+        return None if self.fields is None else [*map(names_of, self.fields)]
 
     def bodies(self) -> Iterator[BodyGroup]:
         """As of `document.bodies`."""

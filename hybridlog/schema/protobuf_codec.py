@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any, cast
 import pyarrow as pa
 
 from hybridlog.schema.arrow_columns import (
-    below,
     lists,
     missing_rows,
     offsets_of,
@@ -27,7 +26,7 @@ from hybridlog.schema.arrow_columns import (
 )
 from hybridlog.schema.arrow_types import plain_values
 from hybridlog.schema.codec import ObjectCodec
-from hybridlog.schema.column import top_level_names
+from hybridlog.schema.column import Wanted, below, top_level_names
 from hybridlog.schema.definition import MAX_DEFINITION, FieldPath
 from hybridlog.schema.objects import Objects, plain_cells
 from hybridlog_storage.errors import DefinitionError, PayloadError
@@ -41,8 +40,6 @@ if TYPE_CHECKING:
     from google.protobuf.message import Message
 
     from hybridlog_storage.messages import Buffer, Schema
-
-    Wanted = Sequence[Sequence[str]] | None
 
 _MAX_UNSET = 10_000
 """Maximum number of fields that no row has and that still get a type."""
@@ -271,8 +268,8 @@ class _Builder:
         arrays: dict[str, pa.Array[Any]] = {}
         spelled = names if above else top_level_names(names)
         for name, field in zip(spelled, descriptor.fields, strict=True):
-            if wanted is None or any(path[0] == name for path in wanted):
-                arrays[name] = self._field(field, messages, below(wanted, name), within)
+            if (inner := below(wanted, name)) != []:
+                arrays[name] = self._field(field, messages, inner, within)
         return structs(arrays, len(messages), missing)
 
     def _field(
@@ -308,9 +305,9 @@ class _Builder:
         arrays: dict[str, pa.Array[Any]] = {}
         for key in sorted({key for row in rows if row is not None for key in row}):
             name = str(key).lower() if isinstance(key, bool) else str(key)
-            if wanted is None or any(path[0] == name for path in wanted):
+            if (rest := below(wanted, name)) != []:
                 values = [row[key] if row is not None and key in row else None for row in rows]
-                arrays[name] = self._values(inner, values, below(wanted, name), above)
+                arrays[name] = self._values(inner, values, rest, above)
         return structs(arrays, len(rows), missing_rows(rows))
 
     def _values(

@@ -16,7 +16,7 @@ from bisect import bisect_right
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
-from hybridlog.schema.column import Column, Records
+from hybridlog.schema.column import Column, Records, Wanted, below, names_of
 from hybridlog.schema.definition import ArrayOf, FieldType, Instant, MessageType, Primitive, Text
 from hybridlog_storage.errors import DefinitionError
 
@@ -24,9 +24,6 @@ if TYPE_CHECKING:
     from collections.abc import Collection
 
 Wire: TypeAlias = Literal["ros1", "cdr"]
-Wanted: TypeAlias = "bool | dict[str, Wanted]"
-
-
 Node: TypeAlias = "int | dict[str, Node]"
 """The slot of a requested field, or those of a message in the order of the definition."""
 
@@ -228,24 +225,6 @@ def _is_fixed(step: Step) -> bool:
     return isinstance(step, Run)
 
 
-def wanted_tree(fields: Collection[str] | None) -> Wanted:
-    """Dotted paths (`[]` optional) as a tree of names; True, as for None, is everything below."""
-    if fields is None:
-        return True
-    tree: dict[str, Wanted] = {}
-    for path in sorted(fields):
-        *parents, last = path.replace("[]", "").split(".")
-        node = tree
-        for name in parents:
-            inner = node.setdefault(name, {})
-            if not isinstance(inner, dict):
-                break
-            node = inner
-        else:
-            node[last] = True
-    return tree
-
-
 class _Compiler:
     def __init__(self, wire: Wire) -> None:
         self._wire = wire
@@ -265,7 +244,7 @@ class _Compiler:
 
     def _slot(self, wanted: Wanted) -> int | None:
         # A path below a field without fields does not exist.
-        if wanted is not True:
+        if wanted is not None:
             return None
         self._slots += 1
         return self._slots - 1
@@ -299,11 +278,11 @@ class _Compiler:
             self._run.append(Fixed(path or message.name, 1, 1, None, None, None))
         found: dict[str, Node] = {}
         for name, field_type in message.fields:
-            below = wanted if isinstance(wanted, bool) else wanted.get(name, False)
-            node = self._add(field_type, f"{path}.{name}" if path else name, below)
+            own = f"{path}.{name}" if path else name
+            node = self._add(field_type, own, below(wanted, name))
             if node is not None:
                 found[name] = node
-        return found if found or wanted is True else None
+        return found if found or wanted is None else None
 
     def _array(self, array: ArrayOf, path: str, wanted: Wanted) -> int | None:
         element = array.element
@@ -319,7 +298,7 @@ class _Compiler:
         inner = _Compiler(self._wire).program(element, f"{path}[]", wanted)
         if inner.least == 0 and inner.steps:
             raise DefinitionError(f"not indexed: {path} nests arrays of messages without fields")
-        slot = self._slot(inner.root is not None)
+        slot = self._slot([] if inner.root is None else None)
         self._steps.append(ArrayStep(path, slot, array.width, inner))
         return slot
 
@@ -329,4 +308,5 @@ def compile_type(message_type: MessageType, wire: Wire, fields: Collection[str] 
 
     Unknown ones are ignored. Elements that take no bytes and hold arrays raise DefinitionError.
     """
-    return _Compiler(wire).program(message_type, "", wanted_tree(fields))
+    wanted = None if fields is None else [*map(names_of, fields)]
+    return _Compiler(wire).program(message_type, "", wanted)

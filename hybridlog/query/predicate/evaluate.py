@@ -297,7 +297,7 @@ def _absolute(values: Any) -> Any:
 
 def _apart(found: _Values, part: str | int | Slice | None = None) -> Iterator[_Values]:
     """Values in JSON text, apart by the types that they have; of objects a field that is wanted."""
-    wanted = [[part]] if isinstance(part, str) else None
+    wanted = [(part,)] if isinstance(part, str) else None
     alike: dict[object, tuple[list[Any], list[int]]] = defaultdict(lambda: ([], []))
     for row, value in zip(found.rows.tolist(), plain_values(found.values), strict=True):
         kind: object = type(value)
