@@ -7,7 +7,7 @@ import signal
 import threading
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from typing import Any
 
 import pytest
@@ -20,7 +20,6 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 
 SECONDS = 60
 COUNT = 20
-LOCKS = (type(threading.Lock()), type(threading.RLock()))
 
 
 def in_child(work: Callable[[], Any]) -> None:
@@ -39,14 +38,12 @@ def in_child(work: Callable[[], Any]) -> None:
 
 
 @contextmanager
-def held(*locks: Any) -> Iterator[None]:
-    """Locks that another thread holds."""
+def held(lock: Any) -> Iterator[None]:
+    """A lock that another thread holds."""
     begun, over = threading.Event(), threading.Event()
 
     def hold() -> None:
-        with ExitStack() as stack:
-            for lock in locks:
-                stack.enter_context(lock)
+        with lock:
             begun.set()
             over.wait(SECONDS)
 
@@ -58,25 +55,6 @@ def held(*locks: Any) -> Iterator[None]:
     finally:
         over.set()
         thread.join()
-
-
-def locks_of(thing: object, seen: dict[int, object]) -> Iterator[Any]:
-    """All locks that an object of this project has, directly or in what it has."""
-    if id(thing) in seen:
-        return
-    seen[id(thing)] = thing
-    if isinstance(thing, LOCKS):
-        yield thing
-    elif isinstance(thing, dict):
-        for one in list(thing.values()):
-            yield from locks_of(one, seen)
-    elif isinstance(thing, list | tuple | set):
-        for one in list(thing):
-            yield from locks_of(one, seen)
-    elif type(thing).__module__.startswith("hybridlog") and not isinstance(thing, type):
-        names = [n for kind in type(thing).__mro__ for n in vars(kind).get("__slots__", ())]
-        for name in [*getattr(thing, "__dict__", ()), *names]:
-            yield from locks_of(getattr(thing, name, None), seen)
 
 
 @pytest.fixture(scope="module")
@@ -128,7 +106,7 @@ def test_a_child_is_told_to_open_the_store(store: hl.Store) -> None:
         assert [m.decode().seq for m in synced[7]] == [7, 7]
 
     in_child(opened)
-    with held(*locks_of(store, {})):
+    with held(store.shared.following):
         in_child(refused)
     assert query.count() == 5
 

@@ -85,26 +85,10 @@ def test_output_is_bounded() -> None:
     assert "1000 recordings" in html
     assert ">r999<" in html
     assert ">r979<" not in html
-    deep = {"deep": ["y" * 10_000] * 10_000}
-    html = message_html("m" * 10_000, {f"f{n}": deep for n in range(10_000)})
+    deep = {"deep": ["y" * 1000] * 1000}
+    html = message_html("m" * 10_000, {f"f{n}": deep for n in range(1000)})
     assert len(html) < 20_000
     assert html.count("<tr>") == 20
-
-
-def test_representations_are_short(store: hl.Store) -> None:
-    path = store.directory.path
-    assert repr(store) == f"<Store {path}>"
-    (entry,) = store.recordings()
-    assert repr(store.recordings()) == f"<Recordings {entry.name}>"
-    assert repr(entry) == f"<Recording {entry.name}; 6 channels, 6 messages>"
-    assert repr(entry.channels[1]) == "<Channel /many ; 1 messages>"
-    query = store.topic("/many").between("+0s", "end").where("f1 > 0").limit(3)
-    assert repr(query) == (
-        f"<Query /many; recording {entry.name}; between +0s and end; where f1 > 0>"
-    )
-    wide = store.all_topics().where(" or ".join(f"f{n} > {n}" for n in range(40)))
-    assert len(repr(wide)) < 450
-    assert "and 3 more" in repr(wide)
 
 
 def test_every_answer_is_a_table_and_an_error_has_no_traceback(store: hl.Store) -> None:

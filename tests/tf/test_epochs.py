@@ -120,30 +120,26 @@ def test_nothing_matches_across(store: hl.Store) -> None:
         assert AGAIN in " ".join(rows.remarks())
 
 
-def test_a_run_without_the_other_topic_has_no_match(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("how", "without", "wanted"),
+    [
+        ("nearest", [(1, n) for n in range(1, 6)], [1, 2, 3, 4, 5, *[None] * 5]),
+        ("interpolate", [(0, 5)], [1, 2, 3, 4, None, 1, 2, 3, 4, 5]),
+    ],
+)
+def test_a_run_that_lacks_messages(
+    tmp_path: Path, how: str, without: list[tuple[int, int]], wanted: list[float | None]
+) -> None:
     messages: list[Said] = []
     for run in range(2):
         for n in range(1, 6):
             at = BEGIN + run * 20 * S + n * S
-            messages += [(topic, point("base", n * S, run), at) for topic in ("/a", "/c")]
-    messages += [("/b", point("base", n * S, 7), BEGIN + n * S) for n in range(1, 6)]
-    with hl.open(tmp_path / "store", create=True, mongo="none") as store:
-        recorded(store, "loop", messages)
-        rows = store.align("/a", ["/b"], how="nearest", clock="header").to_arrow()
-        assert rows["b.point.x"].to_pylist() == [7] * 5 + [None] * 5
-
-
-def test_nothing_is_interpolated_across(tmp_path: Path) -> None:
-    messages: list[Said] = []
-    for run in range(2):
-        for n in range(1, 6):
-            at = BEGIN + run * 20 * S + n * S
-            topics = ("/a", "/b") if (run, n) != (0, 5) else ("/a",)
+            topics = ("/a", "/c") if (run, n) in without else ("/a", "/b", "/c")
             messages += [(topic, point("base", n * S, n), at) for topic in topics]
     with hl.open(tmp_path / "store", create=True, mongo="none") as store:
         recorded(store, "loop", messages)
-        rows = store.align("/a", ["/b"], how="interpolate", clock="header").to_arrow()
-        assert rows["b.point.x"].to_pylist() == [1, 2, 3, 4, None, 1, 2, 3, 4, 5]
+        rows = store.align("/a", ["/b"], how=how, clock="header").to_arrow()
+        assert rows["b.point.x"].to_pylist() == wanted
 
 
 def test_transforms_are_of_the_same_run(store: hl.Store) -> None:

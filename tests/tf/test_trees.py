@@ -7,7 +7,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 import hybridlog as hl
@@ -216,19 +215,9 @@ def test_topics_by_type(store: hl.Store, tmp_path: Path) -> None:
     assert run("fetch", "tf", "--topic-type", "Point*", "--count", store=path).out == "3\n"
 
 
-def test_odd_arguments_and_a_closed_store(store: hl.Store) -> None:
+def test_a_closed_store(store: hl.Store) -> None:
     recorded(store, "x", [("/gps/battery/state", point("base", S), BEGIN)])
     query = store.topic("state")
-    for refused in (lambda: query.limit(True), lambda: query.every(True)):
-        with pytest.raises(UsageError):
-            refused()
-    with pytest.raises(UsageError, match="number of seconds"):
-        store.sql("select 1", timeout="5s")  # type: ignore[arg-type]
-    with pytest.raises(TopicError, match="did you mean /gps/battery/state"):
-        store.topic("batery")
-    nothing = query.where("point.x > 5").to_numpy()
-    assert isinstance(nothing, np.ndarray)
-    assert len(nothing) == 0
     store.close()
     for asked in (query.count, query.to_arrow, store.topics):
         with pytest.raises(UsageError, match="is closed: open it again"):
