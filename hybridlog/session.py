@@ -478,7 +478,9 @@ class Session:
         was_flushed = number in entry.flushed
         if now.logs.get(number) != entry.logs.get(number) or was_flushed != (number in now.flushed):
             self._entries[entry.id] = now
-            raise _changed(entry)
+            raise ChangedError(
+                f"Files of recording {entry.name!r} were replaced while it was read. Ask again."
+            )
 
     def table(self, recording: RecordingEntry, topic: str) -> TopicTable | None:
         """The table of a topic of an ended recording; None without one.
@@ -489,9 +491,3 @@ class Session:
         if recording.status in UNFINISHED or has_marks or recording.lost_spans:
             return None
         return self.tables.of(recording, topic)
-
-
-def _changed(recording: RecordingEntry) -> ChangedError:
-    return ChangedError(
-        f"Files of recording {recording.name!r} were replaced while it was read. Ask again."
-    )

@@ -506,7 +506,7 @@ class Store:
 
     @property
     def sql_engine(self) -> SqlEngine:
-        """Runs SQL; for programs that need several statements in one connection."""
+        """Runs SQL."""
         self.shared.check_process()
         if self._sql is None:
             from hybridlog.sql.engine import SqlEngine
@@ -548,7 +548,7 @@ class Store:
         """
         ids = None if recordings is None else tuple(one.id for one in self._chosen(recordings))
         scope = Question((), ids, Choice.of(during=between).during)
-        return self.sql_engine.connect(memory, scope=scope).query(query, params, timeout)
+        return self.sql_engine.query(query, params, timeout, memory=memory, scope=scope)
 
     # Changes.
 

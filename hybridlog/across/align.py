@@ -53,9 +53,6 @@ RECORDING: Final = "recording"
 MAX_TIMES: Final = 100_000_000
 """Maximum number of rows of `resample`."""
 _DISTANCE: Final = "distance"
-_ELSEWHERE: Final = (
-    "the messages are of other recordings, which --beside or across_recordings takes"
-)
 _LOST: Final = "messages of that time are lost"
 _NO_TIME: Final = "the row has no time on the clock"
 _NO_VALUE: Final = "the message has no such value"
@@ -307,7 +304,6 @@ class TopicReader:
         why = plain if self.tolerance is None else near.format(format_duration(self.tolerance))
         empty[topic, _NO_TIME] += int(is_unknown.sum())
         empty[topic, _LOST] += int(is_lost.sum())
-        why = _ELSEWHERE if self.is_elsewhere(self._recording) else why
         empty[topic, why] += int((missing & ~is_unknown & ~is_lost).sum())
 
     def _is_lost(self, times: NDArray[np.int64]) -> NDArray[np.bool_]:

@@ -26,7 +26,6 @@ from hybridlog.schema.arrow_types import (
     is_list,
     is_text,
     is_time,
-    time_of_day,
 )
 from hybridlog.schema.text import without_nan
 from hybridlog_storage.errors import UsageError
@@ -188,8 +187,6 @@ def _times(array: pa.Array) -> pa.Array:
 
 def _temporal(one: pa.Scalar) -> str:
     """A date, a time of day, or an interval."""
-    if pa.types.is_time(one.type):
-        return f'"{time_of_day(one)}"'
     value = one.as_py()
     if isinstance(value, pa.MonthDayNano):
         names = ("months", "days", "nanoseconds")

@@ -315,7 +315,7 @@ def flat(records: pa.StructArray) -> dict[str, pa.Array[Any]]:
             continue
         while path in leaves:
             path += "_"
-        leaves[path] = _with_fields(array)
+        leaves[path] = with_fields(array)
     return leaves
 
 
@@ -325,17 +325,17 @@ def _children(prefix: str, array: pa.StructArray) -> list[tuple[str, pa.Array[An
     return list(zip(names, array.flatten(), strict=True))[::-1]
 
 
-def _with_fields(array: pa.Array[Any]) -> pa.Array[Any]:
+def with_fields(array: pa.Array[Any]) -> pa.Array[Any]:
     """The array with `true` for messages without fields, which few formats support."""
     if not has_empty(array.type):
         return array
     if is_list(array.type):
-        return with_values(array, _with_fields(array.flatten()))
+        return with_values(array, with_fields(array.flatten()))
     missing = missing_of(array)
     if not array.type.num_fields:
         return pa.array(np.ones(len(array), np.bool_), mask=missing)
     children = zip(array.type, array.flatten(), strict=True)
-    return structs({f.name: _with_fields(child) for f, child in children}, len(array), missing)
+    return structs({f.name: with_fields(child) for f, child in children}, len(array), missing)
 
 
 def leaves_of(

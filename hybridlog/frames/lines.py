@@ -22,7 +22,6 @@ from hybridlog.schema.arrow_types import (
     is_number,
     numpy_type,
     plain_values,
-    time_of_day,
 )
 from hybridlog.schema.column import Records
 
@@ -126,8 +125,6 @@ def _cell(value: pa.Scalar, *, exact: bool, most: int = MAX_CELL) -> str:
         text = _exact(value) if exact else f"{value.as_py():.6g}"
     elif types.is_timestamp(kind):
         text = _time(value)
-    elif types.is_time(kind):
-        text = time_of_day(value)
     elif types.is_duration(kind):
         text = format_duration(value.value)
     elif is_bytes(kind):

@@ -67,12 +67,6 @@ def is_array(kind: pa.DataType) -> bool:
     return is_list(kind) or is_bytes(kind)
 
 
-def time_of_day(value: pa.Scalar) -> str:
-    """A time of day as text: the end of a day is 24:00, as in SQL, and not midnight."""
-    text = str(value.as_py())
-    return "24:00:00" if value.value and text == "00:00:00" else text
-
-
 def is_time(kind: pa.DataType) -> bool:
     """True for times and durations."""
     return bool(_types.is_timestamp(kind) or _types.is_duration(kind))
@@ -137,7 +131,7 @@ def with_values(array: Array, values: Array) -> Array:
 # Common types.
 
 
-def exact(kinds: Kinds, arrays: Arrays) -> pa.DataType:
+def _exact(kinds: Kinds, arrays: Arrays) -> pa.DataType:
     """The type of values that are neither structs nor lists; JSON text where none is exact."""
     if all(is_number(kind) or is_time(kind) for kind in kinds):
         return _exact_number(kinds, arrays)
@@ -146,18 +140,13 @@ def exact(kinds: Kinds, arrays: Arrays) -> pa.DataType:
     return pa.large_binary() if all(map(is_bytes, kinds)) else pa.json_()
 
 
-def common_type(
-    arrays: Arrays,
-    leaf: Callable[[Kinds, Arrays], pa.DataType] = exact,
-    *,
-    summaries: bool = False,
-) -> pa.DataType:
+def common_type(arrays: Arrays, *, summaries: bool = False) -> pa.DataType:
     """The type that represents the values of all arrays exactly.
 
-    `leaf` returns the type of values that are neither structs nor lists; with `summaries`, arrays
-    become summaries beside summaries. A name that stands for two fields raises `pa.ArrowInvalid`.
+    With `summaries`, arrays become summaries beside summaries. A name that stands for two fields
+    raises `pa.ArrowInvalid`.
     """
-    inner = partial(common_type, leaf=leaf, summaries=summaries)
+    inner = partial(common_type, summaries=summaries)
     kinds = list(dict.fromkeys(array.type for array in arrays))
     if len(kinds) > 1 and pa.null() in kinds:
         kinds.remove(pa.null())
@@ -172,7 +161,7 @@ def common_type(
     elif all(map(is_list, kinds)):
         found = _common_list(kinds, arrays, inner)
     else:
-        found = leaf(kinds, arrays)
+        found = _exact(kinds, arrays)
     if found != pa.json_():
         return found
     # The type of an array without values, such as the elements of empty lists, is irrelevant.

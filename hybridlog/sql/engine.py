@@ -1,11 +1,10 @@
-"""Runs SQL on a store: connections to DuckDB, and answers of queries.
+"""Runs SQL on a store: DuckDB as that needs it, and answers of queries.
 
-DuckDB as SQL on a store needs it: bounded, interruptible, without access to anything else.
+DuckDB is bounded, interruptible, without access to anything else.
 """
 
 from __future__ import annotations
 
-import os
 import re
 import resource
 import threading
@@ -39,6 +38,11 @@ if TYPE_CHECKING:
     from hybridlog.query.answers.completeness import Completeness
     from hybridlog.session import Asked
 
+Params = Sequence[Any] | Mapping[str, Any] | None
+EVERYWHERE: Final = Question(())
+"""A scope of all recordings and times."""
+_BATCH_ROWS: Final = 65_536
+_NO_TABLE: Final = re.compile(r"Catalog Error: Table with name (.+?) does not exist")
 MEMORY: Final = 1 << 30
 """Default limit of DuckDB's memory, bytes."""
 MIN_MEMORY: Final = 64 << 20
@@ -60,10 +64,6 @@ _T = TypeVar("_T")
 
 OWN_MEMORY: Final = 512 << 20
 """Bytes that hybridlog may take beside DuckDB, on top of what the process has at the start."""
-
-
-# What Arrow reserves would count as taken; it reads this when it is loaded.
-os.environ.setdefault("MIMALLOC_ARENA_EAGER_COMMIT", "0")
 
 
 def duckdb() -> Any:
@@ -106,26 +106,16 @@ def explained(memory: int, first: Callable[[], Exception | None] = lambda: None)
                 "SQL reads the views of this store alone; files, extensions and other databases "
                 f"are off. {text}"
             ) from error
-        shortage = shortage_of(cause or error, memory)
-        if shortage is not None:
-            raise shortage from error
+        real = cause or error
+        is_short = isinstance(real, MemoryError | package.OutOfMemoryException)
+        if is_short or any(text in str(real) for text in _SHORTAGES):
+            raise ResourceError(
+                f"The query needs more than {memory >> 20} MiB of memory: ask for less at a time, "
+                "or allow more (`hybridlog sql --memory`)."
+            ) from error
         if isinstance(error, package.Error):
-            raise UsageError(str(cause or error).strip()) from error
+            raise UsageError(str(real).strip()) from error
         raise
-
-
-def shortage_of(error: Exception, memory: int) -> ResourceError | None:
-    """The error to raise for one of DuckDB, Arrow or the system that means too little memory.
-
-    `memory` is the limit of DuckDB's memory, bytes.
-    """
-    is_short = isinstance(error, MemoryError | duckdb().OutOfMemoryException)
-    if not is_short and not any(text in str(error) for text in _SHORTAGES):
-        return None
-    return ResourceError(
-        f"The query needs more than {memory >> 20} MiB of memory: ask for less at a time, or "
-        "allow more (`hybridlog sql --memory`)."
-    )
 
 
 class Worker:
@@ -191,14 +181,6 @@ def limited_memory(memory: int) -> Iterator[int]:
         resource.setrlimit(resource.RLIMIT_DATA, (before, hard))
 
 
-Params = Sequence[Any] | Mapping[str, Any] | None
-EVERYWHERE: Final = Question(())
-"""A scope of all recordings and times."""
-_BATCH_ROWS: Final = 65_536
-_FIRST_ROWS: Final = 64
-_NO_TABLE: Final = re.compile(r"Catalog Error: Table with name (.+?) does not exist")
-
-
 class SqlEngine:
     """Runs SQL on an open store. Thread safe."""
 
@@ -208,30 +190,41 @@ class SqlEngine:
         self._content: StoreContent | None = None
         self._lock = threading.RLock()
 
-    def connect(
+    def query(
         self,
-        memory: int | None = None,
+        text: str,
+        params: Params = None,
+        timeout: float | None = None,
         *,
-        only_reads: bool = False,
+        memory: int | None = None,
         scope: Question = EVERYWHERE,
-    ) -> SqlConnection:
-        """A connection; what is created in it is there until it is closed.
+    ) -> SqlAnswer:
+        """Prepare a query; of several statements, all but the last are run.
+
+        What they create is there until the answer is dropped.
 
         Args:
+            text: One statement or several.
+            params: Values of `?` or `$name` in the last statement.
+            timeout: Seconds that it may take; None for no limit.
             memory: Limit of DuckDB's memory, bytes; None for 1 GiB.
-            only_reads: Nothing can be created in it.
             scope: The recordings and times that views and tables show, whatever its topics.
 
         Raises:
             MissingDependencyError: DuckDB is not installed.
-            UsageError: the limit is too low.
+            UsageError: DuckDB refuses it, or the limit is too low.
         """
+        if isinstance(params, str) or not isinstance(() if params is None else params, Iterable):
+            raise UsageError("Parameters are a list, or a dictionary by name: sql(query, [0.5]).")
+        if not isinstance(timeout, int | float | None):
+            raise UsageError(f"A timeout is a number of seconds, not {timeout!r}.")
         most = MEMORY if memory is None else memory
         with self._lock:
             if most not in self._bases:
                 self._bases[most] = open_duckdb(most)
             cursor = self._bases[most].cursor()
-            return SqlConnection(self, cursor, most, scope, only_reads=only_reads)
+        content = self.content(scope)
+        return SqlAnswer(content, cursor, text, params, memory=most, timeout=timeout)
 
     def content(self, scope: Question = EVERYWHERE) -> StoreContent:
         """Recordings and views of a scope as they are now."""
@@ -250,84 +243,10 @@ class SqlEngine:
             self._content = None
 
 
-class SqlConnection:
-    """Runs queries one after the other. Not thread safe.
-
-    `memory` is DuckDB's limit, bytes. With `only_reads`, statements other than queries are refused.
-    """
-
-    def __init__(
-        self,
-        engine: SqlEngine,
-        cursor: Any,
-        memory: int,
-        scope: Question,
-        *,
-        only_reads: bool = False,
-    ) -> None:
-        self.cursor = cursor
-        self.memory = memory
-        self.scope = scope
-        self.reading = Reading()
-        self._engine = engine
-        self._only_reads = only_reads
-        self._has_own = False  # views and macros of the user read what a query does not name
-        self._names: set[str] = set()
-
-    @property
-    def content(self) -> StoreContent:
-        """Recordings and views as they are now."""
-        return self._engine.content(self.scope)
-
-    def query(self, text: str, params: Params = None, timeout: float | None = None) -> SqlAnswer:
-        """Prepare a query; of several statements, all but the last are run.
-
-        Args:
-            text: One statement or several.
-            params: Values of `?` or `$name` in the last statement.
-            timeout: Seconds that it may take; None for no limit.
-
-        Raises:
-            UsageError: DuckDB refuses it.
-        """
-        if isinstance(params, str) or not isinstance(() if params is None else params, Iterable):
-            raise UsageError("Parameters are a list, or a dictionary by name: sql(query, [0.5]).")
-        if not isinstance(timeout, int | float | None):
-            raise UsageError(f"A timeout is a number of seconds, not {timeout!r}.")
-        with explained(self.memory):
-            statements = list(self.cursor.extract_statements(text))
-        if not statements:
-            raise UsageError("The query is empty.")
-        kinds = [*map(_kind, statements)]
-        if self._only_reads and {*kinds} != {"SELECT"}:
-            raise UsageError("Only queries are possible here, such as select and show.")
-        content = self.content
-        self._names.update(content.named(text))
-        for name in self._names.intersection(content.names):
-            view = content.view(name)
-            source = TopicDataset(view, lambda: self.reading) if view else content.table(name)
-            self.cursor.register(name, source)
-        for statement, kind in zip(statements, kinds, strict=True):
-            asked = params if statement is statements[-1] else None
-            named = None
-            if kind == "SELECT" and not self._has_own:
-                sql = statement.query.strip().rstrip(";")
-                named = paths_named(self.cursor.cursor().execute(TREE, [sql]).fetchone()[0])
-            answer = SqlAnswer(self, statement.query, asked, Reading(named), timeout)
-            if kind not in {"SELECT", "EXPLAIN"}:
-                self._has_own = True
-                answer.run()
-        return answer
-
-    def close(self) -> None:
-        """Close the connection."""
-        self.cursor.close()
-
-
 class SqlAnswer:
-    """The answer of a query, computed whenever it is asked for; its connection must be open then.
+    """The answer of a query, computed whenever it is asked for; its store must be open then.
 
-    The timeout is in seconds, None for no limit.
+    The limit of DuckDB's memory is in bytes, the timeout in seconds, None for no limit.
 
     Attributes:
         columns: Names of the columns; empty for statements that return nothing.
@@ -336,32 +255,59 @@ class SqlAnswer:
 
     def __init__(
         self,
-        connection: SqlConnection,
+        content: StoreContent,
+        cursor: Any,
         text: str,
         params: Params,
-        reading: Reading,
+        *,
+        memory: int,
         timeout: float | None,
     ) -> None:
-        self._connection = connection
+        self._content, self._cursor, self._memory = content, cursor, memory
         self._timeout = timeout
-        self.reading = reading
-        self._done: pa.Table | None = None  # of a statement that changes something
+        with explained(memory):
+            statements = list(cursor.extract_statements(text))
+        if not statements:
+            raise UsageError("The query is empty.")
+        named = None
+        if len(statements) == 1 and _kind(statements[0]) == "SELECT":
+            sql = statements[0].query.strip().rstrip(";")
+            named = paths_named(cursor.cursor().execute(TREE, [sql]).fetchone()[0])
+        self.reading = Reading(named)
+        for name in content.named(text):
+            view = content.view(name)
+            source = TopicDataset(view, lambda: self.reading) if view else content.table(name)
+            cursor.register(name, source)
+        for statement in statements:
+            self._done: pa.Table | None = None  # of a statement that changes something
+            asked = params if statement is statements[-1] else None
+            self._relation = self._prepared(statement.query, asked)
+            found = self._relation
+            self.columns: list[str] = [] if found is None else list(found.columns)
+            if _kind(statement) not in {"SELECT", "EXPLAIN"}:
+                self._done = self.to_arrow() if self.columns else pa.table({})
+
+    def _prepared(self, text: str, params: Params) -> Any:
+        """The relation of a statement; None if it returns nothing."""
         try:
-            with explained(connection.memory):
-                self._relation = connection.cursor.sql(text, params=params)
+            with explained(self._memory):
+                return self._cursor.sql(text, params=params)
         except UsageError as error:
             found = _NO_TABLE.match(str(error))
             if found is None:
                 raise
-            hint = meant(found[1], connection.content.names)
+            hint = meant(found[1], self._content.names)
             raise TopicError(f"There is no view {found[1]!r}; {hint}") from error
-        self.columns: list[str] = [] if self._relation is None else list(self._relation.columns)
 
     def __repr__(self) -> str:
         return f"<SqlAnswer of {len(self.columns)} columns: {', '.join(self.columns[:8])}>"
 
     def _repr_html_(self) -> str:
-        return arrow_html(repr(self), self.first(MAX_ROWS, 1 << 20)[0])
+        table = self._done
+        if table is None:
+            rows = self._batches(MAX_ROWS, self._relation.limit(MAX_ROWS))
+            table = pa.Table.from_batches([*rows])
+        return arrow_html(repr(self), table)
 
     def sentences(self) -> list[str]:
         """Sentences about what the computed answer may lack."""
@@ -379,12 +325,8 @@ class SqlAnswer:
     def completeness(self) -> Completeness:
         """Completeness of the computed answer, by what was read for it."""
         topics, recordings = tuple(self.reading.topics), tuple(self.reading.recordings)
-        asked = replace(self._connection.scope, topics=topics, recordings=recordings)
-        return completeness_of(self._connection.content.session, asked)
-
-    def run(self) -> None:
-        """Compute a statement that changes something, once."""
-        self._done = self.to_arrow() if self.columns else pa.table({})
+        asked = replace(self._content.scope, topics=topics, recordings=recordings)
+        return completeness_of(self._content.session, asked)
 
     def check_names(self) -> None:
         """Check that no two columns have one name, for forms that go by names.
@@ -405,24 +347,10 @@ class SqlAnswer:
         done = self._done
         return pa.Table.from_batches([*self.to_batches()]) if done is None else done
 
-    def first(self, rows: int, size: int) -> tuple[pa.Table, bool]:
-        """The first rows of a query, and whether there are more; the others are not computed.
-
-        No further row is taken after so many bytes.
-        """
-        taken: list[pa.RecordBatch] = []
-        # Few rows at a time: each may be an image.
-        for batch in self._batches(_FIRST_ROWS, self._relation.limit(rows + 1)):
-            if sum(one.nbytes for one in taken) > size:
-                return pa.Table.from_batches(taken), True
-            taken.append(batch)
-        table = pa.Table.from_batches(taken)
-        return table.slice(0, rows), table.num_rows > rows
-
     def to_batches(self) -> Iterator[pa.RecordBatch]:
         """The answer in record batches of bounded size, at least one.
 
-        The next query of the connection ends it.
+        When it is computed again, that ends it.
 
         Raises:
             ResourceError: it needs more memory or time than it may.
@@ -433,11 +361,10 @@ class SqlAnswer:
 
     def _batches(self, size: int, relation: Any) -> Iterator[pa.RecordBatch]:
         """The answer in batches of so many rows."""
-        connection = self._connection
-        reading = self.reading = connection.reading = Reading(self.reading.named)
+        reading = self.reading = Reading(self.reading.named)
         with (
-            closing(Worker(connection.cursor, self._timeout)) as worker,
-            explained(connection.memory, lambda: reading.error),
+            closing(Worker(self._cursor, self._timeout)) as worker,
+            explained(self._memory, lambda: reading.error),
         ):
             reader = worker.run(lambda: relation.to_arrow_reader(size))
             batch = worker.run(partial(next, reader, None))

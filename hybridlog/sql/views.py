@@ -1,4 +1,10 @@
-"""Topics as DuckDB reads them: views with the rows that `query/rows.py` finds, in SQL's columns."""
+"""Topics as DuckDB reads them: views with the rows that `query/rows.py` finds, in SQL's columns.
+
+Nested messages are structs. Arrays are lists, whole; one that tables may hold as a summary
+has a twin of the name `<array>_summary` with `n`, `min`, `max` and `mean`. Times are
+timestamps without a zone, in UTC, since DuckDB's timestamps with a zone have microseconds.
+Durations are nanoseconds. Fields without a common exact type are JSON text.
+"""
 
 from __future__ import annotations
 
@@ -10,22 +16,32 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.dataset as ds
 from msgspec import Struct, field
 from msgspec.structs import replace
 
-from hybridlog.columns.fields import NEEDED, PointColumns, is_cloud, without
-from hybridlog.columns.layout import POINTS
+from hybridlog.columns.fields import LIMIT, NEEDED, PointColumns, is_cloud, without
+from hybridlog.columns.layout import OWN_COLUMNS, POINTS, column_names
 from hybridlog.columns.rows import LeftFields, rows_of
-from hybridlog.frames.answer import FIXED
+from hybridlog.frames.answer import FIXED, with_fields
 from hybridlog.query.planner import Planner
 from hybridlog.query.question import Counters, Question, windows_in
 from hybridlog.query.rows import RowBatch, Rows
-from hybridlog.schema.arrow_types import has_empty, is_array
+from hybridlog.schema.arrow_types import (
+    COMPUTED_AS,
+    common_type,
+    converted,
+    has_empty,
+    is_array,
+    is_bytes,
+    is_list,
+    is_text,
+    summary,
+)
 from hybridlog.schema.column import STAMP
 from hybridlog.schema.states import State
-from hybridlog.sql.columns import OWN, ViewColumn, merged, view_columns
-from hybridlog_storage.errors import extra
+from hybridlog_storage.errors import UsageError, extra
 from hybridlog_storage.segments.chunk import Placed
 from hybridlog_storage.times import BEGIN, END, touches
 
@@ -44,12 +60,163 @@ if TYPE_CHECKING:
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
 
+_types = pa.types
 _SAMPLED: Final = 20  # recordings that tell how many messages a topic has
 _UNITS: Final = {"t": 1, "log_time": 1000}
 """Columns of log time, and the nanoseconds that a number in each stands for."""
 _TABLE_OWN: Final = frozenset({"pub", "stamp"})
 Names = frozenset[tuple[str, ...]] | None
 """Names on the way to fields that a query names, folded, from wherever each begins; None: any."""
+
+
+OWN: Final = pa.schema(
+    [
+        ("log_time", pa.timestamp("us", "UTC")),
+        ("t", pa.int64()),
+        ("recording", pa.string()),
+        ("tags", pa.map_(pa.string(), pa.string())),
+        ("seq", pa.int64()),
+        ("pub", pa.int64()),
+        ("stamp", pa.int64()),
+        ("state", pa.string()),
+        ("error", pa.string()),
+    ]
+)
+"""Columns of every view in addition to the fields."""
+_RESERVED: Final = OWN_COLUMNS.union(OWN.names)
+FieldPath = tuple[str, ...]
+Key = tuple[FieldPath, bool]
+"""The path of a field of messages; True for the summary of an array."""
+
+
+class ViewColumn(Struct, frozen=True):
+    """A column of a view, or a field inside one; `inner` are the fields of a struct.
+
+    Its `source` is the path of a field of messages, of a `kind` as codecs give it, its `type` that
+    in SQL. The twin of an array is a summary.
+    """
+
+    name: str
+    source: FieldPath
+    kind: Any
+    type: Any
+    inner: tuple[ViewColumn, ...] = ()
+    is_summary: bool = False
+    is_points: bool = False
+
+    def leaves(self, above: FieldPath = ()) -> Iterator[tuple[FieldPath, ViewColumn]]:
+        """Its fields that are no structs, each with the names on the way in SQL, folded."""
+        path = (*above, self.name.casefold())
+        if not self.inner:
+            yield path, self
+        for column in self.inner:
+            yield from column.leaves(path)
+
+    @property
+    def key(self) -> Key:
+        """Tells it from the others of a view."""
+        return self.source, self.is_summary
+
+    def values(self, records: Any, summaries: Any, wanted: Collection[Key]) -> Any:
+        """Its values in SQL's types, null where messages lack them; those of `wanted` fields only.
+
+        `records` are fields of messages; `summaries` the same, with those of arrays that are gone.
+        """
+        here = field_of(summaries if self.is_summary else records, self.source[-1])
+        if self.inner:
+            here = pa.nulls(len(records), pa.struct([])) if here is None else here
+            beside = field_of(summaries, self.source[-1])
+            beside = here if beside is None else beside
+            children = [one.values(here, beside, wanted) for one in self.inner]
+            fields = list(self.type)
+            return pa.StructArray.from_arrays(children, fields=fields, mask=here.is_null())
+        if here is None or self.key not in wanted:
+            return pa.nulls(len(records), self.type)
+        return fitted(summary(here) if self.is_summary and is_array(here.type) else here, self.kind)
+
+    @classmethod
+    def of_points(cls, kind: Any) -> ViewColumn:
+        """The column of the points of clouds, of a type."""
+        return cls(POINTS, (POINTS,), kind, sql_type(kind), is_points=True)
+
+
+def field_of(columns: Any, name: str) -> Any:
+    """A field of structs, null where these are; None without it."""
+    names = columns.type.names if _types.is_struct(columns.type) else ()
+    return pc.struct_field(columns, [names.index(name)]) if name in names else None
+
+
+def view_columns(kind: Any) -> list[ViewColumn]:
+    """The columns for messages of one type."""
+    return list(_columns(kind, (), _RESERVED))
+
+
+def _columns(message: Any, path: FieldPath, reserved: frozenset[str]) -> Iterator[ViewColumn]:
+    fields: list[tuple[str, Any, bool]] = []
+    for one in message:
+        fields.append((one.name, one, False))
+        if _may_be_summary(one.type):
+            fields.append((f"{one.name}_summary", one, True))
+    named = column_names([name for name, _, _ in fields], reserved)
+    for (_, name), (_, one, is_twin) in zip(named, fields, strict=True):
+        source = (*path, one.name)
+        if is_twin:
+            kind = summary(pa.nulls(0, one.type)).type
+            yield ViewColumn(name, source, kind, sql_type(kind), is_summary=True)
+        elif _types.is_struct(one.type) and one.type.num_fields:
+            inner = tuple(_columns(one.type, source, frozenset()))
+            made = pa.struct([pa.field(column.name, column.type) for column in inner])
+            yield ViewColumn(name, source, one.type, made, inner)
+        else:
+            yield ViewColumn(name, source, one.type, sql_type(one.type))
+
+
+def _may_be_summary(kind: Any) -> bool:
+    """True if tables may hold an array as a summary."""
+    if _types.is_fixed_size_list(kind):
+        return bool(kind.list_size > LIMIT)
+    return is_array(kind)
+
+
+def merged(kinds: Sequence[Any]) -> Any:
+    """The type for values of several types; JSON text without a common one."""
+    return common_type([pa.nulls(0, kind) for kind in kinds])
+
+
+def sql_type(kind: Any) -> Any:
+    """The type in SQL of values of a type."""
+    for applies, made in _SQL_TYPES:
+        if applies(kind):
+            return made(kind)
+    return kind
+
+
+def _sql_struct(kind: Any) -> Any:
+    fields = [field.with_type(sql_type(field.type)) for field in kind]
+    return pa.struct(fields) if fields else pa.bool_()
+
+
+_SQL_TYPES: Final[Sequence[tuple[Callable[[Any], bool], Callable[[Any], Any]]]] = (
+    (_types.is_timestamp, lambda _: pa.timestamp("ns")),
+    (_types.is_duration, lambda _: pa.int64()),
+    (lambda kind: kind == pa.json_() or is_text(kind), lambda _: pa.string()),
+    (is_bytes, lambda _: pa.binary()),
+    (_types.is_null, lambda _: pa.int32()),  # as DuckDB has it
+    (is_list, lambda kind: pa.list_(sql_type(kind.value_type))),
+    (_types.is_struct, _sql_struct),
+    (COMPUTED_AS.__contains__, COMPUTED_AS.__getitem__),
+)
+
+
+def fitted(array: Any, kind: Any) -> Any:
+    """Values of a field, as a codec or a table gives them, in the type that SQL has for it.
+
+    A `UsageError` says that the type does not represent one.
+    """
+    try:
+        return with_fields(converted(array, kind)).cast(sql_type(kind))
+    except pa.ArrowException as error:
+        raise UsageError(f"{array.type} is not {sql_type(kind)}: {error}") from error
 
 
 class Limits(NamedTuple):

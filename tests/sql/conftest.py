@@ -30,7 +30,7 @@ float32[40] far
 """,
 )
 TEXT = Schema("test/Text", "ros1msg", b"string name\nstring f64\nfloat32 i8\n")
-SCANS, LARGE = 900, 1200
+SCANS, LARGE = 300, 1200
 
 
 def scan(n: int) -> bytes:

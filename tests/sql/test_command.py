@@ -48,9 +48,6 @@ def test_json_lines(root: Path) -> None:
     assert (first["day"], first["clock"], first["nothing"]) == ("2020-01-02", "10:00:01", None)
     assert first["i"] == {"months": 0, "days": 3, "nanoseconds": 0}
     assert first["numbered"] == {"1": "a"}
-    end = "select time '24:00:00' as t, time '00:00:00' as u, null::time as v"
-    assert json.loads(run(root, end).stdout) == {"t": "24:00:00", "u": "00:00:00", "v": None}
-    assert "24:00:00  00:00:00" in run(root, end, "-F", "table").stdout
 
 
 @pytest.mark.parametrize("odd", ["'infinity'::date", "'-infinity'::timestamp"])

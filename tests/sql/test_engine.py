@@ -18,7 +18,6 @@ import pytest
 import hybridlog as hl
 from hybridlog.query.choice import Choice
 from hybridlog.sql import engine
-from hybridlog.sql.engine import SqlConnection
 from hybridlog_storage.errors import (
     HybridlogError,
     MissingDependencyError,
@@ -36,13 +35,6 @@ from tests.tables.logs import BASE, SECOND
 from tests.waiting import wait_for
 
 ENDLESS = "select sum(a.range * b.range) from range(10000000) a, range(1000000) b"
-
-
-@pytest.fixture
-def connection(store: hl.Store) -> Iterator[SqlConnection]:
-    opened = store.sql_engine.connect()
-    yield opened
-    opened.close()
 
 
 @pytest.fixture
@@ -101,12 +93,10 @@ update extensions
 
 
 @pytest.mark.parametrize("statement", REFUSED.strip().splitlines())
-def test_a_query_reaches_nothing_else(
-    connection: SqlConnection, tmp_path: Path, statement: str
-) -> None:
+def test_a_query_reaches_nothing_else(store: hl.Store, tmp_path: Path, statement: str) -> None:
     own_variable = pa.table({"secret": [1]})  # noqa: F841
     with pytest.raises(UsageError):
-        connection.query(statement.format(path=tmp_path / "reached")).to_arrow()
+        store.sql(statement.format(path=tmp_path / "reached")).to_arrow()
     assert list(tmp_path.iterdir()) == []
 
 
@@ -139,33 +129,12 @@ def test_a_timeout_ends_a_query(store: hl.Store) -> None:
     assert store.sql("select 1", timeout=60).rows() == [(1,)]
 
 
-def test_the_first_rows(store: hl.Store) -> None:
-    for rows, more in ((2, True), (3, False), (4, False)):
-        table, is_cut = store.sql("select range as n from range(3) order by n desc").first(rows, 99)
-        assert (table["n"].to_pylist(), is_cut) == ([2, 1, 0][:rows], more)
-    table, is_cut = store.sql("select range as n from range(1000)").first(900, 64 * 9)
-    assert (table.num_rows, is_cut) == (128, True)
-    table, is_cut = store.sql("select 1 where false").first(5, 99)
-    assert (table.num_rows, is_cut) == (0, False)
-    assert store.sql("show tables").first(9, 9999)[0].column_names == ["name"]
-
-
-@pytest.mark.parametrize(
-    "text", ["create table a as select 1", "select 1; insert into a values (1)", "explain select 1"]
-)
-def test_a_connection_that_only_reads(store: hl.Store, text: str) -> None:
-    connection = store.sql_engine.connect(only_reads=True)
-    with pytest.raises(UsageError, match="Only queries are possible"):
-        connection.query(text)
-    assert connection.query("describe scan").first(9, 9999)[0].num_rows > 9 - 1
-
-
-def test_ctrl_c_ends_a_query(connection: SqlConnection) -> None:
+def test_ctrl_c_ends_a_query(store: hl.Store) -> None:
     timer = threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT))
     timer.start()
     with pytest.raises(KeyboardInterrupt):
-        connection.query(ENDLESS).rows()
-    assert connection.query("select 1").rows() == [(1,)]
+        store.sql(ENDLESS).rows()
+    assert store.sql("select 1").rows() == [(1,)]
 
 
 def test_without_duckdb(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -264,19 +233,18 @@ def test_refreshing_sees_new_recordings(own: hl.Store) -> None:
         before.rows()
 
 
-def test_a_prompt_sees_what_a_running_recording_has_flushed(tmp_path: Path) -> None:
-    """In one connection, and from chunks alone; a topic that is new, too."""
+def test_a_query_sees_what_a_running_recording_has_flushed(tmp_path: Path) -> None:
+    """From chunks alone; a topic that is new, too."""
     with hl.open(tmp_path / "store", create=True) as opened:
         with opened.start("live", flush_interval_s=0.05) as recording:
             recording.write(Channel("/old", "json", None), b'{"a": 1}', log_time=BASE)
             wait_for(lambda: opened.sql("select * from topics").rows())
-            prompt = opened.sql_engine.connect()
             for n in range(2):
                 recording.write(Channel("/note", "json", None), b'{"n": 1}', log_time=BASE + n)
                 count = f"select 1 from topics where topic = '/note' and messages = {n + 1}"
-                wait_for(lambda count=count: prompt.query(count).rows())
+                wait_for(lambda count=count: opened.sql(count).rows())
                 opened.session.cache.drop("chunk")
-                answer = prompt.query("select sum(n) from note")
+                answer = opened.sql("select sum(n) from note")
                 assert answer.rows() == [(n + 1,)]
                 assert not answer.reading.groups
                 assert answer.reading.counters.chunks_read > 0

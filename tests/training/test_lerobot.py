@@ -431,10 +431,10 @@ def test_depth_has_one_scale_nan_is_a_gap_and_numbers_keep_their_type(tmp_path: 
                 recording.write(state, struct.pack("<df", value, number), log_time=time)
         query, given = store.topic("state", "deep"), {"fps": FPS, "task": "x"}
         with pytest.raises(UsageError, match="gap"):
-            store.to_lerobot(query, features, tmp_path / "set", **given)
+            store.to_lerobot(query, features, tmp_path / "set", depth_scale=(0, 3), **given)
         given["on_gap"] = "hold"
-        report = store.to_lerobot(query, features, tmp_path / "set", **given)
-        assert report.left_out == ("/deep",)
+        with pytest.raises(UsageError, match="Pictures of depth, /deep, need --depth-scale"):
+            store.to_lerobot(query, features, tmp_path / "set", **given)
         store.to_lerobot(query, features, tmp_path / "scaled", depth_scale=(0, 3), **given)
     info = json.loads((tmp_path / "scaled/meta/info.json").read_text())["features"]
     assert [info[name]["dtype"] for name in ("observation.state", "action")] == [

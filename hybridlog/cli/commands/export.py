@@ -75,7 +75,7 @@ class _Training(Options):
         default="refuse",
     )
     depth_scale: tuple[float, float] | None = _option(
-        "Metres at 0 and at 255 in pictures of depth; without, these are left out.",
+        "Metres at 0 and at 255 in pictures of depth, which need it.",
         "NEAR FAR",
         nargs=2,
         type=float,
@@ -302,9 +302,6 @@ def _export_set(store: Store, query: Query, target: Path, given: _Given) -> None
         "with an earlier picture, since its own cannot be shown": report.missing,
     }
     output.notes(f"{counted(number, 'frame')} {what}." for what, number in said.items() if number)
-    if report.left_out:
-        depths = ", ".join(report.left_out)
-        output.note(f"Pictures of depth are left out without --depth-scale NEAR FAR: {depths}.")
     if report.lost:
         lost = f"{counted(report.lost, 'message')} of these topics are lost in the episodes"
         output.note(f"{lost}; meta/hybridlog.json says in which.")

@@ -29,14 +29,14 @@ def sql_command(given: _Given) -> None:
     and views and marks only the time of --between or --last. Needs no MongoDB.
     """
     from hybridlog.query.question import Question
-    from hybridlog.sql.engine import limited_memory
+    from hybridlog.sql.engine import MEMORY, limited_memory
 
     text = sys.stdin.read() if given.query is None else given.query
     with given.opened(snapshot=True) as store:
         ids = None if given.choice.is_everything else given.recordings_in(store).ids
-        connection = store.sql_engine.connect(given.memory, scope=Question((), ids, given.span))
-        with limited_memory(connection.memory):
-            answer = connection.query(text, timeout=given.timeout)
+        engine, scope = store.sql_engine, Question((), ids, given.span)
+        with limited_memory(given.memory or MEMORY):
+            answer = engine.query(text, timeout=given.timeout, memory=given.memory, scope=scope)
             if answer.columns:
                 from pyarrow import Table
 
