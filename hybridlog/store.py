@@ -504,16 +504,6 @@ class Store:
         again = partial(_session_of, self.directory.address, self.shared.index.wanted)
         return Synced(now.session, again, questions, tolerance, cast("Clock", clock))
 
-    @property
-    def sql_engine(self) -> SqlEngine:
-        """Runs SQL."""
-        self.shared.check_process()
-        if self._sql is None:
-            from hybridlog.sql.engine import SqlEngine
-
-            self._sql = SqlEngine(self._source)
-        return self._sql
-
     def sql(
         self,
         query: str,
@@ -546,9 +536,13 @@ class Store:
             TimeError: `between` is no range of time, or outside all recordings.
             MissingDependencyError: DuckDB is not installed.
         """
+        from hybridlog.sql.engine import SqlEngine
+
+        self.shared.check_process()
+        self._sql = self._sql or SqlEngine(self._source)
         ids = None if recordings is None else tuple(one.id for one in self._chosen(recordings))
         scope = Question((), ids, Choice.of(during=between).during)
-        return self.sql_engine.query(query, params, timeout, memory=memory, scope=scope)
+        return self._sql.query(query, params, timeout, memory=memory, scope=scope)
 
     # Changes.
 

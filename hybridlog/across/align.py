@@ -521,13 +521,6 @@ class Aligned:
 
         return to_polars(self.to_arrow())
 
-    @property
-    def is_fixed(self) -> bool:
-        """True if definitions fix the columns; else they may change between tables."""
-        questions = [self._base.question, *(other.question for other in self._beside)]
-        known = (self._session.field_types(q.topics, q.recordings) for q in questions)
-        return None not in known
-
 
 class RegularTimes:
     """Regular times as rows: from the beginning of each recording, or of the asked range.

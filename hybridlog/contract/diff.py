@@ -6,7 +6,7 @@ import math
 import re
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 from msgspec import Struct
 
@@ -106,9 +106,11 @@ def diff(
     """
     known = sorted({*a.topics(), *b.topics()})
     wanted = resolve(topics, known) if topics else known
-    ranges, found = (between, between), []
+    ranges: Sequence[Range | None] = (between, between)
+    found = []
     if between is None and (shared := _shared(a, b)) is not None:
-        ranges, found = shared.ranges, [Difference("", "times", *shared.others)]
+        ranges, others = shared
+        found = [Difference("", "times", others[0], others[1])]
     sides = _Side(a, wanted, ranges[0]), _Side(b, wanted, ranges[1])
     rest: list[Difference] = []
     for topic in sorted({*sides[0].topics, *sides[1].topics}):
@@ -143,17 +145,11 @@ def diff(
     return Rows(found + rest)
 
 
-class _Shared(NamedTuple):
-    """The time that two recordings both have, ns; `others` says what only one of them has."""
-
-    ranges: tuple[Range, Range]
-    others: tuple[str, str]
-
-
-def _shared(a: Recordings, b: Recordings) -> _Shared | None:
+def _shared(a: Recordings, b: Recordings) -> tuple[Sequence[Range], list[str]] | None:
     """The time that two recordings of different length share: the same, else since the begin.
 
-    None if both have about the same, or if there are more recordings.
+    It is for each of them, ns, with words for what only that one has. None if both have about the
+    same, or if there are more recordings.
     """
     if len(a) != 1 or len(b) != 1:
         return None
@@ -174,7 +170,7 @@ def _shared(a: Recordings, b: Recordings) -> _Shared | None:
             if high - low > least
         ]
         others.append(", ".join(told))
-    return _Shared((ranges[0], ranges[1]), (others[0], others[1])) if any(others) else None
+    return (ranges, others) if any(others) else None
 
 
 def _to_ms(duration: int) -> str:

@@ -214,7 +214,7 @@ def fitted(array: Any, kind: Any) -> Any:
     A `UsageError` says that the type does not represent one.
     """
     try:
-        return with_fields(converted(array, kind)).cast(sql_type(kind))
+        return with_fields(converted(array, kind, drops=True)).cast(sql_type(kind))
     except pa.ArrowException as error:
         raise UsageError(f"{array.type} is not {sql_type(kind)}: {error}") from error
 

@@ -92,7 +92,6 @@ def test_fields_that_no_definition_fixes(logs: Logs) -> None:
     times = found["log_time"].cast(pa.int64()).to_pylist()
     assert found["weather.n"].to_pylist() == [latest[time] for time in times]
     later = logs.store.align(logs.store.topic("base").fields("x"), "weather", how="interpolate")
-    assert not later.is_fixed
     kinds = {field.name: field.type for field in later.to_arrow().schema}
     assert kinds["weather.n"] == pa.float64()
     assert kinds["base.x"] == pa.float64()

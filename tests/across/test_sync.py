@@ -8,7 +8,6 @@ import random
 from collections import deque
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,15 +17,9 @@ from hypothesis import strategies as st
 import hybridlog as hl
 from hybridlog.across.sync import Synced, approximate_sets
 from hybridlog_storage.errors import StoreError, TopicError, UsageError
-from hybridlog_storage.messages import Channel, Schema
 from tests.copies import bring
 
 from .conftest import MS, Logs
-
-HEADER = (
-    b"Header header\n" + b"=" * 80 + b"\nMSG: std_msgs/Header\n"
-    b"uint32 seq\ntime stamp\nstring frame_id\n"
-)
 
 
 class ApproximateTime:
@@ -198,19 +191,6 @@ def test_messages_in_no_set_are_counted(logs: Logs) -> None:
     assert pickle.loads(pickle.dumps(asked)).remarks() == asked.remarks()
 
 
-def test_messages_without_a_stamp_are_in_no_set(tmp_path: Path) -> None:
-    schema = Schema("p/S", "ros1msg", HEADER)
-    with hl.open(tmp_path / "store", create=True) as store:
-        with store.start("now") as recording:
-            for n in range(5):
-                stamp = np.array([n, n, 0, 0], np.uint32).tobytes()
-                for topic in ("/a", "/b"):
-                    payload = b"x" if (topic, n) == ("/a", 3) else stamp
-                    recording.write(Channel(topic, "ros1", schema), payload, log_time=n)
-        assert store.sync(["/a", "/b"]).left_out == (2, 2)
-        assert store.sync(["/a", "/b"], clock="log").left_out == (0, 0)
-
-
 def test_only_times_are_read_before_a_set_is_asked_for(logs: Logs) -> None:
     synced = logs.store.sync(["base", "left/pose"])
     assert synced.counters.chunks_read == 0
@@ -230,36 +210,22 @@ def collated(sets: list[tuple[hl.Message, ...]]) -> np.ndarray:
     return np.array([[m.decode().header.seq for m in messages] for messages in sets])
 
 
-def load(synced: Synced, asked: Any, answers: Any) -> None:
+def load(synced: Synced, batches: list[list[int]]) -> list[np.ndarray]:
     """A worker of a data loader: batches of places come, arrays go back."""
-    for number, places in iter(asked.get, None):
-        answers.put((number, collated([synced[place] for place in places])))
+    return [collated([synced[place] for place in places]) for places in batches]
 
 
 def test_a_data_loader_reads_shuffled_batches(logs: Logs) -> None:
     """As PyTorch's does: workers serve several epochs. Forked ones: `tests/test_forks.py`."""
     synced = logs.store.sync(["base", "left/pose"], tolerance="30ms")
-    size = min(len(synced), 40)
-    want = collated(synced[:size])
-    context = multiprocessing.get_context("spawn")
-    queues = [context.Queue() for _ in range(2)]
-    answers = context.Queue()
-    workers = [context.Process(target=load, args=(synced, q, answers)) for q in queues]
-    for worker in workers:
-        worker.start()
-    for epoch in range(2):
-        order = np.random.default_rng(epoch).permutation(size)
-        batches = np.array_split(order, 10)
-        for number, places in enumerate(batches):
-            queues[number % 2].put((number, places.tolist()))
-        for _ in batches:
-            number, found = answers.get(timeout=60)
-            np.testing.assert_array_equal(found, want[batches[number]])
-    for queue in queues:
-        queue.put(None)
-    for worker in workers:
-        worker.join(60)
-        assert worker.exitcode == 0
+    want = collated(synced[:40])
+    orders = [np.random.default_rng(epoch).permutation(40) for epoch in range(2)]
+    batches = [one.tolist() for order in orders for one in np.array_split(order, 10)]
+    with multiprocessing.get_context("spawn").Pool(2) as pool:
+        found = pool.starmap(load, [(synced, batches[::2]), (synced, batches[1::2])])
+    for own, arrays in zip((batches[::2], batches[1::2]), found, strict=True):
+        for places, array in zip(own, arrays, strict=True):
+            np.testing.assert_array_equal(array, want[places])
     np.testing.assert_array_equal(collated(synced[:3]), want[:3])
 
 

@@ -206,8 +206,7 @@ def test_fields_that_no_definition_fixes(tmp_path: Path) -> None:
         found = opened.sql("select info.fields.k.number_value, info.fields.l from c").rows()
         assert found[0][0] == 3.0
         assert found[0][1]["list_value"]["values"][0]["string_value"] == "z"
-        for topic in opened.topics():
-            view = opened.sql_engine.content().views[topic]
+        for topic, view in opened.sql("select topic, view from topics").rows():
             table = opened.sql(f'select * from "{view}" order by t, seq').to_arrow()
             frame = opened.topic(topic).to_arrow()
             assert table.num_rows == frame.num_rows > 0

@@ -82,7 +82,7 @@ def align_command(given: _Given) -> None:
             rows = _aligned(store, given)
         # That there is a transform shows only at the end.
         completeness = rows.completeness if given.strict else None
-        given.answer(rows.to_tables(given.limit), completeness, is_fixed=rows.is_fixed)
+        given.answer(rows.to_tables(given.limit), completeness)
         sys.stdout.flush()
         remarks(rows.remarks())
 

@@ -28,15 +28,18 @@ def sql_command(given: _Given) -> None:
     unambiguous. Tables: recordings, topics, losses, marks. All show the chosen recordings alone,
     and views and marks only the time of --between or --last. Needs no MongoDB.
     """
-    from hybridlog.query.question import Question
     from hybridlog.sql.engine import MEMORY, limited_memory
 
     text = sys.stdin.read() if given.query is None else given.query
     with given.opened(snapshot=True) as store:
-        ids = None if given.choice.is_everything else given.recordings_in(store).ids
-        engine, scope = store.sql_engine, Question((), ids, given.span)
         with limited_memory(given.memory or MEMORY):
-            answer = engine.query(text, timeout=given.timeout, memory=given.memory, scope=scope)
+            answer = store.sql(
+                text,
+                recordings=None if given.choice.is_everything else given.choice,
+                between=given.span,
+                memory=given.memory,
+                timeout=given.timeout,
+            )
             if answer.columns:
                 from pyarrow import Table
 
