@@ -12,14 +12,7 @@ import hybridlog as hl
 
 @pytest.fixture
 def store(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[hl.Store]:
-    """An empty store; a test that is marked `mongo` finds it connected."""
+    """An empty store without MongoDB; a test that is marked `mongo` finds it connected."""
     is_indexed = request.node.get_closest_marker("mongo") is not None
     with hl.open(tmp_path / "store", create=True, require_database=is_indexed) as opened:
-        yield opened
-
-
-@pytest.fixture
-def plain(tmp_path: Path) -> Iterator[hl.Store]:
-    """An empty store without MongoDB."""
-    with hl.open(tmp_path / "store", create=True, mongo="none") as opened:
         yield opened

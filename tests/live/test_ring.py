@@ -38,7 +38,7 @@ class Robot(Recorded):
             reserve_bytes=0,
             ring_s=ring_s,
             flush_interval_s=0.02,
-            **options,  # type: ignore[arg-type]
+            **{"derives": False, **options},  # type: ignore[arg-type]
         )
         super().__init__(store, made)
         self.store = store
@@ -81,7 +81,7 @@ def span_s(store: hl.Store) -> float:
 
 @pytest.mark.mongo
 def test_the_last_seconds_stay_and_nothing_else(store: hl.Store) -> None:
-    robot = Robot(store)
+    robot = Robot(store, derives=True)
     robot.recorder.lost(Loss(Cause.TRANSPORT, "/scan", 4, time.time_ns(), time.time_ns()))
     robot.run(RING_S)
     robot.run_until(lambda: ids(store)[0] and span_s(store) < RING_S + 0.9)
@@ -112,14 +112,14 @@ def test_the_last_seconds_stay_and_nothing_else(store: hl.Store) -> None:
     assert store.verify().findings == []
 
 
-def test_questions_are_answered_while_files_go(plain: hl.Store) -> None:
-    robot = Robot(plain, 5 * RING_S)
+def test_questions_are_answered_while_files_go(store: hl.Store) -> None:
+    robot = Robot(store, 5 * RING_S)
     robot.run(0.5)
     done = threading.Event()
     running = threading.Thread(target=robot.run_until, args=(done.is_set,))
     running.start()
     asked = 0
-    with hl.open(plain.directory.path, mongo="none") as other:
+    with hl.open(store.directory.path, mongo="none") as other:
         while asked < 6 or not robot.recorder.look().let_go:
             assert running.is_alive()
             found = ids(other)
@@ -127,7 +127,7 @@ def test_questions_are_answered_while_files_go(plain: hl.Store) -> None:
             assert other.topic("/scan").count() > 0
             assert other.topic("/scan").where("near >= 0").to_arrow().num_rows > 0
             assert other.sql("select count(*) as n from scan").to_pandas()["n"][0] > 0
-            with hl.open(plain.directory.path, mongo="none") as newer:
+            with hl.open(store.directory.path, mongo="none") as newer:
                 (one,) = newer.recordings()
                 assert one.losses == []
                 assert [*newer.topic("/scan").between("-0.3s", "end")]
@@ -138,57 +138,57 @@ def test_questions_are_answered_while_files_go(plain: hl.Store) -> None:
     robot.stop()
 
 
-def test_what_is_pinned_stays(plain: hl.Store) -> None:
-    robot = Robot(plain, 4 * RING_S, before_s=0.3, after_s=0.3)
+def test_what_is_pinned_stays(store: hl.Store) -> None:
+    robot = Robot(store, 4 * RING_S, before_s=0.3, after_s=0.3)
     robot.run(0.8)
     at = time.time_ns()
     robot.recorder.fire("bump")
     robot.run(0.8)
-    robot.run_until(lambda: len(found := ids(plain)) < found[-1] - found[0])  # behind the pin
+    robot.run_until(lambda: len(found := ids(store)) < found[-1] - found[0])  # behind the pin
     entry = robot.stop()
-    kept = {message.fields["id"]: message.log_time_ns for message in plain.topic("/scan")}
+    kept = {message.fields["id"]: message.log_time_ns for message in store.topic("/scan")}
     around = [n for n, time in kept.items() if abs(time - at) <= 0.3 * SECOND]
     assert around == [*range(around[0], around[-1] + 1)]
     assert kept[around[0]] < at < kept[around[-1]]
-    (mark,) = plain.topic(MARKS)
+    (mark,) = store.topic(MARKS)
     assert mark.fields["tags"] == {"trigger": "bump"}
-    during = plain.topic("/scan").during(plain.topic(MARKS).windows())
+    during = store.topic("/scan").during(store.topic(MARKS).windows())
     assert during.count() == len(around)
-    plain.unpin(*(pin.id for pin in entry.manifest.pins))
+    store.unpin(*(pin.id for pin in entry.manifest.pins))
 
 
 def test_nothing_goes_before_triggers_have_seen_it(
-    plain: hl.Store, monkeypatch: pytest.MonkeyPatch
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     start = child._START
-    monkeypatch.setattr(child, "_START", f"import time; time.sleep(2); {start}")
-    robot = Robot(plain, triggers=[Trigger.of("/scan: id == 120")])
-    robot.run(1.5)
-    assert ids(plain)[0] == 0
+    monkeypatch.setattr(child, "_START", f"import time; time.sleep(1); {start}")
+    robot = Robot(store, derives=True, triggers=[Trigger.of("/scan: id == 20")])
+    robot.run(0.9)
+    assert ids(store)[0] == 0
     while not robot.recorder.look().let_go:
         robot.run(0.2)
-    assert ids(plain)[0] > 0
+    assert ids(store)[0] > 0
     robot.stop()
-    (mark,) = plain.topic(MARKS)
+    (mark,) = store.topic(MARKS)
     at = mark.fields["end"]
-    assert 120 in [m.fields["id"] for m in plain.topic("/scan") if m.log_time_ns <= at]
+    assert 20 in [m.fields["id"] for m in store.topic("/scan") if m.log_time_ns <= at]
 
 
-def test_latched_messages_in_force_stay_and_marks(plain: hl.Store) -> None:
-    robot = Robot(plain)
+def test_latched_messages_in_force_stay_and_marks(store: hl.Store) -> None:
+    robot = Robot(store)
     robot.mark("slipped", {})
     for word in ("old", "map"):
         robot.speaker.say(LATCHED, text(word))
         robot.speaker.say(text_channel(), text("small"))
         robot.run(0.3)
-    robot.run_until(lambda: plain.topics() == [MARKS, "/map", "/scan"])  # of others all is gone
+    robot.run_until(lambda: store.topics() == [MARKS, "/map", "/scan"])  # of others all is gone
     entry = robot.stop()
-    assert [mark.fields["text"] for mark in plain.topic(MARKS)] == ["slipped"]
-    assert [m.fields["data"] for m in plain.topic("/map")] == ["map"]
-    last = plain.topic("/scan").between("-0.1s", "end")
+    assert [mark.fields["text"] for mark in store.topic(MARKS)] == ["slipped"]
+    assert [m.fields["data"] for m in store.topic("/map")] == ["map"]
+    last = store.topic("/scan").between("-0.1s", "end")
     assert last.count() > 0
-    slice_ = plain.query(["/map", "/scan"], [entry.id]).between("-0.1s", "end")
+    slice_ = store.query(["/map", "/scan"], [entry.id]).between("-0.1s", "end")
     front = [batch.payload(0) for batch, _ in slice_.latched()]
     assert front == [text("map")]
-    plain.keep({"max-age": "0s"})
-    assert [m.raw for m in plain.topic("/map")] == [text("map")]
+    store.keep({"max-age": "0s"})
+    assert [m.raw for m in store.topic("/map")] == [text("map")]

@@ -40,7 +40,7 @@ class Simulation(Recorded):
 
     def __init__(self, store: hl.Store, **options: object) -> None:
         self.store = store
-        chosen = RecorderOptions(reserve_bytes=0, use_sim_time=True, **options)  # type: ignore[arg-type]
+        chosen = RecorderOptions(reserve_bytes=0, use_sim_time=True, derives=False, **options)  # type: ignore[arg-type]
         super().__init__(store, chosen)
         self.now = time.time_ns()
 

@@ -190,6 +190,7 @@ def domain() -> dict[str, str]:
 FAKE = """\
 #!{python}
 import json, os, signal, socket, sys, time
+from types import SimpleNamespace
 from hybridlog.live.sources.ros2.child.outbox import *
 
 peer = socket.socket(fileno=int(sys.argv[-1]))
@@ -200,24 +201,18 @@ with open(starts, "a") as log:
 with open(starts) as log:
     start = len(log.readlines())
 
-def event(**what):
-    body = json.dumps(what).encode()
-    peer.sendall(HEADER.pack(EVENT, len(body)) + body)
+box = Outbox(peer)
 
 def hello():
-    event(event="hello", middleware="rmw_fake")
+    box.event("hello", middleware="rmw_fake")
 
-def channel(number=0, topic="/a", **more):
-    known = dict(type="std_msgs/msg/String", encoding="ros2msg", definition="string data",
-                 offered="- durability: 2", hash="")
-    event(event="channel", number=number, topic=topic, **{{**known, **more}})
+def channel(topic="/a", kind="std_msgs/msg/String", text=b"string data", offered="", hash=""):
+    definition = SimpleNamespace(encoding="ros2msg", text=text)
+    return box.channel(topic, kind, definition, offered, hash)
 
-def raw(kind, size, body=b""):
-    peer.sendall(HEADER.pack(kind, size) + body)
-
-def message(number, payload, sequence=1):
-    entry = ENTRY.pack(number, 1_700_000_000_000_000_000, 0, sequence)
-    peer.sendall(HEADER.pack(MESSAGE, len(entry) + len(payload)) + entry + payload)
+def message(payload, sequence=1):
+    box.message(0, payload, 1_700_000_000_000_000_000, 0, sequence)
+    box.flush()
 
 def wait():
     while file.readline():

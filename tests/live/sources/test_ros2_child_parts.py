@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import ast
 import json
-import socket
 import sys
 import time
 from pathlib import Path
-from threading import Thread
 from types import SimpleNamespace
 from typing import Any
 from xml.etree import ElementTree as ET
@@ -18,13 +16,11 @@ import pytest
 from hybridlog.live.sources.ros2.child import middleware as qos
 from hybridlog.live.sources.ros2.child import topics
 from hybridlog.live.sources.ros2.child.child import Child
-from hybridlog.live.sources.ros2.child.definitions import Definition, Definitions, UnknownTypeError
+from hybridlog.live.sources.ros2.child.definitions import Definitions, UnknownTypeError
 from hybridlog.live.sources.ros2.child.middleware import VARIABLES, Offer, Profile
 from hybridlog.live.sources.ros2.child.outbox import Outbox
 from hybridlog.live.sources.ros2.child.topics import Topics
-from hybridlog.live.sources.ros2.source import Receiver
 from tests.imports import ROOT, imports_of
-from tests.live.sources.heard import Heard
 
 GAPS = "hybridlog.live.sources.sequence_gaps"
 CHILD = "hybridlog.live.sources.ros2.child"
@@ -102,29 +98,6 @@ def test_types_that_cannot_be_said(tmp_path: Path, name: str, reason: str) -> No
     )
     with pytest.raises(UnknownTypeError, match=reason):
         definitions.find(name)
-
-
-def test_messages_and_events_arrive_in_their_order() -> None:
-    ours, theirs = socket.socketpair()
-    heard = Heard()
-    reader = Thread(target=Receiver(ours, heard, {}).run)
-    with ours, theirs:
-        reader.start()
-        outbox = Outbox(theirs)
-        definition = Definition("ros2msg", b"caf\xff", has_bytes=False)
-        assert outbox.channel("/x", "a/msg/B", definition, "", "") == 0
-        sizes = [0, 5, 32 << 10, 3, 3 << 20, *[20_000] * 100, 1]
-        for number, size in enumerate(sizes):
-            outbox.message(0, bytes([number % 256]) * size, 10 + number, 0, number)
-        outbox.lost("/x", "transport", 3)
-        theirs.shutdown(socket.SHUT_WR)
-        reader.join()
-    assert [(len(one.payload), one.sequence) for one in heard.taken] == [
-        (size, number) for number, size in enumerate(sizes)
-    ]
-    assert heard.taken[0].channel.schema.data == b"caf\xff"  # type: ignore[union-attr]
-    [loss] = heard.losses
-    assert (loss.topic, loss.cause, loss.count) == ("/x", "transport", 3)
 
 
 class FakeSubscription:
