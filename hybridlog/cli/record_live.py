@@ -30,13 +30,7 @@ from hybridlog.cli.signals import handled, write_note
 from hybridlog.contract import Contract
 from hybridlog.follow.child import Trigger
 from hybridlog.live.incidents import PINNED
-from hybridlog.live.recorder import (
-    Recorder,
-    RecorderOptions,
-    make_room,
-    priority_rule,
-    throttle_rule,
-)
+from hybridlog.live.recorder import Recorder, RecorderOptions, priority_rule, throttle_rule
 from hybridlog.live.recording import default_budget
 from hybridlog.query.answers.completeness import coverage, in_words
 from hybridlog.record.losses import Cause, losses_of
@@ -96,7 +90,6 @@ def _record(choices: RecordChoices) -> int:
         for source in sources:
             held.enter_context(source).check()
         store = held.enter_context(choices.opened(create=True))
-        make_room(store, options.reserve_bytes)
         gc.freeze()  # the collector skips what was there before
         with _stop_flag() as stop:
             while True:

@@ -10,7 +10,6 @@ import threading
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Final
 
-from msgspec import Struct
 from msgspec.structs import replace
 
 from hybridlog.query.times import format_duration, format_time
@@ -59,10 +58,12 @@ class Incidents:
                 self.count += 1
             self._hits[text] = self._new[made.id] = made
 
-    def note(self, mark: Mark) -> None:
-        """Set a mark soon; with the same id again it has another end."""
+    def note(self, mark: Mark) -> bool:
+        """Set a mark soon; with the same id again it has another end, and False is returned."""
         with self._lock:
+            is_new = mark.id not in self._new and mark.id not in self._written
             self._new[mark.id] = mark
+        return is_new
 
     def write(self) -> bool:
         """Mark and pin all so far; returns whether there was anything new.
@@ -107,31 +108,12 @@ def _within(mark: Mark, first: int | None) -> Mark:
     return replace(mark, time=begin if mark.end is None else min(begin, mark.end))
 
 
-class Silence(Struct, frozen=True):
-    """A time between messages of a topic, or to the end, that is longer than its limit, ns.
-
-    `begin` and `end` are log times; it has no end while it lasts.
-    """
-
-    id: str
-    topic: str
-    begin: int
-    end: int | None
-    limit: int
-
-    @property
-    def mark(self) -> Mark:
-        """Its mark, whose text lacks its length, which may grow."""
-        text = f"{self.topic}: no message for more than {format_duration(self.limit)}"
-        tags = {"cause": CONTRACT, "rule": RULE, "topic": self.topic}
-        end = None if self.end is None else max(self.begin, self.end)
-        return Mark(self.id, self.begin, text, tags, end)
-
-
 class SilenceWatch:
     """Follows the topics that have a longest gap in a contract. Thread safe.
 
-    Silences are measured by times that nobody sets, beside log times; all in ns.
+    A silence is a time between messages of a topic, or to the end, that is longer than its limit:
+    a mark, without end while it lasts. It is measured by times that nobody sets, beside log times;
+    all in ns.
     """
 
     def __init__(self, contract: Contract | None) -> None:
@@ -140,8 +122,8 @@ class SilenceWatch:
         self._optional = {name for name, rule in rules.items() if rule.optional}
         self._begin: tuple[int, int] | None = None
         self._last: dict[str, tuple[int, int]] = {}  # time and log time of the last message
-        self._lasting: dict[str, Silence] = {}  # by topic
-        self._over: list[Silence] = []
+        self._lasting: dict[str, Mark] = {}  # by topic
+        self._over: list[Mark] = []
         self._lock = threading.Lock()
         self.breaches = 0
 
@@ -158,19 +140,21 @@ class SilenceWatch:
                 return
             last = self._last.get(topic, self._begin)
             if time - last[0] > limit:
-                self._over.append(replace(self._lasts(topic, last[1]), end=log_time))
+                self._over.append(_ended(self._lasts(topic, last[1]), log_time))
                 del self._lasting[topic]
             self._last[topic] = max(last, (time, log_time))
 
-    def _lasts(self, topic: str, begin: int) -> Silence:
-        """The silence of a topic, which may have begun just now."""
+    def _lasts(self, topic: str, begin: int) -> Mark:
+        """The silence of a topic, which may have begun just now; its length may grow."""
         if topic not in self._lasting:
             self.breaches += 1
-            made = Silence(new_random(), topic, begin, None, self._limits[topic])
-            self._lasting[topic] = made
+            limit = format_duration(self._limits[topic])
+            text = f"{topic}: no message for more than {limit}"
+            tags = {"cause": CONTRACT, "rule": RULE, "topic": topic}
+            self._lasting[topic] = Mark(new_random(), begin, text, tags)
         return self._lasting[topic]
 
-    def look(self, now: int, ended_at: int | None = None) -> list[Silence]:
+    def look(self, now: int, ended_at: int | None = None) -> list[Mark]:
         """Silences that have begun since the last look, or ended, those at the end included.
 
         `ended_at` is the log time at which the recording ends, and with it all silences.
@@ -183,10 +167,14 @@ class SilenceWatch:
                 elif now - last > self._limits[topic] and topic not in self._lasting:
                     found.append(self._lasts(topic, log_time))
             if ended_at is not None:
-                found += [replace(one, end=ended_at) for one in self._lasting.values()]
+                found += [_ended(one, ended_at) for one in self._lasting.values()]
         return found
 
     @property
     def silent(self) -> Sequence[str]:
         """Topics that are silent, as of the last look."""
         return sorted(self._lasting)
+
+
+def _ended(silence: Mark, at: int) -> Mark:
+    return replace(silence, end=max(silence.time, at))

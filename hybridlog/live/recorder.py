@@ -42,7 +42,6 @@ from hybridlog.wording import size
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import (
     DiskFullError,
-    HeldError,
     HybridlogError,
     StoreError,
     UsageError,
@@ -233,7 +232,6 @@ class Recorder:
         self._written = 0
         self._newest = max(store.session.look().summaries, key=attrgetter("created"), default=None)
         self._silence = SilenceWatch(options.contract)
-        self._silences: set[str] = set()  # ids of those that were told
         self._ended_at: int | None = None
         self._simulated: SimulatedTime | None = None
         if options.use_sim_time:
@@ -480,11 +478,9 @@ class Recorder:
 
     def _check_silences(self, ended_at: int | None = None) -> None:
         """Tell silences that begin, and mark them from their beginning on; later their ends."""
-        for one in self._silence.look(self._steady(), ended_at):
-            if one.id not in self._silences:
-                self._silences.add(one.id)
-                self._say(f"{one.mark.text} ({RULE} of the contract)")
-            self._incidents.note(one.mark)
+        for mark in self._silence.look(self._steady(), ended_at):
+            if self._incidents.note(mark):
+                self._say(f"{mark.text} ({RULE} of the contract)")
 
     def unfitting(self) -> list[str]:
         """Options that name topics of which none has come, in words."""
@@ -741,13 +737,12 @@ class Recorder:
                 self._end("its manifest is full")
                 return
         # Messages in memory will be written, and those of a second until the next check.
-        coming = state.filled * options.budget_bytes + state.bytes_per_s
-        try:
-            check_room(state.free_bytes, options.reserve_bytes, coming)
-        except DiskFullError as error:
-            is_over = self._over.is_set()
-            if not (is_over or self._room.make_room(round(options.reserve_bytes + coming))):
-                self._refuse(Cause.DISK, str(error))
+        wanted = options.reserve_bytes + state.filled * options.budget_bytes + state.bytes_per_s
+        is_low = state.free_bytes < wanted and not self._over.is_set()
+        if is_low and not self._room.make_room(round(wanted)):
+            lower = ", or lower --reserve" if options.reserve_bytes else ""
+            left = size(state.free_bytes)
+            self._refuse(Cause.DISK, f"The disk has only {left} left: free some{lower}.")
         failure = self._target.failure
         if isinstance(failure, DiskFullError):
             self._refuse(Cause.DISK, str(failure))
@@ -774,30 +769,3 @@ class Recorder:
         """Report that the clock of this machine was set, or is to be, at a log time, ns."""
         self._say(f"{text}; log times are those of the clock")
         self._incidents.note(Mark(new_random(), at, text, {"cause": CLOCK_SET, **tags}))
-
-
-def make_room(store: Store, reserve_bytes: int) -> None:
-    """Check that a disk has as much free space as the reserve, once the store's rules made room.
-
-    Raises:
-        DiskFullError: It has less.
-    """
-    path, settings = store.directory.path, store.directory.settings
-    rules = Rules.of(settings.retention)
-    if rules.makes_room and shutil.disk_usage(path).free < reserve_bytes:
-        with suppress(HeldError):
-            store.keep(
-                {**settings.retention, "min-free": f"{rules.with_free(reserve_bytes).min_free}B"}
-            )
-    check_room(shutil.disk_usage(path).free, reserve_bytes)
-
-
-def check_room(free_bytes: int, reserve_bytes: int, coming_bytes: float = 0) -> None:
-    """Check that a disk has as much free space as the reserve and what comes next.
-
-    Raises:
-        DiskFullError: It has less.
-    """
-    if free_bytes < reserve_bytes + coming_bytes:
-        lower = ", or lower --reserve" if reserve_bytes else ""
-        raise DiskFullError(f"The disk has only {size(free_bytes)} left: free some{lower}.")

@@ -18,7 +18,7 @@ from collections import deque
 from contextlib import suppress
 from json import dumps, loads
 from pathlib import Path
-from threading import Event, Thread
+from threading import Thread
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.live.sources.base import Cause, ThreadedSource, one_line
@@ -59,8 +59,18 @@ class Ros2Source(ThreadedSource):
 
     def check(self) -> None:
         """Start the child; messages are read after `start`."""
-        if self._child is None:
-            self._child = self._launched()
+        if self._child is not None:
+            return
+        domain = self.address.partition(" ")[2]
+        if not (domain.isascii() and domain.isdigit() and int(domain) <= MAX_DOMAIN):
+            raise UsageError(f"ROS 2 has domains from 0 to {MAX_DOMAIN}, not {domain[:40]!r}")
+        try:
+            child = self._launch()
+        except ChildError as error:
+            raise SourceError(
+                f"ROS 2 does not start: {one_line(str(error))}; does `ros2 topic list` work?"
+            ) from error
+        self.address = f"domain {domain}, {one_line(str(child.hello.get('middleware')))}"
 
     def start(self, sink: Sink) -> None:
         """Begin to listen."""
@@ -68,19 +78,29 @@ class Ros2Source(ThreadedSource):
         child = self._child
         self._begin(sink, lambda: self._supervise(child, sink))
 
-    def _launched(self) -> Process:
-        """The first child; sets what later ones need."""
-        domain = self.address.partition(" ")[2]
-        if not (domain.isascii() and domain.isdigit() and int(domain) <= MAX_DOMAIN):
-            raise UsageError(f"ROS 2 has domains from 0 to {MAX_DOMAIN}, not {domain[:40]!r}")
-        try:
-            child, self._python = launch(self._python, self._stopping)
-        except ChildError as error:
-            raise SourceError(
-                f"ROS 2 does not start: {one_line(str(error))}; does `ros2 topic list` work?"
-            ) from error
-        self.address = f"domain {domain}, {one_line(str(child.hello.get('middleware')))}"
-        return child
+    def _launch(self) -> Process:
+        """A child under the first Python that has rclpy."""
+        tried = []
+        for name in [self._python] if self._python else candidates(os.environ):
+            try:
+                child = Process(name)
+                with self._lock:
+                    self._child = child
+                    if self._stopping.is_set():
+                        child.kill()
+                try:
+                    child.greet()
+                except BaseException:
+                    child.end()
+                    raise
+            except ChildMissingError as error:
+                tried.append(str(error))
+            else:
+                self._python = name
+                return child
+        raise MissingDependencyError(
+            f"recording ROS 2 needs a Python that has rclpy ({'; '.join(tried)}): {_REMEDY}"
+        )
 
     def stop(self) -> None:
         """Stop listening, after the child has passed on its messages."""
@@ -136,17 +156,10 @@ class Ros2Source(ThreadedSource):
         """A new child after a pause; None if the source is stopped meanwhile."""
         while not self._stopping.wait(_PAUSE_S):
             try:
-                child, _ = launch(self._python, self._stopping)
+                return self._launch()
             except (ChildError, MissingDependencyError) as error:
-                if self._stopping.is_set():
-                    break
-                sink.say(one_line(f"ROS 2 does not restart, trying again: {error}"))
-                continue
-            with self._lock:
                 if not self._stopping.is_set():
-                    self._child = child
-                    return child
-            child.end()
+                    sink.say(one_line(f"ROS 2 does not restart, trying again: {error}"))
         return None
 
 
@@ -265,7 +278,6 @@ HELLO_S = 30.0
 SOCKET_BYTES = 4 << 20
 """Requested size of the socket buffer; the kernel may give less."""
 
-_POLL_S = 0.2
 _MAX_LINES = 30
 _MAX_LINE = 300
 
@@ -286,23 +298,19 @@ class ChildMissingError(ChildError):
 
 
 class Process:
-    """A running child, which has sent its greeting, `hello`.
+    """A running child; a Python that does not exist raises ChildMissingError."""
 
-    `cancelled` is set to give up waiting for the greeting. A Python that does not exist, or has no
-    rclpy, raises ChildMissingError.
-    """
-
-    def __init__(
-        self,
-        python: str,
-        environment: Mapping[str, str],
-        cancelled: Event,
-    ) -> None:
+    def __init__(self, python: str) -> None:
+        self.hello: dict[str, Any] = {}
         self.peer, theirs = socket.socketpair()
-        self._cancelled = cancelled
+        self._python = python
         self._lines: deque[str] = deque(maxlen=_MAX_LINES)
         for end, option in ((self.peer, socket.SO_RCVBUF), (theirs, socket.SO_SNDBUF)):
             end.setsockopt(socket.SOL_SOCKET, option, SOCKET_BYTES)
+        environment = dict(os.environ)
+        if python != sys.executable:
+            # The wheels set this once they have found their libraries, and the child has others.
+            environment.pop("_ROS_WHEELS_BOOTSTRAP_COMPLETE", None)
         try:
             with theirs:
                 self._process = subprocess.Popen(  # noqa: S603
@@ -311,7 +319,7 @@ class Process:
                     stdout=subprocess.PIPE,
                     stderr=subprocess.STDOUT,
                     pass_fds=[theirs.fileno()],
-                    env=dict(environment),
+                    env=environment,
                     # Ctrl-C must only reach the recorder, which ends its child.
                     start_new_session=True,
                 )
@@ -322,11 +330,6 @@ class Process:
         self._listener = Thread(target=self._listen, args=(self._process.stdout,), daemon=True)
         self._listener.start()
         self.pid = self._process.pid
-        try:
-            self.hello = self._greet(python)
-        except BaseException:
-            self.end()
-            raise
 
     def _listen(self, output: IO[bytes]) -> None:
         """Stores the last lines of output, which may explain a failure."""
@@ -334,32 +337,25 @@ class Process:
             while line := output.readline(1 << 12):
                 self._lines.append(line.decode(errors="replace").strip()[:_MAX_LINE])
 
-    def _greet(self, python: str) -> dict[str, Any]:
-        deadline = time.monotonic() + HELLO_S
-        self.peer.settimeout(_POLL_S)
+    def greet(self) -> None:
+        """Wait for its greeting, `hello`; ChildMissingError if it has no rclpy."""
+        self.peer.settimeout(HELLO_S)
         try:
-            _, length = HEADER.unpack(self._receive(HEADER.size, deadline))
-            hello: dict[str, Any] = loads(self._receive(length, deadline))
+            _, length = HEADER.unpack(self._receive(HEADER.size))
+            self.hello = loads(self._receive(length))
         except TimeoutError as error:
-            raise ChildError(f"{python} did not load rclpy within {HELLO_S:.0f} s") from error
+            raise ChildError(f"{self._python} did not load rclpy within {HELLO_S:.0f} s") from error
         except OSError as error:
-            raise ChildMissingError(f"{python} ended: {self.exit_report()}") from error
+            raise ChildMissingError(f"{self._python} ended: {self.exit_report()}") from error
         self.peer.settimeout(None)
-        if hello["event"] == "hello":
-            return hello
-        why = f"{python}: {one_line(hello['why'])}"
-        raise ChildMissingError(why) if hello["missing"] else ChildError(why)
+        if self.hello["event"] != "hello":
+            why = f"{self._python}: {one_line(self.hello['why'])}"
+            raise ChildMissingError(why) if self.hello["missing"] else ChildError(why)
 
-    def _receive(self, size: int, deadline: float) -> bytes:
-        """Receives exactly `size` bytes by a deadline of the monotonic clock, or raises OSError."""
+    def _receive(self, size: int) -> bytes:
         parts = b""
         while len(parts) < size:
-            if self._cancelled.is_set() or time.monotonic() > deadline:
-                raise TimeoutError
-            try:
-                part = self.peer.recv(size - len(parts))
-            except TimeoutError:
-                continue
+            part = self.peer.recv(size - len(parts))
             if not part:
                 raise ConnectionResetError
             parts += part
@@ -405,23 +401,6 @@ class Process:
         self.peer.close()
 
 
-def launch(python: str | None, cancelled: Event) -> tuple[Process, str]:
-    """Starts a child under the first Python that has rclpy; returns also its interpreter.
-
-    Of `candidates`, or `python` alone if it is given; `cancelled` is set to give up.
-    """
-    tried = []
-    for name in [python] if python else candidates(os.environ):
-        try:
-            environment = environment_for(name)
-            return Process(name, environment, cancelled), name
-        except ChildMissingError as error:
-            tried.append(str(error))
-    raise MissingDependencyError(
-        f"recording ROS 2 needs a Python that has rclpy ({'; '.join(tried)}): {_REMEDY}"
-    )
-
-
 def candidates(environment: Mapping[str, str]) -> Sequence[str]:
     """Interpreters that may have rclpy, at least one, the most likely first."""
     named = environment.get(PYTHON_VARIABLE)
@@ -433,12 +412,3 @@ def candidates(environment: Mapping[str, str]) -> Sequence[str]:
         on_path = shutil.which("python3", path=environment.get("PATH"))
         found = [path for path in (on_path, "/usr/bin/python3") if path and Path(path).exists()]
     return list(dict.fromkeys([*found, sys.executable]))
-
-
-def environment_for(python: str) -> dict[str, str]:
-    """The environment of a child."""
-    found = dict(os.environ)
-    if python != sys.executable:
-        # The wheels set this once they have found their libraries, and the child has others.
-        found.pop("_ROS_WHEELS_BOOTSTRAP_COMPLETE", None)
-    return found

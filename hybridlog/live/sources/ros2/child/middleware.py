@@ -48,18 +48,12 @@ class Offer(NamedTuple):
 class Subscription:
     """A raw subscription; `take` returns the next message and its information, or None."""
 
-    def __init__(self, middleware: Middleware, handle: Any, profile: Profile) -> None:
+    def __init__(self, inner: Any, profile: Profile) -> None:
         self.profile = profile
         self.take: Callable[[], tuple[bytes, dict[str, Any]] | None] = partial(
-            handle.handle.take_message, handle.msg_type, True
+            inner.handle.take_message, inner.msg_type, True
         )
-        self.handle = handle.handle
-        self._middleware = middleware
-        self._subscription = handle
-
-    def close(self) -> None:
-        """Ends the subscription; messages that were not taken are gone."""
-        self._middleware.remove(self, self._subscription)
+        self.inner = inner
 
 
 class Middleware:
@@ -123,21 +117,21 @@ class Middleware:
             raw=True,
             event_callbacks=self._silent,
         )
-        found = Subscription(self, handle, profile)
+        found = Subscription(handle, profile)
         self._open.append(found)
         self._wait_set = None
         return found
 
-    def remove(self, subscription: Subscription, inner: Any) -> None:
-        """Ends a subscription; only `Subscription.close` calls it."""
-        self._open = [other for other in self._open if other is not subscription]
+    def close_one(self, subscription: Subscription) -> None:
+        """Ends a subscription; messages that were not taken are gone."""
+        self._open.remove(subscription)
         self._wait_set = None
-        self._node.destroy_subscription(inner)
+        self._node.destroy_subscription(subscription.inner)
 
     def wait(self, seconds: float) -> list[Subscription]:
         """Waits, with a time limit, and returns the subscriptions that have messages."""
         if self._wait_set is None:
-            self._at = {sub.handle.pointer: sub for sub in self._open}
+            self._at = {sub.inner.handle.pointer: sub for sub in self._open}
             self._wait_set = self._native.WaitSet(
                 len(self._open), 1, 0, 0, 0, 0, self._context.handle
             )
@@ -145,7 +139,7 @@ class Middleware:
         wait_set.clear_entities()
         add = wait_set.add_subscription
         for sub in self._open:
-            add(sub.handle)
+            add(sub.inner.handle)
         wait_set.add_guard_condition(self._guard.handle)
         wait_set.wait(int(seconds * 1e9))
         return [self._at[pointer] for pointer in wait_set.get_ready_entities("subscription")]

@@ -22,7 +22,7 @@ from hybridlog.live.sources.sequence_gaps import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Collection
 
     from hybridlog.live.sources.ros2.child.definitions import Definition, Definitions
     from hybridlog.live.sources.ros2.child.middleware import Middleware, Offer, Subscription
@@ -41,7 +41,6 @@ class Topic:
     Attributes:
         definition: Definition of the type, None if unknown.
         stream: The messages, None without a subscription.
-        nodes: Names of the nodes of present and past publishers.
         version: Hash of the type of the current channel; `_MIXED` if publishers differ.
         profiles: Profiles that publishers have offered for this channel.
         tried_at: Monotonic time of the last attempt to subscribe.
@@ -54,7 +53,6 @@ class Topic:
         self.is_wanted = False
         self.definition: Definition | None = None
         self.stream: Stream | None = None
-        self.nodes: dict[bytes, str] = {}
         self.version = ""
         self.profiles: set[Profile] = set()
         self.tried_at = 0.0
@@ -144,7 +142,7 @@ class Topics:
     def _close(self, topic: Topic, stream: Stream) -> None:
         topic.stream = None
         self.owners.pop(stream.subscription, None)
-        stream.subscription.close()
+        self._middleware.close_one(stream.subscription)
 
     def _wanted(self, topic: Topic) -> Profile:
         assert topic.definition is not None
@@ -176,7 +174,7 @@ class Topics:
             # rclpy raises errors of many kinds; each concerns only this topic.
             self._refuse(topic, f"rclpy cannot subscribe: {error or type(error).__name__}")
         else:
-            topic.stream = Stream(found, topic.offers)
+            topic.stream = Stream(found)
             self.owners[found] = topic
             self._set_channel(topic, topic.stream)
 
@@ -210,29 +208,20 @@ class Topics:
         """Reports losses in transport."""
         for topic in self.owners.values():
             assert topic.stream is not None
-            self._account(topic, topic.stream, final=final)
-
-    def _account(self, topic: Topic, stream: Stream, *, final: bool) -> None:
-        if len(topic.nodes) > MAX_PUBLISHERS:
-            topic.nodes.clear()
-        topic.nodes.update((offer.publisher, offer.node) for offer in topic.offers if offer.node)
-        for publisher, gap in stream.look(topic.offers, final=final):
-            node = topic.nodes.get(publisher, "")
-            if not stream.named and len(topic.offers) == 1:
-                node = topic.offers[0].node
-            # A message in fragments has the time of the first one, and others may come between.
-            times = min(gap.first, gap.last), max(gap.first, gap.last)
-            detail = f"from {node}" if node else ""
-            self._outbox.lost(topic.name, "transport", gap.missing, times=times, detail=detail)
-        if not stream.numbered:
-            self._outbox.say(
-                "this ROS does not number messages, so losses in transport cannot be counted"
-            )
-        if not stream.named and stream.numbered and len(topic.offers) > 1:
-            self._outbox.say(
-                f"{topic.name}: this rclpy does not name the publishers of messages, so losses "
-                "in transport cannot be counted; ROS 2 Kilted names them"
-            )
+            offers = topic.offers
+            nodes = {offer.publisher: offer.node for offer in offers}
+            if len(offers) == 1:
+                nodes[b""] = offers[0].node
+            for publisher, gap in topic.stream.losses(nodes, final=final):
+                node = nodes.get(publisher, "")
+                # A message in fragments has the time of the first one, and others may be between.
+                times = min(gap.first, gap.last), max(gap.first, gap.last)
+                detail = f"from {node}" if node else ""
+                self._outbox.lost(topic.name, "transport", gap.missing, times=times, detail=detail)
+            if not topic.stream.numbered:
+                self._outbox.say(
+                    "this ROS does not number messages, so losses in transport cannot be counted"
+                )
 
 
 MAX_PUBLISHERS = 1024
@@ -254,20 +243,14 @@ class Stream:
     Attributes:
         subscription: The subscription; the owner closes it, and puts another in its place.
         channel: Number of the channel of its messages; -1 before there is one.
-        named: Messages name their publisher; True until one does not.
         numbered: Messages have numbers; True until one does not.
-        alone: The topic has had the same single publisher since its count began.
     """
 
-    def __init__(self, subscription: Subscription, offers: Sequence[Offer]) -> None:
+    def __init__(self, subscription: Subscription) -> None:
         self.subscription = subscription
         self.channel = -1
-        self.named = True
         self.numbered = True
-        self.alone = len(offers) == 1
         self._gaps: dict[bytes, SequenceGapDetector] = {}
-        self._unsure: list[tuple[bytes, SequenceGap]] = []  # they wait for a look at the graph
-        self._publishers = frozenset(offer.publisher for offer in offers)
 
     def take(self, outbox: Outbox) -> tuple[int, int]:
         """Takes messages, up to a limit for other topics' sake; returns number and bytes."""
@@ -282,25 +265,24 @@ class Stream:
             size += len(payload)
             received = _received(info)
             number = self._number(info)
-            gid = info.get("publisher_gid")
-            if gid is None:
-                self.named = False
-                publisher, is_usable = b"", self.alone and number >= 0
-            else:
-                publisher, is_usable = publisher_id(gid["data"]), number >= 0
-            if is_usable:
-                self._count(publisher, number, received)
+            if number >= 0:
+                gid = info.get("publisher_gid")
+                self._count(b"" if gid is None else publisher_id(gid["data"]), number, received)
             sent = info["source_timestamp"]
             put(channel, payload, received, sent if 0 < sent <= _MAX_INT else 0, number)
         return count, size
 
     def _count(self, publisher: bytes, number: int, received: int) -> None:
+        """Count a message of a publisher, or of any: before Kilted, messages name nobody."""
         gaps = self._gaps.get(publisher)
         if gaps is None:
-            gaps = SequenceGapDetector(trust_after=0, confirm_after=0, max_gap=MAX_GAP)
+            gaps = SequenceGapDetector()
+            if publisher:
+                gaps = SequenceGapDetector(trust_after=0, confirm_after=0, max_gap=MAX_GAP)
             self._gaps[publisher] = gaps
-        # A number that goes back is a late message, which is no loss.
-        if gaps.expected < 0 or (number - gaps.expected) % MODULUS <= MAX_GAP:
+        # A number that goes back is a late message, which is no loss, or shows several publishers.
+        is_late = gaps.expected >= 0 and (number - gaps.expected) % MODULUS > MAX_GAP
+        if not (publisher and is_late):
             gaps.see(number % MODULUS, received)
 
     def _number(self, info: dict[str, Any]) -> int:
@@ -311,27 +293,15 @@ class Stream:
             return -1
         return int(number)
 
-    def look(
-        self, offers: Sequence[Offer], *, final: bool = False
+    def losses(
+        self, publishers: Collection[bytes], *, final: bool = False
     ) -> list[tuple[bytes, SequenceGap]]:
-        """Losses since the last call, by publisher; called at each look at the graph."""
+        """Losses since the last call, by publisher; some `publishers` are there still."""
         found = [
             (publisher, joined_gap(lost))
             for publisher, gaps in self._gaps.items()
-            if (lost := gaps.confirmed())
+            if (lost := gaps.finish() if final else gaps.confirmed())
         ]
-        publishers = frozenset(offer.publisher for offer in offers)
-        if not self.named:
-            self.alone = len(offers) == 1 and publishers == self._publishers
-            if not self.alone:
-                self._gaps.clear()
-                found = self._unsure = []
-            elif not final:
-                # Another publisher may have sent before the graph shows it.
-                found, self._unsure = self._unsure, found
-            else:
-                found = self._unsure + found
-        self._publishers = publishers
         if len(self._gaps) > MAX_PUBLISHERS:
             self._gaps = {key: gaps for key, gaps in self._gaps.items() if key in publishers}
         return found
