@@ -21,12 +21,7 @@ _ROOT = Path(__file__).parents[1]
 
 
 def describe(work: Path | None = None) -> dict[str, object]:
-    """Machine, system, versions, revision and load, as values that JSON can hold.
-
-    Args:
-        work: Where the measured data goes, for the kind of that disk; None for the directory
-            of temporary files.
-    """
+    """Machine, system, versions, revision and load, as values that JSON can hold."""
     cpu = re.search(r"^model name\s*:\s*(.+)$", _text("/proc/cpuinfo"), re.MULTILINE)
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     return {

@@ -43,12 +43,7 @@ class Sample:
 
 
 class Journal:
-    """The samples of a run, in a directory.
-
-    Args:
-        directory: Where it lies, or is made.
-        header: Of a new run: machine, versions, settings, seeds. None reads a journal.
-    """
+    """The samples of a run, in a directory."""
 
     def __init__(self, directory: Path, header: Mapping[str, Any] | None = None) -> None:
         self.path = directory / NAME

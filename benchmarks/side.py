@@ -50,17 +50,7 @@ class SideError(Exception):
 def run_side(
     function: str, arguments: Mapping[str, object], directory: Path, timeout_s: float
 ) -> Values:
-    """Run a side to its end; see that nothing which it has started stays behind.
-
-    Args:
-        function: `module:name`, called with `arguments` as keywords.
-        arguments: Values that JSON can hold.
-        directory: Of the run, nobody else's; what the side writes is put there.
-        timeout_s: It is ended after so many seconds.
-
-    Returns:
-        What the function returned, and `peak_rss`, bytes.
-    """
+    """Run a side to its end; see that nothing which it has started stays behind."""
     output, errors = directory / "side.out", directory / "side.err"
     environment = {
         **os.environ,

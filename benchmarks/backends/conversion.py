@@ -19,20 +19,22 @@ takes thirty times as long: that, and not the database, would be what a ceiling 
 from __future__ import annotations
 
 from base64 import b64encode
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from datetime import datetime, timedelta
 from functools import cache
 from operator import attrgetter
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from benchmarks.backends.base import Backend
 from hybridlog.schema.definition import parse_definition, paths
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
-    from hybridlog_storage.messages import Schema
+    from hybridlog_storage.messages import Channel, Schema
 
 Document = dict[str, Any]
 Convert = Callable[[Any], object]
@@ -71,23 +73,13 @@ class Converter:
         self._to_json = _plan(self._types, self._name, for_json=True)
 
     def document(self, log_time: int, payload: bytes) -> Document:
-        """A message for MongoDB.
-
-        Args:
-            log_time: ns since the epoch.
-            payload: The serialized message.
-        """
+        """A message for MongoDB."""
         document = self._to_bson(self._types.deserialize_ros1(payload, self._name))
         document[META] = {"inserted_at": date_of(log_time), "t": log_time}
         return document
 
     def text(self, log_time: int, payload: bytes) -> str:
-        """A message as JSON.
-
-        Args:
-            log_time: ns since the epoch.
-            payload: The serialized message.
-        """
+        """A message as JSON."""
         import orjson
 
         document = self._to_json(self._types.deserialize_ros1(payload, self._name))
@@ -118,13 +110,7 @@ def typestore_of(schema: Schema) -> tuple[Typestore, str]:
 
 
 def _plan(types: Typestore, name: str, *, for_json: bool) -> Plan:
-    """How messages of a type become dictionaries.
-
-    Args:
-        types: Holds the type.
-        name: As rosbags spells it, `sensor_msgs/msg/Imu`.
-        for_json: Values that JSON can hold, rather than those of MongoDB.
-    """
+    """How messages of a type become dictionaries."""
     if name in _INSTANTS:
         return lambda value: {"secs": value.sec, "nsecs": value.nanosec}
     fields = types.get_msgdef(name).fields
@@ -181,3 +167,31 @@ def _of_array(types: Typestore, element: Any, *, for_json: bool) -> Convert | No
 
 def date_of(log_time: int) -> datetime:
     return _EPOCH + timedelta(microseconds=log_time // 1_000_000 * 1000)
+
+
+def schema_of(channel: Channel) -> Schema:
+    """The definition of a channel's messages: all loads have them."""
+    assert channel.schema is not None
+    return channel.schema
+
+
+class DatabaseBackend(Backend):
+    """A backend whose messages are decoded first."""
+
+    def __init__(self, directory: Path) -> None:
+        super().__init__(directory)
+        self._channels: Sequence[Channel] = ()
+        self._converters: list[Converter] = []
+
+    def _take_channels(self, channels: Sequence[Channel]) -> None:
+        """Compile the decoders, so that no message has to wait for that."""
+        self._channels = channels
+        self._converters = [converter_for(schema_of(channel)) for channel in channels]
+
+    def _topics(self) -> dict[str, list[tuple[str, ...]]]:
+        """Topics in order, and the groups of fields to be indexed in each."""
+        found: dict[str, list[tuple[str, ...]]] = {}
+        for channel, converter in zip(self._channels, self._converters, strict=True):
+            groups = found.setdefault(channel.topic, [])
+            groups.extend(group for group in converter.indexed if group not in groups)
+        return found

@@ -29,8 +29,7 @@ from benchmarks.backends.base import (
     BackendFailedError,
     sums,
 )
-from benchmarks.backends.conversion import typestore_of
-from benchmarks.backends.database import schema_of
+from benchmarks.backends.conversion import schema_of, typestore_of
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -23,8 +23,7 @@ from benchmarks.backends.base import (
     failing,
     sums,
 )
-from benchmarks.backends.conversion import INSERTED_AT, date_of
-from benchmarks.backends.database import DatabaseBackend
+from benchmarks.backends.conversion import INSERTED_AT, DatabaseBackend, date_of
 from benchmarks.backends.server import Server
 from hybridlog_storage.mongo.index_documents import collection_of
 

@@ -67,14 +67,7 @@ def find_programs() -> Programs:
 def start(
     programs: Programs, server: Server, data: Path, settings: Mapping[str, str | int]
 ) -> None:
-    """Make a database cluster if there is none, and start a server on it.
-
-    Args:
-        programs: Run it.
-        server: New.
-        data: Directory of the cluster; its parent exists.
-        settings: Of the server, besides where it listens.
-    """
+    """Make a database cluster if there is none, and start a server on it."""
     server.prepare(data, programs.owner)
     if not any(data.iterdir()):
         _make_cluster(programs, data)

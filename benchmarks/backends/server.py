@@ -28,12 +28,7 @@ _END_LIMIT_S = 90.0
 
 
 class Server:
-    """One server process.
-
-    Args:
-        name: For messages and file names: `mongod`.
-        directory: Exists; gets the log.
-    """
+    """One server process."""
 
     def __init__(self, name: str, directory: Path) -> None:
         self.name = name
@@ -44,12 +39,7 @@ class Server:
         self._stop = signal.SIGTERM
 
     def prepare(self, data: Path, owner: int | None = None) -> None:
-        """Make directories for the data and the socket.
-
-        Args:
-            data: Directory of the data; its parent exists.
-            owner: User id that the server will run as, when it is another one.
-        """
+        """Make directories for the data and the socket."""
         base = tempfile.gettempdir()
         base = base if len(os.fsencode(base)) <= LONGEST_SOCKET - 40 else "/tmp"
         self.sockets = Path(tempfile.mkdtemp(prefix="hybridlog-bench-", dir=base))
@@ -61,13 +51,7 @@ class Server:
     def start(
         self, command: Sequence[str], stop: signal.Signals, answers: Callable[[], bool]
     ) -> None:
-        """Start it and wait until it answers. Needs `prepare`; `stop` is needed after.
-
-        Args:
-            command: The program and its arguments.
-            stop: The signal that ends it in good order.
-            answers: Whether it answers now; returns soon.
-        """
+        """Start it and wait until it answers. Needs `prepare`; `stop` is needed after."""
         begin = self.log.stat().st_size if self.log.exists() else 0
         self._stop = stop
         hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from benchmarks.backends.base import ARM, GRIPPER, HALF_NS, VIEWPOINT, sums
-from benchmarks.backends.database import DatabaseBackend
+from benchmarks.backends.conversion import DatabaseBackend
 from hybridlog_storage.mongo.index_documents import collection_of
 
 if TYPE_CHECKING:
@@ -22,12 +22,7 @@ _BATCH_CHARACTERS = 16 << 20  # of JSON, after which it is not put off any longe
 
 
 def is_due(size: int, since: float) -> bool:
-    """Whether a transaction is not put off any longer.
-
-    Args:
-        size: Characters of JSON in it.
-        since: When it was begun, by the monotonic clock.
-    """
+    """Whether a transaction is not put off any longer."""
     return size >= _BATCH_CHARACTERS or time.monotonic() - since >= _BATCH_S
 
 

@@ -15,12 +15,6 @@ import numpy as np
 
 class Counters:
     """The numbers of one run.
-
-    Args:
-        path: The file.
-        topics: Number of channels; None to take it from a file that is there, else a
-            new file is made.
-
     Attributes:
         sent: Messages of each channel that entered its queue; the publisher writes.
         dropped: Messages of each channel that found their queue full; the publisher writes.

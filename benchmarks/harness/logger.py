@@ -41,17 +41,7 @@ class StoppedError(Exception):
 
 
 def log(*, load: str, backend: str, directory: str, publishing: Publishing) -> Values:
-    """Publish a load into a backend.
-
-    Args:
-        load: The load's directory.
-        backend: `module:class`.
-        directory: For the backend's data.
-        publishing: How.
-
-    Returns:
-        `status`, `reason`, and what was measured.
-    """
+    """Publish a load into a backend."""
     opened = Load.open(Path(load))
     values: Values = {"status": "ok", "reason": ""}
     with ended_by_signals():
@@ -70,11 +60,7 @@ def log(*, load: str, backend: str, directory: str, publishing: Publishing) -> V
 
 
 def count(*, load: str, backend: str, directory: str) -> Values:
-    """What a backend holds that another process has filled.
-
-    Returns:
-        `counts`, messages of each topic; or `status` and `reason`.
-    """
+    """What a backend holds that another process has filled."""
     opened = Load.open(Path(load))
     values: Values = {"status": "ok", "reason": ""}
     with ended_by_signals():
@@ -185,12 +171,7 @@ class _Meter:
         self._server_peak = usage.peak_rss(pids)
 
     def note(self, values: Values, published: dict[str, Any]) -> None:
-        """Note what was used.
-
-        Args:
-            values: Where.
-            published: What the publisher has said; empty when it was ended.
-        """
+        """Note what was used."""
         values |= published
         start = values.pop("start_ns", self._started)
         values |= {

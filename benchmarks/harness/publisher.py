@@ -39,16 +39,7 @@ _BATCH = 512
 def publish_to_queues(
     load: Load, counters: Counters, *, start: int, speed: float, pipes: Sequence[int], limit: int
 ) -> int:
-    """Publish into a queue a topic; returns when the last message was published.
-
-    Args:
-        load: What.
-        counters: Of this run.
-        start: When, ns of the monotonic clock.
-        speed: Times as fast as the load says.
-        pipes: Where the tokens go, a descriptor a channel.
-        limit: Messages that a queue holds.
-    """
+    """Publish into a queue a topic; returns when the last message was published."""
     all_sent, all_dropped, taken = counters.sent, counters.dropped, counters.taken
     sent, dropped = [0] * len(pipes), [0] * len(pipes)
     write = os.write
@@ -84,19 +75,7 @@ def _batches(load: Load, start: int, speed: float) -> Iterator[tuple[int, list[i
 
 
 def main(*, load: str, counters: str, pipes: list[int], limit: int, speed: float) -> dict[str, Any]:
-    """Publish a load once.
-
-    Args:
-        load: Its directory.
-        counters: The counters' file.
-        pipes: Descriptors of the pipes.
-        limit: Messages a queue.
-        speed: Times as fast as the load says.
-
-    Returns:
-        `start_ns` and `end_ns` of the monotonic clock: the start, and when the last
-        message was published.
-    """
+    """Publish a load once."""
     opened = Load.open(Path(load))
     shared = Counters(Path(counters))
     print(READY, flush=True)

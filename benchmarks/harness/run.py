@@ -50,12 +50,6 @@ def run(load: Load, backend: type[Backend], directory: Path, speed: float = 1.0)
     `wall_s` (from the first publication until `finish` had returned), `cpu_s` of the logger,
     `server_cpu_s`, `server_peak_rss`, `peak_rss` (without the payloads), `disk_bytes`,
     `spin_ms`.
-
-    Args:
-        load: What; its directory must stay where it is.
-        backend: A class at the top of a module.
-        directory: Empty and nobody else's. The caller removes it.
-        speed: Times as fast as the load says.
     """
     directory = directory.resolve()
     common = given_to(backend, load, directory)
@@ -90,13 +84,7 @@ def run(load: Load, backend: type[Backend], directory: Path, speed: float = 1.0)
 
 
 def given_to(backend: type[Backend], load: Load, directory: Path) -> dict[str, str]:
-    """The arguments of a side: its backend gets the new folder `data` of the run's directory.
-
-    Args:
-        backend: A class at the top of a module.
-        load: What it gets or has.
-        directory: Of the run, and absolute.
-    """
+    """The arguments of a side: its backend gets the new folder `data` of the run's directory."""
     data = directory / "data"
     data.mkdir()
     return {

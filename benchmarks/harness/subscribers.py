@@ -27,12 +27,6 @@ class Subscribers:
 
     A message whose insert raises anything but `BackendFailedError` is lost and counted,
     as in a logger that must go on.
-
-    Args:
-        load: Where the payloads lie.
-        backend: Where they go.
-        counters: Of this run.
-
     Attributes:
         failed: Set when the backend cannot go on.
         failure: Why.
@@ -50,11 +44,7 @@ class Subscribers:
         self._threads: list[threading.Thread] = []
 
     def start(self, pipes: Sequence[int]) -> None:
-        """Start taking messages.
-
-        Args:
-            pipes: A descriptor a channel; closed at the end.
-        """
+        """Start taking messages."""
         for channel, pipe in enumerate(pipes):
             self._add(self._take_one, pipe, channel)
         for thread in self._threads:
@@ -66,11 +56,7 @@ class Subscribers:
         return size if size <= _HELD else usage.mapped_rss(self._load.payloads.resolve())
 
     def join(self, timeout_s: float) -> bool:
-        """Wait until all is taken.
-
-        Returns:
-            Whether it is, within about that time.
-        """
+        """Wait until all is taken."""
         deadline = time.monotonic() + timeout_s
         for thread in self._threads:
             thread.join(max(deadline - time.monotonic(), 0))

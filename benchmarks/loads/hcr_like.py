@@ -76,14 +76,7 @@ _REMARKS = (
 
 
 def hcr_like(directory: Path, *, seed: int, sessions: int, minutes: float) -> Load:
-    """Make a load of some sessions, one after the other with a gap, and its answers.
-
-    Args:
-        directory: Where it goes; exists.
-        seed: Not negative.
-        sessions: How many, above 0.
-        minutes: Length of each, at least 1.
-    """
+    """Make a load of some sessions, one after the other with a gap, and its answers."""
     types, spool = RobotTypes(), Spool(directory)
     answers: Counter[str] = Counter()
     positions = np.zeros(4)

@@ -189,13 +189,7 @@ def messages(seconds: int, seed: int) -> Iterator[list[Message]]:
 
 
 def robot_load(directory: Path, *, seconds: int, seed: int) -> Load:
-    """The log as a load.
-
-    Args:
-        directory: Where it goes.
-        seconds: Its length.
-        seed: Of its noise.
-    """
+    """The log as a load."""
     spool = Spool(directory)
     for found in messages(seconds, seed):
         times, numbers, payloads = zip(*found, strict=True)

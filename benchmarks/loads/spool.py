@@ -26,9 +26,6 @@ class Spool:
 
     Messages may come in any order. Payloads do not stay in memory, only 28 bytes a
     message do.
-
-    Args:
-        directory: Exists.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -43,13 +40,7 @@ class Spool:
         payloads: Iterable[bytes | memoryview],
         log_time: NDArray[np.int64],
     ) -> None:
-        """Add messages of any length.
-
-        Args:
-            channel: int32[n], index of each one's channel.
-            payloads: n of them.
-            log_time: int64[n], ns since the epoch.
-        """
+        """Add messages of any length."""
         length = np.fromiter(map(self._file.write, payloads), np.int64, len(log_time))
         ends = self._at + np.cumsum(length)
         self._at += int(length.sum())
@@ -66,10 +57,6 @@ class Spool:
 
         A message is due as long after the first one as its log time is after that of the
         first one. Of equal log times, the one that was added first comes first.
-
-        Args:
-            seed: From which it was made.
-            channels: One a topic.
         """
         self._file.close()
         channel, log_time, offset, length = (

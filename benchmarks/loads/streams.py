@@ -53,16 +53,6 @@ def stream(
 
     Half of a message is a smooth range scan in whole millimetres, half is noise, as a
     compressed camera frame is. The topics take turns, evenly over a period.
-
-    Args:
-        directory: Where it goes; exists.
-        size: Bytes of a serialized message.
-        rate: Messages a second on each topic.
-        topics: Number of topics.
-        messages: Messages on each topic.
-        seed: Of the payloads.
-        pool: Payload file of a stream of the same size, seed and `pool_messages`: it is
-            shared, as a hard link.
     """
     payloads = directory / PAYLOADS
     count = pool_messages(size, topics, messages)

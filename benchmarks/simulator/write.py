@@ -54,16 +54,7 @@ def write_bag(
     topics: Iterable[str] | None = None,
     config: RobotConfig | None = None,
 ) -> BagSummary:
-    """Simulate a robot and write its log.
-
-    Args:
-        path: The bag, which must not exist.
-        duration_s: Seconds of log time; the bag spans `[0, duration_s)`.
-        seed: Determines the furniture, the noise and the day.
-        is_compressed: Whether the chunks of the bag are, by lz4.
-        topics: Exact names; None for all.
-        config: Sizes of the large messages.
-    """
+    """Simulate a robot and write its log."""
     path = Path(path)
     speaker = Speaker(Robot(duration_s, seed), config or RobotConfig(), Types())
     wanted = None if topics is None else {*topics}

@@ -142,20 +142,7 @@ def _judged(
 
 
 def ask(*, load: str, backend: str, directory: str, repetitions: int) -> Values:
-    """Fill a backend and ask it.
-
-    Args:
-        load: The load's directory.
-        backend: `module:class`.
-        directory: For the backend's data.
-        repetitions: How often each question is asked after the first time, and how often the
-            backend is opened, to ask for the first time.
-
-    Returns:
-        `status`, `reason`, `results`, and of the filling: `load_s`, `disk_bytes`, `spin_ms`.
-        A question has a result a repetition: `cold_ms` (the first time after the backend was
-        opened), `ms` (again), and the `answers`; or `error`.
-    """
+    """Fill a backend and ask it."""
     cold: dict[str, list[dict[str, Any]]] = {name: [] for name in QUESTIONS}
     warm: dict[str, list[dict[str, Any]]] = {name: [] for name in QUESTIONS}
 

@@ -55,12 +55,7 @@ CASES: dict[str, Case] = {
 
 
 def run(context: Context, name: str) -> None:
-    """Do a case.
-
-    Args:
-        context: Where and how.
-        name: Key of `CASES`.
-    """
+    """Do a case."""
     case, reason = CASES[name], ""
     values: dict[str, object] = {}
     if context.scale != "full":

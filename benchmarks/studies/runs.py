@@ -64,13 +64,7 @@ class Context:
         print(f"[{minutes}:{seconds:02}] {text}", file=sys.stderr, flush=True)
 
     def load(self, name: str, settings: Mapping[str, Any], make: Callable[[Path], Load]) -> Load:
-        """A load that is made once.
-
-        Args:
-            name: What it is, for people who look into the work directory.
-            settings: All that it depends on, values that JSON can hold.
-            make: Makes it in an empty directory.
-        """
+        """A load that is made once."""
         place = self.work / "loads" / "-".join(map(str, [name, *settings.values()]))
         if not place.exists():
             place.mkdir(parents=True)
@@ -78,16 +72,7 @@ class Context:
         return Load.open(place)
 
     def run(self, wanted: Sample, load: Callable[[], Load], *, speed: float = 1.0) -> Sample:
-        """Run one case with one backend.
-
-        Args:
-            wanted: Study, case, backend and repetition.
-            load: Gives the load; called only when it is needed.
-            speed: Times as fast as the load says.
-
-        Returns:
-            The sample, which is in the journal.
-        """
+        """Run one case with one backend."""
         reason = self.missing.get(wanted.backend)
         if reason is not None:
             sample = replace(wanted, status="missing", reason=reason)

@@ -63,12 +63,7 @@ def bracket(kept: Mapping[float, bool]) -> tuple[float | None, float | None]:
 
 
 def next_rate(kept: Mapping[float, bool], bounds: Bounds) -> float | None:
-    """The rate to try next; None when the search is over.
-
-    Args:
-        kept: Of the rates that were tried, whether all was kept.
-        bounds: Where to look.
-    """
+    """The rate to try next; None when the search is over."""
     best, lost = bracket(kept)
     if best is None and lost is None:
         return bounds.start
@@ -112,13 +107,7 @@ class Found(NamedTuple):
 
 
 def searches(samples: Iterable[Sample], axis: str, harness: str) -> dict[str, list[Found]]:
-    """What searches have found, by backend.
-
-    Args:
-        samples: Those of the searches, of one case.
-        axis: Name of the rate in the case of a trial.
-        harness: The backend that keeps nothing, and so shows what the harness can carry.
-    """
+    """What searches have found, by backend."""
     trials: dict[tuple[str, int], dict[float, Sample]] = {}
     carried = math.inf
     for sample in samples:

@@ -90,10 +90,6 @@ class _Connection:
 
 class Talker:
     """Waits until each topic has a listener, then speaks.
-
-    Args:
-        load: What to say.
-
     Attributes:
         uri: Where it can be asked for its topics.
     """

@@ -94,12 +94,7 @@ SQL = {
 
 
 def run(context: Context, group: str) -> None:
-    """Do a group.
-
-    Args:
-        context: Where and how.
-        group: Key of `GROUPS`.
-    """
+    """Do a group."""
     settings = SETTINGS[context.scale]
     wanted = Sample(STUDY, {"group": group, **settings._asdict()}, "hybridlog", 0)
     with context.step(f"tasks: {group}"), run_directory(context.work) as directory:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import shutil
 import struct
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,7 +16,7 @@ from PIL import Image as Pillow
 
 from hybridlog.arrays.message_arrays import IMAGES, VIDEOS, to_numpy
 from hybridlog.drawing.images import Picture, picture, pixels
-from hybridlog_storage.errors import MissingDependencyError, PayloadError, UsageError
+from hybridlog_storage.errors import MissingDependencyError, PayloadError
 from tests.calls import Calls
 from tests.cli.within import Answer, answer
 
@@ -206,21 +205,21 @@ def test_bayer(order: str, bits: int) -> None:
         ("TIFF", "image/tiff", ".tif", False),
     ],
 )
-@pytest.mark.parametrize("said", ["png", "jpeg", ""])
 def test_compressed_images_as_they_came(
-    form: str, media_type: str, suffix: str, *, is_shown: bool, said: str
+    form: str, media_type: str, suffix: str, *, is_shown: bool
 ) -> None:
+    """Bytes say what they are, whatever the message says."""
     data = encoded(GREY, form)
     for kind in sorted(IMAGES - VIDEOS):
         if "Compressed" in kind:
-            found = picture(compressed(said, data, kind))
+            found = picture(compressed("png", data, kind))
             assert found == Picture(media_type, suffix, data)
-    shown = picture(compressed(said, data), raw=False)
+    shown = picture(compressed("png", data), raw=False)
     if is_shown:
         assert shown == found
     else:
         assert np.array_equal(seen(shown), GREY)
-        assert picture(compressed(said, data), raw=False, form="jpg").suffix == ".jpg"
+        assert picture(compressed("png", data), raw=False, form="jpg").suffix == ".jpg"
 
 
 @pytest.mark.parametrize(
@@ -234,15 +233,8 @@ def test_compressed_images_as_they_came(
     ],
 )
 def test_formats_by_their_first_bytes(start: bytes, suffix: str) -> None:
-    assert picture(compressed("", start)).suffix == suffix
-    assert picture(compressed("", start)).data == start
-
-
-@pytest.mark.parametrize("data", [b"\0\0\0\x01\x67\x42", b"BMx", b"RIFF1234WAVE", b"x" * 30])
-@pytest.mark.parametrize("raw_form", [True, False])
-def test_no_known_format(data: bytes, *, raw_form: bool) -> None:
-    with pytest.raises(PayloadError, match="no known format; it says that it is 'h264'"):
-        picture(compressed("h264", data), raw=raw_form)
+    found = picture(compressed("", start))
+    assert (found.suffix, found.data) == (suffix, start)
 
 
 def test_compressed_depth() -> None:
@@ -304,6 +296,8 @@ SCAN = Sent(
         (raw("bayer_rggb8", np.empty((4, 0), np.uint8), step=0), "without pixels"),
         (raw("yuyv", np.empty((2, 0, 2), np.uint8), step=0), "without pixels"),
         (compressed("png", b""), "without pixels"),
+        (compressed("h264", b"RIFF1234WAVE"), "no known format; it says that it is 'h264'"),
+        (compressed("", b"BMx"), "no known format"),
         (compressed("32FC1; compressedDepth", b""), "without pixels"),
         (raw("hsv99", GREY), "unknown encoding"),
         (raw("mono8", GREY, height=50), "needs"),
@@ -316,7 +310,7 @@ def test_no_pictures(message: Any, problem: str) -> None:
         picture(message)
 
 
-@pytest.mark.parametrize("side", [8200, 14_000])
+@pytest.mark.parametrize("side", [8200, 14_000])  # Pillow itself refuses the latter
 def test_a_small_file_with_very_many_pixels_is_no_picture_for_the_eye(side: int) -> None:
     file = io.BytesIO()
     Pillow.new("1", (side, side)).save(file, "PNG")
@@ -353,12 +347,9 @@ def test_raw_images_become_png(drive: Drive, tmp_path: Path) -> None:
     assert first["length"] == (out / first["file"]).stat().st_size
 
 
-@pytest.mark.parametrize("form", ["png", "jpg"])
-def test_compressed_images_are_fetched_as_they_came(
-    drive: Drive, tmp_path: Path, form: str
-) -> None:
+def test_compressed_images_are_fetched_as_they_came(drive: Drive, tmp_path: Path) -> None:
     out = tmp_path / "pictures"
-    fetch(drive, "-t", "rear/*", "-F", form, "-o", out)
+    fetch(drive, "-t", "rear/*", "-F", "png", "-o", out)
     # Two of the same nanosecond have names of their own.
     names = [f"{BASE}.jpg", f"{BASE}-1.webp", f"{BASE + 1}.jpg"]
     assert [row["file"] for row in index_of(out)] == [f"rear__compressed/{n}" for n in names]
@@ -381,23 +372,8 @@ def test_one_image(drive: Drive, tmp_path: Path) -> None:
     assert (tmp_path / "y.jpg").read_bytes() == FILES[0]
     assert fetch(drive, *rear, tmp_path / "y.png", code=2).out == ""
     assert not (tmp_path / "y.png").exists()
-    fetch(drive, "-t", "front", "-n", "1", "-F", "jpg", "-o", tmp_path / "many")
-    assert [path.name for path in (tmp_path / "many").glob("front/*")] == [f"{BASE}.jpg"]
-    shutil.rmtree(tmp_path / "many")
     fetch(drive, "-t", "front", "-o", tmp_path / "z.png", code=2)
     fetch(drive, "-t", "front", "--limit", 0, "-o", tmp_path / "z.png", code=2)
+    fetch(drive, "-t", "drive", "-F", "png", "-o", tmp_path / "z", code=2)
+    fetch(drive, "-t", "broken", "-F", "png", "-o", tmp_path / "z", code=PayloadError.exit_code)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["x.JPEG", "x.jpg", "x.png", "y.jpg"]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "code"),
-    [
-        (("-t", "drive"), UsageError.exit_code),
-        (("-t", "broken"), PayloadError.exit_code),
-    ],
-)
-def test_no_pictures_leave_nothing(
-    drive: Drive, tmp_path: Path, arguments: tuple[str], code: int
-) -> None:
-    fetch(drive, *arguments, "-F", "png", "-o", tmp_path / "x", code=code)
-    assert [*tmp_path.iterdir()] == []

@@ -78,24 +78,6 @@ def test_files(drive: Drive, tmp_path: Path, form: str) -> None:
     assert [p.name for p in tmp_path.iterdir() if p.name.startswith("speed")] == [path.name]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "problem"),
-    [
-        (("-o", "x.gif"), "end it in .png, .svg, .pdf."),
-    ],
-)
-def test_what_is_refused(
-    drive: Drive,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    arguments: tuple[str, ...],
-    problem: str,
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert problem in plot(drive, "-t", "drive", "--fields", "y", *arguments, code=2).err
-    assert [*tmp_path.iterdir()] == []
-
-
 def curves_of(found: list[Line]) -> str:
     return figure(found, size=(500, 300), form="svg").decode()
 
@@ -118,4 +100,6 @@ def test_without_matplotlib(drive: Drive, tmp_path: Path, calls: Calls) -> None:
     with pytest.raises(MissingDependencyError, match=r"pip install 'hybridlog\[plot\]'"):
         figure([], size=(500, 300), form="png")
     plot(drive, *ask, "-o", tmp_path / "y.png", code=MissingDependencyError.exit_code)
+    told = plot(drive, *ask, "-o", tmp_path / "y.gif", code=2).err
+    assert "end it in .png, .svg, .pdf." in told
     assert [*tmp_path.iterdir()] == []

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from hybridlog.drawing.series import ShownRows, numbers_of, series
+from hybridlog.drawing.series import numbers_of, series
 from hybridlog_storage.errors import TopicError, UsageError
 
 from .conftest import BASE, MS, Drive
@@ -207,22 +207,3 @@ def test_questions_without_a_picture(drive: Drive) -> None:
     with pytest.raises(UsageError, match="2 topics in 1 recordings"):
         series(drive.store.topic("drive", "loose"), ["y"], pixels=9)
     assert numbers_of(query) == ["linear.x", "linear.z", "y", "ticks", "on", "age"]
-
-
-@pytest.mark.parametrize(
-    ("times", "gaps"),
-    [
-        ([0, 5, 10, 15, 32, 37], []),  # a pixel without a message is not yet a gap
-        ([0, 5, 10, 15, 45, 47], [30]),
-        ([*range(10), 19, *range(20, 30)], []),  # nobody would see it
-        ([*range(10), *range(50, 60)], [29]),
-    ],
-)
-def test_gaps_between_pixels(times: list[int], gaps: list[int]) -> None:
-    rows = ShownRows((0, 60), 6, most=3)
-    at = np.array(times)
-    rows.add(at, {"x": np.ones(len(at))})
-    (x,) = rows.series(["x"])
-    assert x.times[np.isnan(x.least)].tolist() == gaps
-    firsts = {time // 10: time for time in reversed(times)}
-    assert x.times[~np.isnan(x.least)].tolist() == sorted(firsts.values())

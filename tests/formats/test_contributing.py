@@ -22,6 +22,7 @@ TABLES = {
     "OUTPUTS": "OutputFormat]] = {\n",
     "LOGS": "LOGS: Final = (\n",
     "DTYPES": "DTYPES: Final = {\n",
+    "GROUPS": "GROUPS: Final = {\n",
 }
 """Where rows of a table begin."""
 LINES = '{"log_time_ns": 1000000001, "topic": "/a", "x": 1.5}\nno line\n' + "".join(
@@ -73,8 +74,8 @@ def extended(tmp_path_factory: pytest.TempPathFactory) -> Path:
             path.unlink()
         touched[name] = touched.get(name, 0) + 1
         path.write_text(text, "utf-8")
-    # A writer, a reader and the tables of both; a type of number.
-    assert len(touched) == 4
+    # A writer, a reader and the tables of both; a type of number; a command and its name.
+    assert len(touched) == 6
     return folder
 
 
@@ -116,6 +117,11 @@ def test_the_examples(extended: Path) -> None:
     run(extended, "export", "tables", "-F", "markdown", "-q")
     assert sorted(path.name for path in (extended / "tables").iterdir()) == ["a.md", "b.md"]
     assert "markdown" in run(extended, "align", "--help")[0]
+    run(extended, "tag", "log", "a=b", "-q")
+    assert run(extended, "tags")[0].splitlines() == ["recording  tags", "log        a=b"]
+    assert json.loads(run(extended, "tags", "--json")[0]) == [
+        {"recording": "log", "tags": {"a": "b"}}
+    ]
 
 
 def test_a_field_type(extended: Path, tmp_path: Path) -> None:
@@ -143,6 +149,9 @@ def test_the_tables_name_what_exists() -> None:
         assert hasattr(__import__(module, fromlist=[name]), name)
     suffixes = [suffix for output in OUTPUTS.values() for suffix in output.suffixes]
     assert len(suffixes) == len(set(suffixes))
+    text = (ROOT / "docs" / "contributing.md").read_text("utf-8")
+    for place in re.findall(r"`(hybridlog/[\w./]+)`", text):
+        assert (ROOT / place).exists() or f"python {place}" in text, place
     # The page about the command line has a row for each.
     page = (ROOT / "docs" / "cli.md").read_text("utf-8")
     for name in OUTPUTS:

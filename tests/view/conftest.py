@@ -145,11 +145,11 @@ def installed() -> Chromium:
     return found
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="package")
 def browser(installed: Chromium) -> Iterator[Browser]:
     """A real browser. Tests that use it are marked `@pytest.mark.peer("browser")`.
 
-    While it is open, an event loop runs in this thread, and other files' tests can have none.
+    While it is open, an event loop runs in this thread, so tests of this folder can have none.
     """
     from playwright.sync_api import sync_playwright
 

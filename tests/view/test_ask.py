@@ -16,7 +16,6 @@ from click.testing import CliRunner
 
 import hybridlog as hl
 from hybridlog.cli.commands import fetch
-from hybridlog.drawing.tree import MAX_SHOWN
 from hybridlog.view.guard import Admission
 from hybridlog.view.routes import ask
 from hybridlog.view.routes.ask import SQL_ROWS
@@ -72,8 +71,6 @@ REFUSED: list[tuple[str, dict[str, Any], str]] = [
     ),
     ("ask", {"where": "ranges.minn < 1"}, "ranges.min"),
     ("ask", {"where": "(" * 60 + "range_max > 1" + ")" * 60}, "nested deeper than 50"),
-    ("ask", {"where": "x" * 20_000}, "of length <= 10000"),
-    ("ask", {"where": f'header.frame_id ~ "{"a" * 2000}"'}, "1000"),
     ("ask", {"where": 'header.frame_id ~ "((a{99}){99}){99}"'}, "pattern"),
     ("ask", {"where": "/odom: twist.twist.linear.x > 1"}, "0.1s"),
     ("ask", {"topic": "scan"}, "no topic 'scan'"),
@@ -81,42 +78,24 @@ REFUSED: list[tuple[str, dict[str, Any], str]] = [
     ("matches", {"begin": 0, "end": 9, "pixels": 10**6}, "pixels"),
     ("matches", {"begin": 9, "end": 9, "pixels": 10}, "greater"),
     ("episodes", {"at": 0, "count": 201}, "count"),
-    ("episodes", {"at": 0, "direction": "up"}, "direction"),
     ("sql", {"text": "select 1; drop table x"}, "no view"),
-    ("sql", {"text": "selec 1"}, "LINE 1"),
     ("sql", {"text": "select * from read_text('/etc/passwd')"}, "files"),
-    ("sql", {"text": "select " + "(" * 3000 + "1" + ")" * 3000}, ""),
-    ("export", {"begin": 5, "end": 5}, "greater"),
     ("export", {"begin": 100 * S, "end": 101 * S}, "Nothing was recorded"),
     ("export", {"topic": ["/odom"] * 201}, "200"),
     ("timeline", {"begin": "1000"}, "greater"),
-    ("timeline", {"begin": "x"}, "`int`"),
     ("timeline", {"end": 1 << 63}, "`int` <= 9"),
     ("timeline", {"pixels": "8193"}, "8192"),
-    ("timeline", {"topic": ["/odom"] * 65}, "64"),
     ("timeline", {"topic": ["/odom"] * 60, "pixels": 4000}, "pixels"),
-    ("timeline", {"topic": "/nothing"}, "no topic"),
-    ("timeline", {"recording": "../robot"}, "robot"),
     ("recordings", {"order": "colour"}, "order"),
-    ("recordings", {"count": "201"}, "200"),
     ("recordings", {"count": "٣"}, "`int`"),
-    ("recordings", {"first": "-1"}, "`int` >= 0"),
     ("recordings", {"tag": ["a"] * 17}, "16"),
-    ("recordings", {"tag": "=1"}, ""),
     ("recordings", {"begin": "soon"}, "soon"),
-    ("recordings", {"where": "scan: ranges.min <"}, "expected"),
     ("message", {"at": None}, "missing"),
-    ("message", {"at": "9" * 25}, "`int` <= 9"),
     ("message", {"path": "1..2"}, "path"),
     ("message", {"path": "1.99"}, "no such part"),
-    ("message", {"count": MAX_SHOWN + 1}, "count"),
-    ("series", {"field": []}, "missing"),
-    ("series", {"field": ["range_max"] * 17}, "16"),
     ("series", {"field": "header.frame_id"}, "no number"),
     ("rows", {"before": 501}, "500"),
-    ("rows", {"field": ["range_max"] * 9}, "8"),
     ("points", {"limit": 500_001}, "500000"),
-    ("points", {"value": "x" * 1025}, "of length <= 1024"),
     ("track", {}, "no latitude"),
 ]
 

@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 import threading
 from contextlib import ExitStack
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, get_args
+from typing import Any, get_args
 
 import pytest
 
 import hybridlog as hl
-from benchmarks.simulator.write import write_bag
 from hybridlog.view import context
 from hybridlog.view.guard import Admission
 from hybridlog.view.routes import ask
 from hybridlog.view.server import make_app
 from hybridlog_storage.cache import Kind
 from tests.limits import Limit
-from tests.view.conftest import PORT, ROBOT, TOKEN
+from tests.view.conftest import PORT, TOKEN
 from tests.view.test_ask import ENDLESS, asked_for
-
-if TYPE_CHECKING:
-    pass
-
 
 S = 10**9
 WHOLE = {"begin": 0, "end": 20 * S, "pixels": 100}
@@ -88,20 +84,17 @@ def assert_stops(
     assert said[0]["status"] == 200
 
 
-@pytest.mark.parametrize("has_arrays", [False, True])
 def test_reading_payloads_is_given_up(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: Limit, *, has_arrays: bool
+    demo_store: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: Limit
 ) -> None:
     """By threads that read ahead, and from tables with arrays."""
     limit(min_threaded_bytes=0)
-    write_bag(tmp_path / "robot.bag", duration_s=5, config=ROBOT)
-    with hl.open(tmp_path / "store", create=True) as store:
-        store.record(tmp_path / "robot.bag", name="robot")
-        if has_arrays:
-            store.index.arrays("scan")
-        asked = {**SCAN, "where": "ranges[7] < 3 or ranges[7] > 3.1"}
-        module = "hybridlog/columns/" if has_arrays else "query/chunk_scan"
-        assert_stops(store, monkeypatch, "ask", asked, module)
+    asked = {**SCAN, "where": "ranges[7] < 3 or ranges[7] > 3.1"}
+    assert_stops(demo_store, monkeypatch, "ask", asked, "query/chunk_scan")
+    shutil.copytree(demo_store.directory.path, tmp_path / "store")
+    with hl.open(tmp_path / "store") as store:
+        store.index.arrays("scan")
+        assert_stops(store, monkeypatch, "ask", asked, "hybridlog/columns/")
 
 
 def test_a_question_that_is_given_up_waits_for_nothing(demo_store: hl.Store) -> None:

@@ -107,18 +107,13 @@ def test_without_the_token_nothing_is_told(door: Door) -> None:
     token = door.token
     wrong = [
         "",
-        token[:-1],
         f"{token}x",
         token.swapcase(),
-        f"x{token}",
         f"%00{token}",
         "é",
-        "%C3%A9",
         "%FF",
         "..",
         f"x/{token}",
-        f"/{token}",
-        f"./{token}",
         f"x/../{token}",
     ]
     said = set()
@@ -140,12 +135,9 @@ def test_without_the_token_nothing_is_told(door: Door) -> None:
     "host",
     [
         "evil.example",
-        "evil.example:{port}",
         "127.0.0.1",
         "127.0.0.1:1",
         "127.0.0.1.evil.example:{port}",
-        "localhost.:{port}",
-        "127.1:{port}",
         "0.0.0.0:{port}",
         "user@127.0.0.1:{port}",
         "127.0.0.1:{port}, evil.example",
@@ -180,15 +172,12 @@ def test_one_host_and_origin_are_named(door: Door) -> None:
     [
         {"Origin": "https://evil.example"},
         {"Origin": "null"},
-        {"Origin": "http://127.0.0.1"},
         {"Origin": "http://127.0.0.1:1"},
         {"Origin": "https://127.0.0.1:{port}"},
         {"Origin": "http://127.0.0.1:{port}.evil.example"},
-        {"Origin": "file://"},
         {"Origin": ""},
         {"Sec-Fetch-Site": "cross-site"},
         {"Sec-Fetch-Site": "same-site", "Sec-Fetch-Mode": "no-cors"},
-        {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "cors"},
     ],
 )
 def test_other_origins_are_refused(door: Door, headers: dict[str, str]) -> None:
@@ -203,7 +192,7 @@ def test_other_origins_are_refused(door: Door, headers: dict[str, str]) -> None:
 
 @pytest.mark.parametrize(
     "method",
-    ["POST", "PUT", "DELETE", "PATCH", "OPTIONS", "TRACE", "CONNECT", "PROPFIND", "get", "X" * 99],
+    ["POST", "DELETE", "OPTIONS", "CONNECT", "get", "X" * 99],
 )
 def test_only_get_is_answered(door: Door, method: str) -> None:
     for path in ("recordings", "", "app.js"):
@@ -211,40 +200,27 @@ def test_only_get_is_answered(door: Door, method: str) -> None:
         assert (answer.status, b"never changes the store" in answer.body) == (405, True)
         assert door.below(path, {"Content-Length": "1000000"}, method=method).status == 405
     assert door.ask("/x/recordings", method=method).status == 404
+    asked = {"Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Version": "13"}
+    answer = door.below("recordings", {**asked, "Sec-WebSocket-Key": "x" * 24})
+    assert (answer.status, "upgrade" in answer.headers) == (200, False)  # as without it
     head = door.below("recordings", method="HEAD")
     assert (head.status, head.body) == (200, b"")
 
 
-UP = ("..", "%2e%2e", ".%2e", "%2E.", "%252e%252e", "..%00", "...", "..;", "%c0%ae%c0%ae")
-SLASH = ("/", "%2f", "\\", "%5c", "//")
+UP = ("..", "%2e%2e", ".%2E", "%252e%252e", "..%00", "%c0%ae%c0%ae")
+SLASH = ("/", "%2f", "\\", "//")
 
 
 def test_paths_do_not_leave_the_page(door: Door) -> None:
     """Only files below `static/` come back, whatever is before them."""
     served_files = {path.read_bytes() for path in STATIC.rglob("*") if path.is_file()}
     tried = [
-        *(up + slash + rest for up in UP for slash in SLASH for rest in ("guard.py", "server.py")),
+        *(up + slash + "guard.py" for up in UP for slash in SLASH),
         *(f"panels{slash}{up}{slash}{up}{slash}guard.py" for up in UP for slash in SLASH),
         *(f"{up}{slash}" * 12 + "etc/passwd" for up in UP for slash in SLASH),
-        "/etc/passwd",
-        "//etc/passwd",
-        "%2fetc%2fpasswd",
-        "file:///etc/passwd",
-        "vendor",
-        "vendor/",
-        "panels/",
-        "app.js/",
-        "app.js/..",
-        "app.js%00.html",
-        "%00",
-        "~root",
-        "x" * 5000,
-        "/".join("x" * 3000),
-        "static/app.js",
-        "recordings/",
-        "recordings/..",
-        "docs",
-        "openapi.json",
+        *("/etc/passwd", "//etc/passwd", "%2fetc%2fpasswd", "file:///etc/passwd", "~root"),
+        *("vendor", "panels/", "app.js/..", "app.js%00.html", "%00", "recordings/.."),
+        *("x" * 5000, "/".join("x" * 3000), "static/app.js"),
     ]
     for path in tried:
         answer = door.below(path)
@@ -266,18 +242,12 @@ ABSURD = (
     "9" * 400,
     "NaN",
     "١٢",
-    "\x00",
     "💥" * 300,
-    "%s%n%d",
     "../../../etc/passwd",
     "[" * 3000,
-    '{"a":' * 1500,
     "x" * 8000,
     "a" + " and a" * 1200,
-    "not " * 1500 + "a",
-    "(" * 3000,
     "'; drop table x; --",
-    "$where",
     "\ud7ff\ufffe",
 )
 USUAL = {
@@ -306,11 +276,11 @@ def asked_by_routes() -> list[tuple[str, list[str]]]:
 
 
 def test_absurd_parameters_break_nothing(door: Door, capfd: pytest.CaptureFixture[str]) -> None:
-    """Each parameter of each route with some absurd values, where the others are usual."""
+    """Each parameter of each route with two absurd values, where the others are usual."""
     turn = 0
     for path, names in asked_by_routes():
         for name in names:
-            for value in [ABSURD[(turn + 5 * n) % len(ABSURD)] for n in range(3)]:
+            for value in [ABSURD[(turn + 5 * n) % len(ABSURD)] for n in range(2)]:
                 check(door, path, list({**USUAL, name: value}.items()))
             turn += 1
         check(door, path, [])
@@ -380,7 +350,7 @@ def test_connections_that_only_wait_are_closed(demo_store: hl.Store, limit: Limi
         assert statuses <= {200, 503}
 
 
-@pytest.mark.parametrize("shown", ["nothing", "part", "refused"])
+@pytest.mark.parametrize("shown", ["nothing", "refused"])
 def test_strangers_do_not_keep_the_page_out(demo_store: hl.Store, shown: str) -> None:
     """More connections without the token than are served at once, held open."""
     with served(demo_store) as url, ExitStack() as opened:
@@ -388,7 +358,6 @@ def test_strangers_do_not_keep_the_page_out(demo_store: hl.Store, shown: str) ->
         path, host = f"/{door.token}/", f"Host: 127.0.0.1:{door.port}\r\n"
         said = {
             "nothing": "",
-            "part": f"GET {path} HTTP/1.1\r\n{host}X: ",
             "refused": f"GET /no-token/ HTTP/1.1\r\n{host}\r\n",
         }[shown]
         kept = http.client.HTTPConnection("127.0.0.1", door.port, timeout=60)
@@ -445,10 +414,3 @@ def test_a_hostile_address_shows_a_page_that_works(page: Page, demo_url: str) ->
         page.wait_for_selector("#main > *")
     assert "hybridlog" in page.title()
     assert page.locator("img[src=x]").count() == 0
-
-
-def test_no_upgrade_to_a_web_socket(door: Door) -> None:
-    headers = {"Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Version": "13"}
-    answer = door.below("recordings", {**headers, "Sec-WebSocket-Key": "x" * 24})
-    assert answer.status == 200  # as without it
-    assert "upgrade" not in answer.headers

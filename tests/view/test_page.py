@@ -21,17 +21,22 @@ from tests.view.conftest import lane_of, opened, served
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
-LOOKS = [(1440, "light"), (760, "dark"), (390, "light")]
-OTHERS = [(1440, "dark"), (760, "light"), (390, "dark")]
+LOOKS = [(width, scheme) for width in (1440, 760, 390) for scheme in ("light", "dark")]
 LENGTH = 6 * SECOND  # of the recording `odd`
 PICTURES = os.environ.get("HYBRIDLOG_PICTURES")
 """A folder for pictures of what the tests see, for people."""
 
 
-@pytest.fixture(
-    params=[*LOOKS, *(pytest.param(one, marks=pytest.mark.exhaustive) for one in OTHERS)],
-    ids=lambda one: f"{one[0]}-{one[1]}",
-)
+def seen_at(width: int, scheme: str) -> pytest.MarkDecorator:
+    """A test of a page that looks like this, and of all others on demand."""
+    looks = [
+        one if one == (width, scheme) else pytest.param(one, marks=pytest.mark.exhaustive)
+        for one in LOOKS
+    ]
+    return pytest.mark.parametrize("look", looks, indirect=True, ids=str)
+
+
+@pytest.fixture
 def look(request: pytest.FixtureRequest, browser: Browser) -> Iterator[Page]:
     """An empty page of some width, light or dark; nothing in it is wider than it."""
     width, scheme = request.param
@@ -86,6 +91,7 @@ def colours(page: Page, topic: str, begin: float, end: float) -> set[tuple[int, 
 
 
 @pytest.mark.peer("browser")
+@seen_at(1440, "light")
 def test_what_others_change_is_seen(look: Page, tmp_path: Path) -> None:
     """Marks, what expires, and what is lost: on a page that is open, and after a reload."""
     path = tmp_path / "store"
@@ -96,12 +102,12 @@ def test_what_others_change_is_seen(look: Page, tmp_path: Path) -> None:
         look.locator(".tree .leaf", has_text="n5").first.wait_for()
         before = colours(look, "/camera", 0.02, 0.1)
         with hl.open(path, mongo="none") as other:
-            other.mark("run", BEGIN + 60 * SECOND, "slipped")
+            other.mark("run", BEGIN + 60 * SECOND, "<b>slipped</b>")
             other.edit("run", tag={"seen": "yes"})
             other.keep({"quota": "400KB"})
             (kept, *_) = [m.fields["n"] for m in other.topic("/camera") if not m.is_reduced]
         assert 10 < kept < COUNT
-        said(look, "/camera", 60.5 / COUNT, "Mark: slipped")
+        said(look, "/camera", 60.5 / COUNT, "Mark: <b>slipped</b>")
         said(look, "/camera", 5.5 / COUNT, "Payloads have expired: only fields are here")
         look.get_by_text("seen=yes").wait_for()
         assert "Gap" not in tip_at(look, "/camera", 5.5 / COUNT)
@@ -121,6 +127,7 @@ def test_what_others_change_is_seen(look: Page, tmp_path: Path) -> None:
 
 
 @pytest.mark.peer("browser")
+@seen_at(390, "light")
 def test_trouble_is_on_its_lane(look: Page, odd_url: str) -> None:
     """Lines of a log at WARN and above are ticks on its lane, which comes first."""
     opened(look, odd_url, "odd", ("log", "/rosout", {}))
@@ -135,6 +142,7 @@ def test_trouble_is_on_its_lane(look: Page, odd_url: str) -> None:
 
 
 @pytest.mark.peer("browser")
+@seen_at(760, "dark")
 def test_lanes_are_filtered_and_all_are_reached_by_keyboard(look: Page, demo_url: str) -> None:
     look.goto(f"{demo_url}#recording=robot&panels=[]")
     names = look.locator(".timeline .topic")
@@ -156,6 +164,7 @@ def test_lanes_are_filtered_and_all_are_reached_by_keyboard(look: Page, demo_url
 
 
 @pytest.mark.peer("browser")
+@seen_at(390, "dark")
 def test_the_first_view_has_something(look: Page, demo_url: str) -> None:
     """Each panel shows a message, the map more than a dot; a plot begins with what moves."""
     look.goto(f"{demo_url}#recording=robot")
@@ -181,20 +190,7 @@ def test_the_first_view_has_something(look: Page, demo_url: str) -> None:
 
 
 @pytest.mark.peer("browser")
-def test_matches_are_episodes(look: Page, demo_url: str, demo_store: hl.Store) -> None:
-    query = demo_store.topic("scan").where("ranges.min < 0.8")
-    episodes = [*query.intervals()]
-    ask = '{"kind":"predicate","topic":"/base/scan","text":"ranges.min < 0.8","within":""}'
-    look.goto(f"{demo_url}#recording=robot&panels=[]&ask={ask}")
-    side = look.get_by_role("complementary", name="Matches")
-    side.get_by_text(f"of {len(episodes)} episodes").wait_for()
-    rows = side.get_by_role("listitem")
-    assert rows.count() == len(episodes) < query.count()
-    assert "matches" in rows.first.inner_text()
-
-
-@pytest.mark.peer("browser")
-@pytest.mark.parametrize("look", LOOKS[:1], indirect=True, ids=str)
+@seen_at(1440, "light")
 def test_a_link_stays_right_after_a_restart(
     look: Page, demo_store: hl.Store, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -12,6 +12,7 @@ import pytest
 
 import hybridlog as hl
 from hybridlog_storage.messages import Channel, Schema
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.every_image import HEIGHT, RAW, WIDTH
 from tests.odd_messages import HOSTILE, LOGS, LONG, MS, START, log_time
 from tests.view.conftest import opened, printed_by, served
@@ -238,24 +239,29 @@ def copied(page: Page) -> list[str]:
     return found
 
 
-def test_panels_of_a_recording_that_goes_on(page: Page, tmp_path: Path) -> None:
+def test_a_recording_that_goes_on(page: Page, tmp_path: Path) -> None:
     begun = time.time_ns()  # before messages are sealed, times count from about now
     said = Channel("/said", "json", Schema("foxglove.Log", "jsonschema", b"{}"))
+    other = Channel("/other", "json", None)
 
-    def write(numbers: range) -> None:
+    def write(channel: Channel, numbers: range) -> None:
         for n in numbers:
             text = json.dumps({"level": 2, "message": f"said {n}", "n": n}).encode()
-            recording.write(said, text, log_time=begun + n * S)
+            recording.write(channel, text, log_time=begun + n * S)
 
     with (
-        hl.open(tmp_path / "store", create=True) as writing,
+        hl.open(tmp_path / "store", create=True, mongo="none") as writing,
         writing.start("ended") as ended,
-        writing.start("live", flush_interval_s=0.05) as recording,
-        hl.open(tmp_path / "store") as store,
+        writing.start(
+            "live",
+            flush_interval_s=0.05,
+            settings=SegmentSettings(chunk_size=512, segment_size=1000),
+        ) as recording,
+        hl.open(tmp_path / "store", mongo="none") as store,
     ):
         ended.write(said, b"{}", log_time=S)
         ended.close()
-        write(range(10))
+        write(said, range(10))
         kinds = [("message", "/said", {}), ("log", "/said", {}), ("plot", "/said", {})]
         with served(store) as url:
             page.goto(url)
@@ -264,12 +270,24 @@ def test_panels_of_a_recording_that_goes_on(page: Page, tmp_path: Path) -> None:
             assert "live" in page.locator("tbody tr").first.inner_text()
             opened(page, url, "live", *kinds)
             panel(page, "log").get_by_text("10 lines").wait_for()
-            write(range(10, 30))
+            page.wait_for_selector("text=being recorded")
+            write(said, range(10, 30))
+            write(other, range(7))
             panel(page, "log").get_by_text("30 lines").wait_for()
+            # The cursor was at the end, and stays there.
             panel(page, "log").locator("[aria-current=true]", has_text="said 29").wait_for()
             panel(page, "message").get_by_text("said 29").wait_for()
             output = panel(page, "plot").locator("output[data-field=n]")
             output.get_by_text("29", exact=True).wait_for()
+            lanes = page.locator(".timeline .name")
+            lanes.filter(has_text="/said").filter(has_text="30").wait_for()
+            lanes.filter(has_text="/other").filter(has_text="7").wait_for()
+            menu = page.get_by_label("Topic of the question")
+            menu.locator("option", has_text="/other").wait_for(state="attached")
+            assert menu.input_value() == "/said"
             seek(page, state(page, "at") - 24 * S)
             panel(page, "message").get_by_text("said 5").wait_for()
             output.get_by_text("5", exact=True).wait_for()
+            recording.close()
+            page.wait_for_selector("text=being recorded", state="detached")
+            page.wait_for_selector("text=37 messages")

@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import pytest
 
 import hybridlog as hl
-from hybridlog.live import LiveRecording
-from hybridlog_storage.messages import Channel
-from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
 from tests.damage import flip
-from tests.view.conftest import Asking, lane_of, served, unpacked
-from tests.waiting import wait_for
+from tests.view.conftest import lane_of, served, unpacked
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -79,74 +73,6 @@ def test_gaps_are_those_of_queries(client: TestClient, demo_store: hl.Store, sta
     drawn = [origin + number * width for number in around.lanes[1].gaps.ravel().tolist()]
     assert -width < drawn[0] <= 0
     assert end <= drawn[-1] < end + width
-
-
-A, B = (Channel(name, "json", None) for name in ("/a", "/b"))
-SETTINGS = SegmentSettings(chunk_size=4096, segment_size=30_000, compression="none")
-
-
-@pytest.fixture
-def running(tmp_path: Path) -> Iterator[tuple[LiveRecording, hl.Store]]:
-    """A recording that goes on, and the store as another process has it open."""
-    with (
-        hl.open(tmp_path / "store", create=True) as writing,
-        writing.start("live", settings=SETTINGS, flush_interval_s=0.05) as recording,
-        hl.open(tmp_path / "store") as store,
-    ):
-        yield recording, store
-
-
-def write(recording: LiveRecording, channel: Channel, begin: int, count: int) -> None:
-    for n in range(begin, begin + count):
-        recording.write(channel, b'{"n": 1}', log_time=SECOND * SECOND + n * SECOND // 100)
-
-
-@pytest.mark.peer("browser")
-def test_a_recording_that_goes_on_is_followed(
-    running: tuple[LiveRecording, hl.Store], page: Page, asking: Asking
-) -> None:
-    recording, store = running
-    client = asking(store)
-
-    def live() -> dict[str, Any]:
-        answer = client.get("recording", params={"recording": "live"})
-        assert answer.status_code == 200, answer.text
-        found: dict[str, Any] = answer.json()
-        return found
-
-    write(recording, A, 0, 50)
-    wait_for(lambda: live()["messages"] == 50)
-    (topic,) = live()["topics"]
-    assert (topic["topic"], topic["messages"]) == ("/a", 50)
-    assert topic["last"] == str(49 * SECOND // 100)
-    with served(store) as url:
-        page.goto(f"{url}#recording=live&panels=[]")
-        page.wait_for_selector("text=being recorded")
-        row = page.locator(".timeline .name")
-        row.filter(has_text="/a").filter(has_text="50").wait_for()
-        write(recording, A, 50, 1000)  # several segments
-        write(recording, B, 1050, 50)
-        wait_for(lambda: live()["messages"] == 1100)
-        assert live()["status"] == "open"
-        page.wait_for_selector("text=1,100 messages")
-        row.filter(has_text="/b").filter(has_text="50").wait_for()
-        menu = page.get_by_label("Topic of the question")
-        menu.locator("option", has_text="/b").wait_for(state="attached")
-        assert menu.evaluate("menu => [...menu.options].map(one => one.value)") == ["/a", "/b"]
-        assert menu.input_value() == "/a"
-        # The cursor was at the end, and stays there.
-        until(page, "document.querySelector('.readout').textContent.length > 0")
-        at = json.loads(page.locator(".density").get_attribute("aria-valuenow") or "null")
-        assert at == pytest.approx((int(live()["end"]) - 1) / SECOND)
-        recording.close()
-        page.wait_for_selector("text=being recorded", state="detached")
-        ended = live()
-        assert ended["status"] == "complete"
-
-    store.mark("live", "+2s", "look <b>here</b>")
-    store.refresh()
-    marks = client.get("recording", params={"recording": "live"}).json()["marks"]
-    assert marks == [{"at": 2 * SECOND, "end": 2 * SECOND, "text": "look <b>here</b>"}]
 
 
 def until(page: Page, condition: str) -> None:
