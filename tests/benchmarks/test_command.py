@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import random
-import signal
 import subprocess
 import sys
 from pathlib import Path
 
-import psutil
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -20,7 +18,6 @@ from benchmarks.samples import Journal
 from benchmarks.studies import answers, search
 from benchmarks.studies.runs import Context
 from tests.imports import ROOT
-from tests.waiting import wait_for
 
 pytestmark = pytest.mark.mongo("embedded")
 
@@ -62,23 +59,6 @@ def test_a_tiny_run(tmp_path: Path, parts: list[str], backends: str) -> None:
     text = (tmp_path / "out" / "benchmarks.md").read_text("utf-8")
     assert "\n| poses within a region, counted for the first time, in ms | " in text
     assert "\n| a second of scans, in ms | " in text
-
-
-def test_ctrl_c_ends_a_real_run(tmp_path: Path) -> None:
-    """Signals, processes and the journal of the harness itself."""
-    with run(tmp_path / "out", "--only", "record", "-b", "nothing,bagfile") as process:
-        here = psutil.Process(process.pid)
-        # The logger, and the publisher.
-        wait_for(lambda: len(here.children(recursive=True)) == 2 or process.poll() is not None)
-        started = here.children(recursive=True)
-        process.send_signal(signal.SIGINT)
-        assert process.wait(60) == 130
-    said = (tmp_path / "out" / "said").read_text("utf-8")
-    assert "What was measured is in" in said
-    assert "Traceback" not in said
-    # A helper of the interpreter ends a moment after it; nobody may wait for it.
-    _, left = psutil.wait_procs(started, 10)
-    assert [child.status() for child in left] in ([], [psutil.STATUS_ZOMBIE])
 
 
 class Wrong(SqliteIndexed):

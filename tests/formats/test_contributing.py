@@ -118,9 +118,9 @@ def test_the_examples(extended: Path) -> None:
     assert sorted(path.name for path in (extended / "tables").iterdir()) == ["a.md", "b.md"]
     assert "markdown" in run(extended, "align", "--help")[0]
     run(extended, "tag", "log", "a=b", "-q")
-    assert run(extended, "tags")[0].splitlines() == ["recording  tags", "log        a=b"]
+    assert run(extended, "tags")[0].splitlines() == ["recording  tags", "log.jsonl  a=b"]
     assert json.loads(run(extended, "tags", "--json")[0]) == [
-        {"recording": "log", "tags": {"a": "b"}}
+        {"recording": "log.jsonl", "tags": {"a": "b"}}
     ]
 
 

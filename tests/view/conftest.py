@@ -194,6 +194,15 @@ def lane_of(page: Page, topic: str) -> tuple[FloatRect, FloatRect]:
     raise AssertionError(f"no lane of {topic}")
 
 
+def until(page: Page, holds: Callable[[], object]) -> None:
+    """Wait for something in a page whose policy refuses `wait_for_function`."""
+    for _ in range(750):
+        if holds():
+            return
+        page.wait_for_timeout(20)
+    raise AssertionError("it never came")
+
+
 def opened(
     page: Page, url: str, recording: str, *panels: tuple[str, str, Any], at: int = 0
 ) -> None:

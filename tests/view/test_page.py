@@ -6,7 +6,7 @@ import os
 import stat
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
 
@@ -232,10 +232,3 @@ def test_a_token_is_for_its_owner_alone(tmp_path: Path) -> None:
             token_of(file)
     with pytest.raises(UsageError, match="No token"):
         token_of(tmp_path)
-
-
-def test_files_of_the_page_are_kept_by_the_browser(client: Any) -> None:
-    first = client.get("app.js")
-    assert first.headers["cache-control"] == "no-cache"
-    assert client.get("app.js", headers={"If-None-Match": first.headers["etag"]}).status_code == 304
-    assert client.get("recordings").headers["cache-control"] == "no-store"

@@ -255,7 +255,7 @@ def test_a_recording_that_goes_on(page: Page, tmp_path: Path) -> None:
         writing.start(
             "live",
             flush_interval_s=0.05,
-            settings=SegmentSettings(chunk_size=512, segment_size=1000),
+            settings=SegmentSettings(chunk_size=1024, segment_size=2000),
         ) as recording,
         hl.open(tmp_path / "store", mongo="none") as store,
     ):

@@ -6,7 +6,7 @@ import io
 import json
 import math
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from PIL import Image
 import hybridlog as hl
 from hybridlog_storage.messages import Channel, Schema
 from tests.ros_values import ROS1
-from tests.view.conftest import opened, served
+from tests.view.conftest import opened, served, until
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -92,14 +92,6 @@ def data(page: Page, topic: str) -> dict[str, Any]:
     place = page.locator(f'article[aria-label$="{topic}"] .space')
     found: dict[str, Any] = place.evaluate("one => ({...one.dataset})")
     return found
-
-
-def until(page: Page, holds: Callable[[], bool]) -> None:
-    for _ in range(300):
-        if holds():
-            return
-        page.wait_for_timeout(20)
-    raise AssertionError("it never came")
 
 
 def view(page: Page, kind: str) -> list[float]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -12,7 +11,7 @@ import pytest
 import hybridlog as hl
 from tests import places
 from tests.damage import flip
-from tests.view.conftest import lane_of, served, unpacked
+from tests.view.conftest import lane_of, served, unpacked, until
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -75,14 +74,6 @@ def test_gaps_are_those_of_queries(client: TestClient, demo_store: hl.Store, sta
     assert end <= drawn[-1] < end + width
 
 
-def until(page: Page, condition: str) -> None:
-    """Wait for something in a page whose policy refuses `wait_for_function`."""
-    end = time.monotonic() + 15
-    while not page.evaluate(condition):
-        assert time.monotonic() < end, condition
-        page.wait_for_timeout(20)
-
-
 def cursor(page: Page) -> float:
     return float(page.locator(".density").get_attribute("aria-valuenow") or "nan") * SECOND
 
@@ -101,7 +92,7 @@ def test_the_timeline_is_moved_and_zoomed(
 
     # A click sets the cursor; what the tip says is what the store counts.
     page.mouse.click(box["x"] + box["width"] / 2, box["y"] + 10)
-    until(page, "Number(document.querySelector('.density').ariaValueNow) > 9")
+    until(page, lambda: cursor(page) > 9 * SECOND)
     assert abs(cursor(page) - length / 2) < 2 * length / box["width"]
     page.mouse.move(box["x"] + box["width"] / 2, box["y"] + 10)
     page.wait_for_selector(f".tip:has-text('{first}')")
@@ -114,7 +105,7 @@ def test_the_timeline_is_moved_and_zoomed(
     page.mouse.move(box["x"] + box["width"] / 2, box["y"] + 12)
     page.mouse.up()
     page.keyboard.up("Shift")
-    until(page, "location.hash.includes('begin=')")
+    until(page, lambda: page.evaluate("location.hash.includes('begin=')"))
     shown = hash_of(page)
     assert abs(shown["begin"] - length / 4) < 3 * length / box["width"]
     assert abs(shown["end"] - length / 2) < 3 * length / box["width"]
@@ -123,7 +114,7 @@ def test_the_timeline_is_moved_and_zoomed(
     around = shown["begin"] + (shown["end"] - shown["begin"]) / 4
     page.mouse.move(box["x"] + box["width"] / 4, box["y"] + 10)
     page.mouse.wheel(0, -300)
-    until(page, f"!location.hash.includes('begin={shown['begin']}')")
+    until(page, lambda: page.evaluate(f"!location.hash.includes('begin={shown['begin']}')"))
     near = hash_of(page)
     span = near["end"] - near["begin"]
     assert span < 0.6 * (shown["end"] - shown["begin"])
@@ -131,13 +122,13 @@ def test_the_timeline_is_moved_and_zoomed(
     page.mouse.down()
     page.mouse.move(box["x"] + box["width"] / 2, box["y"] + 10, steps=4)
     page.mouse.up()
-    until(page, f"!location.hash.includes('begin={near['begin']}')")
+    until(page, lambda: page.evaluate(f"!location.hash.includes('begin={near['begin']}')"))
     moved = hash_of(page)
     assert abs(near["begin"] - moved["begin"] - span / 4) < span / 50
     assert abs(moved["end"] - moved["begin"] - span) <= 1
 
     page.keyboard.press("0")
-    until(page, "!location.hash.includes('begin=')")
+    until(page, lambda: page.evaluate("!location.hash.includes('begin=')"))
 
     # A name opens a panel; the arrows go on to lanes that are out of sight.
     names = page.locator(".timeline .topic")

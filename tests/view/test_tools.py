@@ -157,8 +157,7 @@ def test_values_that_json_lacks(ask: Ask) -> None:
     odd = "select 'nan'::double, '-infinity'::float, {'x': 'infinity'::double}"
     (row,) = ask("sql", query=odd).values["rows"]
     assert [*row.values()] == ["NaN", "-Infinity", {"x": "Infinity"}]
-    for query in ("select 'infinity'::date", "select 'infinity'::timestamp"):
-        assert "::varchar" in ask("sql", query=query).error
+    assert "::varchar" in ask("sql", query="select 'infinity'::date").error
     (row,) = ask("sql", query="select 'infinity'::date::varchar").values["rows"]
     assert [*row.values()] == ["infinity"]
 
