@@ -44,7 +44,6 @@ PLACES = {
     "clients_wait_s": "hybridlog.index.of_store._CLIENTS_WAIT_S",
     "playback_sent": "hybridlog.view.playback._MAX_SENT",
     "sql_seconds": "hybridlog.view.routes.ask.SQL_SECONDS",
-    "export_piece_bytes": "hybridlog.view.routes.ask.PIECE",
     "catalog_busy_s": "hybridlog_storage.cells._WAIT_S",
     "matches": "hybridlog.drawing.times.MAX_MATCHES",
     "copy_wait_s": "hybridlog_storage.copy.LOCK_WAIT_S",

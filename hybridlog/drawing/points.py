@@ -38,15 +38,14 @@ Points: TypeAlias = "dict[str, Any]"
 """The points of a message.
 
 * `xyz`: float32[n, 3], metres from `origin`, in the frame of the message.
-* `values`: float32[n] for each name that was asked for: the value minus its base in `bases`. NaN
-  where a point has none. Those called `rgb` are colours, red * 65536 + green * 256 + blue.
+* `values`: float64[n] for each name that was asked for, NaN where a point has none. Those called
+  `rgb` are colours, red * 65536 + green * 256 + blue.
 * `frame`: the frame's name.
 * `names`: every name that can be asked for.
 * `total`: points of the message.
 * `dropped`: number of points that are left out, by reason.
 * `every`: 1 if all others are here, n if only every n-th is.
 * `origin`: metres, [0, 0, 0] unless float32 would lose millimetres without it.
-* `bases`: for each name, 0 unless float32 would lose differences without it.
 * `flat`: true if all points have the same z, as those of a scan.
 """
 
@@ -97,21 +96,20 @@ def _drawn(decoded: Any, rows: NDArray[Any], values: Collection[str] | None, lim
         xyz, taken = xyz[places[::every]], rows[places[::every]]
         offered = _offered(taken)
         chosen_values = {
-            name: _relative(column) if name != COLOUR else (column.astype(np.float32), 0.0)
+            name: column.astype(np.float64)
             for name, column in offered.items()
             if values is None or name in values
         }
     dropped = {"not finite": len(rows) - finite, "out of range": finite - count}
     return {
         "xyz": xyz,
-        "values": {name: value for name, (value, _) in chosen_values.items()},
+        "values": chosen_values,
         "frame": _frame(decoded),
         "names": tuple(offered),
         "total": len(rows),
         "dropped": {why: number for why, number in dropped.items() if number},
         "every": every,
         "origin": origin,
-        "bases": {name: base for name, (_, base) in chosen_values.items()},
         "flat": is_scan if not len(xyz) else bool((xyz[:, 2] == xyz[0, 2]).all()),
     }
 
@@ -177,18 +175,7 @@ def _offered(rows: NDArray[Any]) -> dict[str, NDArray[Any]]:
     return dict(list(found.items())[:_MAX_VALUES])
 
 
-def _relative(values: NDArray[Any]) -> tuple[NDArray[np.float32], float]:
-    """Values as float32, and what was subtracted so that their differences are kept."""
-    finite = values[np.isfinite(values)].astype(np.float64)
-    if values.dtype.itemsize < 4 or values.dtype == np.float32 or not len(finite):
-        return values.astype(np.float32), 0.0
-    least, greatest = float(finite.min()), float(finite.max())
-    if max(abs(least), abs(greatest)) < (greatest - least) * 8192:
-        return values.astype(np.float32), 0.0
-    return (values - np.float64(least)).astype(np.float32), least
-
-
-def bounds(values: NDArray[np.float32]) -> tuple[float, float, float, float] | None:
+def bounds(values: NDArray[np.floating[Any]]) -> tuple[float, float, float, float] | None:
     """Least and greatest finite value, and those without the outermost hundredths.
 
     Garbage in a few points does not change the latter much. None if no value is finite.

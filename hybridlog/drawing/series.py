@@ -1,7 +1,4 @@
-"""Fields that can be drawn over time, with no more points than a picture has pixels.
-
-The track of a satellite receiver, or of poses, in metres and of bounded length.
-"""
+"""Fields over time, and tracks in metres, with no more points than a picture has pixels."""
 
 from __future__ import annotations
 
@@ -14,7 +11,6 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 from msgspec import Struct
 
 from hybridlog.frames.names import FIELD, is_summary
@@ -24,7 +20,6 @@ from hybridlog.query.query import field_types, spans_of, tables_of
 from hybridlog.query.times import TIME_LIMIT
 from hybridlog.schema.arrow_types import is_list, is_number, is_time, lengths_of
 from hybridlog.schema.definition_text import NUMERIC, element_of, width_of
-from hybridlog.wording import listed
 from hybridlog_storage.errors import SegmentError, TopicError, UsageError
 
 if TYPE_CHECKING:
@@ -34,10 +29,11 @@ if TYPE_CHECKING:
     from hybridlog.query.query import Query
     from hybridlog.query.question import Span
 
+
 Numbers: TypeAlias = "NDArray[np.floating[Any]]"
 _Part: TypeAlias = "tuple[NDArray[np.int64], Mapping[str, Numbers]]"
 _ACCESS = re.compile(r"\[(\d{1,9})\]|\.([^.\[\]]+)")
-_MAX_NAMES = 8  # names of fields in a message
+_NO_NUMBER = "{} is no number: only numbers can be drawn, of an array `x[0]` or `x.min`."
 _EXTREMES = (np.fmin, np.fmax)
 
 
@@ -94,9 +90,8 @@ def series(
         raise UsageError(f"A picture is at least one pixel wide, not {pixels}.")
     wanted = [Wanted.of(text) for text in fields]
     if not wanted:
-        raise UsageError(f"Name a field, such as {listed(numbers_of(query), _MAX_NAMES)}.")
+        raise UsageError("Name a field: `hybridlog info -t TOPIC` lists them.")
     narrowed, (begin, end) = over_time(query, [one.path for one in wanted], span)
-    _check(wanted, field_types(narrowed) or {})
     if begin >= end:
         none = np.empty(0)
         return [Series(one.text, none.astype(np.int64), none, none, True) for one in wanted]
@@ -127,24 +122,6 @@ def over_time(query: Query, fields: Sequence[str], span: Span | None) -> tuple[Q
         window = np.array([[begin, max(begin, end), 0]], np.int64)
         narrowed = narrowed.during(Intervals([(recording, window)])) if recording else narrowed
     return narrowed, (begin, end)
-
-
-def numbers_of(query: Query) -> list[str]:
-    """Paths of the fields that are single numbers; none where no definition fixes them."""
-    known = field_types(query) or {}
-    return [p for p, kind in known.items() if kind in NUMERIC and "[" not in p]
-
-
-def _check(wanted: Sequence[Wanted], known: Mapping[str, str]) -> None:
-    """Refuse fields that are known to be no numbers, before anything is read."""
-    for one in wanted:
-        kind = known.get(one.path)
-        has_fields = any(path.startswith(f"{one.path}.") for path in known)
-        if kind and not (one.access or has_fields or kind in NUMERIC):
-            numbers = f"{one.text}[0].x" if "/" in kind else f"{one.text}[0] or {one.text}.min"
-            raise UsageError(
-                f"{one.text} is no number but {kind}: name a number, of an array {numbers}."
-            )
 
 
 class Wanted(Struct, frozen=True):
@@ -204,9 +181,7 @@ def _stepped(array: Any, step: int | str) -> Any:
 def _numbers(array: Any) -> Numbers | None:
     """Values as in a `Series`, NaN for null; None if they are no numbers."""
     types, kind = pa.types, array.type
-    if kind == pa.json_():
-        array = _numbers_in_json(array.cast(pa.string()))
-    elif is_time(kind):
+    if is_time(kind):
         array = array.cast(pa.int64())
     elif types.is_boolean(kind):
         array = array.cast(pa.uint8())
@@ -219,14 +194,6 @@ def _numbers(array: Any) -> Numbers | None:
     else:
         values = array.cast(pa.float64(), safe=False).to_numpy(zero_copy_only=False)
     return values
-
-
-def _numbers_in_json(texts: Any) -> Any:
-    """The numbers among JSON values of several types; null for others."""
-    for word, number in (("true", "1"), ("false", "0")):
-        texts = pc.if_else(pc.equal(texts, word), number, texts)
-    is_number = pc.match_substring_regex(texts, r"^-?[0-9][0-9.eE+-]*$")
-    return pc.if_else(is_number, texts, pa.scalar(None, texts.type))
 
 
 def _read(tables: Iterable[pa.Table], wanted: Sequence[Wanted], rows: ShownRows) -> list[Series]:
@@ -245,7 +212,7 @@ def _read(tables: Iterable[pa.Table], wanted: Sequence[Wanted], rows: ShownRows)
         if not known and count:
             raise TopicError(f"No message here has a field {one.text!r}.")
         if not any(known.values()) and count:
-            raise UsageError(f"{one.text} is no number: only numbers can be drawn.")
+            raise UsageError(_NO_NUMBER.format(one.text))
     paths = dict.fromkeys(p for known in names for p, is_number in known.items() if is_number)
     return rows.series(paths)
 
@@ -419,6 +386,8 @@ def _width(kind: str, path: str, values: Mapping[str, Any]) -> int:
     return width if width <= MAX_ELEMENTS else 0
 
 
+# Tracks of satellite receivers, or of poses.
+
 _RADIUS = 6_378_137.0  # m, semi-major axis of WGS 84
 _ECCENTRICITY = 6.694379990141317e-3  # squared
 _STATUS: Final = "status.status"
@@ -508,7 +477,7 @@ def track(query: Query, *, pixels: int) -> Track:
     grid, messages, fixes = None, 0, 0
     with query.counters.timed():
         for table in tables_of(narrowed) if begin < end else ():
-            first, second, *status = (_coordinates(table, path) for path in paths)
+            first, second, *status = (_column(table, path) for path in paths)
             if is_geographic:
                 has_fix = _is_position(first, second)
             else:
@@ -544,9 +513,9 @@ def _is_position(latitude: Numbers, longitude: Numbers) -> NDArray[np.bool_]:
     return found
 
 
-def _coordinates(table: pa.Table, path: str) -> Numbers:
+def _column(table: pa.Table, path: str) -> Numbers:
     """A column, NaN for null, and for a column that is not there."""
     values = Wanted.of(path).columns(table).get(path, np.full(table.num_rows, np.nan))
     if values is None:
-        raise UsageError(f"{path} is no number: only numbers can be drawn.")
+        raise UsageError(_NO_NUMBER.format(path))
     return values

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 from contextlib import nullcontext
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -16,6 +15,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from hybridlog.view.context import Context, broken_response
 from hybridlog.view.guard import HOST, Admission, Guard, listen, new_token
+from hybridlog.view.routes import ask, pictures
 
 if TYPE_CHECKING:
     from starlette.responses import Response
@@ -64,13 +64,6 @@ class ViewServer:
         self._server.should_exit = True
 
 
-ROUTES: Final = (
-    "ask",
-    "pictures",
-    "recordings",
-)
-"""The modules of `routes/`."""
-
 _STATIC: Final = Path(__file__).parent / "static"
 
 
@@ -85,10 +78,8 @@ class _Page(StaticFiles):
 
 def make_app(store: Store, rules: Admission) -> Guard:
     """The application, behind its guard."""
-    routes = [
-        route for name in ROUTES for route in import_module(f"hybridlog.view.routes.{name}").routes
-    ]
-    routes.append(Mount("/", _Page(directory=_STATIC, html=True), name="page"))
+    page = Mount("/", _Page(directory=_STATIC, html=True), name="page")
+    routes = [*ask.routes, *pictures.routes, page]
     app = Starlette(routes=routes, exception_handlers={Exception: broken_response})
     app.state.context = Context(store)
     return Guard(app, rules)

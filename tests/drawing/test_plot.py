@@ -40,7 +40,7 @@ def test_lines_are_by_topic_and_recording(drive: Drive) -> None:
         lines(drive.store.topic("drive"), ["y", "nothing"], pixels=9)
     with pytest.raises(UsageError, match=f"at most {MAX_LINES} lines"):
         lines(drive.store.topic("drive"), [f"wide[{n}]" for n in range(MAX_LINES + 1)], pixels=9)
-    with pytest.raises(UsageError, match=r"Name a field, such as linear\.x"):
+    with pytest.raises(UsageError, match="Name a field"):
         lines(drive.store.topic("drive"), [], pixels=9)
 
 

@@ -8,7 +8,6 @@ import socket
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
-from importlib import import_module
 from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -18,7 +17,7 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.view import guard
-from hybridlog.view.server import ROUTES
+from hybridlog.view.routes import ask, pictures
 from tests.limits import Limit
 from tests.view.conftest import served
 
@@ -97,10 +96,9 @@ def test_the_page_itself_is_let_in(door: Door) -> None:
     assert "unsafe" not in policy
     assert "frame-ancestors 'none'" in policy
     assert "access-control-allow-origin" not in answer.headers
-    assert (answer.headers["x-content-type-options"], answer.headers["referrer-policy"]) == (
-        "nosniff",
-        "no-referrer",
-    )
+    said = ("x-content-type-options", "referrer-policy", "cache-control")
+    assert [answer.headers[name] for name in said] == ["nosniff", "no-referrer", "no-cache"]
+    assert door.below("recordings").headers["cache-control"] == "no-store"
 
 
 def test_without_the_token_nothing_is_told(door: Door) -> None:
@@ -267,10 +265,9 @@ USUAL = {
 def asked_by_routes() -> list[tuple[str, list[str]]]:
     """Path of each route with its parameters."""
     found = []
-    for name in ROUTES:
-        for one in import_module(f"hybridlog.view.routes.{name}").routes:
-            _, *names = signature(one.endpoint).parameters
-            found.append((one.path, names))
+    for one in (*ask.routes, *pictures.routes):
+        _, *names = signature(one.endpoint).parameters
+        found.append((one.path, names))
     assert {"/recordings", "/points", "/track"} <= {path for path, _ in found}
     return found
 

@@ -189,13 +189,12 @@ def points_at(
         found = points(shown.message, values=[value], limit=limit)
     except (DefinitionError, PayloadError) as error:
         return packed_response({**header, "problem": str(error)}, {})
-    xyz, all_values, bases = found.pop("xyz"), found.pop("values"), found.pop("bases")
-    values = {"value": all_values[value]} if value in all_values else {}
+    xyz, offered = found.pop("xyz"), found.pop("values")
+    values = {"value": offered[value]} if value in offered else {}
     columns = dict(zip("xyz", xyz.T, strict=True)) | values
     header |= {
         **found,
         "shown": len(xyz),
-        "base": bases.get(value, 0.0),
         "bounds": {name: bounds(array) for name, array in columns.items()},
     }
     return packed_response(header, {"xyz": xyz, **values})

@@ -19,8 +19,8 @@ export async function bytes(path, parameters = {}, options = {}) {
   return request(path, parameters, options, (response) => response.arrayBuffer());
 }
 
-/** The address of an answer, for pictures and links. */
-export function address(path, parameters = {}) {
+/** The address of an answer. */
+function address(path, parameters = {}) {
   const pairs = new URLSearchParams();
   for (const [name, value] of Object.entries(parameters)) {
     for (const one of Array.isArray(value) ? value : [value]) {

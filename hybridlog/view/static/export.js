@@ -1,6 +1,6 @@
-/** Parts of the recording as a file: the command line that writes it, and the file itself. */
+/** Parts of the recording as a file: the command line that writes it, and the same in Python. */
 
-import { ApiError, Question, address, isAborted } from "./api.js";
+import { ApiError, Question, isAborted } from "./api.js";
 import { copied, element, fill } from "./dom.js";
 import { predicate } from "./matches.js";
 import * as state from "./state.js";
@@ -22,14 +22,12 @@ export function exportForm(recording) {
   const part = element("select", { "aria-label": "Part to export", onchange: load });
   const told = element("span", { role: "status" });
   const command = element("pre", { class: "command", tabindex: "0", "aria-label": "Command line" });
-  const download = element("a", { class: "button", download: true }, "Download");
   const problem = element("pre", { class: "problem", role: "alert", hidden: true });
   let python = "";
   const asking = new Question();
   const copies = element(
     "span",
     { class: "copies" },
-    download,
     copy("Copy command", () => command.textContent),
     copy("Copy as Python", () => python),
   );
@@ -77,8 +75,6 @@ export function exportForm(recording) {
       told.textContent = found.lost ?? counted(found.count, "message");
       command.textContent = found.command;
       python = found.python;
-      download.href = address("export", asked);
-      download.download = found.name;
       problem.hidden = true;
       copies.hidden = false;
     } catch (error) {

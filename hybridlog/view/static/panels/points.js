@@ -190,7 +190,7 @@ function mount(body, panel) {
     const { value } = found;
     const seen = AXES.includes(value)
       ? core(value, found.origin[AXES.indexOf(value)])
-      : core("value", found.base);
+      : core("value", 0);
     if (seen) {
       const scale = (scales[value] ??= { low: seen[0], high: seen[1] });
       scale.low = Math.min(scale.low, seen[0]);
@@ -218,7 +218,7 @@ function mount(body, panel) {
   }
 
   function colours() {
-    const { value, arrays, origin, base } = found;
+    const { value, arrays, origin } = found;
     const scale = scales[value];
     if (value === COLOUR && arrays.value) return packedColours(arrays.value);
     if (AXES.includes(value) && scale) {
@@ -227,7 +227,7 @@ function mount(body, panel) {
       return coloursOf(arrays.xyz, own, 3, at);
     }
     if (arrays.value && scale) {
-      return coloursOf(arrays.value, { low: scale.low - base, high: scale.high - base });
+      return coloursOf(arrays.value, scale);
     }
     return sameColour(arrays.xyz.length / 3, paints.all().accent);
   }
