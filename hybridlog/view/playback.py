@@ -468,15 +468,11 @@ class _Playback:
         """Begin subscriptions with the messages that are current now."""
         new, own = set(), self._subscriptions
         for each in request.subscriptions:
-            wrong = ""
-            if each.channel not in self._topics:
-                wrong = f"there is no channel {each.channel}"
-            elif each.channel in own or each.id in own.values():
-                wrong = f"there is a subscription {each.id}, or one to channel {each.channel}"
-            else:
+            if each.channel in self._topics and each.channel not in own:
                 own[each.channel] = each.id
                 new.add(each.channel)
-            if wrong:
+            else:
+                wrong = f"channel {each.channel} does not exist, or is subscribed to"
                 await self._connection.send(problem(wrong))
         self._read()
         await self._send_current(new)
