@@ -100,9 +100,9 @@ def _draw(axes: Axes, found: Sequence[Line]) -> None:
 
 
 def _label(text: Text, words: str) -> None:
-    """Set a text that is shown as it is: names in logs are no formulas."""
+    """Set a text that is shown as it is: names in logs are no formulas, and control nothing."""
     text.set_parse_math(False)
-    text.set_text(printable(words))
+    text.set_text("".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in words))
 
 
 MAX_LINES: Final = 50
@@ -161,8 +161,3 @@ def drawable(values: Numbers) -> NDArray[np.float64]:
     found = np.clip(values.astype(np.float64), -_GREATEST, _GREATEST)
     found[np.isinf(values)] = np.nan
     return found
-
-
-def printable(text: str) -> str:
-    """Text without control characters: names in logs are untrusted."""
-    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)

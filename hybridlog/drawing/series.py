@@ -479,7 +479,7 @@ def track(query: Query, *, pixels: int) -> Track:
         for table in tables_of(narrowed) if begin < end else ():
             first, second, *status = (_column(table, path) for path in paths)
             if is_geographic:
-                has_fix = _is_position(first, second)
+                has_fix = (np.abs(first) <= 90) & (np.abs(second) <= 360)
             else:
                 has_fix = np.isfinite(first) & np.isfinite(second)
             if status:
@@ -506,11 +506,6 @@ def track(query: Query, *, pixels: int) -> Track:
         "fixes": fixes,
         "exact": rows.exact,
     }
-
-
-def _is_position(latitude: Numbers, longitude: Numbers) -> NDArray[np.bool_]:
-    found: NDArray[np.bool_] = (np.abs(latitude) <= 90) & (np.abs(longitude) <= 360)
-    return found
 
 
 def _column(table: pa.Table, path: str) -> Numbers:

@@ -440,9 +440,7 @@ class _Playback:
         """Tell a viewer whose protocol has it what the playback does, perhaps after a seek."""
         if self._connection.subprotocol != _WITH_PLAYBACK:
             return
-        state = PLAYING if self._clock.is_running else PAUSED
-        if self._has_ended:
-            state = ENDED
+        state = ENDED if self._has_ended else PLAYING if self._clock.is_running else PAUSED
         position = min(self._clock.position, self._log.end) if seek is None else seek
         about = position, self._clock.speed, seek is not None, len(request)
         await self._connection.send(_STATE.pack(_PLAYBACK_STATE, state, *about) + request)
