@@ -468,16 +468,6 @@ def params_of(command: click.Command) -> list[click.Parameter]:
     return [param for each in command.commands.values() for param in each.params]
 
 
-ASKING = {
-    *("-t", "--topic-type", "--between", "--where", "--strict", "-n", "-F", "-o", "-f"),
-    *("--json", "-q"),
-}
-"""Options that all commands have which ask about topics."""
-CHOICE = "| choosing options | [which recordings]"
-"""The row of a command that chooses recordings by the options that all share."""
-_CHOOSING = {"recording", "tag", "has", "types", "during", "last", "older_than", "conditions"}
-
-
 def option_rows(text: str) -> dict[str, str]:
     """The rows of tables of options, by the first spelling of the option."""
     return {
@@ -493,37 +483,25 @@ def option_rows(text: str) -> dict[str, str]:
 def test_every_option_is_described(name: str) -> None:
     """In the section of its command, or once for all that have it."""
     pages = sections(DOCS / "cli.md", 2)
-    text = pages[name]
-    common = re.findall(r"^\| (.*) \| \[common options\]", text, flags=re.MULTILINE)
+    own = option_rows(pages[name])
+    shared = option_rows(pages["Common options"]) | option_rows(pages["Choosing recordings"])
+    common = re.findall(r"^\| (.*) \| \[common options\]", pages[name], flags=re.MULTILINE)
     named = set(re.findall(r"`([^`]+)`", "".join(common)))
-    asks = re.search(r"^\| asking options \| \[once for all\](.*) \|$", text, re.MULTILINE)
-    if asks is not None:
-        named |= ASKING - set(re.findall(r"`([^`]+)`", asks[1]))
-    shared = option_rows(pages["Common options"])
-    chosen = option_rows(pages["Choosing recordings"])
-    own = option_rows(text)
     params = params_of(commands()[name])
-    everywhere = {"--store", "--mongo", "--help"}
-    if CHOICE in text or asks is not None:
-        assert {parameter.name for parameter in params} >= _CHOOSING
-        assert len(chosen) == len(_CHOOSING)
-        params = [p for p in params if p.name not in _CHOOSING]
     for parameter in params:
         spellings = [*parameter.opts, *parameter.secondary_opts]
         if parameter.param_type_name == "argument":
             shown = (parameter.metavar or parameter.name).strip("[].").upper()
-            assert shown in text, f"{name}: the argument {shown}"
+            assert shown in pages[name], f"{name}: the argument {shown}"
             continue
-        row = own.get(spellings[0], "")
-        if not row and (named | everywhere).intersection(spellings):
-            row = shared[spellings[0]]
+        row = own.get(spellings[0]) or shared.get(spellings[0], "")
         assert row, f"{name}: {spellings[0]} has no row"
         assert set(spellings) <= set(re.findall(r"--?[a-zA-Z][\w-]*", row)), (name, spellings)
         if parameter.envvar:
             assert str(parameter.envvar) in row, f"{name}: {parameter.envvar}"
         for choice in getattr(parameter.type, "choices", ()):
             assert f"`{choice}`" in row, f"{name} {spellings[0]}: {choice}"
-    real = {each for parameter in params_of(commands()[name]) for each in parameter.opts}
+    real = {each for parameter in params for each in parameter.opts}
     assert real >= named, f"{name} has no {sorted(named - real)}"
     assert real >= {*own}, f"{name} has no {sorted({*own} - real)}"
 
