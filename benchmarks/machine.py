@@ -63,7 +63,7 @@ def _disk(directory: Path) -> str:
 
 def _postgres_version() -> str:
     from benchmarks.backends.base import BackendMissingError
-    from benchmarks.backends.postgres_server import find_programs
+    from benchmarks.backends.postgres import find_programs
 
     try:
         program = find_programs().directory / "postgres"

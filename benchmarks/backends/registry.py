@@ -8,7 +8,7 @@ from benchmarks.backends.hybridlog_store import Hybridlog, HybridlogUncompressed
 from benchmarks.backends.mongo import Mongo, MongoIndexed
 from benchmarks.backends.nothing import Nothing
 from benchmarks.backends.postgres import Postgres, PostgresIndexed
-from benchmarks.backends.sqlite import Sqlite, SqliteIndexed
+from benchmarks.backends.sql import Sqlite, SqliteIndexed
 
 BACKENDS: dict[str, type[Backend]] = {
     backend.name: backend

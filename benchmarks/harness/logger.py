@@ -22,8 +22,7 @@ from typing import Any
 
 from benchmarks import usage
 from benchmarks.backends.base import Backend, BackendFailedError, BackendMissingError
-from benchmarks.harness.counters import Counters
-from benchmarks.harness.publisher import READY
+from benchmarks.harness.publisher import READY, Counters
 from benchmarks.harness.subscribers import Subscribers
 from benchmarks.loads.base import Load
 from benchmarks.side import Values, named

@@ -12,6 +12,7 @@ of JSON.
 from __future__ import annotations
 
 import json
+import mmap
 import os
 import sys
 import time
@@ -22,7 +23,6 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.harness.counters import Counters
 from benchmarks.loads.base import Load
 
 READY = "ready"
@@ -34,6 +34,32 @@ _BLOCK = 4096
 """Rows made Python numbers at once: a tenth of a millisecond, also in a log of millions."""
 _BATCH = 512
 """Messages after which the clock is looked at again by a publisher that is late."""
+
+
+class Counters:
+    """The numbers of one run.
+
+    Attributes:
+        sent: Messages of each channel that entered its queue; the publisher writes.
+        dropped: Messages of each channel that found their queue full; the publisher writes.
+        taken: Messages of each channel that left their queue; the channel's subscriber writes.
+        errors: Messages of each channel whose insert raised; the channel's subscriber writes.
+    """
+
+    def __init__(self, path: Path, topics: int | None = None) -> None:
+        if topics is not None:
+            path.write_bytes(bytes(8 * 4 * topics))
+        with path.open("r+b") as stream:
+            whole = memoryview(mmap.mmap(stream.fileno(), 0)).cast("q")
+        count = len(whole) // 4
+        self.sent, self.dropped, self.taken, self.errors = (
+            whole[n * count : (n + 1) * count] for n in range(4)
+        )
+
+    def published(self) -> list[int]:
+        """Messages that were due, of each channel: those sent and those dropped."""
+        sums: list[int] = (np.array(self.sent) + np.array(self.dropped)).tolist()
+        return sums
 
 
 def publish_to_queues(

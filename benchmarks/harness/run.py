@@ -12,7 +12,7 @@ import numpy as np
 
 from benchmarks import usage
 from benchmarks.backends.base import Backend
-from benchmarks.harness.counters import Counters
+from benchmarks.harness.publisher import Counters
 from benchmarks.loads.base import Load
 from benchmarks.samples import Status
 from benchmarks.side import SideError, Values, run_side, spelled, warm_cache

@@ -15,7 +15,7 @@ from benchmarks.backends.base import Backend, BackendFailedError
 from benchmarks.harness.publisher import TOKEN
 
 if TYPE_CHECKING:
-    from benchmarks.harness.counters import Counters
+    from benchmarks.harness.publisher import Counters
     from benchmarks.loads.base import Load
 
 _HELD = 128 << 20  # bytes of payloads up to which they are held in memory
@@ -27,6 +27,7 @@ class Subscribers:
 
     A message whose insert raises anything but `BackendFailedError` is lost and counted,
     as in a logger that must go on.
+
     Attributes:
         failed: Set when the backend cannot go on.
         failure: Why.

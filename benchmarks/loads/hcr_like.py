@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from benchmarks.backends.base import ARM, GRIPPER, HALF_NS, VIEWPOINT
+from benchmarks.loads.base import Spool
 from benchmarks.loads.robot import RobotTypes
-from benchmarks.loads.spool import Spool
 from benchmarks.simulator.topics import Values, xyz, yaw
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.loads.spool import Spool
+from benchmarks.loads.base import Spool
 from benchmarks.simulator.topics import Types
 from hybridlog_storage.messages import Channel, Schema
 from tests.independent import write_mcap

@@ -90,6 +90,7 @@ class _Connection:
 
 class Talker:
     """Waits until each topic has a listener, then speaks.
+
     Attributes:
         uri: Where it can be asked for its topics.
     """

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from benchmarks.__main__ import PARTS
 from benchmarks.backends.registry import BACKENDS
-from benchmarks.backends.sqlite import SqliteIndexed
+from benchmarks.backends.sql import SqliteIndexed
 from benchmarks.samples import Journal
 from benchmarks.studies import answers, search
 from benchmarks.studies.runs import Context
