@@ -16,7 +16,7 @@ import struct
 import time
 from collections.abc import Callable, Collection, Generator, Iterator, Sequence
 from http import HTTPStatus
-from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple, TypeAlias
 
 import msgspec
 import numpy as np
@@ -217,16 +217,12 @@ class Subscription(msgspec.Struct):
     channel: _Number = msgspec.field(name="channelId")
 
 
-class Subscribe(msgspec.Struct, tag_field="op", tag="subscribe"):
-    """A request for channels."""
+class Subscriptions(msgspec.Struct):
+    """A request for channels, or to end subscriptions, by their numbers."""
 
-    subscriptions: list[Subscription]
-
-
-class Unsubscribe(msgspec.Struct, tag_field="op", tag="unsubscribe"):
-    """A request to end subscriptions, by their numbers."""
-
-    subscriptions: list[_Number] = msgspec.field(name="subscriptionIds")
+    op: Literal["subscribe", "unsubscribe"]
+    subscriptions: list[Subscription] = []
+    ended: list[_Number] = msgspec.field(name="subscriptionIds", default_factory=list)
 
 
 class Control(NamedTuple):
@@ -238,8 +234,7 @@ class Control(NamedTuple):
     id: bytes
 
 
-_Text = Subscribe | Unsubscribe
-Request = _Text | Control
+Request = Subscriptions | Control
 
 
 def _described(number: int, channel: Channel) -> dict[str, Any]:
@@ -269,18 +264,15 @@ def parse(message: str | bytes) -> Request:
     """A message of a client; one that is malformed or unknown raises UsageError."""
     if isinstance(message, str):
         try:
-            request: _Text = msgspec.json.decode(message, type=_Text)
+            return msgspec.json.decode(message, type=Subscriptions)
         except (msgspec.MsgspecError, RecursionError, UnicodeError) as wrong:
             raise UsageError(f"a message is no request to a playback: {wrong}") from wrong
-        return request
-    try:
-        kind, command, speed, seeks, position, length = _CONTROL.unpack_from(message)
-    except struct.error as wrong:
-        raise UsageError("a message is no whole request to a playback") from wrong
     name = message[_CONTROL.size :]
-    if kind != _PLAYBACK_CONTROL or command not in {_PLAY, _PAUSE} or len(name) != length:
-        raise UsageError("a message is no request to a playback, which takes no messages")
-    return Control(command == _PLAY, speed, position if seeks else None, name)
+    with contextlib.suppress(struct.error):
+        kind, command, speed, seeks, position, length = _CONTROL.unpack_from(message)
+        if kind == _PLAYBACK_CONTROL and command in {_PLAY, _PAUSE} and len(name) == length:
+            return Control(command == _PLAY, speed, position if seeks else None, name)
+    raise UsageError("a message is no request to a playback, which takes no messages")
 
 
 # The server.
@@ -453,18 +445,16 @@ class _Playback:
         except UsageError as error:
             await self._connection.send(problem(str(error)))
             return
-        if isinstance(request, Subscribe):
+        if isinstance(request, Subscriptions):
             await self._subscribe(request)
-        elif isinstance(request, Unsubscribe):
-            ended, own = set(request.subscriptions), self._subscriptions
-            self._subscriptions = {c: s for c, s in own.items() if s not in ended}
-            self._read()
         else:
             await self._control(request)
 
-    async def _subscribe(self, request: Subscribe) -> None:
-        """Begin subscriptions with the messages that are current now."""
-        new, own = set(), self._subscriptions
+    async def _subscribe(self, request: Subscriptions) -> None:
+        """End subscriptions, and begin others with the messages that are current now."""
+        new, ended = set(), set(request.ended)
+        own = {c: s for c, s in self._subscriptions.items() if s not in ended}
+        self._subscriptions = own
         for each in request.subscriptions:
             if each.channel in self._topics and each.channel not in own:
                 own[each.channel] = each.id

@@ -246,7 +246,10 @@ class PageQuestion:
         return query.where(self.where, self.within or None) if self.where else query
 
     def command(self) -> str:
-        """The command line that writes it to a file."""
+        """The command line that writes it to a file named by recording and range."""
+        begin, end = self.span or self.recording.extent
+        times = "_".join(format_time(time).replace(":", "") for time in (begin, end))
+        name = re.sub(r"[^\w.+-]+", "_", self.recording.name)
         words = ["hybridlog", "fetch", "--store", self.store.directory.place]
         words += ["-r", self.recording.name]
         for topic in self.topics or ["**"]:
@@ -257,7 +260,7 @@ class PageQuestion:
             words += ["--where", self.where]
         if self.within:
             words += ["--within", self.within]
-        return shlex.join([*words, "-o", self._file_name()])
+        return shlex.join([*words, "-o", f"{name}_{times}.mcap"])
 
     def python(self) -> str:
         """A program that asks the same."""
@@ -277,13 +280,6 @@ class PageQuestion:
             "        print(message.log_time_ns, message.topic)\n"
         )
         return _program(self.store, body)
-
-    def _file_name(self) -> str:
-        """The name of its file: recording and range."""
-        begin, end = self.span or self.recording.extent
-        times = "_".join(format_time(time).replace(":", "") for time in (begin, end))
-        name = re.sub(r"[^\w.+-]+", "_", self.recording.name)
-        return f"{name}_{times}.mcap"
 
 
 def _program(store: Store, body: str) -> str:
