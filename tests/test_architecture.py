@@ -125,6 +125,27 @@ def test_storage_never_imports_hybridlog() -> None:
             assert not wrong, f"mechanism must not know policy: {_places(name, wrong)}"
 
 
+ROOMS = {n: p for n, p in MODULES.items() if p.name == "__init__.py" and n.count(".") == 1}
+
+
+@pytest.mark.parametrize("room", sorted(ROOMS))
+def test_a_room_imports_what_its_first_lines_say(room: str) -> None:
+    """Of the other folders of its package; modules that lie loose beside them are for all."""
+    said = re.search(r"Imports: ([^.]+)\.", ROOMS[room].read_text("utf-8"))
+    assert said, f"{room} does not say what it imports"
+    package, allowed = room.partition(".")[0], said[1].split(",")
+    others = [n for n in ROOMS if n != room and _is(n, package) and allowed != ["any"]]
+    wrong = {
+        f"{other}: {_places(name, [i])}"
+        for name, imports in all_imports().items()
+        for i in imports
+        for other in others
+        if _is(name, room) and _is(i.module, other) and not i.typing
+        if other.rpartition(".")[2] not in map(str.strip, allowed)
+    }
+    assert not wrong, f"{ROOMS[room]} does not say that it imports {sorted(wrong)}"
+
+
 @pytest.mark.parametrize("package", sorted(ALLOWED))
 def test_third_party_packages_stay_where_they_belong(package: str) -> None:
     for name, imports in all_imports().items():

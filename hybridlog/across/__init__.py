@@ -1,1 +1,4 @@
-"""Questions across topics: joins by time and sets of messages."""
+"""Questions across topics: joins by time and sets of messages.
+
+Imports: frames, query, schema, tf.
+"""

@@ -1,4 +1,4 @@
-"""Messages, images and points as numpy arrays."""
+"""Messages, images and points as numpy arrays. Imports: none."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command line: it parses and prints; the library decides."""
+"""The command line: it parses and prints; the library decides. Imports: any."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Contracts: YAML files of rules for a recording and its topics, which are untrusted."""
+"""Contracts: YAML files of rules for a recording and its topics, which are untrusted.
+
+Imports: across, arrays, formats, query, record.
+"""
 
 from __future__ import annotations
 

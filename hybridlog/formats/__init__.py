@@ -1,6 +1,8 @@
 """Formats of logs that are read, and of files that are written for other tools.
 
 `LOGS` and `OUTPUTS` list them; a reader or writer is imported when it is used.
+
+Imports: arrays, columns, drawing, query, schema.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""Tables of messages, in Arrow and in pandas."""
+"""Tables of messages, in Arrow and in pandas. Imports: columns, formats, index, query, schema."""

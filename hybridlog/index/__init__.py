@@ -1,1 +1,4 @@
-"""The index in MongoDB: connecting, making and writing its documents."""
+"""The index in MongoDB: connecting, making and writing its documents.
+
+Imports: maintenance, query, schema.
+"""

@@ -1,1 +1,4 @@
-"""Questions about messages: times, topics, predicates and plans."""
+"""Questions about messages: times, topics, predicates and plans.
+
+Imports: across, arrays, columns, frames, index, live, record, schema, tf.
+"""

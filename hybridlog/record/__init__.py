@@ -1,1 +1,4 @@
-"""Writes recordings: the recorder, its capture, losses and marks."""
+"""Writes recordings: the recorder, its capture, losses and marks.
+
+Imports: maintenance, query, schema.
+"""

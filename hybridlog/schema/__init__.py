@@ -1,1 +1,4 @@
-"""Message definitions and payloads: from bytes to columns, documents and objects."""
+"""Message definitions and payloads: from bytes to columns, documents and objects.
+
+Imports: columns.
+"""

@@ -1,4 +1,7 @@
-"""SQL over topics: DuckDB reads the tables of topics as the store holds them."""
+"""SQL over topics: DuckDB reads the tables of topics as the store holds them.
+
+Imports: columns, frames, query, schema.
+"""
 
 import os
 

@@ -1,1 +1,4 @@
-"""Training sets for robot learning, from recordings."""
+"""Training sets for robot learning, from recordings.
+
+Imports: across, arrays, drawing, formats, query, schema.
+"""

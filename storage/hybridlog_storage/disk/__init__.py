@@ -1,1 +1,1 @@
-"""Files and directories: durability, guards, locks, temporary names."""
+"""Files and directories: durability, guards, locks, temporary names. Imports: segments."""

@@ -1,1 +1,1 @@
-"""Reads MCAP files of any origin, damaged ones too."""
+"""Reads MCAP files of any origin, damaged ones too. Imports: segments."""

@@ -1,1 +1,1 @@
-"""The embedded MongoDB, connections to it, and the collections of a store."""
+"""The embedded MongoDB, connections to it, and the collections of a store. Imports: disk."""

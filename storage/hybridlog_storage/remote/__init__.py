@@ -1,4 +1,4 @@
-"""Objects in a bucket: S3, Google Cloud Storage, Azure."""
+"""Objects in a bucket: S3, Google Cloud Storage, Azure. Imports: disk."""
 
 from __future__ import annotations
 
