@@ -11,14 +11,13 @@ import bson
 import pytest
 from bson.raw_bson import DEFAULT_RAW_BSON_OPTIONS
 from mcap.reader import make_reader
-from mcap.stream_reader import StreamReader
 
 import hybridlog as hl
 from hybridlog_storage.errors import SourceError
 from tests import independent, places
 from tests.data import DATA, needs_data
 
-pytestmark = [needs_data, pytest.mark.mongo]
+pytestmark = needs_data
 
 WHOLE = [
     *(f"real/{n}" for n in (
@@ -72,7 +71,6 @@ DAMAGED = {
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
     with hl.open(tmp_path_factory.mktemp("real") / "store", create=True) as opened:
-        assert opened.shared.index.reached() is not None, opened.shared.index.unavailable
         yield opened
 
 
@@ -90,13 +88,12 @@ def fetched(store: hl.Store, recording: str) -> list[independent.Seen]:
 def test_every_message_comes_back(store: hl.Store, name: str) -> None:
     report = store.record(DATA / name, name=name.replace("/", "-"))
     assert not report.damage
-    assert report.missed == 0
     got = fetched(store, report.entry.id)
     want = independent.read(DATA / name)
     assert Counter(got) == Counter(want)
     times = [m.log_time for m in got]
     assert times == sorted(times)
-    assert report.entry.messages == report.indexed == len(want)
+    assert report.entry.messages == len(want)
     by_topic = Counter(m.topic for m in want)
     for topic, count in by_topic.items():
         assert store.query([topic], [report.entry.id]).count() == count
@@ -109,8 +106,7 @@ def test_damaged_logs_give_what_can_be_read(store: hl.Store, name: str) -> None:
     assert report.entry.messages == messages
     assert len(report.damage) >= places
     assert report.entry.status == ("damaged" if places else "complete")
-    for damage in report.damage:
-        assert damage.reason
+    assert all(damage.reason for damage in report.damage)
     got = Counter(fetched(store, report.entry.id))
     assert got.total() == messages
     if origin is not None:
@@ -131,22 +127,23 @@ def test_segments_pass_the_official_readers(store: hl.Store) -> None:
         counted = 0
         for _, path in places.segments(store.directory.path, entry.id):
             data = path.read_bytes()
-            list(StreamReader(io.BytesIO(data), validate_crcs=True).records)
             reader = make_reader(io.BytesIO(data), validate_crcs=True)
             counted += sum(1 for _ in reader.iter_messages())
         assert counted == entry.messages
+    assert store.verify().findings == []
 
 
 def dump(store: hl.Store) -> dict[str, list[bytes]]:
     """Everything in the database, as bytes; but for how often it was begun anew."""
-    assert store.shared.index.reached() is not None
+    reached = store.shared.index.reached()
+    assert reached is not None, store.shared.index.unavailable
     found = {
         name: sorted(
             document.raw
-            for raw in store.shared.index.reached().each([(name, {})], lambda _: {"$match": {}})
+            for raw in reached.each([(name, {})], lambda _: {"$match": {}})
             for document in bson.decode_iter(raw, DEFAULT_RAW_BSON_OPTIONS)
         )
-        for name in store.shared.index.reached().list_collections()
+        for name in reached.list_collections()
     }
     for name in ("hybridlog.recordings", "hybridlog.store"):
         documents = [bson.decode(document) for document in found[name]]
@@ -154,9 +151,13 @@ def dump(store: hl.Store) -> dict[str, list[bytes]]:
     return found
 
 
-def test_verify_finds_nothing_and_reindex_changes_nothing(store: hl.Store) -> None:
-    assert store.verify().findings == []
-    before = dump(store)
-    assert sum(map(len, before.values())) > 50_000
-    store.index.rebuild()
-    assert dump(store) == before
+@pytest.mark.mongo
+def test_an_index_made_anew_is_the_same(tmp_path: Path) -> None:
+    with hl.open(tmp_path / "store", create=True) as store:
+        for name in ("every_sensor_msg_ros2.mcap", "array_test.bag", "foxglove_log.mcap"):
+            report = store.record(DATA / "odd" / name)
+            assert report.indexed == report.entry.messages
+        before = dump(store)
+        assert store.verify().findings == []
+        store.index.rebuild()
+        assert dump(store) == before

@@ -35,6 +35,8 @@ def run(
     store: Path | None = None,
     code: int | None = 0,
     before: Callable[[], None] | None = None,
+    width: int = 0,
+    typed: str = "",
     **env: str,
 ) -> Answer:
     """Run a command to its end, as its process would.
@@ -44,26 +46,33 @@ def run(
         store: What HYBRIDLOG_STORE says.
         code: The exit code that is expected; None for any.
         before: Called in a process of its own, which then runs the command.
+        width: Columns of the terminal that it is on; 0 for none.
+        typed: What the person types there.
         env: Variables.
     """
     if store is not None:
         env["HYBRIDLOG_STORE"] = str(store)
     words = [os.fsdecode(a) if isinstance(a, bytes) else str(a) for a in arguments]
-    done = _within(words, env) if before is None else _apart(words, env, before)
+    if width:
+        env["COLUMNS"] = str(width)
+    done = _within(words, env, typed) if before is None else _apart(words, env, before)
     assert "Traceback" not in done.err, done.err
     if code is not None:
         assert done.code == code, (done.code, done.out[-2000:], done.err[-2000:])
     return done
 
 
-def _within(words: list[str], env: dict[str, str]) -> Answer:
+def _within(words: list[str], env: dict[str, str], typed: str) -> Answer:
     variables = {**dict.fromkeys(NOT_INHERITED), "LC_ALL": "C.UTF-8", **env}
     with (
-        CliRunner().isolation(env=variables) as (out, err, _),
+        CliRunner().isolation(typed, env=variables) as (out, err, _),
         pytest.MonkeyPatch.context() as patch,
     ):
         patch.setattr(sys, "argv", ["hybridlog", *words])
         output.begin(None)  # as in a new process
+        if "COLUMNS" in env:
+            patch.setattr(sys.stdout, "isatty", lambda: True)
+            patch.setattr(sys.stdin, "isatty", lambda: True)
         for stream in (sys.stdout, sys.stderr):
             stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
         code = run_app()
@@ -89,19 +98,10 @@ def _apart(words: list[str], env: dict[str, str], before: Callable[[], None]) ->
 
 def complete(words: str) -> list[str]:
     """What bash would offer for the last word."""
-    ended = subprocess.run(
-        COMMAND,
-        capture_output=True,
-        text=True,
-        env=environment(
-            _HYBRIDLOG_COMPLETE="bash_complete",
-            COMP_WORDS=f"hybridlog {words}",
-            COMP_CWORD=str(len(words.split())),
-        ),
-        check=True,
-    )
-    assert ended.stderr == ""
-    return [line.partition(",")[2] for line in ended.stdout.splitlines() if line]
+    typed = {"COMP_WORDS": f"hybridlog {words}", "COMP_CWORD": str(len(words.split()))}
+    done = run(_HYBRIDLOG_COMPLETE="bash_complete", **typed)
+    assert done.err == ""
+    return [line.partition(",")[2] for line in done.lines if line]
 
 
 @contextmanager

@@ -5,30 +5,9 @@ from __future__ import annotations
 import subprocess
 from pathlib import Path
 
-import pytest
-
-from tests.independent import Seen, read_bag
-
 from .running import COMMAND, environment, run
 
 SCAN = ("fetch", "-t", "/base/scan", "-r", "robot")
-SECOND = 10**9
-
-
-@pytest.fixture(scope="module")
-def seen(logs: Path) -> list[Seen]:
-    """What the robot said, by log time."""
-    return sorted(read_bag(logs / "robot.bag"), key=lambda m: m.log_time)
-
-
-@pytest.fixture(scope="module")
-def start(seen: list[Seen]) -> int:
-    return seen[0].log_time
-
-
-@pytest.fixture(scope="module")
-def scans(seen: list[Seen]) -> list[Seen]:
-    return [m for m in seen if m.topic == "/base/scan"]
 
 
 def test_a_wrong_predicate_is_pointed_at(store: Path) -> None:
@@ -65,13 +44,7 @@ def test_no_directory_is_deleted(store: Path, tmp_path: Path) -> None:
 
 
 def test_a_full_disk_behind_standard_output(store: Path) -> None:
-    asked = (
-        ["fetch", "-t", "scan", "-F", "csv"],
-        ["ls"],
-        ["ls", "--json"],
-        ["diff", "robot", "torn"],
-    )
-    for command in asked:
+    for command in (["fetch", "-t", "scan", "-F", "csv"], ["ls", "--json"]):
         with Path("/dev/full").open("wb") as full:
             ended = subprocess.run(
                 [*COMMAND, *command, "--store", str(store)],

@@ -13,8 +13,6 @@ from tests.other_user import User, needs_root, open_place
 
 from .running import run
 
-pytestmark = pytest.mark.mongo
-
 
 def test_verify_lists_what_is_off(fresh: Path) -> None:
     flip(places.segment(fresh, "small", 1), 1 / 2)

@@ -50,7 +50,7 @@ def _peak(*words: str) -> int:
 
 
 @pytest.mark.parametrize(
-    ("form", "kind"), in_turn(["jsonl", "csv", "table", "arrow"], ["bytes", "doubles"])
+    ("form", "kind"), in_turn(["jsonl", "table", "csv", "arrow"], ["bytes", "doubles"], every=2)
 )
 def test_one_long_message(store: Path, form: str, kind: str) -> None:
     words = ("fetch", "-q", "--store", str(store), "-F", form, "-o", "-")

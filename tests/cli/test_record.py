@@ -15,8 +15,6 @@ from tests.json_schemas import misfit, schema_of
 
 from .running import run
 
-pytestmark = pytest.mark.mongo
-
 
 def test_a_line_says_what_is_recorded(logs: Path, tmp_path: Path) -> None:
     done = run("record", logs / "small.bag", "--store", tmp_path / "s")
@@ -25,6 +23,7 @@ def test_a_line_says_what_is_recorded(logs: Path, tmp_path: Path) -> None:
     assert done.err == ""
 
 
+@pytest.mark.mongo
 def test_json_is_exact(logs: Path, tmp_path: Path) -> None:
     done = run("record", logs / "small.bag", "--store", tmp_path / "s", "--json").json
     seen = read_bag(logs / "small.bag")
@@ -40,16 +39,8 @@ def test_choices(logs: Path, tmp_path: Path) -> None:
     seen = read_bag(logs / "small.bag")
     start = min(m.log_time for m in seen)
     run(
-        *(
-            "record",
-            logs / "small.bag",
-            "--name",
-            "my run/1",
-            "--set-tag",
-            "a=b=c",
-            "--set-tag",
-            "d=",
-        ),
+        *("record", logs / "small.bag", "--name", "my run/1"),
+        *("--set-tag", "a=b=c", "--set-tag", "d="),
         *("--topic", "imu/*", "--topic", "scan", "--exclude", "re:.*scan"),
         *("--between", "+1s", "+2s", "--compression", "lz4"),
         store=tmp_path / "s",
@@ -68,6 +59,7 @@ def test_choices(logs: Path, tmp_path: Path) -> None:
     assert {c.compression for c in summary.chunk_indexes} <= {"lz4", ""}
 
 
+@pytest.mark.mongo
 def test_what_cannot_be_indexed_is_said(logs: Path, tmp_path: Path) -> None:
     done = run("record", logs / "odd.mcap", "--json", store=tmp_path / "s")
     for topic in ("/code", "/recursive", "/no_definition", "/cbor"):

@@ -3,42 +3,28 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
-import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 
 import hybridlog as hl
-from hybridlog.cli.app import app
 from hybridlog.cli.signals import Stopped
 from hybridlog_storage import stopping
-from hybridlog_storage.errors import DatabaseError, HybridlogError
+from hybridlog_storage.errors import DatabaseError
 from tests import places
 from tests.calls import Calls
 from tests.formats.test_find import METADATA, mcap
+from tests.waiting import wait_for
 
-from .running import COMMAND, environment
-
-pytestmark = pytest.mark.mongo
-
-
-@pytest.fixture(scope="module")
-def opened(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
-    with hl.open(tmp_path_factory.mktemp("directory") / "store", create=True) as opened:
-        opened.shared.index.connect()
-        yield opened
+from .running import run, started
 
 
 @pytest.fixture
-def store(opened: hl.Store) -> Path:
-    """A store without recordings, whose MongoDB runs."""
-    opened.refresh()
-    for label in opened.recordings().names:
-        opened.remove(label)
-    return opened.directory.path
+def store(tmp_path: Path) -> Path:
+    return tmp_path / "store"
 
 
 @pytest.fixture
@@ -56,12 +42,9 @@ def top(tmp_path: Path) -> Path:
 
 
 def record(store: Path, *words: object) -> tuple[int, str, str]:
-    """Run `record` in this process: exit code, standard output, standard error."""
-    done = CliRunner().invoke(app, ["record", *map(str, words), "--store", str(store)])
-    if isinstance(done.exception, HybridlogError):
-        return done.exception.exit_code, done.stdout, f"{done.stderr}{done.exception}"
-    assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
-    return done.exit_code, done.stdout, done.stderr
+    """Exit code, standard output and standard error of `record`."""
+    done = run("record", *words, store=store, code=None)
+    return done.code, done.out, done.err
 
 
 def counts(store: Path) -> dict[str, int]:
@@ -177,19 +160,11 @@ def test_a_watch_goes_on_after_errors(
 
 
 def test_a_signal_ends_a_watch_normally(top: Path, store: Path) -> None:
-    process = subprocess.Popen(
-        [*COMMAND, "record", str(top), "--watch", "--settle", "0s", "--store", str(store)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        env=environment(),
-    )
-    assert process.stdout is not None
-    assert process.stderr is not None
-    with process.stdout, process.stderr:
-        for _ in range(5):
-            assert process.stdout.readline()
+    out = store.parent / "out"
+    words = ("record", top, "--watch", "--settle", "0s", "--store", store)
+    with started(*words, output=out) as process:
+        wait_for(lambda: len(re.findall("messages?, ", out.read_text())) == 5)
         process.terminate()
-        err = process.stderr.read().decode()
-        assert process.wait(60) == 0, err
-    assert "5 logs recorded" in err
-    assert "Traceback" not in err
+        assert process.wait(60) == 0
+    assert "5 logs recorded" in out.read_text()
+    assert "Traceback" not in out.read_text()

@@ -21,8 +21,12 @@ def test_a_background_job_is_stopped_by_sigint_and_nohup_still_holds() -> None:
     assert ignored == [signal.SIGTERM, signal.SIGHUP]
 
 
-@pytest.mark.parametrize("is_terminal", [True, False])
+@pytest.mark.parametrize(
+    ("number", "is_terminal"),
+    [(signal.SIGINT, True), (signal.SIGTERM, False), (signal.SIGHUP, False)],
+)
 def test_a_command_with_nothing_to_take_back_leaves_in_the_handler(
+    number: signal.Signals,
     is_terminal: bool,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -37,8 +41,8 @@ def test_a_command_with_nothing_to_take_back_leaves_in_the_handler(
     place = beside(tmp_path / "x")
     place.path.touch()
     with pytest.raises(SystemExit) as left:
-        signal.raise_signal(signal.SIGINT)
-    assert left.value.code == 130
+        signal.raise_signal(number)
+    assert left.value.code == 128 + number
     assert list(tmp_path.iterdir()) == []
     # The bar's line is cleared, and the cursor shown again.
     clear = "\r\x1b[K\x1b[?25h" if is_terminal else ""

@@ -80,15 +80,6 @@ def test_refused(name: str, words: str) -> None:
     assert str(DATA / name) in str(caught.value)
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="the next test does the same as another user")
-def test_permission(tmp_path: Path) -> None:
-    file = tmp_path / "a.bag"
-    file.write_bytes(b"#ROSBAG V2.0\n")
-    file.chmod(0)
-    with pytest.raises(SourceError, match=r"permission denied; .*chmod"):
-        open_source(file)
-
-
 @needs_root
 def test_permission_of_another_user() -> None:
     script = "import sys, pathlib; from hybridlog.formats.log_set import LogSet, open_source\n"
