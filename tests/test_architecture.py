@@ -79,7 +79,7 @@ ALLOWED = {
     ),
     "zstandard": (
         "hybridlog.formats.log_set",
-        "hybridlog.formats.spool",
+        "hybridlog.formats.reading",
         "hybridlog_storage.mcap.mcap_content",
     ),
 }

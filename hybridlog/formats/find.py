@@ -13,9 +13,8 @@ from typing import NamedTuple
 from msgspec import Struct, field
 
 from hybridlog.formats import LOGS
-from hybridlog.formats.log_set import UNKNOWN, LogFile, LogSet, grouped_parts
+from hybridlog.formats.log_set import NAME, UNKNOWN, LogFile, LogSet, grouped_parts, read_metadata
 from hybridlog.formats.reading import cannot_open
-from hybridlog.formats.rosbag2.directory import NAME, read_metadata
 from hybridlog_storage.errors import SourceError
 from hybridlog_storage.settings import NAME as STORE
 
@@ -181,7 +180,7 @@ def _log_file(file: _File, problems: list[SourceError]) -> LogFile | None:
 def _listed(folder: Path, files: Sequence[_File]) -> set[str]:
     """The names that the metadata of the ROS 2 bag in a directory lists; none without."""
     bag = read_metadata(folder)[0] if any(file.path.name == NAME for file in files) else None
-    return set() if bag is None else {Path(name).name for name in bag.files}
+    return set() if bag is None else {*bag.files}
 
 
 def _has_end(file: _File) -> bool:

@@ -6,28 +6,100 @@ import re
 from collections import Counter
 from contextlib import nullcontext, suppress
 from itertools import chain, pairwise
+from pathlib import PureWindowsPath
 from stat import S_ISDIR, S_ISREG
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Annotated, Final, TypeAlias
 
 import numpy as np
 import zstandard
-from msgspec import Struct
+from msgspec import Meta, Struct, ValidationError, convert, field
 from msgspec.structs import replace
 
 from hybridlog.formats import LOGS, LogFormat
-from hybridlog.formats.reading import BATCH_BYTES, Damage, Source, cannot_open, size_of, split
-from hybridlog.formats.rosbag2.directory import NAME, locate, plain, read_metadata
-from hybridlog.formats.spool import ZSTD_MAGIC, peek, spool
+from hybridlog.formats.reading import (
+    BATCH_BYTES,
+    ZSTD_MAGIC,
+    Damage,
+    Source,
+    cannot_open,
+    peek,
+    size_of,
+    split,
+    spool,
+)
+from hybridlog.formats.yaml_values import YamlError, parse_yaml
 from hybridlog.wording import listed
 from hybridlog_storage.errors import SourceError
 from hybridlog_storage.messages import MAX_PAYLOAD, Batch
 from hybridlog_storage.times import span_of
 
 if TYPE_CHECKING:
-    from collections.abc import Generator, Iterable, Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
+
+
+def read_metadata(folder: Path) -> tuple[BagMetadata | None, list[Damage]]:
+    """The metadata of the bag in a folder, None without any, and the damage if it is unreadable."""
+    path = folder / NAME
+    try:
+        with path.open("rb") as file:
+            return parse_metadata(file.read(MAX_BYTES + 1).decode(errors="replace")), []
+    except (FileNotFoundError, NotADirectoryError):
+        return None, []
+    except OSError as error:
+        reason = f"the metadata cannot be read ({error.strerror})"
+    except YamlError as error:
+        reason = f"the metadata cannot be used ({error}); the files beside it are read without it"
+    return None, [Damage(path, 0, None, reason, 0)]
+
+
+def plain(path: Path) -> str:
+    """Name of a file before it was compressed."""
+    return path.name.removesuffix(".zstd")
+
+
+NAME = "metadata.yaml"
+
+MAX_BYTES = 64 << 20
+"""Largest metadata; that of 65,535 topics has about 40 MB."""
+
+_Count: TypeAlias = Annotated[int, Meta(ge=0, le=(1 << 63) - 1)]
+
+
+class _Listed(Struct):
+    path: str
+
+
+class BagMetadata(Struct, frozen=True):
+    """The used part of a bag's metadata; the number of messages is None if unknown."""
+
+    listed: list[_Listed] | None = field(default=None, name="files")
+    relative_file_paths: list[str] | None = None
+    message_count: _Count | None = None
+
+    @property
+    def files(self) -> list[str]:
+        """Names of its files, in order."""
+        paths = self.relative_file_paths or [file.path for file in self.listed or ()]
+        # Splits at both kinds of slashes.
+        names = dict.fromkeys(PureWindowsPath(path).name for path in paths)
+        return [name for name in names if name not in {"", ".."}]
+
+
+class _Document(Struct):
+    bag: BagMetadata = field(name="rosbag2_bagfile_information")
+
+
+def parse_metadata(text: str) -> BagMetadata:
+    """Parse the metadata of a bag."""
+    if len(text) > MAX_BYTES:
+        raise YamlError(f"it has more than {MAX_BYTES >> 20} MiB")
+    try:
+        return convert(parse_yaml(text), _Document).bag
+    except ValidationError as error:
+        raise YamlError(f"it does not describe a bag: {error}") from error
 
 
 _LONGEST = max(len(start) for log in LOGS for start in log.beginnings)
@@ -236,11 +308,13 @@ class LogSet(Struct, frozen=True):
 def _in_folder(folder: Path) -> LogSet:
     """The log in a directory; its metadata need not list all parts, nor right names."""
     bag, damage = read_metadata(folder)
-    found, missing = ([], []) if bag is None else locate(folder, bag)
     paths = (path for path in folder.iterdir() if path.name[:1] != "." and path.is_file())
     there = [*map(LogFile.at, sorted(paths, key=natural))]
     logs = [one for one in there if one.format is not UNKNOWN]
-    files = [*map(LogFile.at, found)] if found else logs
+    by_name = {plain(one.path): one for one in reversed(there)}
+    wanted = {} if bag is None else {folder / name: plain(folder / name) for name in bag.files}
+    found = [by_name[name] for name in wanted.values() if name in by_name]
+    files = found or logs
     if not found and (not logs or (len(logs) > 1 and not is_split(logs))):
         reason = f"a directory without a log; hybridlog reads {kinds()}"
         if logs:
@@ -258,7 +332,10 @@ def _in_folder(folder: Path) -> LogSet:
         elif file.format is not UNKNOWN:  # the log lacks nothing by that
             reason = "the file is not read: it is no part of this log; record it by its own path"
             damage.append(Damage(file.path, None, None, reason, 0))
-    damage += missing if found else missing_parts(files) if bag is None else []
+    if bag is None:
+        damage += missing_parts(files)
+    for path in (path for path, name in wanted.items() if found and name not in by_name):
+        damage.append(Damage(path, None, None, f"the file is missing; {NAME} lists it", None))
     count = None if bag is None else bag.message_count
     return LogSet(folder, tuple(files), count, tuple(damage))
 
@@ -351,7 +428,7 @@ class _JoinedSource(Source):
         """Yield the messages of one open file, over the channels of this source."""
         numbers = np.empty(0, np.int32)
         self._alike.clear()
-        for batch in self._unpacked(part.path, inner):
+        for batch in self._unpacked(inner):
             self._got += len(batch)
             numbers = self._numbered(inner, numbers)
             share = inner.bytes_read / inner.size_bytes if inner.size_bytes else 1.0
@@ -359,7 +436,6 @@ class _JoinedSource(Source):
             yield replace(batch, channel=numbers[batch.channel])
         self._numbered(inner, numbers)
         self.damage.extend(replace(damage, file=part.path) for damage in inner.damage)
-        self.remarks += inner.remarks
 
     def _numbered(self, inner: Source, numbers: NDArray[np.int32]) -> NDArray[np.int32]:
         """Numbers of the channels of a file in this source.
@@ -378,43 +454,33 @@ class _JoinedSource(Source):
             more.append(self._numbers[key])
         return np.append(numbers, np.array(more, np.int32)) if more else numbers
 
-    def _unpacked(self, path: Path, inner: Source) -> Iterator[Batch]:
+    def _unpacked(self, inner: Source) -> Iterator[Batch]:
         """Unpack messages of CDR that are zstd frames, whatever the log says of them.
 
         CDR never begins like a frame. Frames that do not unpack stay as they are.
         """
         may_be = np.empty(0, np.bool_)
-        broken = 0
         for batch in chain.from_iterable(map(split, inner.batches())):
             if len(may_be) < len(inner.channels):
                 may_be = np.array([c.message_encoding in _CDR for c in inner.channels], np.bool_)
             packed = may_be[batch.channel] & _is_frame(batch)
-            if not packed.any():
-                yield batch
-                continue
-            broken += yield from _unpacked_rows(batch, packed)
-        if broken:
-            reason = f"{broken} payloads are zstd frames that do not unpack; they stay as they are"
-            self.damage.append(Damage(path, None, None, reason, 0))
+            yield from _unpacked_rows(batch, packed) if packed.any() else (batch,)
 
 
-def _unpacked_rows(batch: Batch, packed: NDArray[np.bool_]) -> Generator[Batch, None, int]:
-    """A batch with its frames unpacked, in parts; returns how many do not unpack."""
-    unpacker, broken, row = zstandard.ZstdDecompressor(), 0, 0
+def _unpacked_rows(batch: Batch, packed: NDArray[np.bool_]) -> Iterator[Batch]:
+    """A batch with its frames unpacked, in parts."""
+    unpacker, row = zstandard.ZstdDecompressor(), 0
     while row < len(batch):
         start, size = row, 0
         payloads: list[bytes] = []
         while row < len(batch) and size < BATCH_BYTES:
             payload = bytes(batch.payload(row))
-            data = _unpack_payload(unpacker, payload) if packed[row] else payload
-            broken += data is None
-            payloads.append(payload if data is None else data)
+            payloads.append(_unpack_payload(unpacker, payload) if packed[row] else payload)
             size += len(payloads[-1])
             row += 1
         length = np.fromiter(map(len, payloads), np.int64, len(payloads))
         rows, offset = batch.take(slice(start, row)), length.cumsum() - length
         yield replace(rows, buffer=b"".join(payloads), length=length, offset=offset)
-    return broken
 
 
 def _is_frame(batch: Batch) -> NDArray[np.bool_]:
@@ -429,19 +495,13 @@ def _is_frame(batch: Batch) -> NDArray[np.bool_]:
     return found
 
 
-def _unpack_payload(unpacker: zstandard.ZstdDecompressor, payload: bytes) -> bytes | None:
-    """The content of a zstd frame, None if it is damaged or too large."""
+def _unpack_payload(unpacker: zstandard.ZstdDecompressor, payload: bytes) -> bytes:
+    """The content of a zstd frame; the payload itself where that is damaged or too large."""
     try:
-        size = zstandard.frame_content_size(payload)
-        if size > MAX_PAYLOAD:
-            return None
-        if size >= 0:
-            return unpacker.decompress(payload)
-        with unpacker.stream_reader(payload) as reader:
-            data = reader.read(MAX_PAYLOAD + 1)
+        is_large = zstandard.frame_content_size(payload) > MAX_PAYLOAD
+        return payload if is_large else unpacker.decompress(payload, MAX_PAYLOAD)
     except zstandard.ZstdError:
-        return None
-    return data if len(data) <= MAX_PAYLOAD else None
+        return payload
 
 
 def _without_path(error: SourceError, path: Path) -> str:

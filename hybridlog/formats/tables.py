@@ -28,7 +28,7 @@ import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from itertools import chain
 from tempfile import SpooledTemporaryFile
-from typing import IO, TYPE_CHECKING, Any, Protocol, TypeAlias, cast
+from typing import IO, TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
 import pyarrow as pa
@@ -73,12 +73,6 @@ Arrays: TypeAlias = "Iterator[tuple[str, NDArray[Any]]]"
 """Arrays by name."""
 
 
-class _ArrowFile(Protocol):
-    def write_table(self, table: pa.Table) -> None: ...
-
-    def close(self) -> None: ...
-
-
 def write_parquet(answer: Answer, target: Target) -> None:
     """Write Parquet, row groups of zstd.
 
@@ -120,18 +114,17 @@ def _write(
     answer: Answer,
     target: Target,
     form: str,
-    open_file: Callable[[Sink, pa.Table], _ArrowFile],
+    open_file: Callable[[Sink, pa.Table], Any],
 ) -> None:
     """Write tables."""
     with Sink(target) as sink:
         try:
-            file: _ArrowFile | None = None
+            file: Any = None
             for table in groups(answer, form):
                 file = file or open_file(sink, table)
                 file.write_table(table)
                 if answer.is_live:
                     sink.flush()
-            assert file is not None
             file.close()
         except pa.ArrowException as error:
             raise UsageError(
@@ -188,11 +181,11 @@ def _unspooled(spool: Any) -> Iterator[pa.Table]:
         yield pa.ipc.open_stream(spool).read_all()
 
 
-def _open_parquet(sink: Sink, table: pa.Table) -> _ArrowFile:
+def _open_parquet(sink: Sink, table: pa.Table) -> Any:
     kinds = {leaf.path: leaf.kind for leaf in leaves(table.schema)}
     # Arrow holds the dictionary of a long array, and many copies of a long text.
     has_long_rows = table.nbytes > _LONG_ROW * max(table.num_rows, 1)
-    file: _ArrowFile = pa.parquet.ParquetWriter(
+    return pa.parquet.ParquetWriter(
         sink,
         table.schema,
         compression="zstd",
@@ -204,7 +197,6 @@ def _open_parquet(sink: Sink, table: pa.Table) -> _ArrowFile:
             and not (has_long_rows and not pa.types.is_primitive(kind))
         ],
     )
-    return file
 
 
 class _CsvFile:

@@ -293,16 +293,11 @@ def failures(name: str) -> Iterator[None]:
     except BrokenPipeError:
         raise
     except OSError as error:
-        raise explain(error, name) from error
-
-
-def explain(error: OSError, name: str) -> HybridlogError:
-    """Map a failure in writing an output to a hybridlog error."""
-    reason = error.strerror or str(error)
-    if error.errno in NO_SPACE:
-        return DiskFullError(
-            f"no space left for {name}: {reason}; free some, or write to another place with -o"
-        )
-    if error.errno in _WRONG_PLACE:
-        return UsageError(f"cannot write {name}: {reason}")
-    return HybridlogError(f"writing {name} failed: {reason}")
+        reason = error.strerror or str(error)
+        if error.errno in NO_SPACE:
+            raise DiskFullError(
+                f"no space left for {name}: {reason}; free some, or write to another place with -o"
+            ) from error
+        if error.errno in _WRONG_PLACE:
+            raise UsageError(f"cannot write {name}: {reason}") from error
+        raise HybridlogError(f"writing {name} failed: {reason}") from error

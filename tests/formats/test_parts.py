@@ -136,7 +136,7 @@ def test_files_that_got_other_names(
         (["0", "9", "10"], None, {"0.db3": None}),
         (["d_008", "d_010", "d_100"], None, {"d_008.db3": None, "d_010.db3": None}),
         (["bag_1"], ["bag_1.db3"], {"metadata.yaml": 2}),
-        (["data/x_0", "x_1"], ["data/x_0.db3", "x_1.db3", "data/x_2.db3"], {"x_2.db3": 1}),
+        (["x_0", "x_1"], ["data/x_0.db3", "x_1.db3", "data/x_2.db3"], {"x_2.db3": 1}),
     ],
 )
 def test_names_tell_the_order_and_what_is_missing(

@@ -19,8 +19,8 @@ from hybridlog.formats.reading import (
     Damage,
     Source,
     cannot_open,
+    copy_start,
 )
-from hybridlog.formats.spool import copy_start
 from hybridlog.schema.definition_text import interface_of
 from hybridlog.wording import listed
 from hybridlog_storage.errors import SourceError

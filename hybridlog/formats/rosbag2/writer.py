@@ -14,8 +14,8 @@ from msgspec import Struct, field
 from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 
+from hybridlog.formats.log_set import NAME
 from hybridlog.formats.mcap.writer import McapWriter
-from hybridlog.formats.rosbag2.directory import NAME
 from hybridlog.formats.writing import Answer, LogWriter, Target, failures, new_directory, path_of
 from hybridlog.formats.yaml_values import YamlError, parse_yaml
 from hybridlog_storage.errors import DiskFullError, HybridlogError, UsageError
