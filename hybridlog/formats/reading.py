@@ -21,10 +21,10 @@ from typing import TYPE_CHECKING, BinaryIO, NamedTuple, Self
 
 import numpy as np
 import zstandard
-from hybridlog_storage.disk.unfinished import undone
 from msgspec import Struct
 from msgspec.structs import force_setattr, replace
 
+from hybridlog_storage.disk.files import undone
 from hybridlog_storage.errors import NO_SPACE, SourceError
 from hybridlog_storage.messages import MAX_CHANNELS
 
