@@ -6,7 +6,6 @@ import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from itertools import islice
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
@@ -326,8 +325,6 @@ class ShownRows:
         return found
 
 
-MAX_FIELDS: Final = 5000
-"""Most fields of a topic that are listed."""
 MAX_ELEMENTS: Final = 36
 """Most elements of an array that are listed one by one: those of a covariance."""
 
@@ -347,16 +344,12 @@ def known_fields(query: Query) -> Mapping[str, str]:
     return {one.path: one.type for one in infer_fields(query)}
 
 
-def fields_of(known: Mapping[str, str], messages: Iterator[Message]) -> list[Field]:
+def fields_of(known: Mapping[str, str], messages: Iterator[Message]) -> Iterator[Field]:
     """Numbers, elements of short arrays and summaries of arrays, in the order of the definition.
 
     `known` are the types of the fields, by path; the first of the messages tells how long arrays
     are.
     """
-    return list(islice(_fields(known, messages), MAX_FIELDS))
-
-
-def _fields(known: Mapping[str, str], messages: Iterator[Message]) -> Iterator[Field]:
     first = None
     with suppress(SegmentError):  # damage hides how long arrays are, and no field
         first = next(messages, None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from itertools import islice
 from math import isfinite
 from typing import TYPE_CHECKING, Annotated, Any, Final, TypeAlias
 
@@ -57,6 +58,8 @@ MAX_LANES: Final = 64
 """Topics of one picture."""
 MAX_BINS: Final = 1 << 17
 """Topics times pixels of one picture."""
+MAX_LISTED: Final = 5000
+"""Most fields of a topic that are listed."""
 MAX_FIELDS: Final = 16
 """Most fields of one plot."""
 _GREATEST_EXACT: Final = 1 << 53
@@ -106,7 +109,7 @@ def _small(counts: NDArray[np.int64]) -> NDArray[Any]:
 def fields(context: Context, *, recording: Text, topic: Text) -> dict[str, Any]:
     """The fields of a topic that can be drawn, and their types."""
     _, query = context.topic(recording, topic)
-    found = fields_of(known_fields(query), iter(query.limit(1)))
+    found = islice(fields_of(known_fields(query), iter(query.limit(1))), MAX_LISTED)
     return {"fields": [{"path": path, "type": kind} for path, kind in found]}
 
 
