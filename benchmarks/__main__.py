@@ -108,8 +108,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(chosen: argparse.Namespace, command: list[str]) -> int:
-    from benchmarks.machine import describe
-    from benchmarks.studies.runs import Context
+    from benchmarks.studies.runs import Context, describe
 
     backends, is_broken = _backends(chosen.backends), False
     with TemporaryDirectory(prefix="hybridlog-bench-", dir=chosen.work) as directory:

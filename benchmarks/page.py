@@ -13,7 +13,7 @@ from benchmarks.numbers import FLOORS, OURS, number, percent, size, title
 from benchmarks.samples import Journal, Sample
 from benchmarks.studies import record
 from benchmarks.studies.live import CASES
-from benchmarks.studies.search import Found, searches
+from benchmarks.studies.record import Found, searches
 from hybridlog.cli.output import printable
 
 Values = dict[str, float]
@@ -28,11 +28,8 @@ class Row(NamedTuple):
     """What was measured of several systems.
 
     Attributes:
-        what: It.
         short: The same, to say where another one is ahead; empty to leave it out of the README.
-        values: By backend.
         best: `max` or `min`, whichever is better.
-        unit: After a figure.
         above: Backends whose figures are higher than shown: the harness offered no more.
     """
 

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from benchmarks.backends.base import Backend
-from benchmarks.backends.files import BagFile, McapFile
+from benchmarks.backends.files import BagFile, McapFile, Nothing
 from benchmarks.backends.hybridlog_store import Hybridlog, HybridlogUncompressed
 from benchmarks.backends.mongo import Mongo, MongoIndexed
-from benchmarks.backends.nothing import Nothing
 from benchmarks.backends.postgres import Postgres, PostgresIndexed
 from benchmarks.backends.sql import Sqlite, SqliteIndexed
 

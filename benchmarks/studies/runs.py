@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+import os
+import platform
+import re
+import sqlite3
+import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from benchmarks.harness.run import run as run_load
 from benchmarks.loads.base import Load
 from benchmarks.samples import Journal, Sample, Scale
+from hybridlog_storage.mongo.mongod import find_mongod
+from hybridlog_storage.threads import processors
 
 if TYPE_CHECKING:
     from benchmarks.backends.base import Backend
@@ -29,9 +38,6 @@ class Context:
     Attributes:
         work: Directory for loads (kept) and the data of runs (removed after each).
         backends: Those that take part, by name, in the order in which they take turns.
-        journal: Where samples go.
-        scale: How much is measured.
-        seed: Of all loads.
         missing: Why backends are missing that were found so: they are not tried again.
         quiet_at: When the machine will be done with what the last run left, seconds of
             `time.monotonic`.
@@ -106,3 +112,69 @@ def run_directory(work: Path) -> Iterator[Path]:
     work.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory(dir=work, ignore_cleanup_errors=True) as directory:
         yield Path(directory)
+
+
+_PACKAGES = ("hybridlog", "mcap", "numpy", "pandas", "psycopg", "pyarrow", "pymongo", "rosbags")
+_ROOT = Path(__file__).parents[2]
+
+
+def describe(work: Path | None = None) -> dict[str, object]:
+    """Machine, system, versions, revision and load, as values that JSON can hold."""
+    cpu = re.search(r"^model name\s*:\s*(.+)$", _text("/proc/cpuinfo"), re.MULTILINE)
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return {
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+        "cpu": cpu[1] if cpu else platform.processor() or "unknown",
+        "cores": processors(),
+        "memory_gib": round(memory / 2**30, 1),
+        "disk": _disk(work or Path(tempfile.gettempdir())),
+        "system": f"{platform.system()} {platform.release()} {platform.machine()}",
+        "python": platform.python_version(),
+        "packages": {name: version(name) for name in _PACKAGES},
+        "mongod": _said([str(find_mongod()), "--version"], r"db version v(\S+)"),
+        "postgres": _postgres_version(),
+        "sqlite": sqlite3.sqlite_version,
+        # With a plus sign when files differ from the commit.
+        "revision": _said(
+            ["git", "-C", str(_ROOT), "describe", "--always", "--abbrev=12", "--dirty=+"], r"(\S+)"
+        ),
+        "load_1min": round(os.getloadavg()[0], 2),
+    }
+
+
+def _text(path: str) -> str:
+    try:
+        return Path(path).read_text()
+    except OSError:
+        return ""
+
+
+def _disk(directory: Path) -> str:
+    """File system and disk of a directory: `ext4 on vda`."""
+    number = directory.resolve().stat().st_dev
+    for fields in map(str.split, _text("/proc/self/mountinfo").splitlines()):
+        if fields[2] == f"{os.major(number)}:{os.minor(number)}":
+            kind, source = fields[fields.index("-") + 1 :][:2]
+            return f"{kind} on {Path(source).name}"
+    return "unknown"
+
+
+def _postgres_version() -> str:
+    from benchmarks.backends.base import BackendMissingError
+    from benchmarks.backends.postgres import find_programs
+
+    try:
+        program = find_programs().directory / "postgres"
+    except BackendMissingError:
+        return "absent"
+    return _said([str(program), "--version"], r"\(PostgreSQL\) (\S+)")
+
+
+def _said(command: Sequence[str], pattern: str) -> str:
+    """What a program says that matches a pattern."""
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"
+    found = re.search(pattern, done.stdout)
+    return found[1] if found else "unknown"

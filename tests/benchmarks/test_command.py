@@ -15,7 +15,7 @@ from benchmarks.__main__ import PARTS
 from benchmarks.backends.registry import BACKENDS
 from benchmarks.backends.sql import SqliteIndexed
 from benchmarks.samples import Journal
-from benchmarks.studies import answers, search
+from benchmarks.studies import answers, record
 from benchmarks.studies.runs import Context
 from tests.imports import ROOT
 
@@ -89,12 +89,12 @@ def test_a_wrong_answer_fails(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -
 @given(truth=st.floats(1, 16384), start=st.sampled_from([4.0, 50.0, 64.0, 100.0]))
 def test_the_search_comes_within_a_half(truth: float, start: float) -> None:
     kept: dict[float, bool] = {}
-    bounds = search.Bounds(start, lowest=1.0, highest=16384.0)
-    while (rate := search.next_rate(kept, bounds)) is not None:
+    bounds = record.Bounds(start, lowest=1.0, highest=16384.0)
+    while (rate := record.next_rate(kept, bounds)) is not None:
         assert rate not in kept
         kept[rate] = rate <= truth
         assert len(kept) < 30
-    best, lost = search.bracket(kept)
+    best, lost = record.bracket(kept)
     if best is None:
         assert lost is not None
         assert lost / 2 < 1

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from benchmarks import usage
-from benchmarks.backends.nothing import Nothing
+from benchmarks.backends.files import Nothing
 from benchmarks.harness.run import run
 from benchmarks.loads.base import PAYLOADS, Load
 from benchmarks.side import MARK
