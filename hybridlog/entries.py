@@ -511,7 +511,7 @@ def _lines_of(
         if not isinstance(reader, GoneLog):
             return sealed, None, ()
         log = reader.log
-    from hybridlog.columns.rows_file import line_of
+    from hybridlog.columns.rows import line_of
 
     others = sorted(n for n in listing.rows if int(n[:6]) == number and n != name)
     return sealed, log, [line_of(path, log, one) for one in (name, *others)]

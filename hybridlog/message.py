@@ -171,7 +171,7 @@ class Messages:
 
     def fields(self, row: int) -> dict[str, object]:
         """The fields of one message, as in its index document."""
-        from hybridlog.schema.codec import bodies_of, document_of
+        from hybridlog.schema.codecs import bodies_of, document_of
 
         if row not in self._bodies:
             index = int(self._batch.channel[row])
@@ -192,7 +192,7 @@ class Messages:
     def refuse(self, row: int) -> NoReturn:
         """Refuse a payload that is gone."""
         from hybridlog.columns.rows import digest_in, with_rows
-        from hybridlog.schema.codec import missing_payload
+        from hybridlog.schema.codecs import missing_payload
 
         left = with_rows(self._batch.take(slice(row, row + 1))).left
         assert left is not None

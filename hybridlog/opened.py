@@ -104,7 +104,7 @@ class OpenStore(Shared):
     def recorded(self, report: RecordReport) -> None:
         """See a recording that has ended."""
         self.catch_up(report.entry.id)
-        from hybridlog.schema.codec import unindexed  # loads numpy
+        from hybridlog.schema.codecs import unindexed  # loads numpy
 
         with suppress(HybridlogError):  # its files may have gone already
             report.not_indexed = unindexed(self.now().definitions(report.entry))

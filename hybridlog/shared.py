@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from hybridlog.columns.rows_file import RowsFile
+    from hybridlog.columns.rows import RowsFile
     from hybridlog.columns.tables import Tables
     from hybridlog.query.question import RecordedChannel
     from hybridlog.record.running import RunningRecording
@@ -75,7 +75,7 @@ class RecordingRows:
         return messages_left(found)
 
     def _open(self, log: int) -> tuple[list[RowsFile], str]:
-        from hybridlog.columns.rows_file import RowsFile
+        from hybridlog.columns.rows import RowsFile
 
         files: list[RowsFile] = []
         problems: list[str] = []

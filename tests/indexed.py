@@ -11,7 +11,8 @@ from bson import encode
 
 import hybridlog as hl
 from hybridlog.index.access import again_if_lost
-from hybridlog.schema.codec import Codec, bodies_of, document_of
+from hybridlog.schema.codec import Codec
+from hybridlog.schema.codecs import bodies_of, document_of
 from hybridlog.schema.document import BodyGroup
 from hybridlog_storage.messages import Batch
 from hybridlog_storage.mongo.index_documents import IndexState, collection_of

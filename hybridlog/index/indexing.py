@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from hybridlog.schema.codec import Codec, Decoded, bodies_in, codec_for, stamps_of
+from hybridlog.schema.codec import Codec, Decoded, stamps_of
+from hybridlog.schema.codecs import bodies_in, codec_for
 from hybridlog.schema.column import STAMP, Records, header_stamps
 from hybridlog.schema.states import encoding_of
 from hybridlog_storage.cache import lazy

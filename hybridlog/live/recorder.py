@@ -36,7 +36,7 @@ from hybridlog.query.times import format_duration, format_time
 from hybridlog.query.topics import TopicMatcher, matcher
 from hybridlog.record.losses import Cause
 from hybridlog.record.marks import CLOCK_SET
-from hybridlog.schema.codec import codec_for
+from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.ros_codec import completed
 from hybridlog.wording import size
 from hybridlog_storage.disk import files

@@ -22,7 +22,7 @@ from msgspec import Struct, field
 
 from hybridlog.record.losses import Cause, Ledger
 from hybridlog.record.recorder import Capture, RecordReport
-from hybridlog.schema.codec import codec_for
+from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.errors import DatabaseError, DiskFullError, UsageError
 from hybridlog_storage.manifest import Loss
 from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD

@@ -5,7 +5,7 @@ passes for its own recording and for those that nobody records; what others reco
 them.
 
 What is left of the messages of a log are files of rows: the fields as in tables, times, sizes and
-hashes (`columns/rows_file.py`). They are written once and listed beside the log, as soon as it is
+hashes (`columns/rows.py`). They are written once and listed beside the log, as soon as it is
 sealed where a store has rules, else before it goes. Then one change of the manifest says that logs
 are gone; from then on their rows are the truth. A crash on either side of a change leaves files
 that the next change of the store removes.
@@ -469,7 +469,8 @@ def write_rows(recording: Path, line: File, into: Path, *, version: int = 0) -> 
     The line of the log says that it is gone; the folder of its recording stays as it is. A damaged
     log, or one with what rows cannot keep, raises SegmentError.
     """
-    from hybridlog.columns.rows_file import RowsWriter
+    from hybridlog.columns.rows import RowsWriter
+    from hybridlog.index.indexing import ChunkIndexer
 
     with SegmentReader(recording / line.name, line.number) as reader:
         summary = reader.summary()
@@ -478,11 +479,12 @@ def write_rows(recording: Path, line: File, into: Path, *, version: int = 0) -> 
         if summary.attachments:
             raise SegmentError(f"{reader.path} has attachments of its log")
         begin = front(reader, summary, line)
-        writer = RowsWriter(into, line, summary.channels, begin, version)
+        writer, indexer = RowsWriter(into, line, begin, version), ChunkIndexer(into.name)
         reader.fetch(summary.chunks)
         try:
             for place in summary.chunks:
-                writer.add(reader.read_chunk(place))
+                for one in indexer.messages_in([reader.read_chunk(place)], summary.channels):
+                    writer.add(one.channel, one.placed, one.decoded)
             return writer.close()
         except BaseException as error:
             writer.discard()

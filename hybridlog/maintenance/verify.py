@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from msgspec import Struct, field, structs
 
 from hybridlog.columns.layout import topics_of
-from hybridlog.columns.rows_file import RowsFile
+from hybridlog.columns.rows import RowsFile
 from hybridlog.entries import free_name_in, made_again, put_entry
 from hybridlog.follow.follower import bring, make_tables
 from hybridlog.maintenance.opening import missing, recover, recover_segments

@@ -59,7 +59,7 @@ def is_video(channel: Channel) -> bool:
 def is_key_frame(channel: Channel, payload: Buffer) -> bool:
     """True if a message of a video channel is a key frame."""
     from hybridlog.arrays import video
-    from hybridlog.schema.codec import codec_for
+    from hybridlog.schema.codecs import codec_for
 
     try:
         form, data = video.frame_of(codec_for(channel).decode(memoryview(payload)))

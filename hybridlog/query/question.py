@@ -95,7 +95,7 @@ class RecordedChannel(Struct, frozen=True, dict=True):
     @lazy
     def codec(self) -> Codec:
         """Decodes its payloads; made when first used."""
-        from hybridlog.schema.codec import codec_for
+        from hybridlog.schema.codecs import codec_for
 
         return codec_for(self.channel)
 

@@ -35,7 +35,7 @@ from hybridlog.live.recorder import (
 from hybridlog.live.state import choose, read, running
 from hybridlog.record.losses import Cause
 from hybridlog.record.marks import MARKS
-from hybridlog.schema.codec import unindexed
+from hybridlog.schema.codecs import unindexed
 from hybridlog_storage.disk import append_file, files
 from hybridlog_storage.errors import (
     DiskFullError,

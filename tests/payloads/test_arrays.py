@@ -23,7 +23,7 @@ import hybridlog as hl
 from hybridlog.arrays.message_arrays import to_numpy
 from hybridlog.columns.fields import PointColumns, as_columns
 from hybridlog.query.planner import Planner
-from hybridlog.schema.codec import codec_for
+from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.errors import PayloadError, StoreError, TopicError, UsageError
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places

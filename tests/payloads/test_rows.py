@@ -15,11 +15,10 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 import hybridlog as hl
-from hybridlog.columns.rows import reduced
-from hybridlog.columns.rows_file import RowsFile
+from hybridlog.columns.rows import RowsFile, reduced
 from hybridlog.entries import put_entry
 from hybridlog.maintenance.keep import expire, write_rows
-from hybridlog.schema.codec import codec_for
+from hybridlog.schema.codecs import codec_for
 from hybridlog.shared import RecordingRows
 from hybridlog_storage import manifest as truth
 from hybridlog_storage.errors import PayloadError, SegmentError, StoreError

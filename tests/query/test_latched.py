@@ -18,7 +18,7 @@ from hybridlog.columns.rows import reduced
 from hybridlog.formats.slices import Front
 from hybridlog.query.latching import KEEP_ALL, LatchedFront, depth_of
 from hybridlog.query.query import Query
-from hybridlog.schema.codec import codec_for
+from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.errors import ResourceError
 from hybridlog_storage.messages import REDUCED, Batch, Channel, Schema, left_channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings

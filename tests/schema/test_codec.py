@@ -17,7 +17,8 @@ from bson.int64 import Int64
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybridlog.schema.codec import Codec, codec_for, no_messages
+from hybridlog.schema.codec import Codec, no_messages
+from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.errors import DefinitionError, PayloadError
 from hybridlog_storage.messages import Channel, Schema
 from tests.indexed import batch_of, groups_of, index_fields

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from rosbags.typesys import Stores, get_typestore
 
 from hybridlog.schema import ros_codec
-from hybridlog.schema.codec import codec_for
+from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.definition import parse_definition, typestore
 from hybridlog.schema.ros_codec import completed
 from hybridlog_storage.errors import DefinitionError

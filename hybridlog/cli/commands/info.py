@@ -117,7 +117,7 @@ def _as_dict(store: Store, entry: RecordingEntry) -> dict[str, Any]:
     from hybridlog.query.answers.completeness import coverage
     from hybridlog.query.intervals import mean_rate
     from hybridlog.record.losses import losses_of
-    from hybridlog.schema.codec import unindexed
+    from hybridlog.schema.codecs import unindexed
     from hybridlog.schema.states import shown_channels
 
     attachments: list[StoredAttachment] = []

@@ -13,7 +13,7 @@ import pytest
 
 from hybridlog.live.sources.base import Cause
 from hybridlog.live.sources.ros2.source import Ros2Source
-from hybridlog.schema.codec import codec_for
+from hybridlog.schema.codecs import codec_for
 from tests.indexed import index_fields
 from tests.limits import Limit
 from tests.live.sources.heard import Heard

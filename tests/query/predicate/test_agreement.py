@@ -18,7 +18,8 @@ from hybridlog.query.predicate.evaluate import matches, on_columns, statistic_of
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.question import Part, RecordedChannel
 from hybridlog.schema.arrow_columns import objects_array
-from hybridlog.schema.codec import codec_for, no_messages
+from hybridlog.schema.codec import no_messages
+from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.catalog import ChannelStats, RecordingEntry
 from hybridlog_storage.manifest import Manifest
 from hybridlog_storage.messages import REDUCED, Batch, Channel, Schema, left_channel
