@@ -30,7 +30,12 @@ LONG = (
     *("tables/test_other_readers", "payloads/", "copying/", "scale/", "tables/test_writer"),
     *("schema/test_wire", "test_mending", "test_repair", "contract/", "query/test_latest"),
     *("training/", "query/test_intervals", "storage/test_segments", "query/test_differences"),
-    *("tf/test_in_frame", "across/test_sync", "test_sensor_messages", "storage/test_append_file"),
+    *(
+        "tf/test_in_frame",
+        "across/test_sync",
+        "test_definitions_of_logs",
+        "storage/test_append_file",
+    ),
     *("test_interrupted", "test_edits_at_once", "demo/", "simulator/"),
 )
 """Tests that take long, the longest first: they begin first, or one processor would wait at the

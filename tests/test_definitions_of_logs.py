@@ -1,4 +1,4 @@
-"""Logs without definitions, or with odd ones and odd payloads, through every output."""
+"""Logs without definitions, or with odd ones, and every type of sensor_msgs, in every output."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from tests.every_output import compare_every_output
 from tests.formats.test_rosbag2 import MESSAGES, TOPICS, database
 from tests.independent import write_mcap
 from tests.ros_values import ROS1, ROS2, message_of, plain_of
+from tests.some import EXHAUSTIVE
 
 CASES = Path(__file__).parent / "cases"
 FOXY = get_typestore(Stores.ROS2_FOXY)
@@ -36,6 +37,13 @@ IN_MCAP = [
     ("/ros1/empty", "ros1", "nav_msgs/msg/Odometry", "ros1msg", b""),
     ("/ros2/prose", "cdr", "sensor_msgs/msg/LaserScan", "ros2msg", b"Scans of the robot.\n"),
     ("/ros2/name", "cdr", "sensor_msgs/msg/Range", "ros2msg", b"sensor_msgs/Range"),
+]
+SENSORS = [
+    (f"/sensors{ros}/{name.rpartition('/')[2]}", encoding, name, f"ros{ros}msg", text.encode())
+    for ros, encoding, types in ((1, "ros1", ROS1), (2, "cdr", ROS2))
+    for name in sorted(types.fielddefs)
+    if name.startswith("sensor_msgs/")
+    for text, _ in [types.generate_msgdef(name, ros_version=ros)]
 ]
 
 
@@ -59,7 +67,7 @@ def write_db3(path: Path) -> None:
 
 def write_logs_mcap(path: Path) -> None:
     said = []
-    for topic, encoding, name, kind, data in IN_MCAP:
+    for topic, encoding, name, kind, data in IN_MCAP + SENSORS:
         spelled = name.replace("/msg/", "/") if encoding == "ros1" else name
         channel = Channel(topic, encoding, Schema(spelled, kind, data))
         pairs = messages(*types_of(encoding, name))
@@ -102,14 +110,20 @@ def test_a_db3_without_definitions(
     assert channel.stats.unreadable == channel.stats.surplus == 0
 
 
-@pytest.mark.parametrize(("topic", "encoding", "name"), [case[:3] for case in IN_MCAP])
-def test_an_mcap_without_definitions(
+@pytest.mark.parametrize(
+    ("topic", "encoding", "name"),
+    [case[:3] for case in IN_MCAP + SENSORS[::3]]
+    + [pytest.param(*case[:3], marks=EXHAUSTIVE) for case in SENSORS[1::3] + SENSORS[2::3]],
+)
+def test_an_mcap_with_and_without_definitions(
     store: hl.Store, tmp_path: Path, topic: str, encoding: str, name: str
 ) -> None:
     types, _, write = types_of(encoding, name)
     pairs = messages(types, name, write)
     wanted = [plain_of(types, name, message) for message, _ in pairs]
-    compare_every_output(store.topic(topic), wanted, [payload for _, payload in pairs], tmp_path)
+    query = store.topic(topic)
+    compare_every_output(query, wanted, [payload for _, payload in pairs], tmp_path)
+    assert query.counters.unreadable == 0
 
 
 def decoded(path: Path, topic: str, name: str, text: str | None) -> tuple[list[Any], list[bytes]]:

@@ -13,8 +13,14 @@ from hypothesis import strategies as st
 from hybridlog.frames import answer
 from hybridlog.frames.answer import Block, table_of
 from hybridlog.frames.frame import frame_of
-from hybridlog.schema.arrow_columns import records_array, values_array
-from hybridlog.schema.arrow_types import common_type, converted, extremes, plain_values
+from hybridlog.schema.arrow_types import (
+    common_type,
+    converted,
+    extremes,
+    plain_values,
+    records_array,
+    values_array,
+)
 from hybridlog.schema.column import Arrays, Column, Records, Scalars, Strings
 
 

@@ -23,8 +23,7 @@ from hybridlog.query.intervals import Intervals, joined
 from hybridlog.query.planner import Planner, bounds_in, log_spans, log_times, resolved
 from hybridlog.query.question import Counters
 from hybridlog.query.times import DurationLike, format_duration, parse_duration
-from hybridlog.schema.arrow_columns import DURATION, numbers
-from hybridlog.schema.arrow_types import column_of, common_schema
+from hybridlog.schema.arrow_types import DURATION, column_of, common_schema, numbers
 from hybridlog.schema.column import STAMP
 from hybridlog.snapshot import UNFINISHED
 from hybridlog.tf.in_frame import Known, stream

@@ -18,8 +18,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from hybridlog.schema.arrow_columns import numbers
-from hybridlog.schema.arrow_types import COMPUTED_AS, is_number, numpy_type
+from hybridlog.schema.arrow_types import COMPUTED_AS, is_number, numbers, numpy_type
 from hybridlog.tf.tree import Transform
 from hybridlog.tf.tree import interpolated as slerp
 from hybridlog_storage.times import BEGIN

@@ -32,7 +32,6 @@ from hybridlog.columns.layout import (
     SUMMARY,
     column_names,
 )
-from hybridlog.schema.arrow_columns import lists, numbers, structs
 from hybridlog.schema.arrow_types import (
     Array,
     common_type,
@@ -41,7 +40,10 @@ from hybridlog.schema.arrow_types import (
     is_bytes,
     is_list,
     lengths_of,
+    lists,
     missing_of,
+    numbers,
+    structs,
     summary,
     with_values,
 )

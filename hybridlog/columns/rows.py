@@ -34,7 +34,6 @@ from hybridlog.columns.fields import (
     without,
 )
 from hybridlog.columns.layout import OWN_COLUMNS, Section
-from hybridlog.schema.arrow_columns import objects_array, structs
 from hybridlog.schema.arrow_types import (
     Array,
     bounds_of,
@@ -42,8 +41,10 @@ from hybridlog.schema.arrow_types import (
     is_array,
     is_list,
     is_summary,
+    objects_array,
     plain_values,
     statistic,
+    structs,
 )
 from hybridlog.schema.codec import (
     Decoded,

@@ -36,7 +36,7 @@ from hybridlog.columns.layout import (
 )
 from hybridlog.columns.rows import LeftFields, columns_from, rows_of
 from hybridlog.columns.tables import shared_for, shared_name, shared_times, type_folders
-from hybridlog.schema.arrow_columns import structs
+from hybridlog.schema.arrow_types import structs
 from hybridlog.schema.codec import no_messages
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.states import encoding_of, state_of

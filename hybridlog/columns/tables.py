@@ -39,8 +39,7 @@ from hybridlog.columns.layout import (
     Section,
     type_prefix,
 )
-from hybridlog.schema.arrow_columns import structs
-from hybridlog.schema.arrow_types import converted
+from hybridlog.schema.arrow_types import converted, structs
 from hybridlog.schema.column import names_of, ranges
 from hybridlog.schema.states import State, encoding_of
 from hybridlog_storage.cache import Cache

@@ -13,8 +13,9 @@ from hybridlog.columns.rows import LeftFields
 from hybridlog.frames.names import FIELD, arranged, free_name, is_part, own_columns, summary_of
 from hybridlog.index.indexing import rows_by_channel
 from hybridlog.query.rows import summaries_in
-from hybridlog.schema.arrow_columns import OFFSET_LIMIT, TIME, numbers, structs
 from hybridlog.schema.arrow_types import (
+    OFFSET_LIMIT,
+    TIME,
     common_type,
     converted,
     has_empty,
@@ -22,7 +23,9 @@ from hybridlog.schema.arrow_types import (
     is_list,
     is_time,
     missing_of,
+    numbers,
     statistic,
+    structs,
     with_values,
 )
 from hybridlog.schema.codec import no_messages, stamp_array

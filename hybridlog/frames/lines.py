@@ -15,13 +15,13 @@ from hybridlog.frames.answer import Decoder, leaves_of, text_column
 from hybridlog.frames.names import arranged, free_name
 from hybridlog.index.indexing import rows_by_channel
 from hybridlog.query.times import format_duration, format_time
-from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.arrow_types import (
     is_bytes,
     is_list,
     is_number,
     numpy_type,
     plain_values,
+    structs,
 )
 from hybridlog.schema.column import Records
 

@@ -247,7 +247,7 @@ class Intervals:
         import pyarrow as pa
 
         from hybridlog.frames.frame import frame_of_table
-        from hybridlog.schema.arrow_columns import numbers
+        from hybridlog.schema.arrow_types import numbers
 
         codes, rows = self._all()
         begin, end, messages = np.ascontiguousarray(rows.T)

@@ -87,7 +87,7 @@ class Decoded(Struct):
         """
         if not isinstance(self.records, Records):
             return self.records.arrow()
-        from hybridlog.schema.arrow_columns import records_array
+        from hybridlog.schema.arrow_types import records_array
 
         return records_array(self.records)
 

@@ -84,7 +84,7 @@ class Objects:
 
     def arrow(self) -> pa.StructArray:
         """The messages as an Arrow array; see `Decoded.arrow`."""
-        from hybridlog.schema.arrow_columns import objects_array
+        from hybridlog.schema.arrow_types import objects_array
 
         return objects_array(self.plain(), self.wanted())
 

@@ -17,14 +17,14 @@ from typing import TYPE_CHECKING, Any, cast
 
 import pyarrow as pa
 
-from hybridlog.schema.arrow_columns import (
+from hybridlog.schema.arrow_types import (
     lists,
     missing_rows,
     offsets_of,
+    plain_values,
     structs,
     times_array,
 )
-from hybridlog.schema.arrow_types import plain_values
 from hybridlog.schema.codec import ObjectCodec
 from hybridlog.schema.column import Wanted, below, top_level_names
 from hybridlog.schema.definition import MAX_DEFINITION, FieldPath

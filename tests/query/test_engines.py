@@ -28,7 +28,7 @@ from hybridlog.query.predicate.evaluate import on_columns
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.query import Query, field_types
 from hybridlog.query.rows import Rows
-from hybridlog.schema.arrow_columns import objects_array
+from hybridlog.schema.arrow_types import objects_array
 from hybridlog_storage.errors import DatabaseError, TimeError
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segments.segment_writer import SegmentSettings

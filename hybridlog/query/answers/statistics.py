@@ -340,7 +340,7 @@ def infer_fields(messages: Iterable[Message]) -> list[FieldPath]:
 
     What cannot be read is skipped. Names that no path can have are in backticks.
     """
-    from hybridlog.schema.arrow_columns import objects_array  # loads pyarrow
+    from hybridlog.schema.arrow_types import objects_array  # loads pyarrow
 
     values: list[Any] = []
     for message in islice(messages, SAMPLE):

@@ -34,16 +34,19 @@ from hybridlog.query.predicate.tree import (
     is_meta,
     root_of,
 )
-from hybridlog.schema.arrow_columns import json_array, lists, structs, values_array
 from hybridlog.schema.arrow_types import (
     is_array,
     is_list,
     is_summary,
     is_text,
     is_time,
+    json_array,
     lengths_of,
+    lists,
     plain_values,
     statistic,
+    structs,
+    values_array,
 )
 from hybridlog.schema.column import offsets, ranges, summary_of
 from hybridlog.schema.text import nearest

@@ -17,7 +17,7 @@ from hybridlog.columns.rows import reduced
 from hybridlog.query.predicate.evaluate import matches, on_columns, statistic_of
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.question import Part, RecordedChannel
-from hybridlog.schema.arrow_columns import objects_array
+from hybridlog.schema.arrow_types import objects_array
 from hybridlog.schema.codec import no_messages
 from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.catalog import ChannelStats, RecordingEntry

@@ -16,7 +16,7 @@ from hybridlog.query.predicate.evaluate import on_columns
 from hybridlog.query.predicate.mongo_filter import mongo_filter
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.tree import Condition, Field
-from hybridlog.schema.arrow_columns import objects_array
+from hybridlog.schema.arrow_types import objects_array
 
 ORDERS = {
     "==": operator.eq,

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hybridlog.query.predicate.evaluate import on_columns
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.tree import Condition, Predicate, check
-from hybridlog.schema.arrow_columns import objects_array
+from hybridlog.schema.arrow_types import objects_array
 from hybridlog_storage.errors import WhereError
 
 Document = dict[str, object]
