@@ -306,7 +306,8 @@ class RecordingWriter:
             self.flush()
             for record in [*self._extras]:  # for which there was no room
                 self._disk.submit(self._add, record).result()
-            self._disk.submit(self._define_rest).result()
+            rest = [number for number in self.channels if not self.written[number]]
+            self._disk.submit(lambda: self._define(self._first(), rest)).result()
             self._disk.submit(self._seal).result()
         finally:
             self._shut_down()
@@ -451,10 +452,6 @@ class RecordingWriter:
         if isinstance(record, Attachment) and self._is_full():
             self._seal()
 
-    def _define_rest(self) -> None:
-        """Define the channels without messages in the last group."""
-        self._define(self._first(), [c for c in self.channels if not self.written[c]])
-
     def _define(self, segment: SegmentFile, channel_ids: Sequence[int]) -> None:
         channels = [(number, self.channels[number]) for number in channel_ids]
         segment.define(
@@ -531,15 +528,11 @@ class RecordingWriter:
 
     def _seal(self) -> None:
         self._first()  # an empty recording has one
-        segments = [*self._segments.values()]
-        self._on_sealing(self._with_room(partial(self._prepared, segments)))
+        segments, sync = [*self._segments.values()], self.settings.sync != "never"
+        # The first one last: until then it takes records.
+        prepared = self._with_room(lambda: [one.prepare(sync=sync) for one in reversed(segments)])
+        self._on_sealing(prepared[::-1])
         self._closed += [segment.publish(sync=segment is segments[-1]) for segment in segments]
         self.sealed += len(segments)
         self._division.begin()
         self._segments.clear()
-
-    def _prepared(self, segments: Sequence[SegmentFile]) -> list[Sealed]:
-        """Complete segments, the first one last: until then it takes records."""
-        for segment in reversed(segments):
-            segment.complete()
-        return [segment.prepare(sync=self.settings.sync != "never") for segment in segments]
