@@ -408,11 +408,22 @@ class SegmentFile:
                     f"{final} is there already, so {self.path} cannot be sealed. "
                     "Move one of them out of the store."
                 )
-            sealed = self.complete()
+            if self._sealed is None:
+                # In one write: without room the file is unchanged, and can be sealed again.
+                content = self.content
+                self._append([content.tail(self.position)])
+                self._sealed = Sealed.of(
+                    (self.number, self.group),
+                    (self.position, self._file.digest()),
+                    content.table.build(),
+                    content.channels,
+                    extras=(len(content.attachments), len(content.of_source)),
+                    losses=content.losses,
+                )
             if not self._finished:
                 self._file.finish(sync=sync)
                 self._finished = True
-        return sealed
+        return self._sealed
 
     def publish(self, *, sync: bool = True) -> Path:
         """Give a prepared file its final name, with `sync` also on the disk; may be repeated."""
@@ -424,24 +435,6 @@ class SegmentFile:
             if sync:
                 files.sync_folder(final.parent)
         return final
-
-    def complete(self) -> Sealed:
-        """Write the summary, without renaming the file or forcing it to the disk."""
-        if self._sealed is None:
-            # In one write: without room the file is unchanged, and can be sealed again.
-            content = self.content
-            self._append([content.tail(self.position)])
-            with self._explained("reading"):
-                digest = self._file.digest()
-            self._sealed = Sealed.of(
-                (self.number, self.group),
-                (self.position, digest),
-                content.table.build(),
-                content.channels,
-                extras=(len(content.attachments), len(content.of_source)),
-                losses=content.losses,
-            )
-        return self._sealed
 
     def abandon(self) -> None:
         """Close without sealing; the next opening of the store recovers the file."""
