@@ -143,8 +143,11 @@ class Follower:
             if number in listing.sealed and number in manifest.logs:
                 digest = manifest.logs[number].digest
                 self._read_sealed(number, listing.sealed[number], digest)
-            else:
-                self._read_open(number)
+            else:  # what it has got since the last time
+                segment = self._segment(number)
+                opened = segment.opened = segment.opened or Walk.opened(self._path, number)
+                opened.follow()
+                self._read(number, opened.reader, places_of(opened.flushed.table), opened.channels)
         self._send()
 
     def finish(self, entry: RecordingEntry) -> RecordingEntry:
@@ -184,13 +187,6 @@ class Follower:
     def _segment(self, number: int) -> _Segment:
         is_wanted = self._target.is_wanted and str(number) not in self._done
         return self._segments.setdefault(number, _Segment(is_wanted))
-
-    def _read_open(self, number: int) -> None:
-        """Read what a segment has got since the last time."""
-        segment = self._segment(number)
-        opened = segment.opened = segment.opened or Walk.opened(self._path, number)
-        opened.follow()
-        self._read(number, opened.reader, places_of(opened.flushed.table), opened.channels)
 
     def _read_sealed(
         self, number: int, name: str, digest: str, report: Callable[[int], None] = lambda _: None

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from msgspec import Struct
 
 from hybridlog.columns.layout import topics_of, type_prefix
-from hybridlog.follow.follower import Follower, bring, make_tables
+from hybridlog.follow.follower import bring, make_tables
 from hybridlog.maintenance.report import ArraysOfTopic, Progress, RepairReport
 from hybridlog.snapshot import Snapshot
 from hybridlog_storage.disk.directory import LOCK_WAIT_S, StoreDirectory
@@ -79,7 +79,9 @@ class StoreIndex(Struct, frozen=True):
                 # A process that holds the lock indexes it.
                 with suppress(HeldError, TopicError):
                     try:
-                        made = self._bring(entry)
+                        made = bring(
+                            directory, self.catalog, entry, self.database, progress=self.progress
+                        )
                     except SegmentError as error:
                         report.unreadable[entry.id] = str(error)
                     else:
@@ -87,10 +89,6 @@ class StoreIndex(Struct, frozen=True):
         if current:
             self.catalog.put_indexed(current, index)
         return changed.union(current)
-
-    def _bring(self, entry: RecordingEntry, **options: Any) -> Follower | None:
-        directory, catalog, database = self.directory, self.catalog, self.database
-        return bring(directory, catalog, entry, database, progress=self.progress, **options)
 
     def rebuild(self, entries: Iterable[RecordingEntry]) -> dict[str, HybridlogError]:
         """Rebuild the index of recordings from their segments; returns why some are unchanged.
@@ -102,7 +100,15 @@ class StoreIndex(Struct, frozen=True):
         for chosen in entries:
             self.catalog.put_indexed([chosen.id], "")
             try:
-                self._bring(chosen, anew=True, wait_s=LOCK_WAIT_S)
+                bring(
+                    self.directory,
+                    self.catalog,
+                    chosen,
+                    self.database,
+                    anew=True,
+                    wait_s=LOCK_WAIT_S,
+                    progress=self.progress,
+                )
             except (HeldError, TopicError) as error:
                 left[chosen.id] = error
         return left

@@ -33,7 +33,6 @@ from hybridlog_storage.mongo.index_documents import IndexState
 if TYPE_CHECKING:
     from hybridlog.opened import OpenStore
     from hybridlog_storage.catalog import RecordingEntry
-    from hybridlog_storage.mongo.database import Database
 
 
 def change(
@@ -274,14 +273,9 @@ def remove_if(
                 shared.catalog.remove(entry.id)
             if database is not None:
                 with suppress(DatabaseError):
-                    _clear(database, entry)
+                    state = IndexState(database)
+                    state.begin(entry)
+                    state.clear(entry)
+                    state.remove([entry.key])
     finally:
         shared.catch_up()
-
-
-def _clear(database: Database, entry: RecordingEntry) -> None:
-    """Remove a recording from the index."""
-    state = IndexState(database)
-    state.begin(entry)
-    state.clear(entry)
-    state.remove([entry.key])

@@ -318,7 +318,12 @@ class _Planning:
             size = sum(file.bytes for file in manifest.present.values())
             if not logs or rules.is_never(manifest.tags):
                 others += size
-            elif age is not None and self._is_old(manifest, logs[-1], parse_duration(age)):
+            elif (
+                age is not None
+                and manifest.is_ended
+                and not manifest.pins
+                and self._is_older(logs[-1], parse_duration(age))
+            ):
                 self._step(Step(manifest.name, manifest.id, (), size, f"fields older than {age}"))
             else:
                 others += sum(one.size + one.row_bytes for one in logs if one.stays)
@@ -337,9 +342,6 @@ class _Planning:
     def _is_older(self, one: Held, age: int) -> bool:
         # The age of what a clock that was not set has written is unknown.
         return _CLOCK_WAS_SET <= one.written <= self._now - age
-
-    def _is_old(self, manifest: Manifest, last: Held, age: int) -> bool:
-        return manifest.is_ended and not manifest.pins and self._is_older(last, age)
 
     def _refuse(self, needed: int) -> None:
         """Leave out a quota that cannot be kept: it would take all, and miss what it is for."""

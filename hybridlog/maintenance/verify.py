@@ -229,10 +229,10 @@ class _Check(Struct):
         except StoreError as error:
             found, has_summary = [], file.kind == "rows" or not isinstance(error, SegmentError)
             yield file.name, str(error), RESTORE
-        if not has_summary or (found and not found[0].offset):  # or it is another one
+        if not has_summary or (found and not found[0][0]):  # or it is another one
             self.lost[file.number, WHOLE] = ""
         cure = RESTORE if has_summary or found[1:] else _REPAIR
-        for at, problem, _ in found:
+        for at, problem in found:
             yield f"{file.name} byte {at}", problem, cure
 
     def _others(self, listing: Listing, manifest: Manifest) -> None:

@@ -323,7 +323,8 @@ def record(
             "kind": source.kind,
             "profile": source.profile,
             "bytes": source.size_bytes,
-            **_identity(fingerprint),
+            "fingerprint": fingerprint.whole,
+            "parts": fingerprint.parts if 1 < len(fingerprint.parts) <= _MAX_PARTS else (),
         },
         settings=options.settings,
         no_index=options.no_index,
@@ -469,13 +470,6 @@ def _check_result(source: Source, writer: RecordingWriter, options: RecordOption
         raise TopicError(
             f"{source.path}: no message is on the topics asked for; the log has: {topics}"
         )
-
-
-def _identity(fingerprint: Fingerprint) -> dict[str, object]:
-    """The fingerprint of a log in the description of its recording."""
-    several = 1 < len(fingerprint.parts) <= _MAX_PARTS
-    parts = {"parts": list(fingerprint.parts)} if several else {}
-    return {"fingerprint": fingerprint.whole, **parts}
 
 
 def _check_new(

@@ -130,11 +130,16 @@ class RunningRecording:
         return [
             *joined([*(row for row in sealed if row["cause"] != Cause.SEGMENT), *flushed]),
             *(row for row in sealed if row["cause"] == Cause.SEGMENT),
-            *(_damaged(*one) for one in damaged),
+            *(  # an unknown number of messages at unknown times
+                loss_values(
+                    Loss(
+                        Cause.SEGMENT,
+                        reason=reason,
+                        file=f"{number:06d}{OPEN_SUFFIX}",
+                        offset=offset,
+                        length=length,
+                    )
+                )
+                for number, reason, offset, length in damaged
+            ),
         ]
-
-
-def _damaged(number: int, reason: str, offset: int | None, length: int | None) -> dict[str, Any]:
-    """A row for an unknown number of messages at unknown times."""
-    file = f"{number:06d}{OPEN_SUFFIX}"
-    return loss_values(Loss(Cause.SEGMENT, reason=reason, file=file, offset=offset, length=length))

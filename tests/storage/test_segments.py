@@ -109,7 +109,7 @@ def recorder(
 
 
 def problems(path: Path, digest: str = "") -> list[tuple[int, str]]:
-    return [(at, problem) for at, problem, _ in damage_of(path, digest)[0]]
+    return damage_of(path, digest)[0]
 
 
 def summary_of(path: Path, number: int) -> SegmentSummary:
@@ -596,8 +596,8 @@ def test_all_that_is_wrong_is_told_at_once(tmp_path: Path) -> None:
     path.write_bytes(damaged)
     read: list[int] = []
     found, has_summary = damage_of(path, progress=read.append)
-    assert [(one.offset, one.chunk) for one in found] == [(chunks[0].place.offset, 0)]
-    assert found[0].problem.startswith("chunk 0 is lost (messages: /large 1): ")
+    assert [at for at, _ in found] == [chunks[0].place.offset]
+    assert found[0][1].startswith("chunk 0 is lost (messages: /large 1): ")
     assert read == sorted(read)
     assert has_summary
     # Without its summary, what has a checksum of its own is still looked at.
@@ -606,4 +606,4 @@ def test_all_that_is_wrong_is_told_at_once(tmp_path: Path) -> None:
     path.write_bytes(damaged)
     found, has_summary = damage_of(path)
     assert not has_summary
-    assert chunks[0].place.offset in [one.offset for one in found]
+    assert chunks[0].place.offset in dict(found)

@@ -403,11 +403,13 @@ class SegmentFile:
         """
         final = self.path.with_name(sealed_name(self.number))
         with self._explained("sealing"):
-            if self.path != final and _is_there(final):
-                raise StoreError(
-                    f"{final} is there already, so {self.path} cannot be sealed. "
-                    "Move one of them out of the store."
-                )
+            if self.path != final:
+                with suppress(FileNotFoundError):
+                    files.status(final)
+                    raise StoreError(
+                        f"{final} is there already, so {self.path} cannot be sealed. "
+                        "Move one of them out of the store."
+                    )
             if self._sealed is None:
                 # In one write: without room the file is unchanged, and can be sealed again.
                 content = self.content
@@ -447,14 +449,6 @@ class SegmentFile:
 
     def _explained(self, doing: str) -> AbstractContextManager[None]:
         return files.explained(self.path, doing)
-
-
-def _is_there(path: Path) -> bool:
-    try:
-        files.status(path)
-    except FileNotFoundError:
-        return False
-    return True
 
 
 def _joined(records: Iterable[McapRecord]) -> bytes:

@@ -352,7 +352,8 @@ def recover_segment(
                 f"{final} is sealed, and {path} lies beside it. Move one of them out of the store."
             )
         with SegmentReader(path, number) as reader:
-            walk = _walked(reader)
+            walk = Walk(reader, reads=True)
+            walk.go_on()
             damage = [f"byte {one.offset}: {one.reason}" for one in walk.damaged]
             if not (walk.recording or walk.table.chunks or walk.attachments or damage):
                 files.unlink(path)
@@ -372,12 +373,6 @@ def recover_segment(
             finally:
                 segment.abandon()
     return found
-
-
-def _walked(reader: SegmentReader) -> Walk:
-    walk = Walk(reader, reads=True)
-    walk.go_on()
-    return walk
 
 
 def _damage(walk: Walk) -> dict[int, str]:
@@ -407,7 +402,8 @@ def rebuild_summary(path: Path) -> bool:
     """Seal a segment again of which the summary alone is damaged; False if more is."""
     number = int(path.name.partition(".")[0])
     with SegmentReader(path, number) as reader:
-        walk = _walked(reader)
+        walk = Walk(reader, reads=True)
+        walk.go_on()
     if _damage(walk) or walk.recording is None or not walk.is_complete:
         return False
     opened = path.with_name(f"{number:06d}{OPEN_SUFFIX}")
@@ -418,25 +414,14 @@ def rebuild_summary(path: Path) -> bool:
     return True
 
 
-class SegmentDamage(NamedTuple):
-    """A damaged place of a segment; `offset` is the byte where it starts.
-
-    `chunk` is the number of a chunk that cannot be read; None for something else.
-    """
-
-    offset: int
-    problem: str
-    chunk: int | None = None
-
-
 def damage_of(
     path: Path, digest: str = "", progress: Callable[[int], None] | None = None
-) -> tuple[list[SegmentDamage], bool]:
+) -> tuple[list[tuple[int, str]], bool]:
     """All damage in a sealed segment; its records are read only if the digest differs.
 
-    It is in file order, but for a damaged summary, which comes first; with it comes whether the
-    summary is whole. `digest` is that of the manifest; empty if it lists none. `progress` is called
-    with the number of bytes read so far.
+    It is byte and problem of each place, in file order, but for a damaged summary, which comes
+    first; with it comes whether the summary is whole. `digest` is that of the manifest; empty if
+    it lists none. `progress` is called with the number of bytes read so far.
     """
     with SegmentReader(path, 0) as reader:
         if reader.digest(progress) == digest:
@@ -446,21 +431,18 @@ def damage_of(
             summary = reader.summary()
         except SegmentError as error:
             walk.go_on()
-            found = [SegmentDamage(*one) for one in _damage(walk).items()]
-            return [SegmentDamage(max(reader.size - 1, 0), str(error)), *found], False
+            return [(max(reader.size - 1, 0), str(error)), *_damage(walk).items()], False
         walk.channels |= summary.channels
         walk.go_on()
-    why, whole, found = _damage(walk), {*walk.table.build().chunks["offset"].tolist()}, []
+    found, whole = _damage(walk), {*walk.table.build().chunks["offset"].tolist()}
     for place in summary.chunks:
         if place.offset not in whole:
             parts = summary.table.chunk_parts(place.number)[["channel", "messages"]].tolist()
             lost = ", ".join(f"{summary.channels[c].topic} {count}" for c, count in parts[:5])
             lost += ", ..." if parts[5:] else ""
-            reason = why.pop(place.offset, "it cannot be read")
+            reason = found.get(place.offset, "it cannot be read")
             problem = f"chunk {place.number} is lost (messages: {lost}): {reason}"
-            found.append(SegmentDamage(place.offset, problem, place.number))
-    found = sorted([*found, *(SegmentDamage(*one) for one in why.items())])
+            found[place.offset] = problem
     if digest and not found:
-        problem = "it is not the file that the manifest lists: their digests differ"
-        found = [SegmentDamage(0, problem)]
-    return found, True
+        found[0] = "it is not the file that the manifest lists: their digests differ"
+    return sorted(found.items()), True
