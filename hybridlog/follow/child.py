@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
+from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -28,8 +29,6 @@ from hybridlog_storage.errors import (
 )
 
 if TYPE_CHECKING:
-    from multiprocessing.connection import Connection
-
     from hybridlog.query.predicate.tree import Predicate
     from hybridlog.shared import Shared
     from hybridlog_storage.catalog import RecordingEntry
@@ -125,8 +124,6 @@ class FollowerProcess:
 
     def start(self) -> None:
         """Begin."""
-        import multiprocessing.connection  # noqa: F401 - not while messages come
-
         self._thread.start()
 
     def finish(self, entry: RecordingEntry) -> RecordingEntry:
@@ -192,8 +189,6 @@ class FollowerProcess:
 
     def _follow(self) -> bool:
         """Start it, and hear it to its end; True if it has done everything."""
-        from multiprocessing import Pipe
-
         ours, theirs = Pipe()
         with ours:
             with theirs:
