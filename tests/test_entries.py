@@ -305,6 +305,15 @@ def test_without_a_manifest_most_segments_say_what_recording_it_is(
     assert kept(entry) == by_topic(1, 2, 3)
 
 
+def test_a_segment_that_the_manifest_does_not_list(made: Made) -> None:
+    made.drop(1)
+    # It answers, and is listed by the next one that may write.
+    check(made.entry())
+    made.adopt()
+    assert made.manifest().logs.keys() == {0, 1, 2, 3}
+    check(made.entry())
+
+
 def test_what_a_crash_took_of_a_listed_segment(made: Made) -> None:
     """It was listed with all its messages, and came out of the crash with fewer."""
     there = made.manifest().logs[3]
