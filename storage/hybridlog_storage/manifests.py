@@ -40,7 +40,6 @@ _ODD: Final = frozenset({0, errno.EISDIR, errno.ELOOP, errno.ENOTDIR})  # no fil
 MANIFESTS: Final = "manifests"
 RECORDINGS: Final = "recordings"
 _SUFFIX: Final = ".json"
-_NEW: Final = ".new"
 _ALL: Final = ".lock"
 MANIFEST_LOCK: Final = "manifest.lock"
 WRITER_LOCK: Final = "writer.lock"
@@ -276,15 +275,12 @@ class DiskManifests(Manifests):
 
     def _write(self, path: Path, data: bytes) -> None:
         """Write a manifest whose lock is held; a power cut never leaves a part of it."""
-        new = path.with_name(f".{path.stem}{_NEW}")
         modified = time.time_ns()
         with suppress(FileNotFoundError):
             # Clocks of file systems tick in milliseconds, and sizes and inodes come again: what
             # was read of a manifest must never pass for what another one says.
             modified = max(modified, files.status(path).st_mtime_ns + 1)
-        with suppress(FileNotFoundError):
-            files.unlink(new)  # of a writer that died
-        files.write_file(path, data, modified=modified, temporary=new)
+        files.write_file(path, data, modified=modified)
 
     def restore(self, recording: str, make: Callable[[Manifest | None], Manifest]) -> Manifest:
         """Make a manifest again that is lost or damaged; returns the one there if it can be read.

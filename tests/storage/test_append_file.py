@@ -179,13 +179,15 @@ def test_a_small_file_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
     steps = Steps()
     with through(steps):
         files.write_file(tmp_path / "f", b"old")
-    assert [what for what, _ in steps.log] == ["create", "write", "sync", "rename", "sync"]
-    assert [name for _, name in steps.log][3:] == ["f", tmp_path.name]
+    assert [what for what, _ in steps.log] == [
+        *("unlink", "create", "write", "sync", "rename", "sync")
+    ]
+    assert [name for _, name in steps.log][4:] == ["f", tmp_path.name]
     for number in range(len(steps.log)):
         failing = Steps(fail_from=number, fail_until=number + 1)
         with through(failing), pytest.raises(OSError, match="no space"):
             files.write_file(tmp_path / "f", b"new")
-        want = b"new" if number == 4 else b"old"
+        want = b"new" if number == 5 else b"old"
         assert (tmp_path / "f").read_bytes() == want
         assert [path.name for path in tmp_path.iterdir()] == ["f"]
         (tmp_path / "f").write_bytes(b"old")

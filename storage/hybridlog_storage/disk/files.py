@@ -122,19 +122,15 @@ def left_over(views: Sequence[memoryview], done: int) -> list[memoryview]:
 
 
 def write_file(
-    path: Path,
-    content: bytes,
-    *,
-    sync: bool = True,
-    modified: int | None = None,
-    temporary: Path | None = None,
+    path: Path, content: bytes, *, sync: bool = True, modified: int | None = None
 ) -> None:
-    """Write a small file atomically. It replaces a file or symlink of its name.
+    """Write a small file atomically, as the only writer. It replaces a file or symlink of its name.
 
-    With `sync` it is on the disk when this returns. `modified` is in ns. `temporary` is a free name
-    beside it, until all is written; None for a random one.
+    With `sync` it is on the disk when this returns. `modified` is in ns.
     """
-    temporary = temporary or path.with_name(f".{path.name}.{secrets.token_hex(8)}")
+    temporary = path.with_name(f".{path.name}.new")
+    with suppress(FileNotFoundError):
+        unlink(temporary)  # of a writer that died
     fd = open_file(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
     try:
         try:
