@@ -58,7 +58,7 @@ class DocumentAssembler:
     def __init__(self, key: str, channel: Channel) -> None:
         self._key = key
         self._channel = channel
-        self._tails: dict[str | None, _Tail] = {}
+        self._tail = _Tail(key, channel, None)
 
     def assemble(
         self,
@@ -72,11 +72,7 @@ class DocumentAssembler:
         `rows` is intp[k]; `body` is uint8[k, w], the BSON elements of each message's fields.
         `error` is the reason for missing ones, for `_meta.error`.
         """
-        tail = self._tails.get(error)
-        if tail is None:
-            if len(self._tails) > 256:
-                self._tails.clear()
-            tail = self._tails[error] = _Tail(self._key, self._channel, error)
+        tail = self._tail if error is None else _Tail(self._key, self._channel, error)
         count, fields = body.shape
         width = _HEAD_WIDTH + fields + len(tail.template)
         out = np.empty((count, width), np.uint8)

