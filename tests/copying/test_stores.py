@@ -95,7 +95,7 @@ def test_payloads_expire_here_when_they_are_proved_there(robots: Path, tmp_path:
     """A damaged copy is mended first."""
     robot, lab = tmp_path / "robot", tmp_path / "lab"
     shutil.copytree(robots, robot)
-    right = {label: answers(robot, label) for label in STATES}
+    right = all_answers(robot)
     with hl.open(robot, mongo="none") as store:
         store.copy(lab, ["calm"])
         flip(places.segment(lab, "calm"), 1 / 3)
@@ -104,12 +104,13 @@ def test_payloads_expire_here_when_they_are_proved_there(robots: Path, tmp_path:
         assert report.freed_bytes
         with pytest.raises(UsageError, match="cannot expire"):
             store.copy(lab, None, CopyOptions(then_expire=True, only_fields=True))
+    here = all_answers(robot)
+    assert all_answers(lab) == right
     for label in STATES:
         is_gone = label in {"recorded", "damaged", "driven", "calm"}  # a pin keeps the noted one
-        found = answers(robot, label)
+        found = here[label]
         assert (found != right[label]) == is_gone, label
         assert found == {key: value for key, value in right[label].items() if key in found}
-        assert answers(lab, label) == right[label]
     told = f"{lab} has more payloads of recorded; ask there"
     assert told in " ".join(answer("info", "recorded", store=robot).out.split())
     said = answer("fetch", "-t", "/cloud", "-r", "recorded", "--count", "--where", "data[0] > 0",
