@@ -28,7 +28,7 @@ from msgspec import Struct, field
 
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import LOCK_WAIT_S, StoreDirectory
-from hybridlog_storage.errors import RecordingExistsError, StoreError, unreadable
+from hybridlog_storage.errors import ExistsError, StoreError, unreadable
 from hybridlog_storage.manifest import File, Manifest, digest_of, hasher, replace
 from hybridlog_storage.manifests import (
     MANIFEST_LOCK,
@@ -481,7 +481,7 @@ class _Copy:
             )
         if there is None:
             # Another process may be faster.
-            with suppress(RecordingExistsError), manifests.creating() as create:
+            with suppress(ExistsError), manifests.creating() as create:
                 made = replace(here, name=self._how.named(here.name))
                 create(made)
                 return made

@@ -117,10 +117,6 @@ class BucketError(HybridlogError):
     exit_code = 5
 
 
-class ObjectExistsError(BucketError):
-    """An object of this name exists, with other content."""
-
-
 class ObjectChangedError(BucketError):
     """An object is not the version any more that was read. Ask again."""
 
@@ -129,8 +125,8 @@ class ManifestError(StoreError):
     """A manifest that is damaged. `verify --repair` makes it again."""
 
 
-class RecordingExistsError(StoreError):
-    """A recording that is in the store already."""
+class ExistsError(StoreError):
+    """A recording that is in the store already, or an object of this name in a bucket."""
 
 
 class RecordingGoneError(StoreError):

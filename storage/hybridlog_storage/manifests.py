@@ -19,10 +19,10 @@ from typing import TYPE_CHECKING, ClassVar, Final
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import (
     DiskFullError,
+    ExistsError,
     HeldError,
     ManifestError,
     ObjectChangedError,
-    RecordingExistsError,
     RecordingGoneError,
     StoreError,
     unreadable,
@@ -234,7 +234,7 @@ class DiskManifests(Manifests):
     def _create(self, manifest: Manifest) -> None:
         data, path = encode(manifest), self.path(manifest.id)
         if os.path.lexists(path):
-            raise RecordingExistsError(f"There is a recording {manifest.id} already.")
+            raise ExistsError(f"There is a recording {manifest.id} already.")
         folder = self._recordings / manifest.id
         with files.explained(path, "writing"):
             self._make_lock(folder)

@@ -22,10 +22,10 @@ from urllib.parse import unquote, urlsplit
 from hybridlog_storage.copy import Place, folder_of
 from hybridlog_storage.disk.directory import LOCK, LOCK_WAIT_S
 from hybridlog_storage.errors import (
+    ExistsError,
     HeldError,
     HybridlogError,
     ObjectChangedError,
-    RecordingExistsError,
     StoreError,
     UsageError,
 )
@@ -217,7 +217,7 @@ class _ServerManifests(Manifests):
         self.place, self._server = server.address, server
 
     def _create(self, manifest: Manifest) -> None:
-        exists = RecordingExistsError(f"There is a recording {manifest.id} already.")
+        exists = ExistsError(f"There is a recording {manifest.id} already.")
         self._put(manifest.id, encode(manifest), "", exists)
 
     def _get(self, recording: str) -> tuple[bytes, str]:

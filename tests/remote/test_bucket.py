@@ -8,8 +8,8 @@ import pytest
 
 from hybridlog_storage.errors import (
     BucketError,
+    ExistsError,
     ObjectChangedError,
-    ObjectExistsError,
     UsageError,
 )
 from hybridlog_storage.remote.bucket import Bucket
@@ -23,7 +23,7 @@ def test_create_replace_read_delete(address: str, proxy: Proxy) -> None:
     bucket = Bucket(address)
     version = bucket.create("a/one", DATA)
     assert bucket.create("a/one", DATA) == version
-    with pytest.raises(ObjectExistsError):
+    with pytest.raises(ExistsError):
         bucket.create("a/one", DATA[1:])
     bucket.delete(["a/one"])
     assert bucket.create("a/one", DATA[::-1]) != version

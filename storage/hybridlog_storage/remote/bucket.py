@@ -39,9 +39,9 @@ from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import (
     BucketError,
+    ExistsError,
     MissingDependencyError,
     ObjectChangedError,
-    ObjectExistsError,
     ResourceError,
     UsageError,
 )
@@ -155,18 +155,18 @@ class Bucket:
         return self._again(name, read)
 
     def create(self, name: str, content: bytes) -> str:
-        """Create an object of a free name, else `ObjectExistsError`; returns its version.
+        """Create an object of a free name, else `ExistsError`; returns its version.
 
         One that has this very content counts as created.
         """
         self._check("create")
-        with suppress(ObjectExistsError):  # by another writer, or by this one whose answer is lost
+        with suppress(ExistsError):  # by another writer, or by this one whose answer is lost
             return self._put(name, content, "create")
         with suppress(FileNotFoundError):
             about, found = self.read_whole(name, len(content))
             if found == content:
                 return about.version
-        raise ObjectExistsError(f"{self._place(name)} exists, with other content.")
+        raise ExistsError(f"{self._place(name)} is there already, with other content.")
 
     def replace(self, name: str, content: bytes, version: str) -> str:
         """Replace an object that still has a version; returns the new one.
@@ -207,7 +207,7 @@ class Bucket:
             for each in (mode, mode) if mode == "create" else (mode,):
                 self._put(name, b"1", each)  # at last it is taken, or there is none
                 made.append(name)
-        except (FileNotFoundError, ObjectChangedError, ObjectExistsError):
+        except (FileNotFoundError, ObjectChangedError, ExistsError):
             self._honoured.add(type(mode))
             return
         except exceptions.NotSupportedError:
@@ -259,7 +259,7 @@ class Bucket:
         except exceptions.PreconditionError as error:
             raise ObjectChangedError(f"{self._place(name)} was changed meanwhile.") from error
         except exceptions.AlreadyExistsError as error:
-            raise ObjectExistsError(f"{self._place(name)} exists.") from error
+            raise ExistsError(f"{self._place(name)} exists.") from error
         except exceptions.NotSupportedError:
             raise
         except (exceptions.BaseError, ValueError) as error:

@@ -31,9 +31,8 @@ from hybridlog_storage.disk.directory import (
     gone,
 )
 from hybridlog_storage.errors import (
+    ExistsError,
     ObjectChangedError,
-    ObjectExistsError,
-    RecordingExistsError,
     RecordingGoneError,
     StoreError,
 )
@@ -142,10 +141,7 @@ class BucketManifests(Manifests):
 
     def _create(self, manifest: Manifest) -> None:
         data = encode(manifest)
-        try:
-            version = self._bucket.create(_name_of(manifest.id), data)
-        except ObjectExistsError:
-            raise RecordingExistsError(f"There is a recording {manifest.id} already.") from None
+        version = self._bucket.create(_name_of(manifest.id), data)
         self._note(manifest.id, data, version)
 
     def _replace(self, recording: str, data: bytes, version: str) -> None:
@@ -285,7 +281,7 @@ class RemoteDirectory(StoreDirectory):
     @classmethod
     def create_in(cls, address: str) -> RemoteDirectory:
         """The store at an address; made if there is none."""
-        with suppress(ObjectExistsError):  # it is there, or another process makes it, too
+        with suppress(ExistsError):  # it is there, or another process makes it, too
             new = StoreSettings(secrets.token_hex(16), mongo=NONE)
             mount(address).bucket.create(SETTINGS, settings_text(new))
         return cls(address)
