@@ -17,9 +17,7 @@ import errno
 import fcntl
 import math
 import os
-import random
 import resource
-import secrets
 import shutil
 import stat
 import time
@@ -184,7 +182,7 @@ def _lock(fd: int, wait_s: float) -> None:
         except BlockingIOError:
             if time.monotonic() >= end:
                 raise
-            pause(random.uniform(0, _POLL_S))  # noqa: S311 - no secret
+            pause(_POLL_S * os.urandom(1)[0] / 255)
         else:
             return
 
@@ -427,7 +425,7 @@ class Unfinished:
 
 def beside(final: Path) -> Unfinished:
     """An unused name in the same directory."""
-    return Unfinished(final.with_name(f".{final.name[:100]}.{secrets.token_hex(6)}.partial"))
+    return Unfinished(final.with_name(f".{final.name[:100]}.{os.urandom(6).hex()}.partial"))
 
 
 @contextmanager
