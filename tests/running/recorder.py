@@ -9,7 +9,7 @@ from tests.running.running import begun
 
 
 def main() -> None:
-    with begun(Path(sys.argv[1]), sys.argv[2], 60) as running:
+    with begun(Path(sys.argv[1]), sys.argv[2], 60, "none") as running:
         print("begun", flush=True)
         running.write(100_000, 0.003)
 

@@ -116,10 +116,13 @@ class Running:
 
 
 @contextmanager
-def begun(path: Path, kind: str, steps: int = 200) -> Iterator[Running]:
+def begun(path: Path, kind: str, steps: int = 200, mongo: str | None = None) -> Iterator[Running]:
     """A recording with the first steps of the sequence."""
     options = LiveOptions(settings=SETTINGS[kind], flush_interval_s=FLUSH_S, tags=TAGS)
-    with hl.open(path, create=True) as store, hl.open(path) as before:
+    with (
+        hl.open(path, create=True, mongo=mongo) as store,
+        hl.open(path, mongo=mongo) as before,
+    ):
         assert LABEL not in before.recordings().names
         with store.start(LABEL, options) as recording:
             running = Running(recording, store, before)

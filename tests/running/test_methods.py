@@ -86,6 +86,7 @@ def check_all(store: hl.Store, running: Running) -> None:
     assert sent_of(then, running).counts == known.counts
 
 
+@pytest.mark.parametrize("running", ["many"], indirect=True)
 def test_one_moment_while_segments_are_sealed(running: Running) -> None:
     """A snapshot sees one state of the recording, whatever is sealed meanwhile."""
     segments = running.before.entry(LABEL).segments

@@ -119,7 +119,7 @@ def test_payloads_expire_while_it_is_recorded(tmp_path: Path) -> None:
         assert misindexed(store) == {}
 
 
-@pytest.mark.parametrize("kind", ["one", "many"])
+@pytest.mark.parametrize("kind", [pytest.param("one", marks=pytest.mark.exhaustive), "many"])
 def test_a_killed_recorder(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "store"
     process = subprocess.Popen(
@@ -172,7 +172,7 @@ def test_documents_are_a_beginning(running: Running) -> None:
 
 def test_extras_and_what_is_shown(tmp_path: Path) -> None:
     """Attachments and metadata of a log that is being recorded; completion."""
-    with begun(tmp_path / "store", "one", 130) as found:
+    with begun(tmp_path / "store", "one", 130, "none") as found:
         record = tmp_path / "calibration.yaml"
         record.write_bytes(b"fx: 500")
         with record.open("rb") as file:
@@ -202,7 +202,7 @@ def test_extras_and_what_is_shown(tmp_path: Path) -> None:
 @pytest.fixture
 def ended(tmp_path: Path) -> Iterator[tuple[hl.Store, Known]]:
     """A handle that has asked about a recording, and which has been closed since."""
-    with begun(tmp_path / "store", "many", 130) as found:
+    with begun(tmp_path / "store", "many", 130, "none") as found:
         with hl.open(found.path, mongo=NO_MONGODB) as store:
             known = found.flushed()
             assert rows(store.topic("arm")) == sent(known.of("/arm"))
@@ -211,7 +211,7 @@ def ended(tmp_path: Path) -> Iterator[tuple[hl.Store, Known]]:
 
 
 def test_sealed_between_a_look_and_reading(tmp_path: Path) -> None:
-    with begun(tmp_path / "store", "many", 130) as found:
+    with begun(tmp_path / "store", "many", 130, "none") as found:
         known = found.flushed()
         with hl.open(found.path, mongo=NO_MONGODB) as store:
             then = store.snapshot()
@@ -248,11 +248,11 @@ def test_removed_meanwhile(ended: tuple[hl.Store, Known]) -> None:
 def test_what_questions_read(tmp_path: Path) -> None:
     """Ended recordings are asked without the running one; that is read once."""
     path = tmp_path / "store"
-    with hl.open(path, create=True) as store, store.start("ended") as recording:
+    with hl.open(path, create=True, mongo="none") as store, store.start("ended") as recording:
         for one in messages(0, 50, 0):
             if one.topic == "/said":
                 recording.write(SAID, one.raw, log_time=one.log_time)
-    with begun(path, "one", 130) as found, hl.open(path, mongo=NO_MONGODB) as store:
+    with begun(path, "one", 130, "none") as found, hl.open(path, mongo=NO_MONGODB) as store:
         about_ended = store.topic("said").in_recording("ended")
         assert about_ended.count() == 50
         cost = cost_of(store, lambda: (rows(about_ended), about_ended.where("n > 3").count()))
