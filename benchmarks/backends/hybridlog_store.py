@@ -81,8 +81,6 @@ class Hybridlog(Backend):
 
             settings = replace(LIVE_SETTINGS, compression=self.compression)
             self._recording = self.store.start("benchmark", settings=settings)
-            # As a recorder would that has just subscribed.
-            self._recording.expect(*channels)
 
     def insert(self, channel: int, log_time: int, payload: bytes) -> None:
         assert self._recording is not None

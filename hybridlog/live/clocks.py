@@ -43,25 +43,17 @@ class SimulatedTime:
     """Passes messages on to a recorder, with the time of `/clock` as their receive time.
 
     It is a `Sink`; what is not about times is done by the recorder. Messages that come before the
-    clock are held in `max_bytes`. `drop` counts one as received and lost: its channel, bytes of its
-    payload, cause, a text for the user, time of the loss (ns).
+    clock are held in `max_bytes`.
     """
 
-    def __init__(
-        self,
-        recorder: Sink,
-        drop: Callable[[Channel, int, Cause, str, int], None],
-        max_bytes: int,
-    ) -> None:
+    def __init__(self, recorder: Sink, max_bytes: int) -> None:
         self._recorder = recorder
-        self._drop = drop
         self._max_bytes = max_bytes
-        self._is_clock_recorded = True
         self._lock = threading.Lock()
         self._latest = (0, 0)
         self._ticks: deque[tuple[int, int]] = deque(maxlen=_MAX_TICKS)
-        # What is done when the clock comes, and when it does not.
-        self._held: list[tuple[_Record, Callable[[], None]]] | None = []
+        # What is done when the clock comes, and what is lost when it does not.
+        self._held: list[tuple[_Record, Loss]] | None = []
         self._held_bytes = 0
 
     @property
@@ -101,18 +93,14 @@ class SimulatedTime:
         """Count what is held as lost, if the clock never came."""
         with self._lock:
             held, self._held = self._held, None
-        for _, drop in held or ():
-            drop()
+        for _, loss in held or ():
+            self._recorder.lost(loss)
 
     # The sink.
 
     def wants(self, topic: str, type_name: str) -> bool:
-        """See `Sink.wants`; the clock is needed even if it is not recorded."""
-        wanted = self._recorder.wants(topic, type_name)
-        if topic == CLOCK:
-            self._is_clock_recorded = wanted
-            return True
-        return wanted
+        """See `Sink.wants`; the clock is recorded in any case."""
+        return topic == CLOCK or self._recorder.wants(topic, type_name)
 
     def take(
         self,
@@ -133,45 +121,39 @@ class SimulatedTime:
                 )
             else:
                 self._tick(now, received)
-            if not self._is_clock_recorded:
-                return
 
         def record(at: Callable[[int], int]) -> None:
             self._recorder.take(
                 channel, payload, received=at(received), sent=sent, sequence=sequence
             )
 
-        def drop() -> None:
-            detail = f"it came before the first time of {CLOCK}"
-            self._drop(channel, len(payload), Cause.CLOCK, detail, received)
-
-        self._pass(len(payload), record, drop)
+        detail = f"it came before the first time of {CLOCK}"
+        loss = Loss(Cause.CLOCK, channel.topic, 1, received, received, detail)
+        self._pass(len(payload), record, loss)
 
     def lost(self, loss: Loss) -> None:
         """See `Sink.lost`."""
-        if loss.topic == CLOCK and not self._is_clock_recorded:
-            return
 
         def record(at: Callable[[int], int]) -> None:
             self._recorder.lost(replace(loss, first=at(loss.first or 0), last=at(loss.last or 0)))
 
-        self._pass(0, record, lambda: self._recorder.lost(loss))
+        self._pass(0, record, loss)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._recorder, name)
 
-    def _pass(self, size: int, record: _Record, drop: Callable[[], None]) -> None:
+    def _pass(self, size: int, record: _Record, loss: Loss) -> None:
         """Pass something on with the time of the clock, or hold it until there is one."""
         with self._lock:
             is_held, size = self._held is not None, size + _OVERHEAD
             fits = self._held_bytes + size <= self._max_bytes
             if self._held is not None and fits:
                 self._held_bytes += size
-                self._held.append((record, drop))
+                self._held.append((record, loss))
         if not is_held:
             record(self.at)
         elif not fits:
-            drop()
+            self._recorder.lost(loss)
 
     def _release(self, now: int) -> None:
         """Pass on what is held, in the order of arrival."""

@@ -62,7 +62,6 @@ _GROUPS = 10  # of files in the time of a ring, about
 _MAX_REPORTS = 1000
 _MAX_CACHED = 4096  # channel objects that are found without comparing their content
 _FULL_BYTES = 4 << 20  # of a manifest; then another recording goes on
-_MAX_EXPECTED = 1000  # channels whose definitions are parsed before their first message
 _SEQUENCES = 1 << 32
 _HELD_SHARE = 8  # of the memory budget, for messages that come before `/clock`
 _FITS_S = 5.0  # until options that fit no topic are told
@@ -181,7 +180,6 @@ class _RecordedChannel(Struct):
     throttle: Throttle | None
     whole_below: float
     reduced: Channel | None = None
-    is_complete: bool = False
 
 
 class Recorder:
@@ -218,7 +216,6 @@ class Recorder:
         self._topics: dict[str, TopicCounts] = {}
         self._lock = threading.Lock()
         self._said: set[str] = set()
-        self._expected = 0
         self._unended = len(sources)
         self._over = threading.Event()
         self.reason = ""  # for the end; empty while the recorder runs
@@ -236,7 +233,7 @@ class Recorder:
         self._simulated: SimulatedTime | None = None
         if options.use_sim_time:
             held = options.budget_bytes // _HELD_SHARE
-            self._simulated = SimulatedTime(self, self.drop, held)
+            self._simulated = SimulatedTime(self, held)
         self._sink = cast("Sink", self._simulated or self)
         self._target = LiveRecording(
             store.shared, self._begin_to_follow, options.name, self._of_recording()
@@ -309,6 +306,7 @@ class Recorder:
                 recording is removed.
         """
         try:
+            self.look()  # nothing is stored where there is no room
             if self._options.derives:
                 self._follower.start()
             for source in self._sources:
@@ -520,14 +518,6 @@ class Recorder:
         with self._lock:
             return self._options.matcher(topic)
 
-    def expect(self, channel: Channel) -> None:
-        """See `Sink.expect`."""
-        with self._lock:
-            self._expected += 1
-            too_many = self._expected > _MAX_EXPECTED
-        if not too_many:
-            self._target.expect(channel)
-
     def take(
         self,
         channel: Channel,
@@ -583,17 +573,10 @@ class Recorder:
         self._count_lost(loss.topic, loss.cause, loss.count or 0)
         self._target.ledger.note(loss)
 
-    def drop(self, channel: Channel, size: int, cause: Cause, detail: str, at: int) -> None:
-        """See `SimulatedTime`."""
-        recorded = self._recorded.get(channel) or self._meet(channel, None)
-        recorded.tally.add(size, at)
-        self._lose(recorded, cause, detail, at)
-
     def topic_came(self, topic: str, type_name: str) -> None:
         """See `Sink.topic_came`."""
-        if self.wants(topic, type_name):  # `/clock` may come unasked
-            with self._lock:
-                self._topic(topic, type_name).is_present = True
+        with self._lock:
+            self._topic(topic, type_name).is_present = True
 
     def topic_gone(self, topic: str) -> None:
         """See `Sink.topic_gone`."""
@@ -622,12 +605,12 @@ class Recorder:
 
     # Parts of `take`.
 
-    def _meet(self, channel: Channel, payload: bytes | None) -> _RecordedChannel:
-        """Look up a channel object by its content, or add it.
+    def _meet(self, channel: Channel, payload: bytes) -> _RecordedChannel:
+        """Look up a channel object by its content, or add it, with its first message.
 
-        Its first message may complete its definition; a dropped one has no payload.
-        A publisher that reconnects makes a new channel object with the same content. It
-        shares the old channel: a robot with a bad cable would otherwise use up all numbers.
+        That may complete its definition. A publisher that reconnects makes a new channel object
+        with the same content. It shares the old channel: a robot with a bad cable would otherwise
+        use up all numbers.
         """
         content = (
             channel.topic,
@@ -644,18 +627,13 @@ class Recorder:
                 hz = first_fit(self._options.throttles, topic)
                 priority = first_fit(self._options.priorities, topic)
                 recorded = _RecordedChannel(
-                    channel,
+                    completed(channel, [payload]),
                     Tally(),
                     None if hz is None else Throttle(hz),
                     WHOLE_BELOW["normal"] if priority is None else priority,
                 )
                 self._topic(topic, type_name).tallies.append(recorded.tally)
                 self._recorded_by_content[content] = recorded
-            if payload is None:
-                return recorded
-            if not recorded.is_complete:
-                recorded.channel = completed(recorded.channel, [payload])
-                recorded.is_complete = True
             if len(self._recorded) >= _MAX_CACHED:
                 self._recorded.clear()  # they are found again by content
             self._recorded[channel] = recorded
@@ -729,7 +707,7 @@ class Recorder:
         if options.duration_s is not None and state.elapsed_s >= options.duration_s:
             self._end("the duration is over")
             return
-        if self._goes_on and not self._over.is_set():
+        if self._goes_on and self._recorded and not self._over.is_set():
             with suppress(OSError):
                 manifest = self._directory.path / MANIFESTS / f"{self._target.id}.json"
                 self.is_full = files.status(manifest).st_size >= _FULL_BYTES

@@ -22,7 +22,6 @@ from msgspec import Struct, field
 
 from hybridlog.record.losses import Cause, Ledger
 from hybridlog.record.recorder import Capture, RecordReport
-from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.errors import DatabaseError, DiskFullError, UsageError
 from hybridlog_storage.manifest import Loss
 from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD
@@ -191,21 +190,6 @@ class LiveRecording:
         with self._closing:
             if not self._is_closing:
                 self.close()
-
-    def expect(self, *channels: Channel) -> None:
-        """Prepare for channels before their first message.
-
-        Parsing a definition takes some ten milliseconds. It is better to spend them before
-        messages come.
-
-        Raises:
-            UsageError: A channel cannot be stored, or the recording was closed.
-            DiskFullError: The disk is full.
-        """
-        self._check()
-        for channel in channels:
-            _check_channel(channel)
-            codec_for(channel).paths()
 
     def write(
         self,

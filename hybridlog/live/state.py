@@ -123,25 +123,18 @@ def states(directory: StoreDirectory, recording: str, every_s: float) -> Iterato
 
 
 def choose(directory: StoreDirectory, named: Sequence[str]) -> list[str]:
-    """The ids of recordings that recorders write; without names, the only one.
+    """The ids of recordings that recorders write, by ids or names; without names, the only one.
 
-    A name is that of a recording, its id, or the beginning of one of them. UsageError if no
-    recorder runs, or a name fits none or several.
+    UsageError if no recorder runs, or a name fits none, or none is named of several.
     """
-    names, found = running(directory), list[str]()
+    names = running(directory)
     if not names:
         raise UsageError("No recorder runs on this store; start one with `hybridlog record`.")
-    for name in named or [""]:
-        fitting = [one for one, known in names.items() if name in {one, known}] or [
-            one
-            for one, known in names.items()
-            if any(text.startswith(name) for text in (known, one, one[-16:]))
-        ]
-        if len(fitting) != 1:
-            what = f"{name!r} is no running recorder" if name else "Several recorders run"
-            raise UsageError(f"{what}: name one of {', '.join(names.values())}.")
-        found += fitting
-    return list(dict.fromkeys(found))
+    unknown = [name for name in named if name not in {*names, *names.values()}]
+    if unknown or (not named and len(names) > 1):
+        what = f"{unknown[0]!r} is no running recorder" if unknown else "Several recorders run"
+        raise UsageError(f"{what}: name one of {', '.join(names.values())}.")
+    return [one for one, known in names.items() if not named or {one, known} & {*named}]
 
 
 def _path(store: Path, recording: str) -> Path:

@@ -186,9 +186,8 @@ def test_a_recorder_is_visited(logs: Path, tmp_path: Path) -> None:
         store, "--replay", logs / "robot.bag", "--speed", 0.2, "--name", "first drive"
     ) as process:
         until_it_speaks(process)
-        # By name, by the beginning of the id, and by nothing at all.
         run("mark", "gripper slipped", "--set-tag", "trial=7", "-r", "first drive", store=store)
-        state = run("top", "first d", "--json", "--once", store=store).json
+        state = run("top", "first drive", "--json", "--once", store=store).json
         assert state["messages"] > 0
         shown = run("top", store=store).out
         assert "/imu/data" in shown

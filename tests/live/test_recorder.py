@@ -22,7 +22,6 @@ from msgspec.structs import replace
 
 import hybridlog as hl
 from hybridlog.live import recorder as recorder_module
-from hybridlog.live import recording as recording_module
 from hybridlog.live.recorder import (
     WHOLE_BELOW,
     Recorder,
@@ -179,19 +178,6 @@ def test_a_reduced_message_says_what_it_was(store: hl.Store, limit: Limit, tmp_p
     assert store.topic("/scan").fields("near").to_pandas()["near"].dropna().tolist() == [2.5, 2.5]
 
 
-def test_when_the_budget_is_spent_the_rest_is_counted(store: hl.Store, calls: Calls) -> None:
-    blocked = block_writing(calls)
-    robot = Running(store, replace(FREE, budget_bytes=1 << 20))
-    channel = text_channel()
-    for number in range(1000):
-        robot.speaker.say(channel, text("x" * 4000), SECOND + number)
-    blocked.set()
-    rows = robot.rows()
-    kept = in_segments(store, robot.recorder.name)
-    assert 300 < kept["/chatter", "ros1"] < 330
-    assert rows == {("/chatter", "queue"): 1000 - kept["/chatter", "ros1"]}
-
-
 def test_a_disk_that_has_room_for_little_more(
     store: hl.Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -259,15 +245,6 @@ def test_a_disk_without_room_for_a_message_leaves_no_recording(
     assert not store.directory.ids()
 
 
-def test_a_recorder_that_is_refused_at_once_leaves_no_recording(store: hl.Store) -> None:
-    robot = Running(store, replace(FREE, reserve_bytes=1 << 62))
-    robot.recorder.look()
-    robot.speaker.say(text_channel(), text("a"))
-    assert robot.recorder.stop() == []
-    assert robot.recorder.look().lost == {"disk": 1}
-    assert not store.directory.ids()
-
-
 @pytest.mark.mongo
 def test_what_no_follower_derives_is_made_later(store: hl.Store) -> None:
     robot = Running(store)
@@ -284,7 +261,7 @@ def test_what_no_follower_derives_is_made_later(store: hl.Store) -> None:
 
 
 def test_bounds_of_time_and_number(store: hl.Store) -> None:
-    robot = Running(store, replace(FREE, duration_s=0.05))
+    robot = Running(store, replace(FREE, duration_s=1.0))
     robot.speaker.say(text_channel(), text("x"))
     wait_for(lambda: robot.recorder.look() and robot.recorder.wait(0))
     assert robot.recorder.stop()[0].entry.messages == 1
@@ -395,26 +372,6 @@ def test_visitors(store: hl.Store) -> None:
     other.recorder.stop()
 
 
-def test_a_crash_loses_no_more_rows_than_messages(store: hl.Store, tmp_path: Path) -> None:
-    """What lies on the disk at a moment is what a `kill -9` leaves."""
-    robot = Running(store, replace(FREE, flush_interval_s=0.2))
-    for number in range(60):
-        now = time.time_ns()
-        robot.speaker.say(text_channel(), text(str(number)), now)
-        robot.recorder.lost(Loss(Cause.TRANSPORT, "/scan", 1, now, now))
-        time.sleep(0.02)
-    left = shutil.ignore_patterns("mongod*", "*.sock")
-    shutil.copytree(store.directory.path, tmp_path / "left", ignore=left)
-    robot.rows()
-    with hl.open(tmp_path / "left") as crashed:
-        crashed.shared.recover()
-        (recording,) = crashed.recordings()
-        assert recording.status == "recovered"
-        # 0.2 s are ten messages and ten rows; the machine may be slow.
-        assert recording.messages >= 40
-        assert sum(row["count"] for row in recording.losses) >= 40
-
-
 def test_a_mark_that_is_no_text(store: hl.Store) -> None:
     robot = Running(store)
     robot.mark("bad\udcff\udcfebytes", {"a": "\udc80"})
@@ -439,33 +396,18 @@ def test_the_reserve_holds_for_what_waits_in_memory(
     assert robot.recorder.stop() == []
     robot = Running(store, replace(FREE, reserve_bytes=120 << 20, budget_bytes=64 << 20))
     robot.recorder.look()
+    robot.speaker.say(text_channel(), text("a"))
     assert robot.recorder.wait(0)
+    assert robot.recorder.look().lost == {"disk": 1}
     assert robot.recorder.stopped_for_disk
     assert "only 157.3 MB left: free some, or lower --reserve." in robot.recorder.reason
     assert robot.recorder.stop() == []
-
-
-def test_what_is_expected_is_ready_before_its_first_message(
-    store: hl.Store, limit: Limit, calls: Calls
-) -> None:
-    limit(expected_topics=2)
-    prepared = calls(recording_module, "codec_for")
-    robot = Running(store)
-    channels = [text_channel(topic) for topic in ("/said", "/silent", "/one_too_many")]
-    for channel in channels:
-        robot.recorder.expect(channel)
-    assert [channel.topic for (channel,) in prepared] == ["/said", "/silent"]
-    robot.speaker.say(channels[0], text("x"))
-    (report,) = robot.recorder.stop()
-    assert [channel.topic for channel in report.entry.channels] == ["/said"]
-    assert store.topics() == ["/said"]
 
 
 def test_a_standard_type_without_its_definition(store: hl.Store) -> None:
     robot = Running(store)
     bare = Channel("/chatter", "ros1", Schema("std_msgs/String", "", b""))
     odd = Channel("/odd", "ros1", Schema("std_msgs/String", "", b""), {"md5sum": "1" * 32})
-    robot.recorder.drop(bare, 5, Cause.CLOCK, "no time yet", SECOND)
     for number in range(3):
         robot.speaker.say(bare, text(str(number)), SECOND + number)
         robot.speaker.say(odd, text(str(number)), SECOND + number)
@@ -478,7 +420,10 @@ def test_a_standard_type_without_its_definition(store: hl.Store) -> None:
 
 
 def test_fields_land_when_no_payload_finds_room(store: hl.Store, calls: Calls) -> None:
-    """Whatever their priority: three large messages are more than the budget."""
+    """Whatever their priority: three large messages are more than the budget.
+
+    What does not land is counted.
+    """
     blocked = block_writing(calls)
     rules = [priority_rule(f"/{word}", word) for word in ("low", "normal", "high")]
     options = replace(FREE, budget_bytes=4 << 20, priorities=rules)
@@ -486,10 +431,14 @@ def test_fields_land_when_no_payload_finds_room(store: hl.Store, calls: Calls) -
     for number in range(10):
         for rule in rules:
             robot.speaker.say(scan_channel(rule.pattern), scan(number, 3_000_000))
+    for _ in range(2000):
+        robot.speaker.say(text_channel(), text("x" * 4000))
     blocked.set()
     rows = robot.rows()
+    lost = rows.pop(("/chatter", "queue"))
     assert {cause for _, cause in rows} == {"degrade"}
     kept = in_segments(store, robot.recorder.name)
+    assert 0 < lost == 2000 - kept["/chatter", "ros1"] < 2000
     for rule in rules:
         assert kept[rule.pattern, "ros1"] + rows[rule.pattern, "degrade"] == 10
         assert kept[rule.pattern, "hybridlog.reduced"] == rows[rule.pattern, "degrade"]

@@ -209,9 +209,8 @@ def test_misuse(store: hl.Store) -> None:
         with pytest.raises(UsageError, match="out of range"):
             recording.write(own, b"", **wrong)
     recording.close()
-    for late in (lambda: recording.write(own, b""), lambda: recording.expect(own)):
-        with pytest.raises(UsageError, match="was closed"):
-            late()
+    with pytest.raises(UsageError, match="was closed"):
+        recording.write(own, b"")
     with pytest.raises(UsageError, match="memory budget"):
         store.start("talk", budget_bytes=10)
     with pytest.raises(UsageError, match="flush interval"):
@@ -261,8 +260,6 @@ def test_a_channel_that_cannot_be_stored_does_no_harm(store: hl.Store, bad: Any)
         with pytest.raises(UsageError, match=r"/a|None") as caught:
             recording.write(bad, text(b"bad"))
         str(caught.value).encode()
-        with pytest.raises(UsageError, match=r"/a|None"):
-            recording.expect(bad)
         recording.write(channel("/talk"), text(b"after"))
     assert [m.raw for m in store.topic("/talk")] == [text(b"before"), text(b"after")]
 

@@ -162,7 +162,7 @@ def test_nothing_goes_before_triggers_have_seen_it(
 ) -> None:
     start = child._START
     monkeypatch.setattr(child, "_START", f"import time; time.sleep(1); {start}")
-    robot = Robot(store, derives=True, triggers=[Trigger.of("/scan: id == 20")])
+    robot = Robot(store, derives=True, triggers=[Trigger.of("/scan: id == 80")])
     robot.run(0.9)
     assert ids(store)[0] == 0
     while not robot.recorder.look().let_go:
@@ -171,7 +171,7 @@ def test_nothing_goes_before_triggers_have_seen_it(
     robot.stop()
     (mark,) = store.topic(MARKS)
     at = mark.fields["end"]
-    assert 20 in [m.fields["id"] for m in store.topic("/scan") if m.log_time_ns <= at]
+    assert 80 in [m.fields["id"] for m in store.topic("/scan") if m.log_time_ns <= at]
 
 
 def test_latched_messages_in_force_stay_and_marks(store: hl.Store) -> None:

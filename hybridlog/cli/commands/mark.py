@@ -14,7 +14,7 @@ from hybridlog_storage.errors import StoreError, UsageError
 
 class _Given(InStore, Quiet):
     recording: tuple[str, ...] = option(
-        "Only this recorder (id or name of its recording, or the beginning of the id).",
+        "Only this recorder (id or name of its recording).",
         "RECORDING",
         short="-r",
     )

@@ -25,7 +25,7 @@ _SHORT = 60  # characters of a reason
 
 class _Given(Place):
     recording: str | None = argument(
-        "One of several recorders: id or name of its recording, or the beginning of the id.",
+        "One of several recorders: id or name of its recording.",
         "[RECORDING]",
     )
     once: bool = option("Show it once and end.")

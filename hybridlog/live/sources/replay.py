@@ -124,7 +124,6 @@ class ReplaySource(ThreadedSource):
         if channel.topic not in self._present:
             self._present.add(channel.topic)
             self._sink.topic_came(channel.topic, type_name)
-        self._sink.expect(channel)
         return channel
 
     def _report(self, damage: Damage) -> None:

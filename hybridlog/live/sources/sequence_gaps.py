@@ -76,7 +76,9 @@ class SequenceGapDetector:
             missing = (number - self.expected) % MODULUS
             self._trusted = self._trusted and missing <= self._max_gap
             if self._trusted:
-                self._wait(SequenceGap(missing, first, last))
+                if not self.waiting:
+                    self._messages_after = 0
+                self.waiting.append(SequenceGap(missing, first, last))
             else:
                 self.waiting.clear()
         self._start = number
@@ -106,19 +108,6 @@ class SequenceGapDetector:
         if self.waiting and self._messages_after + run > self._confirm_after:
             self._confirmed += self.waiting
             self.waiting = []
-
-    def _wait(self, gap: SequenceGap) -> None:
-        if not self.waiting:
-            self._messages_after = 0
-        elif self.waiting[-1][1:] == gap[1:]:
-            # Many gaps in what was received at once are one.
-            gap = joined_gap([self.waiting.pop(), gap])
-        self.waiting.append(gap)
-
-
-def joined_gap(gaps: list[SequenceGap]) -> SequenceGap:
-    """One gap that spans several, the oldest first; at least one."""
-    return SequenceGap(sum(gap.missing for gap in gaps), gaps[0].first, gaps[-1].last)
 
 
 def has_sequence_numbers(channel: Channel) -> bool:

@@ -87,8 +87,6 @@ class Heard:
     def __init__(self, wanted: Callable[[str, str], bool] = lambda *_: True) -> None:
         self.wanted = wanted
         self.asked: list[tuple[str, str]] = []
-        self.expected: list[Channel] = []
-        self.unexpected: list[Channel] = []
         self.taken: list[Taken] = []
         self.losses: list[Loss] = []
         self.topics: list[tuple[Any, ...]] = []
@@ -121,9 +119,6 @@ class Heard:
         self._note(self.asked, (topic, type_name))
         return self.wanted(topic, type_name)
 
-    def expect(self, channel: Channel) -> None:
-        self._note(self.expected, channel)
-
     def take(
         self,
         channel: Channel,
@@ -133,8 +128,6 @@ class Heard:
         sent: int | None = None,
         sequence: int | None = None,
     ) -> None:
-        if not any(expected is channel for expected in self.expected):
-            self._note(self.unexpected, channel)
         self._note(self.taken, Taken(channel, payload, received, sent, sequence))
 
     def lost(self, loss: Loss) -> None:

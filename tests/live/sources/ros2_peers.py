@@ -191,7 +191,7 @@ FAKE = """\
 #!{python}
 import json, os, signal, socket, sys, time
 from types import SimpleNamespace
-from hybridlog.live.sources.ros2.child.outbox import *
+from hybridlog.live.sources.ros2.child.child import *
 
 peer = socket.socket(fileno=int(sys.argv[-1]))
 file = peer.makefile("rb")

@@ -9,8 +9,7 @@ import struct
 
 import pytest
 
-from hybridlog.live.sources.base import Cause, PeerError, one_line
-from hybridlog.live.sources.network import endpoint_of
+from hybridlog.live.sources.base import Cause, PeerError, endpoint_of, one_line
 from hybridlog.live.sources.ros1.source import (
     channel_of,
     decode_header,

@@ -13,13 +13,11 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
+from hybridlog.live.sources.ros2.child import child
 from hybridlog.live.sources.ros2.child import middleware as qos
-from hybridlog.live.sources.ros2.child import topics
-from hybridlog.live.sources.ros2.child.child import Child
+from hybridlog.live.sources.ros2.child.child import Child, Outbox
 from hybridlog.live.sources.ros2.child.definitions import Definitions, UnknownTypeError
 from hybridlog.live.sources.ros2.child.middleware import VARIABLES, Offer, Profile
-from hybridlog.live.sources.ros2.child.outbox import Outbox
-from hybridlog.live.sources.ros2.child.topics import Topics
 from tests.imports import ROOT, imports_of
 
 GAPS = "hybridlog.live.sources.sequence_gaps"
@@ -159,8 +157,7 @@ class Rig:
                 "a/msg/Bad.msg": "",
             },
         )
-        self.topics = Topics(self.ros, self.box, found)
-        self.child = Child(self.ros, self.topics, self.box)
+        self.child = Child(self.ros, self.box, found)
 
     def told(self, kind: str) -> list[dict[str, Any]]:
         return [event for event in self.events if event["event"] == kind]
@@ -183,20 +180,20 @@ def live_topic(tmp_path: Path, *offers: Offer, kind: str = "a/msg/T") -> Rig:
     """One topic, subscribed to, after two looks."""
     rig = Rig(tmp_path)
     rig.ros.graph = {("/t", kind): list(offers)}
-    rig.topics.look()
-    rig.topics.subscribe("/t", kind)
-    rig.topics.look()
+    rig.child.look()
+    rig.child.subscribe("/t", kind)
+    rig.child.look()
     return rig
 
 
 def test_a_subscription_outlives_its_publishers(tmp_path: Path) -> None:
     rig = live_topic(tmp_path, offer())
     rig.ros.graph = {}
-    rig.topics.look()
-    rig.topics.look()
+    rig.child.look()
+    rig.child.look()
     assert len(rig.told("gone")) == 1
     rig.ros.graph = {("/t", "a/msg/T"): [offer(B)]}
-    rig.topics.look()
+    rig.child.look()
     assert len(rig.told("topic")) == 2
     assert len(rig.ros.made) == 1
     assert not rig.ros.made[0].is_closed
@@ -206,7 +203,7 @@ def test_a_publisher_that_offers_less_is_heard_too(tmp_path: Path) -> None:
     rig = live_topic(tmp_path, offer())
     rig.ros.made[0].queue = [(b"1", info(1)), (b"2", info(2))]
     rig.ros.graph = {("/t", "a/msg/T"): [offer(), offer(B, reliability=qos.BEST_EFFORT)]}
-    rig.topics.look()
+    rig.child.look()
     old, new = rig.ros.made
     assert new.profile.reliability == qos.BEST_EFFORT
     assert old.is_closed
@@ -215,7 +212,7 @@ def test_a_publisher_that_offers_less_is_heard_too(tmp_path: Path) -> None:
     rig.child._take(0.0)
     assert [message[1] for message in rig.messages] == [b"1", b"2", b"x", b"5", b"6"]
     assert len(rig.told("channel")) == 2
-    rig.topics.account(final=True)
+    rig.child.account(final=True)
     assert [(lost["topic"], lost["count"]) for lost in rig.told("lost")] == [("/t", 2)]
 
 
@@ -223,10 +220,10 @@ def test_a_topic_that_cannot_be_subscribed_to_again_is_said_to_be_lost(tmp_path:
     rig = live_topic(tmp_path, offer())
     rig.ros.subscribe = lambda *_: 1 / 0
     rig.ros.graph = {("/t", "a/msg/T"): [offer(), offer(B, reliability=qos.BEST_EFFORT)]}
-    rig.topics.look()
-    rig.topics.look()
-    rig.topics.account(final=True)
-    assert "cannot subscribe again" in rig.told("say")[0]["text"]
+    rig.child.look()
+    rig.child.look()
+    rig.child.account(final=True)
+    assert "rclpy cannot subscribe: division by zero" in rig.told("say")[0]["text"]
     [lost] = rig.told("lost")
     assert (lost["topic"], lost["cause"], lost["count"]) == ("/t", "unreadable", None)
 
@@ -243,14 +240,14 @@ def test_a_type_that_nobody_knows_is_told_and_told_again(
     [lost] = rig.told("lost")
     assert (lost["topic"], lost["cause"], lost["count"]) == ("/t", "unreadable", None)
     later = time.monotonic() + 11
-    monkeypatch.setattr(topics, "time", SimpleNamespace(monotonic=lambda: later))
-    rig.topics.look()
+    monkeypatch.setattr(child.time, "monotonic", lambda: later)
+    rig.child.look()
     assert len(rig.told("lost")) == 2
     rig.ros.graph = {}
-    rig.topics.look()
+    rig.child.look()
     assert len(rig.told("gone")) == 1
     rig.ros.graph = {("/t", kind): [offer()]}
-    rig.topics.look()
+    rig.child.look()
     assert len(rig.told("candidate")) == 2
 
 
@@ -260,8 +257,8 @@ def test_losses_name_the_publisher(tmp_path: Path) -> None:
         (b"", info(number, gid)) for number in (1, 2, 3, 7, 8) for gid in (A, B) if number != gid[0]
     ]
     rig.child._take(0.0)
-    rig.topics.look()
-    rig.topics.look()
+    rig.child.look()
+    rig.child.look()
     assert [(lost["count"], lost["detail"]) for lost in rig.told("lost")] == [
         (3, "from /one"),
         (3, "from /two"),
@@ -273,7 +270,7 @@ def test_a_late_message_is_stored_and_no_loss(tmp_path: Path, late: list[int]) -
     rig = live_topic(tmp_path, offer())
     rig.ros.made[0].queue = [(b"", info(number)) for number in (1, 2, 5, *late, 6, 7)]
     rig.child._take(0.0)
-    rig.topics.account(final=True)
+    rig.child.account(final=True)
     assert [lost["count"] for lost in rig.told("lost")] == [2]
     assert len(rig.messages) == 5 + len(late)
 
@@ -287,8 +284,8 @@ def test_without_names_nobody_is_accused_when_publishers_mix(
     rig = live_topic(tmp_path, offer())
     rig.ros.made[0].queue = [(b"", info(number, None)) for number in numbers]
     rig.child._take(0.0)
-    rig.topics.look()
-    rig.topics.account(final=True)
+    rig.child.look()
+    rig.child.account(final=True)
     assert [lost["count"] for lost in rig.told("lost")] == missing
     assert {lost["detail"] for lost in rig.told("lost")} <= {"from /n"}
     assert len(rig.messages) == len(numbers)
@@ -298,7 +295,7 @@ def test_without_numbers_nothing_is_counted(tmp_path: Path) -> None:
     rig = live_topic(tmp_path, offer())
     rig.ros.made[0].queue = [(b"", info(None))]
     rig.child._take(0.0)
-    rig.topics.look()
+    rig.child.look()
     assert not rig.told("lost")
     assert rig.messages[0][4] == -1
     assert "does not number messages" in rig.told("say")[0]["text"]
@@ -355,7 +352,7 @@ def test_each_version_of_a_type_is_a_channel_of_its_own(tmp_path: Path) -> None:
     rig = live_topic(tmp_path, one)
     for number, offers in enumerate([[one], [one, other], [other], [], [one]]):
         rig.ros.graph = {("/t", "a/msg/T"): offers} if offers else {}
-        rig.topics.look()
+        rig.child.look()
         rig.ros.made[0].queue = [(b"", info(number))]
         rig.child._take(0.0)
     assert channels(rig) == [
@@ -382,15 +379,15 @@ def test_another_type_of_a_topic_waits_for_its_turn(
 
     rig.ros.subscribe = subscribe
     rig.ros.graph["/t", "a/msg/Bytes"] = [offer(B)]
-    rig.topics.look()
-    rig.topics.subscribe("/t", "a/msg/Bytes")
+    rig.child.look()
+    rig.child.subscribe("/t", "a/msg/Bytes")
     assert "it has another type" in rig.told("say")[0]["text"]
     assert [(lost["topic"], lost["count"]) for lost in rig.told("lost")] == [("/t", None)]
     del rig.ros.graph["/t", "a/msg/T"]
-    rig.topics.look()
+    rig.child.look()
     later = time.monotonic() + 11
-    monkeypatch.setattr(topics.time, "monotonic", lambda: later)
-    rig.topics.look()
+    monkeypatch.setattr(child.time, "monotonic", lambda: later)
+    rig.child.look()
     rig.ros.made[1].queue = [(b"x", info(1, B))]
     rig.child._take(0.0)
     assert [message[1] for message in rig.messages] == [b"x"]

@@ -51,7 +51,6 @@ def by_the_detector(numbers: Sequence[int]) -> int:
 def by_ros1(numbers: Sequence[int], *, at_once: bool) -> int:
     channel = Channel("/a", "ros1", Schema("a/B", "ros1msg", DEFINITION.encode()))
     heard = Heard()
-    heard.expect(channel)
     ours, peer = socket.socketpair()
     ours.setblocking(False)
     with peer:
@@ -147,25 +146,6 @@ def test_all_report_the_same_losses(
 def test_a_gap_lies_between_two_messages() -> None:
     assert detected([*range(100), *range(110, 200)]) == [SequenceGap(10, 99, 100)]
     assert detected([*range(MODULUS - 20, MODULUS), 3]) == [SequenceGap(3, 19, 20)]
-
-
-def test_gaps_of_messages_that_were_received_together_are_one() -> None:
-    detector = SequenceGapDetector()
-    for number in range(20):
-        detector.see(number, number)
-    for number in (22, 24, 26):
-        detector.jump(number, 19, 20)
-    assert detector.finish() == [SequenceGap(4, 19, 20)]
-
-
-def test_foxglove_puts_close_gaps_into_few_rows() -> None:
-    heard = heard_by_foxglove(*map(payload, [*range(100), *range(100, 400, 3)]))
-    assert reported(heard) == 2 * 99
-    assert len(heard.losses) < 20
-    lost = heard.losses[0]
-    assert "header.seq" in lost.reason
-    assert lost.first == heard.taken[100].received
-    assert lost.last in [taken.received for taken in heard.taken[101:]]
 
 
 @pytest.mark.parametrize("data", [b"", b"abc"])

@@ -26,7 +26,16 @@ from picows import (
     ws_connect,
 )
 
-from hybridlog.live.sources.base import Cause, Loss, PeerError, Sink, one_line
+from hybridlog.live.sources.base import (
+    Cause,
+    Endpoint,
+    Loss,
+    PeerError,
+    Sink,
+    connect,
+    one_line,
+    reason_of,
+)
 from hybridlog.live.sources.foxglove.protocol import (
     MAX_TEXT,
     MESSAGE_DATA,
@@ -35,12 +44,10 @@ from hybridlog.live.sources.foxglove.protocol import (
     Offer,
     parse_channel,
 )
-from hybridlog.live.sources.network import Endpoint, connect, reason_of
 from hybridlog.live.sources.sequence_gaps import (
     SequenceGap,
     SequenceGapDetector,
     has_sequence_numbers,
-    joined_gap,
 )
 from hybridlog_storage.messages import Channel
 
@@ -177,7 +184,7 @@ _NO_CHANNEL = re.compile(
 )
 _LARGE: Final = 1 << 14  # bytes from which a second copy costs more than a view
 _RETRY_S: Final = 0.2
-_SEND_S: Final = 3.0
+_MAX_UNREAD: Final = 8 << 20  # bytes of ours
 _NUMBER: Final = Struct("<I").unpack_from
 _HEAD: Final = Struct("<xIQ")
 _CONTENT: Final = attrgetter("topic", "message_encoding", "schema", "metadata")
@@ -218,7 +225,6 @@ class Session(WSListener):
         self._retired: deque[int] = deque()
         self._loop = asyncio.get_running_loop()
         self._transport: WSTransport
-        self._overdue: asyncio.TimerHandle
 
     def _say(self, text: str) -> None:
         """Report a problem; the text may quote the server."""
@@ -229,7 +235,7 @@ class Session(WSListener):
     def on_ws_connected(self, transport: WSTransport) -> None:
         """Check the protocol."""
         self._transport, self.is_connected = transport, True
-        transport.underlying_transport.set_write_buffer_limits(1)
+        transport.underlying_transport.set_write_buffer_limits(_MAX_UNREAD)
         if transport.response.headers.get("Sec-WebSocket-Protocol") in SUBPROTOCOLS:
             self._reached()
         else:
@@ -272,15 +278,8 @@ class Session(WSListener):
             self._fail(error)
 
     def pause_writing(self) -> None:
-        """Read on when the server reads, too."""
-        self._transport.underlying_transport.pause_reading()
-        error = PeerError(f"has not read for {_SEND_S:g} s")
-        self._overdue = self._loop.call_later(_SEND_S, self._fail, error)
-
-    def resume_writing(self) -> None:
-        """The server has read."""
-        self._overdue.cancel()
-        self._transport.underlying_transport.resume_reading()
+        """Leave a server that does not read."""
+        self._fail(PeerError(f"leaves more than {_MAX_UNREAD} bytes unread"))
 
     def _fail(self, error: Exception) -> None:
         self.problem = self.problem or error
@@ -385,7 +384,6 @@ class Session(WSListener):
         self._topics[topic] += 1
         if self._topics[topic] == 1:
             self._sink.topic_came(topic, offer.type_name)
-        self._sink.expect(offer.channel)
         since = self._missed.pop(topic, None)
         if since is not None:
             detail = "the connection was down; messages of this time are unknown"
@@ -423,10 +421,9 @@ class Session(WSListener):
         if self._subscriptions.get(refused.offer.id) is refused:
             self._subscribe([refused])
 
-    def _report(self, topic: str, gaps: list[SequenceGap]) -> None:
-        """Notes messages that a publisher counted and that never came, in one row."""
-        if gaps:
-            gap = joined_gap(gaps)
+    def _report(self, topic: str, gaps: Iterable[SequenceGap]) -> None:
+        """Notes messages that a publisher counted and that never came."""
+        for gap in gaps:
             detail = "numbers are missing in header.seq"
             self._sink.lost(Loss(Cause.TRANSPORT, topic, gap.missing, gap.first, gap.last, detail))
 

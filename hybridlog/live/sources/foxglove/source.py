@@ -18,9 +18,8 @@ in another century.
 
 from __future__ import annotations
 
-from hybridlog.live.sources.base import Sink
+from hybridlog.live.sources.base import LoopSource, Sink
 from hybridlog.live.sources.foxglove.protocol import parse_address, without_user
-from hybridlog.live.sources.network import LoopSource
 from hybridlog_storage.errors import extra
 
 

@@ -30,14 +30,15 @@ from xml.parsers.expat import ExpatError
 
 import msgspec
 
-from hybridlog.live.sources.base import PeerError, one_line
-from hybridlog.live.sources.network import (
+from hybridlog.live.sources.base import (
     PATIENCE_S,
     Endpoint,
     LoopSource,
+    PeerError,
     UnreachedError,
     connect,
     endpoint_of,
+    one_line,
     reason_of,
 )
 from hybridlog.live.sources.ros1.stream import Reader, Stream, u32
@@ -251,9 +252,7 @@ class Subscription:
             self._type = self._type or type_name
             if not self._graph.sink.wants(self.topic, type_name):
                 return None
-        channel = channel_of(self.topic, fields)
-        self._graph.sink.expect(channel)
-        return channel
+        return channel_of(self.topic, fields)
 
     async def _connect(self, uri: str, link: _Link) -> None:
         await link.run(self._graph)

@@ -9,12 +9,10 @@ from __future__ import annotations
 import io
 import os
 import shutil
-import signal
 import socket
 import subprocess
 import sys
 import time
-from collections import deque
 from contextlib import suppress
 from json import dumps, loads
 from pathlib import Path
@@ -22,7 +20,7 @@ from threading import Thread
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.live.sources.base import Cause, ThreadedSource, one_line
-from hybridlog.live.sources.ros2.child.outbox import ENTRY, EVENT, HEADER
+from hybridlog.live.sources.ros2.child.child import ENTRY, EVENT, HEADER
 from hybridlog_storage.errors import MissingDependencyError, SourceError, UsageError
 from hybridlog_storage.manifest import Loss
 from hybridlog_storage.messages import Channel, Schema
@@ -132,10 +130,9 @@ class Ros2Source(ThreadedSource):
 
     def _listen(self, child: Process, sink: Sink) -> str:
         """Reads from a child until it ends; returns the reason of its end."""
-        receiver = Receiver(child.peer, sink, self._outages)
         reasons = []
         try:
-            receiver.run()
+            child.listen(sink, self._outages)
         except (EOFError, OSError) as error:
             reasons.append(str(error))
         except MemoryError:
@@ -144,11 +141,11 @@ class Ros2Source(ThreadedSource):
         finally:
             reasons.append(child.exit_report())
             child.end()
-        if not (self._stopping.is_set() and receiver.said_bye):
-            for topic in receiver.subscribed:
-                self._outages.setdefault(topic, receiver.last_received)
+        if not (self._stopping.is_set() and child.said_bye):
+            for topic in child.subscribed:
+                self._outages.setdefault(topic, child.last_received)
         if not self._stopping.is_set():
-            for topic in sorted(receiver.present):
+            for topic in sorted(child.present):
                 sink.topic_gone(topic)
         return one_line("; ".join(reasons))
 
@@ -165,94 +162,6 @@ class Ros2Source(ThreadedSource):
 
 # Reads of whole multiples of this size bypass the buffer.
 _BUFFER = 32 << 10
-
-
-class Receiver:
-    """Reads from one child until it ends.
-
-    Args:
-        outages: Topics that an earlier child recorded, with the time of its end, ns since
-            the epoch. Topics that are recorded again are removed.
-
-    Attributes:
-        subscribed: Topics that the child has subscribed to.
-        present: Topics with publishers, as reported to the sink.
-        last_received: Time of the last frame, ns since the epoch.
-        said_bye: The child has ended regularly.
-    """
-
-    def __init__(self, peer: socket.socket, sink: Sink, outages: dict[str, int]) -> None:
-        self._peer = peer
-        self._sink = sink
-        self._outages = outages
-        self._channels: dict[int, Channel] = {}
-        self.subscribed: set[str] = set()
-        self.present: set[str] = set()
-        self.last_received = time.time_ns()
-        self.said_bye = False
-
-    def run(self) -> None:
-        """Reads to the end; EOFError if that is within a frame, OSError of the socket."""
-        # A large payload is read directly into the bytes object for the sink, without a
-        # copy.
-        raw = io.FileIO(self._peer.fileno(), closefd=False)
-        with io.BufferedReader(raw, _BUFFER) as file:
-            while file.peek(1):
-                kind, length = HEADER.unpack(_read(file, HEADER.size))
-                if kind == EVENT:
-                    self._event(loads(_read(file, length)))
-                else:
-                    number, received, sent, sequence = ENTRY.unpack(_read(file, ENTRY.size))
-                    self._sink.take(
-                        self._channels[number],
-                        _read(file, length - ENTRY.size),
-                        received=received,
-                        sent=sent or None,
-                        sequence=sequence if sequence >= 0 else None,
-                    )
-                self.last_received = time.time_ns()
-
-    def _event(self, event: dict[str, Any]) -> None:
-        match event:
-            case {"event": "candidate", "topic": str(topic), "type": str(kind)}:
-                if self._sink.wants(topic, kind):
-                    command = dumps({"subscribe": topic, "type": kind})
-                    self._peer.sendall(command.encode("ascii") + b"\n")
-            case {"event": "channel"}:
-                self._channel(event)
-            case {"event": "topic", "topic": str(topic), "type": str(kind)}:
-                self.present.add(topic)
-                self._sink.topic_came(topic, kind)
-            case {"event": "gone", "topic": str(topic)}:
-                self.present.discard(topic)
-                self._sink.topic_gone(topic)
-            case {"event": "lost", "topic": topic, "cause": cause, "count": count, **rest}:
-                detail = one_line(rest["detail"])
-                loss = Loss(Cause(cause), topic, count, rest["first"], rest["last"], detail)
-                self._sink.lost(loss)
-            case {"event": "say", "text": str(text)}:
-                self._sink.say(one_line(f"ROS 2: {text}"))
-            case {"event": "bye"}:
-                self.said_bye = True
-
-    def _channel(self, event: dict[str, Any]) -> None:
-        topic = event["topic"]
-        definition = event["definition"].encode("utf-8", "surrogateescape")
-        metadata = {"offered_qos_profiles": event["offered"]}
-        if event["hash"]:
-            metadata["topic_type_hash"] = event["hash"]
-        channel = self._channels[event["number"]] = Channel(
-            topic=topic,
-            message_encoding="cdr",
-            schema=Schema(event["type"], event["encoding"], definition),
-            metadata=metadata,
-            has_publish_time=True,
-        )
-        self._sink.expect(channel)
-        self.subscribed.add(topic)
-        since = self._outages.pop(topic, None)
-        if since is not None:
-            report_outage(self._sink, topic, since)
 
 
 def report_outage(sink: Sink, topic: str, since: int) -> None:
@@ -278,7 +187,6 @@ HELLO_S = 30.0
 SOCKET_BYTES = 4 << 20
 """Requested size of the socket buffer; the kernel may give less."""
 
-_MAX_LINES = 30
 _MAX_LINE = 300
 
 _REMEDY = (
@@ -298,13 +206,27 @@ class ChildMissingError(ChildError):
 
 
 class Process:
-    """A running child; a Python that does not exist raises ChildMissingError."""
+    """A running child; a Python that does not exist raises ChildMissingError.
+
+    Attributes:
+        subscribed: Topics that it has subscribed to.
+        present: Topics with publishers, as reported to the sink.
+        last_received: Time of the last frame, ns since the epoch.
+        said_bye: It has ended regularly.
+    """
 
     def __init__(self, python: str) -> None:
         self.hello: dict[str, Any] = {}
+        self.subscribed: set[str] = set()
+        self.present: set[str] = set()
+        self.last_received = time.time_ns()
+        self.said_bye = False
+        self._channels: dict[int, Channel] = {}
+        self._sink: Sink
+        self._outages: dict[str, int]
         self.peer, theirs = socket.socketpair()
         self._python = python
-        self._lines: deque[str] = deque(maxlen=_MAX_LINES)
+        self._last_line = ""
         for end, option in ((self.peer, socket.SO_RCVBUF), (theirs, socket.SO_SNDBUF)):
             end.setsockopt(socket.SOL_SOCKET, option, SOCKET_BYTES)
         environment = dict(os.environ)
@@ -332,10 +254,10 @@ class Process:
         self.pid = self._process.pid
 
     def _listen(self, output: IO[bytes]) -> None:
-        """Stores the last lines of output, which may explain a failure."""
+        """Keeps the last line of output, which may explain a failure."""
         with output:
             while line := output.readline(1 << 12):
-                self._lines.append(line.decode(errors="replace").strip()[:_MAX_LINE])
+                self._last_line = one_line(line, _MAX_LINE) or self._last_line
 
     def greet(self) -> None:
         """Wait for its greeting, `hello`; ChildMissingError if it has no rclpy."""
@@ -361,22 +283,81 @@ class Process:
             parts += part
         return parts
 
+    def listen(self, sink: Sink, outages: dict[str, int]) -> None:
+        """Reads to the end; EOFError if that is within a frame, OSError of the socket.
+
+        `outages` are topics that an earlier child recorded, with the time of its end, ns since the
+        epoch. Topics that are recorded again are removed.
+        """
+        self._sink, self._outages = sink, outages
+        # A large payload is read directly into the bytes object for the sink, without a
+        # copy.
+        raw = io.FileIO(self.peer.fileno(), closefd=False)
+        with io.BufferedReader(raw, _BUFFER) as file:
+            while file.peek(1):
+                kind, length = HEADER.unpack(_read(file, HEADER.size))
+                if kind == EVENT:
+                    self._event(loads(_read(file, length)))
+                else:
+                    number, received, sent, sequence = ENTRY.unpack(_read(file, ENTRY.size))
+                    self._sink.take(
+                        self._channels[number],
+                        _read(file, length - ENTRY.size),
+                        received=received,
+                        sent=sent or None,
+                        sequence=sequence if sequence >= 0 else None,
+                    )
+                self.last_received = time.time_ns()
+
+    def _event(self, event: dict[str, Any]) -> None:
+        match event:
+            case {"event": "candidate", "topic": str(topic), "type": str(kind)}:
+                if self._sink.wants(topic, kind):
+                    command = dumps({"subscribe": topic, "type": kind})
+                    self.peer.sendall(command.encode("ascii") + b"\n")
+            case {"event": "channel"}:
+                self._channel(event)
+            case {"event": "topic", "topic": str(topic), "type": str(kind)}:
+                self.present.add(topic)
+                self._sink.topic_came(topic, kind)
+            case {"event": "gone", "topic": str(topic)}:
+                self.present.discard(topic)
+                self._sink.topic_gone(topic)
+            case {"event": "lost", "topic": topic, "cause": cause, "count": count, **rest}:
+                detail = one_line(rest["detail"])
+                loss = Loss(Cause(cause), topic, count, rest["first"], rest["last"], detail)
+                self._sink.lost(loss)
+            case {"event": "say", "text": str(text)}:
+                self._sink.say(one_line(f"ROS 2: {text}"))
+            case {"event": "bye"}:
+                self.said_bye = True
+
+    def _channel(self, event: dict[str, Any]) -> None:
+        topic = event["topic"]
+        definition = event["definition"].encode("utf-8", "surrogateescape")
+        metadata = {"offered_qos_profiles": event["offered"]}
+        if event["hash"]:
+            metadata["topic_type_hash"] = event["hash"]
+        self._channels[event["number"]] = Channel(
+            topic=topic,
+            message_encoding="cdr",
+            schema=Schema(event["type"], event["encoding"], definition),
+            metadata=metadata,
+            has_publish_time=True,
+        )
+        self.subscribed.add(topic)
+        since = self._outages.pop(topic, None)
+        if since is not None:
+            report_outage(self._sink, topic, since)
+
     def exit_report(self) -> str:
-        """Exit code or signal of the child, and its last line of output."""
+        """Exit code of the child, negative after a signal, and its last line of output."""
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(1.0)
         self._listener.join(1.0)
         code = self._process.returncode
-        if code is None:
-            how = "it still runs"
-        elif code < 0:
-            with suppress(ValueError):
-                code = signal.Signals(-code).name
-            how = f"killed by {code}"
-        else:
-            how = f"exit code {code}"
-        lines = [line for line in self._lines if line]
-        return one_line(f"{how}: {lines[-1]}" if lines else how)
+        how = "it still runs" if code is None else f"exit code {code}"
+        return f"{how}: {self._last_line}" if self._last_line else how
 
     def end_input(self) -> None:
         """Asks the child to pass on its messages and end."""

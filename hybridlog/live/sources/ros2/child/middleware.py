@@ -45,15 +45,12 @@ class Offer(NamedTuple):
     type_hash: str
 
 
-class Subscription:
+class Subscription(NamedTuple):
     """A raw subscription; `take` returns the next message and its information, or None."""
 
-    def __init__(self, inner: Any, profile: Profile) -> None:
-        self.profile = profile
-        self.take: Callable[[], tuple[bytes, dict[str, Any]] | None] = partial(
-            inner.handle.take_message, inner.msg_type, True
-        )
-        self.inner = inner
+    inner: Any
+    profile: Profile
+    take: Callable[[], tuple[bytes, dict[str, Any]] | None]
 
 
 class Middleware:
@@ -117,7 +114,9 @@ class Middleware:
             raw=True,
             event_callbacks=self._silent,
         )
-        found = Subscription(handle, profile)
+        found = Subscription(
+            handle, profile, partial(handle.handle.take_message, handle.msg_type, True)
+        )
         self._open.append(found)
         self._wait_set = None
         return found
@@ -231,6 +230,7 @@ _OTHERS = ("FASTDDS_BUILTIN_TRANSPORTS", "ROS2_EASY_MODE")
 _FILES = ("DEFAULT_FASTDDS_PROFILES.xml", "DEFAULT_FASTRTPS_PROFILES.xml")
 
 _KERNEL_LIMIT = Path("/proc/sys/net/core/rmem_max")
+"""Of socket buffers, bytes."""
 
 BUFFER = 32 << 20
 """Socket buffer in bytes, if the kernel allows it."""
@@ -264,16 +264,6 @@ _PROFILE = """\
 """
 
 
-def profile(allowed: str) -> str:
-    """The profile, as XML.
-
-    `allowed` is the kernel's limit for socket buffers, bytes; if it is not a number, the buffer has
-    the minimum size.
-    """
-    limit = int(allowed) if allowed.strip().isdigit() else _MIN_BUFFER
-    return _PROFILE.format(size=max(_MIN_BUFFER, min(BUFFER, limit)))
-
-
 def is_set_up(environment: MutableMapping[str, str], folder: Path) -> bool:
     """Tells whether the user has chosen a profile or a transport of Fast DDS.
 
@@ -290,18 +280,15 @@ def default_profile(environment: MutableMapping[str, str] = os.environ) -> Itera
         yield False
         return
     try:
-        allowed = _KERNEL_LIMIT.read_text(encoding="ascii")
-    except OSError:
-        allowed = ""
-    try:
+        limit = int(_KERNEL_LIMIT.read_text(encoding="ascii"))
         number, name = tempfile.mkstemp(prefix="hybridlog-", suffix=".xml")
-    except OSError:
+    except (OSError, ValueError):
         # No folder is writable. Fast DDS starts without the profile, and may lose more.
         yield False
         return
     try:
         with os.fdopen(number, "w", encoding="utf-8") as file:
-            file.write(profile(allowed))
+            file.write(_PROFILE.format(size=max(_MIN_BUFFER, min(BUFFER, limit))))
         environment.update(dict.fromkeys(VARIABLES, name))
         yield True
     finally:
